@@ -1,0 +1,26 @@
+# Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
+# ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
+.POSIX:
+.PHONY: help demo test lint clean
+
+help:
+	@echo 'make demo    show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
+	@echo 'make test    all checks: ruff, mypy, tests, tests on real vcan   (ARGS="--only lint|types|unit|vcan")'
+	@echo 'make lint    ruff and mypy only'
+	@echo 'make clean   remove .venv and all caches'
+
+demo:
+	@tests/bootstrap.sh demo
+	@.venv/bin/kontronik-can-gw demo $(ARGS)
+
+test:
+	@tests/bootstrap.sh test
+	@.venv/bin/python tests/run.py $(ARGS)
+
+lint:
+	@tests/bootstrap.sh lint
+	@.venv/bin/python tests/run.py --only lint --only types
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis tests/vm/.cache build dist
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

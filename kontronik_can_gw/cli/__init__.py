@@ -1,0 +1,57 @@
+"""The command line: ``kontronik-can-gw COMMAND``. One module per command; each imports what is heavy only when it runs.
+
+Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data goes to standard output, talk to standard error.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.errors import UserError
+
+COMMANDS = {
+    "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
+    "run": "the gateway: ESC telemetry in, CAN frames out",
+    "check": "check a configuration and print what it will send",
+    "init": "write a commented example configuration",
+    "dbc": "write the DBC for several ESCs or for a configuration",
+    "decode": "decode recorded UART bytes to JSON lines or CSV",
+    "simulate": "simulate ESCs on pseudo terminals",
+    "schema": "print the JSON Schema of the configuration",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; return its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        prog="kontronik-can-gw",
+        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN, described by a DBC.",
+        epilog="kontronik-can-gw COMMAND --help tells more of a command.",
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    chosen = next((word for word in words if not word.startswith("-")), None)
+    for name, line in COMMANDS.items():
+        sub = commands.add_parser(name, help=line, description=line[0].upper() + line[1:] + ".")
+        if name == chosen:
+            module = import_module(f"kontronik_can_gw.cli.{name}")
+            module.add_arguments(sub)
+            sub.set_defaults(main=module.main)
+    args = parser.parse_args(words)
+    try:
+        code: int = args.main(args)
+        sys.stdout.flush()
+    except UserError as error:
+        for problem in error.problems:
+            print(f"kontronik-can-gw {args.command}: {problem}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:  # the reader of our output has gone, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return code

@@ -1,0 +1,15 @@
+"""``schema``: the JSON Schema of the configuration, for editors."""
+
+import argparse
+import json
+
+from kontronik_can_gw.config import schema
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "Editors with TOML support (taplo, Even Better TOML) check and complete gateway.toml with it."
+
+
+def main(_args: argparse.Namespace) -> int:
+    print(json.dumps(schema(), indent=2))
+    return 0

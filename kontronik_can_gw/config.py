@@ -1,0 +1,405 @@
+"""The TOML configuration: frozen objects, checked completely before anything is opened, all mistakes reported at once.
+
+Each key is defined once, below, with its range and its text; validation and the JSON Schema come from that definition.
+"""
+
+import difflib
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields
+from fractions import Fraction
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from kontronik_can_gw.dbc_output.layout import DbcSettings, normalize
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.sources import sources
+from kontronik_can_gw.telemetry import MS, EscSettings
+
+T = TypeVar("T")
+SHIPPED = "shipped"
+
+
+def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
+    """A configuration key. ``kind``: string, integer, boolean, ratio, bindings, ids. ``limits``: low, high, choices, pattern."""
+    metadata = {"doc": doc, "kind": kind} | limits
+    if isinstance(default, dict):
+        return field(default_factory=lambda: dict(default), metadata=metadata)
+    return field(metadata=metadata) if default is MISSING else field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class CanConfig:
+    """The CAN interface."""
+
+    interface: str = _key(
+        "python-can interface name: socketcan, virtual, pcan, kvaser, slcan ...", "string", "socketcan"
+    )
+    channel: str = _key("channel of that interface, as can0", "string", "can0")
+    bitrate: int = _key(
+        "bit rate in bit/s; with socketcan it is set by the system and only the bus load is computed from it",
+        "integer",
+        500_000,
+        low=10_000,
+        high=1_000_000,
+    )
+    fd: bool = _key("allow CAN FD messages (longer than 8 bytes)", "boolean", False)
+    data_bitrate: int = _key(
+        "bit rate of the CAN FD data phase in bit/s", "integer", 2_000_000, low=10_000, high=8_000_000
+    )
+
+
+@dataclass(frozen=True)
+class DbcConfig:
+    """The DBC output."""
+
+    file: str = _key(
+        "DBC file, relative to this configuration; 'shipped' is the one of this package", "string", SHIPPED
+    )
+    node: str | None = _key("transmitter node in the DBC whose messages are sent", "string", None)
+    on_loss: str = _key(
+        "without telemetry: 'not_available' sends values marked as such, 'silent' stops messages with an ESC's values",
+        "string",
+        "not_available",
+        choices=("not_available", "silent"),
+    )
+    base_id: int | None = _key(
+        "move the messages so that the lowest id is this", "integer", None, low=0, high=0x1FFFFFFF
+    )
+    id_step: int | None = _key(
+        "distance of the ids from ESC to ESC when a one-ESC DBC serves several", "integer", None, low=1, high=0x1FFFFFFF
+    )
+    bind: Mapping[str, str | float] = _key(
+        "'Message.Signal' or 'Signal' = a source ('battery_voltage', 'left.battery_voltage') or a constant number",
+        "bindings",
+        {},
+    )
+    e2e_data_ids: Mapping[str, int] = _key("message name = AUTOSAR E2E data id", "ids", {}, low=0, high=0xFFFF)
+
+
+@dataclass(frozen=True)
+class EscConfig:
+    """One ESC and its serial port."""
+
+    port: str = _key("serial port, best by /dev/serial/by-id/...", "string")
+    name: str = _key(
+        "short name, prefix of messages and signals with several ESCs; default esc1, esc2 ...",
+        "string",
+        "",
+        pattern="[A-Za-z][A-Za-z0-9_]{0,11}",
+    )
+    pole_pairs: int = _key("pole pairs of the motor (half the number of magnets)", "integer", 1, low=1, high=100)
+    gear: Fraction = _key(
+        "motor revolutions per output revolution: a number or 'numerator/denominator'", "ratio", Fraction(1)
+    )
+    cell_count: int = _key("cells of the battery; 0: as the ESC tells", "integer", 0, low=0, high=255)
+    telemetry_timeout_ms: int = _key(
+        "live values older than this are not available", "integer", 250, low=20, high=60_000
+    )
+
+    @property
+    def settings(self) -> EscSettings:
+        return EscSettings(
+            self.name, self.pole_pairs, self.gear, self.cell_count, timeout_ns=self.telemetry_timeout_ms * MS
+        )
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """How the gateway runs."""
+
+    wait_for_devices: bool = _key(
+        "at start: wait for ports and interfaces that are missing instead of ending with an error", "boolean", False
+    )
+
+
+@dataclass(frozen=True)
+class Config:
+    """The whole configuration; ``file`` is where it came from."""
+
+    can: CanConfig
+    dbc: DbcConfig
+    run: RunConfig
+    esc: tuple[EscConfig, ...]
+    file: str = "(built-in)"
+
+    @cached_property
+    def escs(self) -> list[EscSettings]:
+        return [esc.settings for esc in self.esc]
+
+    @property
+    def dbc_settings(self) -> DbcSettings:
+        dbc = self.dbc
+        return DbcSettings(dict(dbc.bind), dbc.node, dbc.base_id, dbc.id_step, dict(dbc.e2e_data_ids))
+
+    @property
+    def dbc_path(self) -> Path:
+        """The DBC file, the shipped one or relative to the configuration."""
+        if self.dbc.file == SHIPPED:
+            return shipped("dbc/kontronik_esc.dbc")
+        return Path(self.file).parent / self.dbc.file
+
+
+_TABLES: dict[str, type[Any]] = {"can": CanConfig, "dbc": DbcConfig, "run": RunConfig, "esc": EscConfig}
+
+
+def shipped(name: str) -> Path:
+    """A file that comes with the package: inside it when installed, beside it in a checkout."""
+    package = Path(__file__).parent
+    installed = package / "shipped" / name
+    return installed if installed.exists() else package.parent / name
+
+
+def load(path: Path) -> Config:
+    """Read and check a configuration file. UserError with every mistake, each with file, key and remedy."""
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be read: {error.strerror}. `kontronik-can-gw init` writes an example."
+        ) from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: is not a text file in UTF-8, so no TOML configuration") from None
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"{path}: is not valid TOML: {error}") from None
+    return parse(tables, str(path))
+
+
+def parse(tables: Mapping[str, Any], file: str) -> Config:
+    """A configuration from TOML tables. UserError with every mistake."""
+    problems: list[str] = []
+    for name in tables:
+        if name not in _TABLES:
+            problems.append(f"{file}: {name}: unknown table.{_nearest(name, _TABLES)}")
+    made = {
+        name: _table(tables.get(name, {}), kind, name, file, problems)
+        for name, kind in _TABLES.items()
+        if name != "esc"
+    }
+    listed = tables.get("esc", [])
+    if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
+        problems.append(f"{file}: esc: is written [[esc]], once for each ESC")
+        listed = []
+    elif not listed:
+        problems.append(
+            f"{file}: esc: at least one [[esc]] with its port is needed. `kontronik-can-gw init` shows one."
+        )
+    escs = []
+    for number, entry in enumerate(listed, 1):
+        named = {"name": f"esc{number}"} | entry
+        if (esc := _table(named, EscConfig, f"esc[{number}]", file, problems)) is not None:
+            escs.append(esc)
+    _check_escs(escs, file, problems)
+    if problems:
+        raise UserError(*problems)
+    return Config(**cast(Any, made), esc=tuple(escs), file=file)
+
+
+def schema() -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of the configuration, for editors."""
+    properties: dict[str, Any] = {}
+    for name, kind in _TABLES.items():
+        required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]
+        table: dict[str, Any] = {
+            "type": "object",
+            "description": (kind.__doc__ or "").strip(),
+            "additionalProperties": False,
+            "properties": {f.name: _schema_of(f) for f in fields(kind)},
+        }
+        if required:
+            table["required"] = required
+        properties[name] = {"type": "array", "minItems": 1, "items": table} if name == "esc" else table
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "kontronik-can-gw configuration",
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["esc"],
+        "properties": properties,
+    }
+
+
+def as_toml(config: Config) -> str:
+    """The effective configuration as TOML, defaults included."""
+    lines: list[str] = []
+    for name in ("can", "dbc", "run"):
+        lines += _toml_table(f"[{name}]", getattr(config, name))
+    for esc in config.esc:
+        lines += _toml_table("[[esc]]", esc)
+    return "\n".join(lines).strip() + "\n"
+
+
+def _table(given: Any, kind: type[T], path: str, file: str, problems: list[str]) -> T | None:
+    before = len(problems)
+    if not isinstance(given, dict):
+        problems.append(f"{file}: {path}: is a table, written [{path}]")
+        return None
+    known = {f.name: f for f in fields(cast(Any, kind))}
+    values: dict[str, Any] = {}
+    for name, value in given.items():
+        if name not in known:
+            problems.append(f"{file}: {path}.{name}: unknown key.{_nearest(name, known)}")
+            continue
+        try:
+            values[name] = _value(value, known[name])
+        except ValueError as error:
+            problems.append(f"{file}: {path}.{name}: {error}")
+    for name, f in known.items():
+        if name not in given and f.default is MISSING and f.default_factory is MISSING:
+            problems.append(f"{file}: {path}.{name}: is required: {f.metadata['doc']}")
+    return kind(**values) if len(problems) == before else None
+
+
+def _value(value: Any, f: Field[Any]) -> Any:
+    limits = f.metadata
+    match limits["kind"]:
+        case "boolean":
+            if not isinstance(value, bool):
+                raise ValueError(f"{value!r} is not true or false")
+            return value
+        case "integer":
+            return _integer(value, limits)
+        case "ratio":
+            return _ratio(value)
+        case "bindings" | "ids":
+            if not isinstance(value, dict):
+                raise ValueError(f"{value!r} is not a table")
+            return {name: _entry(name, entry, limits) for name, entry in _flat(value).items()}
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"{value!r} is not a text")
+    choices = limits.get("choices")
+    if choices and value not in choices:
+        raise ValueError(f"{value!r} is none of {', '.join(choices)}.{_nearest(value, choices)}")
+    pattern = limits.get("pattern")
+    if pattern and not re.fullmatch(pattern, value):
+        raise ValueError(
+            f"{value!r} is not a name of 1 to 12 letters, digits and underscores that begins with a letter"
+        )
+    return value
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``Message.Signal = x`` without quotes is a nested table in TOML: taken as meant."""
+    found: dict[str, Any] = {}
+    for name, value in table.items():
+        if isinstance(value, dict):
+            found |= _flat(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def _entry(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
+    if limits["kind"] == "ids":
+        try:
+            return _integer(value, limits)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise ValueError(f"{name}: {value!r} is neither the name of a source nor a number")
+    return value
+
+
+def _integer(value: Any, limits: Mapping[str, Any]) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{value!r} is not a whole number")
+    if not limits["low"] <= value <= limits["high"]:
+        raise ValueError(f"{value} is outside {limits['low']}..{limits['high']}")
+    return value
+
+
+def _ratio(value: Any) -> Fraction:
+    try:
+        if isinstance(value, bool):
+            raise ValueError
+        ratio = Fraction(value) if isinstance(value, str) else Fraction(repr(value))
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"{value!r} is neither a number nor 'numerator/denominator'") from None
+    if not Fraction(1, 1000) <= ratio <= 1000:
+        raise ValueError(f"{value} is outside 0.001..1000")
+    return ratio
+
+
+def _check_escs(escs: list[EscConfig], file: str, problems: list[str]) -> None:
+    names = {normalize(name) for name in sources(EscSettings())}
+    for what in ("name", "port"):
+        seen: dict[str, int] = {}
+        for number, esc in enumerate(escs, 1):
+            text = getattr(esc, what)
+            key = normalize(text) if what == "name" else text
+            if key in seen:
+                problems.append(f"{file}: esc[{number}].{what}: {text!r} is also that of esc[{seen[key]}]")
+            seen.setdefault(key, number)
+    for number, esc in enumerate(escs, 1):
+        key = normalize(esc.name)
+        if any(other.startswith(key) and other.removeprefix(key) in names for other in names):
+            problems.append(
+                f"{file}: esc[{number}].name: {esc.name!r} makes signal names ambiguous. Choose another name."
+            )
+
+
+def _nearest(name: str, known: Any) -> str:
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" Did you mean {near[0]}?" if near else f" Known: {', '.join(known)}."
+
+
+def _schema_of(f: Field[Any]) -> dict[str, Any]:
+    limits = f.metadata
+    entry: dict[str, Any] = {"description": limits["doc"]}
+    match limits["kind"]:
+        case "integer":
+            entry |= {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
+        case "ratio":
+            entry |= {
+                "anyOf": [
+                    {"type": "number", "minimum": 0.001, "maximum": 1000},
+                    {"type": "string", "pattern": r"^\s*\d+(\.\d+)?\s*(/\s*\d+\s*)?$"},
+                ]
+            }
+        case "bindings":
+            value = {"type": ["string", "number"]}
+            entry |= {
+                "type": "object",
+                "additionalProperties": {"anyOf": [value, {"type": "object", "additionalProperties": value}]},
+            }
+        case "ids":
+            number = {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
+            entry |= {"type": "object", "additionalProperties": number}
+        case kind:
+            entry["type"] = kind
+            if kind == "string":
+                entry["minLength"] = 1
+    if "choices" in limits:
+        entry["enum"] = list(limits["choices"])
+    if "pattern" in limits:
+        entry["pattern"] = f"^{limits['pattern']}$"
+    if f.default not in (MISSING, None, ""):
+        entry["default"] = float(f.default) if isinstance(f.default, Fraction) else f.default
+    return entry
+
+
+def _toml_table(head: str, table: Any) -> list[str]:
+    lines = [head]
+    nested: list[str] = []
+    for f in fields(table):
+        value = getattr(table, f.name)
+        if isinstance(value, Mapping):
+            if value:
+                nested += ["", f"{head[:-1]}.{f.name}]", *(f"{_toml(k)} = {_toml(v)}" for k, v in value.items())]
+        elif value is not None:
+            lines.append(f"{f.name} = {_toml(value)}")
+    return [*lines, *nested, ""]
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, Fraction):
+        return repr(float(value)) if Fraction(repr(float(value))) == value else f'"{value}"'
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return repr(value)

@@ -1,0 +1,144 @@
+"""A one-ESC DBC -> the DBC of several ESCs: names prefixed, ids moved, nothing lost. Also the only place that writes a DBC."""
+
+import re
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.dbc_output.layout import Binder, is_one_esc_layout
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.sources import Group
+from kontronik_can_gw.telemetry import EscSettings
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database, Message
+
+_NAME_LIMIT = 32
+
+
+def esc_prefix(name: str) -> str:
+    """An ESC's name as the beginning of message and signal names: ``left_front`` becomes ``LeftFront``."""
+    return "".join(part[:1].upper() + part[1:] for part in re.split(r"[^A-Za-z0-9]+", name) if part)
+
+
+def needs_expansion(database: "Database", node: str, escs: Sequence[EscSettings]) -> bool:
+    """True for several ESCs and a DBC that describes one."""
+    return len(escs) > 1 and is_one_esc_layout(database, node, Binder(escs, {}))
+
+
+def expand(
+    database: "Database",
+    node: str,
+    escs: Sequence[EscSettings],
+    file: str,
+    bind: dict[str, str | float] | None = None,
+    base_id: int | None = None,
+    id_step: int | None = None,
+) -> tuple["Database", dict[str, str | float]]:
+    """The database for these ESCs and the bindings that go with it.
+
+    With one ESC names stay, with several each ESC's messages and signals get its name as prefix (a leading ``Esc`` of a message name
+    gives way) and its ids are moved by ``id_step`` an ESC: the smallest step without a clash where None. ``base_id`` becomes the
+    lowest of our ids. Messages of the gateway itself and of other nodes are taken over once. UserError for names or ids that do not fit.
+    """
+    import cantools.database.can
+
+    bind = dict(bind or {})
+    ours = [message for message in database.messages if node in message.senders]
+    per_esc = [message for message in ours if _speaks_of_an_esc(message, bind)] if len(escs) > 1 else []
+    shift = 0 if base_id is None else base_id - min(message.frame_id for message in ours)
+    once = [message for message in database.messages if message not in per_esc]
+    taken = {(m.frame_id + (shift if m in ours else 0), m.is_extended_frame) for m in once}
+    step = _step([(m.frame_id + shift, m.is_extended_frame) for m in per_esc], taken, len(escs), id_step, file)
+    messages: list[Message] = []
+    problems: list[str] = []
+    out_bind: dict[str, str | float] = {k: v for k, v in bind.items() if "." not in k}
+    for message in database.messages:
+        copies = enumerate(escs) if message in per_esc else [(0, None)]
+        for index, esc in copies:
+            copy = deepcopy(message)
+            if message in ours:
+                copy.frame_id = message.frame_id + shift + index * step
+                limit = 0x1FFFFFFF if message.is_extended_frame else 0x7FF
+                if not 0 <= copy.frame_id <= limit:
+                    problems.append(
+                        f"{file}: {message.name}: id {message.frame_id:X}h moved to {copy.frame_id:X}h is outside 0..{limit:X}h."
+                    )
+            if esc is not None:
+                _rename(copy, esc_prefix(esc.name), problems, file)
+            for old, new in zip(message.signals, copy.signals, strict=True):
+                for key in (f"{message.name}.{old.name}", old.name):
+                    if key in bind:
+                        value = bind[key]
+                        out_bind.pop(old.name, None)
+                        if esc is not None and isinstance(value, str):
+                            value = f"{esc.name}.{value}"
+                        out_bind[f"{copy.name}.{new.name}"] = value
+                        break
+            messages.append(copy)
+    if problems:
+        raise UserError(*problems)
+    result = cantools.database.can.Database(
+        messages=messages,
+        nodes=database.nodes,
+        buses=database.buses,
+        version=database.version,
+        dbc_specifics=database.dbc,
+        strict=False,
+        sort_signals=None,
+    )
+    return result, out_bind
+
+
+def dbc_text(database: "Database") -> str:
+    """The database as DBC text by the rules that every tool reads: empty NS_, LF, signals in the order of their bits."""
+    text = database.as_dbc_string(
+        sort_signals=lambda signals: sorted(signals, key=lambda s: s.start), shorten_long_names=False
+    )
+    text = text.replace("\r\n", "\n")
+    text = re.sub(r"^NS_ ?:[^\n]*\n(?:\t[^\n]*\n)*", "NS_ :\n", text, count=1, flags=re.MULTILINE)
+    return re.sub(r"\n{3,}", "\n\n", text).strip("\n") + "\n"
+
+
+def _speaks_of_an_esc(message: "Message", bind: dict[str, str | float]) -> bool:
+    binder = Binder([EscSettings()], bind)
+    for signal in message.signals:
+        bound = binder.bound(message.name, signal.name)
+        found = binder.by_name(bound if isinstance(bound, str) else signal.name)
+        if found and found[0].group is not Group.GATEWAY:
+            return True
+    return False
+
+
+def _step(
+    ids: Sequence[tuple[int, bool]], taken: set[tuple[int, bool]], count: int, wanted: int | None, file: str
+) -> int:
+    if not ids:
+        return 0
+    span = max(i for i, _ in ids) - min(i for i, _ in ids) + 1
+    for step in [wanted] if wanted is not None else range(1, span + 2):
+        moved = [(i + n * step, extended) for i, extended in ids for n in range(count)]
+        if len(set(moved)) == len(moved) and not taken & set(moved):
+            return step
+    if wanted is not None:
+        raise UserError(f"{file}: with ids moved by {wanted} an ESC, ids of {count} ESCs clash. Take another step.")
+    raise UserError(f"{file}: no step moves the ids for {count} ESCs without a clash. Give the messages other ids.")
+
+
+def _rename(message: "Message", prefix: str, problems: list[str], file: str) -> None:
+    old_name = message.name
+    stem = old_name.removeprefix("Esc")
+    message.name = prefix + (stem if stem[:1].isupper() else old_name)
+    names = {signal.name: prefix + signal.name for signal in message.signals}
+    for signal in message.signals:
+        signal.name = names[signal.name]
+        if signal.multiplexer_signal is not None:
+            signal.multiplexer_signal = names[signal.multiplexer_signal]
+    for group in message.signal_groups or []:
+        group.signal_names = [names.get(name, name) for name in group.signal_names]
+    for name in (message.name, *names.values()):
+        if len(name) > _NAME_LIMIT:
+            problems.append(
+                f"{file}: {old_name}: {name} is longer than {_NAME_LIMIT} characters. Take a shorter ESC name."
+            )
+    message.refresh(strict=False)

@@ -1,0 +1,642 @@
+"""DBC -> compiled layout. Everything that can be wrong with a DBC or its binding is found here, at start, all at once.
+
+A layout is the tuple of MessagePlans that the configured transmitter node sends. Ids, positions, byte order, sign, factor, offset,
+limits, value tables and timing come from the file and from nowhere else.
+"""
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum, Flag
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from kontronik_can_gw.dbc_output import units
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.sources import Group, Source, sources
+from kontronik_can_gw.telemetry import MS, EscSettings
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database, Message, Signal
+
+_NOT_AVAILABLE_TEXTS = frozenset({"notavailable", "sna", "na", "signalnotavailable"})
+_ERROR_TEXTS = frozenset({"error", "err", "invalid"})
+_ALIVE_ENDINGS = (
+    "alive",
+    "alivecounter",
+    "alivecount",
+    "livecounter",
+    "messagecounter",
+    "rollingcounter",
+    "sequencecounter",
+)
+_CRC_ENDINGS = ("crc", "crc8", "checksum")
+EXPECTED_LIVE_HZ = 100
+"""What a UART is expected to bring, for the computed bus load only; the gateway sends as frames come."""
+
+
+class SendType(Flag):
+    """When a message is sent. Several may hold."""
+
+    CYCLIC = 1
+    EVENT = 2
+    """With each UART frame (or change of the link) that brings one of its signals."""
+    ON_CHANGE = 4
+
+
+_SEND_TYPES = {
+    "cyclic": SendType.CYCLIC,
+    "cyclicx": SendType.CYCLIC,
+    "periodic": SendType.CYCLIC,
+    "fixedperiodic": SendType.CYCLIC,
+    "event": SendType.EVENT,
+    "spontaneous": SendType.EVENT,
+    "spontan": SendType.EVENT,
+    "spontanwithdelay": SendType.EVENT,
+    "onwrite": SendType.EVENT,
+    "onchange": SendType.ON_CHANGE,
+    "cyclicandevent": SendType.CYCLIC | SendType.EVENT,
+    "cyclicandspontan": SendType.CYCLIC | SendType.EVENT,
+    "cyclicandspontanwithdelay": SendType.CYCLIC | SendType.EVENT,
+    "cyclicandspontaneous": SendType.CYCLIC | SendType.EVENT,
+    "cyclicandonchange": SendType.CYCLIC | SendType.ON_CHANGE,
+}
+_NO_SEND_TYPE = frozenset({"", "none", "nomsgsendtype", "notused", "nosendtype"})
+
+
+class Role(Enum):
+    """What fills a signal."""
+
+    SOURCE = "source"
+    ALIVE = "alive counter"
+    CRC = "CRC"
+    CONSTANT = "constant"
+    MULTIPLEXER = "multiplexer"
+
+
+class Piece(NamedTuple):
+    """``(raw >> shift & (1 << width) - 1) << at``, ``at`` counted from bit 0 of byte 0 upward."""
+
+    shift: int
+    width: int
+    at: int
+
+
+@dataclass(frozen=True)
+class SignalPlan:
+    """One signal with what fills it. Raw value of a source in steps x: ``x * slope + intercept``, rounded."""
+
+    name: str
+    unit: str
+    role: Role
+    length: int
+    signed: bool
+    is_float: bool
+    pieces: tuple[Piece, ...]
+    low: int
+    high: int
+    not_available: int
+    error: int
+    slope: Fraction = Fraction(1)
+    intercept: Fraction = Fraction(0)
+    source: Source | None = None
+    esc: int | None = None
+    """Index of the ESC the source is read from; None for the gateway."""
+    numbers: Mapping[int, int] | None = None
+    """Source number to raw value for an enumeration; what is missing is sent as Error."""
+    constant: int = 0
+    page: int | None = None
+    """The multiplexer value under which the signal is sent; None: always."""
+    notes: tuple[str, ...] = ()
+    """What resolution or range is lost, for people."""
+
+
+@dataclass(frozen=True)
+class MessagePlan:
+    """One message of ours, as it is sent."""
+
+    name: str
+    can_id: int
+    extended: bool
+    fd: bool
+    length: int
+    send_type: SendType
+    cycle_ns: int
+    """0: not cyclic."""
+    delay_ns: int
+    """Minimum distance between two frames."""
+    signals: tuple[SignalPlan, ...]
+    escs: frozenset[int]
+    groups: frozenset[Group]
+    pages: tuple[int | None, ...] = (None,)
+    data_id: int = 0
+    """AUTOSAR E2E profile 1 data id, used where the message has a CRC signal."""
+
+    @property
+    def bits(self) -> int:
+        """Length on the bus in bits with the most stuffing that is possible (classical CAN) or nominal bits (CAN FD, without BRS)."""
+        if self.fd:
+            return (49 if self.extended else 29) + self.length * 8 * 6 // 5 + (21 if self.length > 16 else 17) + 20
+        head = 54 if self.extended else 34
+        return head + 13 + 8 * self.length + (head + 8 * self.length - 1) // 4
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second to be expected with all UARTs at 100 Hz; messages sent on change are counted by their cycle."""
+        events = 0.0
+        if SendType.EVENT in self.send_type:
+            if Group.LIVE in self.groups:
+                events = EXPECTED_LIVE_HZ * len(self.escs)
+            elif Group.INFO in self.groups:
+                events = EXPECTED_LIVE_HZ / 100 * len(self.escs)
+        if self.cycle_ns:
+            events += 1e9 / self.cycle_ns
+        return min(events, 1e9 / self.delay_ns) if self.delay_ns else events
+
+
+@dataclass(frozen=True)
+class DbcSettings:
+    """How a DBC is used. ``bind``: "Message.Signal" or "Signal" to a source name (``name`` or ``esc.name``) or a constant."""
+
+    bind: Mapping[str, str | float] = field(default_factory=dict)
+    node: str | None = None
+    """The transmitter whose messages are ours; None: the only one that sends."""
+    base_id: int | None = None
+    id_step: int | None = None
+    data_ids: Mapping[str, int] = field(default_factory=dict)
+    """Message name to E2E data id; otherwise the CAN id's low 16 bits."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """All messages of ours and what should be said about them."""
+
+    file: str
+    node: str
+    messages: tuple[MessagePlan, ...]
+    warnings: tuple[str, ...] = ()
+
+    def bus_load(self, bitrate: int) -> float:
+        """Share of the bus, 0 to 1 and above, that the messages need at ``bitrate`` bit/s."""
+        return sum(message.bits * message.rate_hz for message in self.messages) / bitrate
+
+
+def normalize(name: str) -> str:
+    """A name as it is compared: letters and digits only, lower case."""
+    return "".join(c for c in name.casefold() if c.isalnum())
+
+
+def load_database(path: Path) -> "Database":
+    """Read a DBC file. UserError with one line for a file that cannot be read or is no DBC."""
+    import cantools.database
+
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+    if b"\0" in raw:
+        raise UserError(f"{path}: is a binary file, not a DBC")
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        text = raw.decode("cp1252", errors="replace")
+    try:
+        database = cantools.database.load_string(text, database_format="dbc", strict=False, sort_signals=None)
+    except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"{path}: is not a DBC that can be read: {reason}") from None
+    if not isinstance(database, cantools.database.Database):
+        raise UserError(f"{path}: is not a CAN database")
+    if not database.messages:
+        raise UserError(f"{path}: has no message; is it a DBC file?")
+    return database
+
+
+def choose_node(database: "Database", wanted: str | None, file: str) -> str:
+    """The transmitter node whose messages are ours."""
+    senders = sorted({sender for message in database.messages for sender in message.senders})
+    if wanted is not None:
+        if wanted in senders:
+            return wanted
+        raise UserError(
+            f"{file}: no message is sent by node {wanted!r}; nodes that send: {', '.join(senders) or 'none'}. "
+            f"Set dbc.node to one of them."
+        )
+    if len(senders) == 1:
+        return senders[0]
+    gateways = [sender for sender in senders if sender == "KontronikGateway"]
+    if gateways:
+        return gateways[0]
+    if not senders:
+        raise UserError(f"{file}: no message has a transmitter, so none is ours. Name one in the DBC (BU_ and BO_).")
+    raise UserError(f"{file}: several nodes send: {', '.join(senders)}. Set dbc.node to the gateway's.")
+
+
+def attribute(owner: Any, name: str, database: "Database") -> Any:
+    """An attribute's value, its default where it is not set, None where it is not defined; enumerations as text."""
+    definition = database.dbc.attribute_definitions.get(name) if database.dbc else None
+    if definition is None:
+        return None
+    own = owner.dbc.attributes.get(name) if owner.dbc else None
+    value = definition.default_value if own is None else own.value
+    choices = definition.choices
+    if choices and isinstance(value, int):
+        return choices[value] if 0 <= value < len(choices) else None
+    return value
+
+
+class Binder:
+    """Finds the source that a signal name means, for a given set of ESCs."""
+
+    def __init__(self, escs: Sequence[EscSettings], bind: Mapping[str, str | float]) -> None:
+        self.escs = escs
+        self.bind = bind
+        self.used: set[str] = set()
+        self._sources = [sources(esc) for esc in escs]
+        self._by_key = {normalize(name): name for name in self._sources[0]}
+        self._prefixes = sorted(((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0]))
+
+    def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Source, int | None] | None:
+        """The source of a normalized name, ``percent`` at its end ignored; ``esc`` None: unprefixed."""
+        name = self._by_key.get(key) or self._by_key.get(key.removesuffix("percent"))
+        if name is None:
+            return None
+        source = self._sources[esc or 0][name]
+        return (source, None) if source.group is Group.GATEWAY else (source, esc)
+
+    def by_name(self, name: str) -> tuple[Source, int | None] | None:
+        """The source a signal name or a bound name means, and its ESC (None: the name says no ESC, or the gateway)."""
+        key = normalize(name)
+        if len(self.escs) == 1 and (found := self.gateway_or_esc(key, 0)):
+            return found
+        for prefix, esc in self._prefixes:
+            if key.startswith(prefix) and (found := self.gateway_or_esc(key[len(prefix) :], esc)):
+                return found
+        return self.gateway_or_esc(key, None)
+
+    def bound(self, message: str, signal: str) -> str | float | None:
+        """What ``[dbc.bind]`` says of a signal."""
+        for key in (f"{message}.{signal}", signal):
+            if key in self.bind:
+                self.used.add(key)
+                return self.bind[key]
+        return None
+
+    def suggestions(self, name: str) -> str:
+        """A sentence with the nearest known names, or an empty text."""
+        key = normalize(name)
+        for prefix, _ in self._prefixes:
+            key = key.removeprefix(prefix) or key
+        near = difflib.get_close_matches(key, self._by_key, n=3, cutoff=0.5)
+        names = [self._by_key[n] for n in near]
+        return f" Did you mean {' or '.join(names)}?" if names else ""
+
+
+def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
+    """True if a signal of ours means an ESC's value without saying which ESC."""
+    for message in database.messages:
+        if node in message.senders:
+            for signal in message.signals:
+                bound = binder.bound(message.name, signal.name)
+                name = bound if isinstance(bound, str) else signal.name
+                found = binder.by_name(name)
+                if found and found[1] is None and found[0].group is not Group.GATEWAY:
+                    return True
+    return False
+
+
+def compile_layout(
+    database: "Database",
+    file: str,
+    escs: Sequence[EscSettings],
+    settings: DbcSettings,
+    taken_ids: Mapping[int, str] | None = None,
+    fd_allowed: bool = False,
+) -> Layout:
+    """Compile every message of ours. UserError with all mistakes at once.
+
+    ``taken_ids``: 11-bit ids that are used otherwise (COB-IDs of our CANopen nodes) and by what.
+    """
+    node = choose_node(database, settings.node, file)
+    compiler = _Compiler(database, file, escs, settings, fd_allowed)
+    ours = [message for message in database.messages if node in message.senders]
+    plans = [plan for message in ours if (plan := compiler.message(message)) is not None]
+    compiler.check_ids(ours, taken_ids or {})
+    for key in sorted(set(settings.bind) - compiler.binder.used):
+        known = [m.name for m in ours] + [f"{m.name}.{s.name}" for m in ours for s in m.signals]
+        near = difflib.get_close_matches(key, known, n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        compiler.problems.append(f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{hint}")
+    for name in sorted(set(settings.data_ids) - {m.name for m in ours}):
+        compiler.problems.append(f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}.")
+    if compiler.problems:
+        raise UserError(*compiler.problems)
+    return Layout(file, node, tuple(plans), tuple(compiler.warnings))
+
+
+class _Compiler:
+    def __init__(
+        self, database: "Database", file: str, escs: Sequence[EscSettings], settings: DbcSettings, fd_allowed: bool
+    ) -> None:
+        self.database = database
+        self.file = file
+        self.settings = settings
+        self.fd_allowed = fd_allowed
+        self.binder = Binder(escs, settings.bind)
+        self.problems: list[str] = []
+        self.warnings: list[str] = []
+
+    def check_ids(self, ours: Sequence["Message"], taken: Mapping[int, str]) -> None:
+        seen: dict[tuple[int, bool], str] = {}
+        for message in self.database.messages:
+            key = (message.frame_id, message.is_extended_frame)
+            other = seen.setdefault(key, message.name)
+            if other != message.name and (message in ours or any(m.name == other for m in ours)):
+                self.problems.append(
+                    f"{self.file}: {message.name}: id {message.frame_id:X}h is also that of {other}. Change one of them."
+                )
+        for message in ours:
+            if not message.is_extended_frame and message.frame_id in taken:
+                self.problems.append(
+                    f"{self.file}: {message.name}: id {message.frame_id:X}h is used by {taken[message.frame_id]}. "
+                    f"Move the message (free for all: 680h..6DFh) or change the node-ID."
+                )
+
+    def message(self, message: "Message") -> MessagePlan | None:
+        where = f"{self.file}: {message.name}"
+        before = len(self.problems)
+        is_fd = message.is_fd or message.length > 8
+        if is_fd and not self.fd_allowed:
+            self.problems.append(
+                f"{where}: is a CAN FD message ({message.length} bytes). Set can.fd = true, or shorten it."
+            )
+        if message.is_container or message.length == 0 or not message.signals:
+            self.problems.append(f"{where}: has no signal that could be sent. Remove it or give it signals.")
+            return None
+        send_type, cycle_ms, delay_ms = self._timing(message, where)
+        multiplexers = [s for s in message.signals if s.is_multiplexer]
+        if len(multiplexers) > 1 or any(s.is_multiplexer and s.multiplexer_ids for s in message.signals):
+            self.problems.append(f"{where}: has more than one level of multiplexing; one is supported.")
+            return None
+        pages: set[int] = {page for s in message.signals for page in s.multiplexer_ids or ()}
+        signals: list[SignalPlan] = []
+        for signal in message.signals:
+            for page in signal.multiplexer_ids or (None,):
+                if (plan := self._signal(message, signal, page)) is not None:
+                    signals.append(plan)
+        self._check_overlap(message, where)
+        crcs = [s for s in signals if s.role is Role.CRC]
+        if len(crcs) > 1:
+            self.problems.append(f"{where}: has several CRC signals: {', '.join(s.name for s in crcs)}. Keep one.")
+        if crcs:
+            alive = [s for s in signals if s.role is Role.ALIVE]
+            if len(alive) != 1:
+                self.problems.append(
+                    f"{where}: {crcs[0].name}: E2E profile 1 needs exactly one alive counter in the message."
+                )
+        if len(self.problems) > before:
+            return None
+        return MessagePlan(
+            name=message.name,
+            can_id=message.frame_id,
+            extended=message.is_extended_frame,
+            fd=is_fd,
+            length=message.length,
+            send_type=send_type,
+            cycle_ns=cycle_ms * MS if SendType.CYCLIC in send_type else 0,
+            delay_ns=delay_ms * MS,
+            signals=tuple(signals),
+            escs=frozenset(s.esc for s in signals if s.esc is not None),
+            groups=frozenset(s.source.group for s in signals if s.source),
+            pages=tuple(sorted(pages)) if pages else (None,),
+            data_id=self.settings.data_ids.get(message.name, message.frame_id & 0xFFFF),
+        )
+
+    def _timing(self, message: "Message", where: str) -> tuple[SendType, int, int]:
+        def number(name: str) -> int:
+            value = attribute(message, name, self.database)
+            if value is None or value == "":
+                return 0
+            try:
+                if float(value) < 0:
+                    raise ValueError
+                return round(float(value))
+            except ValueError:
+                self.problems.append(f"{where}: {name} is {value!r}, which is no time in ms.")
+                return 0
+
+        cycle, delay = number("GenMsgCycleTime"), number("GenMsgDelayTime")
+        text = str(attribute(message, "GenMsgSendType", self.database) or "")
+        key = normalize(text)
+        if key in _NO_SEND_TYPE:
+            return (SendType.CYCLIC if cycle else SendType.EVENT), cycle, delay
+        if key not in _SEND_TYPES:
+            self.problems.append(
+                f"{where}: GenMsgSendType {text!r} is not known. Known: Cyclic, Event, OnChange, CyclicAndEvent, CyclicAndOnChange."
+            )
+            return SendType.EVENT, cycle, delay
+        send_type = _SEND_TYPES[key]
+        if SendType.CYCLIC in send_type and not cycle:
+            self.problems.append(f"{where}: is sent {text} but its GenMsgCycleTime is 0. Set one in ms.")
+        return send_type, cycle, delay
+
+    def _check_overlap(self, message: "Message", where: str) -> None:
+        owners: dict[tuple[int, int | None], str] = {}
+        reported: set[tuple[str, str]] = set()
+        pages: set[int | None] = {None} | {page for s in message.signals for page in s.multiplexer_ids or ()}
+        for signal in message.signals:
+            bits = _bits(signal)
+            if max(bits) >= message.length * 8:
+                self.problems.append(
+                    f"{where}.{signal.name}: lies outside the message's {message.length} bytes. Move or shorten it."
+                )
+            for page in signal.multiplexer_ids or pages:
+                for bit in bits:
+                    other = owners.setdefault((bit, page), signal.name)
+                    if other != signal.name and (other, signal.name) not in reported:
+                        reported.add((other, signal.name))
+                        self.problems.append(f"{where}.{signal.name}: overlaps {other}. Move one of them.")
+
+    def _signal(self, message: "Message", signal: "Signal", page: int | None) -> SignalPlan | None:
+        where = f"{self.file}: {message.name}.{signal.name}"
+        length, signed, is_float = signal.length, signal.is_signed, signal.is_float
+        if is_float and length not in (32, 64):
+            self.problems.append(f"{where}: a float of {length} bits cannot be sent; 32 and 64 can.")
+            return None
+        factor, offset = _exact(signal.scale), _exact(signal.offset)
+        if factor == 0:
+            self.problems.append(f"{where}: has factor 0.")
+            return None
+        codes = {normalize(str(text)): int(raw) for raw, text in (signal.choices or {}).items()}
+        low, high = (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        start = attribute(signal, "GenSigStartValue", self.database)
+        not_available = next((codes[t] for t in codes if t in _NOT_AVAILABLE_TEXTS), None)
+        error = next((codes[t] for t in codes if t in _ERROR_TEXTS), None)
+        if not_available is None:
+            start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
+            if start_is_set and start is not None and float(start).is_integer() and low <= float(start) <= high:
+                not_available = int(float(start))
+            else:
+                not_available = low if signed else high
+        if error is None:
+            error = not_available
+        base: dict[str, Any] = {
+            "name": signal.name,
+            "unit": signal.unit or "",
+            "length": length,
+            "signed": signed,
+            "is_float": is_float,
+            "pieces": _pieces(signal),
+            "not_available": not_available,
+            "error": error,
+            "page": page,
+        }
+        special = [code for name, code in codes.items() if name in _NOT_AVAILABLE_TEXTS | _ERROR_TEXTS]
+        limits_set = not (signal.minimum is None and signal.maximum is None) and not (
+            signal.minimum == 0 and signal.maximum == 0
+        )
+        if limits_set:
+            ends = sorted(
+                (_exact(end) - offset) / factor for end in (signal.minimum, signal.maximum) if end is not None
+            )
+            if signal.minimum is not None and signal.maximum is not None:
+                low, high = max(low, math.ceil(ends[0])), min(high, math.floor(ends[1]))
+        while high in special:
+            high -= 1
+        while low in special:
+            low += 1
+        base |= {"low": low, "high": high}
+        if signal.is_multiplexer:
+            return SignalPlan(role=Role.MULTIPLEXER, **base)
+        bound = self.binder.bound(message.name, signal.name)
+        if isinstance(bound, (int, float)):
+            raw = (_exact(bound) - offset) / factor
+            if not (raw.denominator == 1 and (-(1 << length - 1) if signed else 0) <= raw < 1 << length):
+                self.problems.append(f"{where}: the constant {bound} bound to it cannot be sent exactly.")
+                return None
+            return SignalPlan(role=Role.CONSTANT, constant=int(raw), **base)
+        name = signal.name if bound is None else bound
+        found = self.binder.by_name(name)
+        key = normalize(name)
+        if found is None and key.endswith(_ALIVE_ENDINGS):
+            if is_float or length < 2:
+                self.problems.append(f"{where}: an alive counter needs a whole number of 2 bits or more.")
+                return None
+            return SignalPlan(role=Role.ALIVE, **base)
+        if found is None and key.endswith(_CRC_ENDINGS):
+            if length != 8 or len(base["pieces"]) != 1 or base["pieces"][0].at % 8:
+                self.problems.append(f"{where}: an E2E profile 1 CRC needs 8 bits on a byte border.")
+                return None
+            return SignalPlan(role=Role.CRC, **base)
+        if found is None:
+            via = f" (bound by dbc.bind to {bound!r})" if bound is not None else ""
+            self.problems.append(
+                f"{where}: no such source{via}.{self.binder.suggestions(name)} Bind it under [dbc.bind] or rename it."
+            )
+            return None
+        source, esc = found
+        if esc is None and source.group is not Group.GATEWAY:
+            names = " or ".join(f"{e.name}.{source.name}" for e in self.binder.escs[:2])
+            self.problems.append(f"{where}: does not say of which ESC. Prefix it or bind it: {names}.")
+            return None
+        return self._bound_signal(where, signal, source, esc, base, codes, (factor, offset))
+
+    def _bound_signal(
+        self,
+        where: str,
+        signal: "Signal",
+        source: Source,
+        esc: int | None,
+        base: dict[str, Any],
+        codes: Mapping[str, int],
+        linear: tuple[Fraction, Fraction],
+    ) -> SignalPlan | None:
+        factor, offset = linear
+        numbers: dict[int, int] | None = None
+        notes: list[str] = []
+        if source.names:
+            by_text = {
+                number: codes[normalize(text)] for number, text in source.names.items() if normalize(text) in codes
+            }
+            if by_text:
+                numbers = by_text
+                missing = [text for number, text in source.names.items() if number not in by_text]
+                if missing:
+                    notes.append(f"sent as Error, not in the value table: {', '.join(missing)}")
+        converted = units.conversion(source.unit, signal.unit or "")
+        if converted is None:
+            can = ", ".join(units.texts_like(source.unit)[:8]) or "no unit"
+            self.problems.append(
+                f"{where}: {source.name} is in {source.unit or 'no unit'} and cannot be converted to "
+                f"{signal.unit!r}. Possible: {can}."
+            )
+            return None
+        if source.unit and not signal.unit:
+            self.warnings.append(f"{where}: has no unit; {source.unit} is taken.")
+        scale, shift = converted
+        slope = scale / source.per_unit / factor
+        intercept = (shift - offset) / factor
+        low, high = base["low"], base["high"]
+        if numbers is None and not signal.is_float:
+            step = abs(1 / slope)
+            if step > 1 and source.whole:
+                notes.append(f"resolution {_number(abs(factor))} {signal.unit or source.unit}".rstrip())
+            if not source.rolls:
+                ends = [end * slope + intercept for end in (source.low, source.high) if end is not None]
+                if ends and (min(ends) < low - 2 or max(ends) > high + 2):  # more than NotAvailable and Error cost
+                    text = f"{_number(low * factor + offset)} to {_number(high * factor + offset)} {signal.unit or ''}".rstrip()
+                    notes.append(f"range {text}, beyond it Error")
+        if source.rolls:
+            if slope != 1 or intercept != 0 or low != 0:
+                self.problems.append(
+                    f"{where}: {source.name} is a counter; it needs factor 1, offset 0 and a minimum of 0."
+                )
+                return None
+            notes.append(f"starts again at 0 after {high}")
+        return SignalPlan(
+            role=Role.SOURCE,
+            source=source,
+            esc=esc,
+            numbers=numbers,
+            slope=slope,
+            intercept=intercept,
+            notes=tuple(notes),
+            **base,
+        )
+
+
+def _exact(number: Any) -> Fraction:
+    """The decimal that stands in the file, not the float nearest to it."""
+    return Fraction(repr(number)) if isinstance(number, float) else Fraction(number)
+
+
+def _number(value: Fraction) -> str:
+    return f"{float(value):.10g}"
+
+
+def _bits(signal: "Signal") -> list[int]:
+    """The signal's bits from its least significant one, each as byte * 8 + bit in byte."""
+    if signal.byte_order == "little_endian":
+        return list(range(signal.start, signal.start + signal.length))
+    bits, at = (
+        [],
+        signal.start,
+    )  # big-endian: start is the most significant bit, downward within a byte, then the next byte
+    for _ in range(signal.length):
+        bits.append(at)
+        at = at + 15 if at % 8 == 0 else at - 1
+    return bits[::-1]
+
+
+def _pieces(signal: "Signal") -> tuple[Piece, ...]:
+    """Runs of neighbouring bits."""
+    pieces: list[Piece] = []
+    for shift, at in enumerate(_bits(signal)):
+        last = pieces[-1] if pieces else None
+        if last and at == last.at + last.width:
+            pieces[-1] = last._replace(width=last.width + 1)
+        else:
+            pieces.append(Piece(shift, 1, at))
+    return tuple(pieces)

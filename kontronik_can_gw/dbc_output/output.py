@@ -1,0 +1,131 @@
+"""Plans, packers and schedule put together: telemetry events and time in, CAN frames out."""
+
+from collections.abc import Sequence
+
+from kontronik_can_gw.dbc_output import e2e
+from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType
+from kontronik_can_gw.dbc_output.packer import alive_modulus, compile_pack
+from kontronik_can_gw.dbc_output.schedule import Schedule
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.sources import GatewayStatus, Group
+from kontronik_can_gw.telemetry import EscTelemetry, Event
+
+_EVENT_OF_GROUP = {Group.LIVE: Event.LIVE, Group.INFO: Event.INFO, Group.LINK: Event.LINK, Group.GATEWAY: Event.NONE}
+
+
+class _Message:
+    """One message at work. ``last`` holds the bits of the last frame of each page, without alive counter and CRC."""
+
+    __slots__ = ("alive", "alive_modulus", "crc_at", "last", "pack", "page", "plan", "silent_able", "triggers")
+
+    def __init__(self, plan: MessagePlan, silent: bool) -> None:
+        self.plan = plan
+        self.pack = compile_pack(plan)
+        self.page = 0
+        self.alive = 0
+        crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
+        alive = next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)
+        self.crc_at = None if crc is None else crc.pieces[0].at // 8
+        self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 1
+        self.last: dict[int | None, int] = {}
+        self.silent_able = silent and bool(plan.groups & {Group.LIVE, Group.INFO})
+        self.triggers = Event.NONE
+        if plan.send_type & (SendType.EVENT | SendType.ON_CHANGE):
+            for group in plan.groups:
+                self.triggers |= _EVENT_OF_GROUP[group]
+            if Event.LIVE in self.triggers and plan.send_type & SendType.EVENT:
+                self.triggers &= ~Event.LINK  # live frames set the pace; a loss is a live event too
+
+
+class DbcOutput:
+    """All messages of one layout. Frames are appended to ``frames``, which the owner empties.
+
+    ``silent``: on loss of telemetry messages with values of a lost ESC stop instead of carrying NotAvailable.
+    """
+
+    def __init__(
+        self, layout: Layout, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int, silent: bool = False
+    ) -> None:
+        self.frames: list[CanFrame] = []
+        self._escs = escs
+        self._gateway = gateway
+        self._messages = [_Message(plan, silent) for plan in layout.messages]
+        self._schedule = Schedule(layout.messages, now)
+        self._listeners: list[list[tuple[int, Event]]] = [[] for _ in escs]
+        for index, message in enumerate(self._messages):
+            for esc in message.plan.escs:
+                if message.triggers:
+                    self._listeners[esc].append((index, message.triggers))
+
+    def start(self, now: int) -> None:
+        """Send every message that has no cycle once, so that nobody goes on with values from before a restart."""
+        for index, message in enumerate(self._messages):
+            if not message.plan.cycle_ns and self._schedule.request(index, now):
+                self._send(index, now)
+
+    def on_event(self, esc: int, events: Event, now: int) -> None:
+        """Something of an ESC changed: send, or note for later, the messages that follow it."""
+        for index, triggers in self._listeners[esc]:
+            if triggers & events:
+                message = self._messages[index]
+                if SendType.EVENT not in message.plan.send_type and not self._changed(message, now):
+                    continue
+                if self._schedule.request(index, now):
+                    self._send(index, now)
+
+    def on_gateway_change(self, now: int, at_once: bool = False) -> None:
+        """The gateway's own state changed: messages with its values that are sent by event or on change follow.
+
+        ``at_once``: without regard to their minimum distance, for the last word.
+        """
+        for index, message in enumerate(self._messages):
+            send_type = message.plan.send_type
+            if Group.GATEWAY not in message.plan.groups:
+                continue
+            wanted = SendType.EVENT in send_type or (SendType.ON_CHANGE in send_type and self._changed(message, now))
+            if wanted and (at_once or self._schedule.request(index, now)):
+                self._send(index, now)
+
+    def advance(self, now: int) -> None:
+        """Send what is due."""
+        for index, cyclic in self._schedule.due(now):
+            message = self._messages[index]
+            if cyclic or SendType.EVENT in message.plan.send_type or self._changed(message, now):
+                self._send(index, now)
+
+    def next_deadline(self) -> int | None:
+        """When ``advance`` has something to do."""
+        return self._schedule.next_deadline()
+
+    def _changed(self, message: _Message, now: int) -> bool:
+        return self._changed_page(message, now) is not None
+
+    def _changed_page(self, message: _Message, now: int) -> int | None:
+        """Place of the first page that differs from what was sent of it last."""
+        for place, page in enumerate(message.plan.pages):
+            if message.pack(self._escs, self._gateway, now, 0, page or 0) != message.last.get(page):
+                return place
+        return None
+
+    def _send(self, index: int, now: int) -> None:
+        message = self._messages[index]
+        plan = message.plan
+        if message.silent_able and not any(self._escs[esc].up for esc in plan.escs):
+            return
+        if len(plan.pages) > 1:  # one page after the other; a changed one first where changes matter
+            changed = self._changed_page(message, now) if SendType.ON_CHANGE in plan.send_type else None
+            place = message.page if changed is None else changed
+            message.page = (place + 1) % len(plan.pages)
+            page = plan.pages[place]
+        else:
+            page = plan.pages[0]
+        pack = message.pack
+        bits = pack(self._escs, self._gateway, now, message.alive, page or 0)
+        if SendType.ON_CHANGE in plan.send_type:
+            message.last[page] = pack(self._escs, self._gateway, now, 0, page or 0)
+        message.alive = (message.alive + 1) % message.alive_modulus
+        data = bits.to_bytes(plan.length, "little")
+        if message.crc_at is not None:
+            at = message.crc_at
+            data = data[:at] + bytes((e2e.crc(data, at, plan.data_id),)) + data[at + 1 :]
+        self.frames.append(CanFrame(plan.can_id, data, plan.extended, plan.fd))

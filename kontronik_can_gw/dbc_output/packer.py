@@ -1,0 +1,196 @@
+"""Message plans -> one compiled function each: ``pack(escs, gateway, now, alive, page) -> frame bits`` as an integer.
+
+Python source is generated from the plan once, at start. A value that does not fit becomes the signal's Error code, one that is not
+available its NotAvailable code; nothing wraps, nothing is clipped. Bit 0 of the integer is bit 0 of byte 0.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+
+from kontronik_can_gw.dbc_output.layout import MessagePlan, Piece, Role, SignalPlan
+from kontronik_can_gw.sources import GatewayStatus, Group
+from kontronik_can_gw.telemetry import EscTelemetry
+
+Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
+_NAN = {32: b"\0\0\xc0\x7f", 64: b"\0\0\0\0\0\0\xf8\x7f"}
+
+
+def place(pieces: Sequence[Piece], raw: int) -> int:
+    """A raw value (negative ones in two's complement) at its bits of the frame."""
+    return sum((raw >> piece.shift & (1 << piece.width) - 1) << piece.at for piece in pieces)
+
+
+def take(pieces: Sequence[Piece], bits: int) -> int:
+    """The raw value (unsigned) that stands at the pieces of a frame."""
+    return sum((bits >> piece.at & (1 << piece.width) - 1) << piece.shift for piece in pieces)
+
+
+def float_bits(value: float, length: int) -> int:
+    """The IEEE 754 bits of a 32- or 64-bit float; beyond the 32-bit range: infinity is not sent, but NaN."""
+    try:
+        return int.from_bytes(struct.pack("<f" if length == 32 else "<d", value), "little")
+    except OverflowError:
+        return int.from_bytes(_NAN[length], "little")
+
+
+def not_available_bits(signal: SignalPlan) -> int:
+    """What a signal holds when its value is not available, at its place."""
+    raw = int.from_bytes(_NAN[signal.length], "little") if signal.is_float else signal.not_available
+    return place(signal.pieces, raw)
+
+
+def alive_modulus(signal: SignalPlan, has_crc: bool) -> int:
+    """An alive counter runs 0..modulus-1: to its greatest value, with an E2E profile 1 CRC to 14 of 4 bits."""
+    return min(signal.high + 1, 15) if has_crc else signal.high + 1
+
+
+def source_text(plan: MessagePlan) -> str:
+    """The generated function, behind the tables of its enumerations."""
+    lines = [f"{_table_name(s)} = { {int(k): v for k, v in s.numbers.items()} }" for s in plan.signals if s.numbers]
+    lines.append("def pack(escs, gateway, now, alive, page):")
+    constant = 0
+    has_crc = any(signal.role is Role.CRC for signal in plan.signals)
+    for signal in plan.signals:
+        if signal.role is Role.CONSTANT and signal.page is None:
+            constant |= place(signal.pieces, signal.constant)
+    lines.append(f"    bits = {constant:#x}")
+    lines += [f"    {line}" for line in _body(plan, None, has_crc)]
+    for page in plan.pages:
+        if page is None:
+            continue
+        body = _body(plan, page, has_crc)
+        for signal in plan.signals:
+            if signal.role is Role.MULTIPLEXER:
+                body.append(f"bits |= {place(signal.pieces, page):#x}")
+            elif signal.role is Role.CONSTANT and signal.page == page:
+                body.append(f"bits |= {place(signal.pieces, signal.constant):#x}")
+        lines.append(f"    if page == {page}:")
+        lines += [f"        {line}" for line in body]
+    lines.append("    return bits")
+    return "\n".join(lines) + "\n"
+
+
+def compile_pack(plan: MessagePlan) -> Pack:
+    """The function of ``source_text``, compiled."""
+    names: dict[str, object] = {"float_bits": float_bits}
+    exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
+    return names["pack"]  # type: ignore[return-value]
+
+
+def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
+    lines: list[str] = []
+    chosen = [signal for signal in plan.signals if signal.page == page]
+    for signal in chosen:
+        if signal.role is Role.ALIVE:
+            lines += [f"v = alive % {alive_modulus(signal, has_crc)}", f"bits |= {_placed(signal)}"]
+    by_owner: dict[tuple[int | None, Group], list[SignalPlan]] = {}
+    for signal in chosen:
+        if signal.source is not None:
+            by_owner.setdefault((signal.esc, signal.source.group), []).append(signal)
+    for (esc, group), signals in by_owner.items():
+        if esc is not None:
+            lines.append(f"esc = escs[{esc}]")
+        code = _values(signals)
+        if group in (Group.LIVE, Group.INFO):
+            nothing = 0
+            for signal in signals:
+                nothing |= not_available_bits(signal)
+            lines.append(f"{group.value} = esc.{group.value}")
+            lines.append(f"if {group.value} is None:")
+            lines.append(f"    bits |= {nothing:#x}")
+            lines.append("else:")
+            lines += [f"    {line}" for line in code]
+        else:
+            lines += code
+    return lines
+
+
+def _values(signals: Sequence[SignalPlan]) -> list[str]:
+    lines: list[str] = []
+    flags: dict[tuple[str, int], int] = {}  # (word, distance moved up) -> bits of the word that move together
+    for signal in signals:
+        source = signal.source
+        assert source is not None
+        if source.bit is not None and _is_plain_flag(signal):
+            key = (source.expression, signal.pieces[0].at - source.bit)
+            flags[key] = flags.get(key, 0) | 1 << source.bit
+            continue
+        code = _value(signal)
+        if source.supplied is not None:
+            lines.append(f"if {source.supplied}:")
+            lines += [f"    {line}" for line in code]
+            lines.append("else:")
+            lines.append(f"    bits |= {not_available_bits(signal):#x}")
+        else:
+            lines += code
+    for (word, distance), mask in flags.items():
+        moved = f"<< {distance}" if distance >= 0 else f">> {-distance}"
+        lines.append(f"bits |= ({word} & {mask:#x}) {moved}")
+    return lines
+
+
+def _is_plain_flag(signal: SignalPlan) -> bool:
+    return (
+        signal.length == 1 and not signal.is_float and signal.slope == 1 and signal.intercept == 0 and not signal.signed
+    )
+
+
+def _value(signal: SignalPlan) -> list[str]:
+    source = signal.source
+    assert source is not None
+    expression = source.expression if source.bit is None else f"{source.expression} >> {source.bit} & 1"
+    if signal.is_float:
+        slope, intercept = float(signal.slope), float(signal.intercept)
+        scaled = f"({expression}) * {slope!r} + {intercept!r}"
+        return [f"v = float_bits({scaled}, {signal.length})", f"bits |= {_placed(signal)}"]
+    if signal.numbers is not None:
+        return [f"v = {_table_name(signal)}.get({expression}, {signal.error})", f"bits |= {_placed(signal)}"]
+    if source.rolls:
+        return [f"v = ({expression}) % {signal.high + 1}", f"bits |= {_placed(signal)}"]
+    lines = [f"v = {_scaled(expression, signal.slope, signal.intercept, source.whole)}"]
+    if not _always_fits(signal):
+        lines.append(f"if not {signal.low} <= v <= {signal.high}:")
+        lines.append(f"    v = {signal.error}")
+        codes = {code for code in (signal.not_available, signal.error) if signal.low <= code <= signal.high}
+        if codes and signal.error != signal.not_available:  # a code amid the values: a true value must not look like it
+            lines.append(f"elif v == {signal.not_available}:")
+            lines.append(f"    v = {signal.error}")
+    lines.append(f"bits |= {_placed(signal)}")
+    return lines
+
+
+def _table_name(signal: SignalPlan) -> str:
+    return f"numbers_at_{signal.pieces[0].at}_of_{signal.page or 0}"
+
+
+def _scaled(expression: str, slope: Fraction, intercept: Fraction, whole: bool) -> str:
+    if not whole:
+        return f"round(({expression}) * {float(slope)!r} + {float(intercept)!r})"
+    if slope == 1 and intercept == 0:
+        return expression
+    if slope.denominator == 1 and intercept.denominator == 1:
+        return f"({expression}) * {slope} + {intercept}"
+    common = slope.denominator * intercept.denominator
+    a, b = int(slope * common), int(intercept * common)
+    return f"(({expression}) * {2 * a} + {2 * b + common}) // {2 * common}"  # rounded to the nearest, halves up
+
+
+def _always_fits(signal: SignalPlan) -> bool:
+    source = signal.source
+    assert source is not None
+    if source.low is None or source.high is None or not source.whole:
+        return False
+    ends = [source.low * signal.slope + signal.intercept, source.high * signal.slope + signal.intercept]
+    inside = signal.low <= min(ends) and max(ends) <= signal.high
+    return inside and not signal.low <= signal.not_available <= signal.high
+
+
+def _placed(signal: SignalPlan) -> str:
+    """``v`` at its bits. Only signed values and codes can have bits beyond the length."""
+    parts = []
+    for piece in signal.pieces:
+        moved = f"v >> {piece.shift}" if piece.shift else "v"
+        part = f"({moved} & {(1 << piece.width) - 1:#x})"
+        parts.append(f"{part} << {piece.at}" if piece.at else part)
+    return " | ".join(parts)

@@ -1,0 +1,40 @@
+"""From a DBC file and ESCs to what will be sent: the database (expanded to the ESCs where it describes one) and its layout."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.dbc_output.expand import expand, needs_expansion
+from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, choose_node, compile_layout
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.telemetry import EscSettings
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+WARN_LOAD, REFUSE_LOAD = 0.5, 1.0
+
+
+def prepare(
+    database: "Database",
+    file: str,
+    escs: Sequence[EscSettings],
+    settings: DbcSettings,
+    fd_allowed: bool = False,
+    taken_ids: Mapping[int, str] | None = None,
+) -> tuple["Database", Layout]:
+    """The exact database of what a gateway with these ESCs sends, and the compiled layout. UserError with every mistake."""
+    node = choose_node(database, settings.node, file)
+    if needs_expansion(database, node, escs) or settings.base_id is not None:
+        database, bind = expand(database, node, escs, file, dict(settings.bind), settings.base_id, settings.id_step)
+        settings = replace(settings, bind=bind)
+    return database, compile_layout(database, file, escs, settings, taken_ids, fd_allowed)
+
+
+def check_load(layout: Layout, bitrate: int) -> str | None:
+    """A warning above 50 % computed bus load, UserError above 100 %, else None."""
+    load = layout.bus_load(bitrate)
+    text = f"{layout.file}: the messages need {load:.0%} of {bitrate // 1000} kbit/s"
+    if load > REFUSE_LOAD:
+        raise UserError(f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime) or raise can.bitrate.")
+    return f"{text}; other nodes get little" if load > WARN_LOAD else None

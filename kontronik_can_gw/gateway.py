@@ -1,0 +1,84 @@
+"""The assembly of the pure core, and the only surface the runtime sees: bytes and time in, CAN frames and deadlines out.
+
+``now`` is integer nanoseconds of one monotonic clock: the loop's when live, the capture's in replay.
+"""
+
+from collections.abc import Sequence
+
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.dbc_output.output import DbcOutput
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus
+from kontronik_can_gw.telemetry import EscSettings, EscTelemetry, Event
+
+
+class Gateway:
+    """One gateway: several ESCs in, one CAN bus out."""
+
+    def __init__(self, escs: Sequence[EscSettings], layout: Layout, now: int, silent_on_loss: bool = False) -> None:
+        self.escs = [EscTelemetry(settings, now) for settings in escs]
+        self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
+        self._output = DbcOutput(layout, self.escs, self.status, now, silent_on_loss)
+        self._link_changes: list[int] = []
+
+    def start(self, now: int) -> None:
+        """The runtime has opened what it could: run."""
+        self.status.state = GatewayState.RUNNING
+        self._output.start(now)
+
+    def stop(self, now: int) -> None:
+        """The last word: a status that says the gateway is going."""
+        self.status.state = GatewayState.STOPPING
+        self._output.on_gateway_change(now, at_once=True)
+
+    def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
+        """Bytes of one ESC's UART, read at ``now``."""
+        self._follow(esc, self.escs[esc].receive(data, now), now)
+
+    def port_opened(self, esc: int, now: int) -> None:
+        """An ESC's port is open (again)."""
+        self._follow(esc, self.escs[esc].port_opened(), now)
+
+    def port_lost(self, esc: int, now: int) -> None:
+        """An ESC's port cannot be used: its values are not available from now on."""
+        self._follow(esc, self.escs[esc].port_lost(), now)
+
+    def set_can_state(self, state: CanState, now: int) -> None:
+        """What the runtime knows of the CAN controller."""
+        if state is not self.status.can_state:
+            self.status.can_state = state
+            self._output.on_gateway_change(now)
+
+    def advance(self, now: int) -> None:
+        """Let time pass: time-outs, cyclic messages."""
+        for index, esc in enumerate(self.escs):
+            if now >= esc.next_deadline():
+                self._follow(index, esc.advance(now), now)
+        self._output.advance(now)
+
+    def next_deadline(self) -> int:
+        """When ``advance`` is to be called at the latest."""
+        deadlines = [esc.next_deadline() for esc in self.escs]
+        output = self._output.next_deadline()
+        return min(deadlines) if output is None else min(output, *deadlines)
+
+    def take_frames(self) -> list[CanFrame]:
+        """The frames to send, oldest first; the list is handed over."""
+        frames = self._output.frames
+        self._output.frames = []
+        return frames
+
+    def take_link_changes(self) -> list[int]:
+        """ESCs whose link state, layout or device changed since the last call."""
+        changes, self._link_changes = self._link_changes, []
+        return changes
+
+    def _follow(self, esc: int, events: Event, now: int) -> None:
+        if events:
+            self._output.on_event(esc, events, now)
+        if Event.LINK in events:
+            self._link_changes.append(esc)
+            escs_ok = sum(e.up for e in self.escs)
+            if escs_ok != self.status.escs_ok:
+                self.status.escs_ok = escs_ok
+                self._output.on_gateway_change(now)

@@ -1,0 +1,171 @@
+"""Simulated ESCs on pseudo terminals: the cable between a ``SimulatedEsc`` and a gateway that believes in serial ports.
+
+A real ESC must never be sent a byte (its line has an ASCII mode in which parameters can be written). So the other side of
+every pseudo terminal is watched: whatever a gateway sends, echo included, is counted in ``PtyEsc.received``.
+"""
+
+import heapq
+import os
+import select
+import termios
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.simulator import SECOND_NS, Sent, SimulatedEsc
+
+
+class PtyEsc:
+    """The ESC's end of a pseudo terminal, as context manager. The gateway opens ``path``, or the symbolic link ``link``.
+
+    An existing symbolic link at ``link`` is replaced, anything else there is left alone (RunError). The link goes at close.
+    """
+
+    __slots__ = ("_link", "_master", "_slave", "dropped_bytes", "first_received", "path", "received")
+
+    def __init__(self, link: str | Path | None = None) -> None:
+        self.dropped_bytes = 0
+        """Bytes not taken because nobody read and the terminal was full."""
+        self.received = 0
+        """Bytes that came from the gateway. Must stay 0."""
+        self.first_received = b""
+        """The first of them, at most 64."""
+        self._link: Path | None = None
+        try:
+            self._master, self._slave = os.openpty()
+        except OSError as error:
+            raise RunError(f"no pseudo terminal to be had: {error.strerror}. Use fewer ESCs.") from None
+        try:
+            _set_raw(self._slave)
+            os.set_blocking(self._master, False)
+            self.path = os.ttyname(self._slave)
+            if link is not None:
+                self._link = _make_link(Path(link), self.path)
+        except BaseException:
+            self.close()
+            raise
+
+    def fileno(self) -> int:
+        """The ESC's end, to poll for bytes from the gateway."""
+        return self._master
+
+    def write(self, data: bytes) -> bool:
+        """Send without blocking. False, and counted in ``dropped_bytes``, if not everything was taken."""
+        if not data:
+            return True
+        try:
+            taken = os.write(self._master, data)
+        except BlockingIOError:
+            taken = 0
+        self.dropped_bytes += len(data) - taken
+        return taken == len(data)
+
+    def check(self) -> int:
+        """Fetch what the gateway sent since the last call; return how many bytes. Anything but 0 is a fault of the gateway."""
+        total = 0
+        try:
+            while data := os.read(self._master, 4096):
+                self.first_received = (self.first_received + data)[:64]
+                total += len(data)
+        except BlockingIOError:
+            pass
+        self.received += total
+        return total
+
+    def close(self) -> None:
+        """Remove the link if it is still ours, close the terminal. May be called again."""
+        if self._link is not None:
+            if self._link.is_symlink() and str(self._link.readlink()) == self.path:
+                self._link.unlink(missing_ok=True)
+            self._link = None
+        if self._master >= 0:
+            os.close(self._slave)  # held open until now, so that readers may come and go
+            os.close(self._master)
+            self._master = self._slave = -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def run(
+    escs: Sequence[tuple[SimulatedEsc, PtyEsc]],
+    *,
+    seconds: float | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    on_sent: Callable[[int, Sent, bool], None] | None = None,
+    on_received: Callable[[int], None] | None = None,
+    origin_ns: int | None = None,
+) -> None:
+    """Send in real time, all ESCs in this one thread.
+
+    Ends when what leaves before ``seconds`` was sent, or ``stop()`` is true (asked at least each 100 ms). The simulations'
+    time 0 is ``origin_ns`` of time.monotonic_ns, the call's time unless given. ``on_sent`` gets the index of the ESC, the
+    frame, and whether the terminal took it; ``on_received`` the index of an ESC that was sent something.
+    """
+    if origin_ns is None:
+        origin_ns = time.monotonic_ns()
+    end_ns = None if seconds is None else round(seconds * SECOND_NS)
+    poller = select.poll()
+    index_of = {}
+    for index, (_, terminal) in enumerate(escs):
+        index_of[terminal.fileno()] = index
+        poller.register(terminal, select.POLLIN)
+    due = [(esc.next_ns, index) for index, (esc, _) in enumerate(escs)]
+    heapq.heapify(due)
+    over = False
+    while not over:
+        now_ns = time.monotonic_ns() - origin_ns
+        if end_ns is not None and now_ns >= end_ns:
+            now_ns, over = end_ns - 1, True
+        over = over or stop()
+        while due and due[0][0] <= now_ns:
+            index = due[0][1]
+            esc, terminal = escs[index]
+            for sent in esc.frames_until(now_ns):
+                taken = terminal.write(sent.wire)
+                if on_sent is not None:
+                    on_sent(index, sent, taken)
+            heapq.heapreplace(due, (esc.next_ns, index))
+        # At least 1 ms: what falls due within it goes in one round, so 64 ESCs cost no more rounds than 10.
+        until_ns = min(due[0][0] if due else now_ns + SECOND_NS, now_ns + SECOND_NS // 10)
+        if end_ns is not None:
+            until_ns = min(until_ns, end_ns)
+        for fd, _ in poller.poll(0 if over else max((until_ns - now_ns) / 1e6, 1)):
+            index = index_of[fd]
+            if escs[index][1].check() and on_received is not None:
+                on_received(index)
+
+
+def _set_raw(fd: int) -> None:
+    """No echo, no line discipline, no translation: bytes pass as on a UART."""
+    mode = termios.tcgetattr(fd)
+    mode[0] = mode[1] = mode[3] = 0
+    mode[2] |= termios.CS8 | termios.CREAD | termios.CLOCAL
+    termios.tcsetattr(fd, termios.TCSANOW, mode)
+
+
+def _make_link(link: Path, target: str) -> Path:
+    """Put the symbolic link in place; return it as an absolute path, since the directory may change later."""
+    link = link.absolute()
+    try:
+        if not link.is_symlink() and link.exists():
+            raise RunError(f"{link}: exists and is not a symbolic link. Remove it or give another --link.")
+        beside = link.with_name(f".{link.name}.{os.getpid()}")  # made there and moved: never a moment without a link
+        beside.unlink(missing_ok=True)
+        beside.symlink_to(target)
+        try:
+            beside.replace(link)
+        except OSError:
+            beside.unlink()
+            raise
+    except OSError as error:
+        raise RunError(f"{link}: no link can be made: {error.strerror}. Give another --link.") from None
+    return link

@@ -1,0 +1,97 @@
+"""Frame bytes <-> data, in both layouts.
+
+    V4      live  KODL  16 fields  2 reserved  CRC over 0..35 at 36      40 bytes
+    V4      info  KODI  18 fields  3 reserved  CRC over 0..39 at 40      44 bytes
+    legacy  live  KODL  16 fields              CRC over 0..31 at 34      38 bytes
+    legacy  info  KODI  18 fields              CRC over 0..35 at 37      41 bytes
+
+The CRC is the standard CRC-32 (zlib.crc32), little-endian, over the largest multiple of four bytes in front of it: so in the
+legacy layout the last field or two (live: operating state, timing; info: maximum BEC temperature) are not protected.
+"""
+
+import struct
+from enum import Enum
+from zlib import crc32
+
+from kontronik_can_gw.protocol.fields import Data, DataType, InfoData, LiveData, body_format, rows
+
+
+class Kind(Enum):
+    """Which of the two frames."""
+
+    LIVE = "live"
+    INFO = "info"
+
+
+class Layout(Enum):
+    """Which of the two layouts."""
+
+    V4 = "v4"
+    LEGACY = "legacy"
+
+
+class Form:
+    """One of the four frame forms: its length, what its CRC covers, and how its body is packed."""
+
+    __slots__ = ("_data", "_struct", "covered", "crc_at", "data_type", "header", "kind", "layout", "length")
+
+    def __init__(self, kind: Kind, layout: Layout) -> None:
+        self.kind = kind
+        self.layout = layout
+        self.header = b"KODL" if kind is Kind.LIVE else b"KODI"
+        self.data_type: DataType = LiveData if kind is Kind.LIVE else InfoData
+        reserved = 0 if layout is Layout.LEGACY else -(4 + struct.calcsize("<" + body_format(self.data_type))) % 4
+        self._struct = struct.Struct(f"<4s{body_format(self.data_type)}{reserved}xI")
+        self.length = self._struct.size
+        self.crc_at = self.length - 4
+        self.covered = self.crc_at // 4 * 4
+        self._data = struct.Struct(f"<4x{body_format(self.data_type)}")
+
+    def __repr__(self) -> str:
+        return f"Form({self.kind.value}, {self.layout.value}, {self.length} bytes)"
+
+    def matches(self, buffer: bytes, at: int = 0) -> bool:
+        """True if a whole frame of this form stands at ``at``: header and CRC. False also where bytes are missing."""
+        end = at + self.length
+        return (
+            len(buffer) >= end
+            and buffer.startswith(self.header, at)
+            and crc32(buffer[at : at + self.covered]) == int.from_bytes(buffer[at + self.crc_at : end], "little")
+        )
+
+    def decode(self, buffer: bytes, at: int = 0) -> Data:
+        """The fields of a frame that ``matches``; no check is repeated here."""
+        return self.data_type._make(self._data.unpack_from(buffer, at))
+
+    def encode(self, data: Data) -> bytes:
+        """The frame with reserved bytes 0 and its CRC. ValueError naming the field that does not fit its wire type."""
+        try:
+            frame = self._struct.pack(self.header, *data, 0)
+        except struct.error:
+            for name, row in rows(self.data_type).items():
+                low, high = row.type_range
+                value = getattr(data, name)
+                if not low <= value <= high:
+                    raise ValueError(f"{name}: {value} is outside {low}..{high}") from None
+            raise
+        return frame[:-4] + crc32(frame[: self.covered]).to_bytes(4, "little")
+
+
+FORMS = tuple(Form(kind, layout) for kind in Kind for layout in (Layout.LEGACY, Layout.V4))
+"""All four; of one kind the shorter first, which is also the order in which they are tried."""
+
+FORMS_BY_KIND_BYTE = {
+    kind_byte: tuple(form for form in FORMS if form.header[3] == kind_byte)
+    for kind_byte in sorted({form.header[3] for form in FORMS})
+}
+
+
+def encode(data: Data, layout: Layout) -> bytes:
+    """The frame bytes of a LiveData or InfoData in the given layout. ValueError if a value does not fit its wire type."""
+    kind = Kind.LIVE if isinstance(data, LiveData) else Kind.INFO
+    return next(form for form in FORMS if form.kind is kind and form.layout is layout).encode(data)
+
+
+def find_form(buffer: bytes, at: int = 0) -> Form | None:
+    """The form of the whole frame that stands at ``at``, or None. Where two forms match, the shorter."""
+    return next((form for form in FORMS if form.matches(buffer, at)), None)

@@ -1,0 +1,228 @@
+"""Byte stream -> frames.
+
+Contract: the frames emitted are exactly those a brute-force search finds in the whole stream (earliest start first, no overlap,
+one of the four forms by header, length and CRC; the shorter where two match), however the stream is cut into chunks. A frame
+comes out with its last byte unless an earlier, still undecided header forbids it. ``feed`` and ``flush`` never raise; garbage
+is counted and dropped. At most 43 bytes are held; work is linear in the bytes fed.
+"""
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+from kontronik_can_gw.protocol.codec import FORMS, FORMS_BY_KIND_BYTE, Form, Kind, Layout
+from kontronik_can_gw.protocol.fields import Data, LiveData
+from kontronik_can_gw.protocol.states import LARGEST_STATE
+
+LONGEST = max(form.length for form in FORMS)
+_PREFIX = b"KOD"
+# A line that is read at a far higher rate than it is sent shows its bits as long runs: zeros, then ones.
+_LONG_RUNS = bytes(0x100 - (1 << n) for n in range(8)) + b"\0"
+
+
+class Frame(NamedTuple):
+    """An accepted frame: its form, the stream position of its first byte, its fields."""
+
+    form: Form
+    offset: int
+    data: Data
+
+    @property
+    def kind(self) -> Kind:
+        return self.form.kind
+
+    @property
+    def layout(self) -> Layout:
+        return self.form.layout
+
+    @property
+    def suspect(self) -> bool:
+        """True where the bytes outside a legacy live frame's CRC are impossible (operating state above 26)."""
+        data = self.data
+        return self.form.layout is Layout.LEGACY and isinstance(data, LiveData) and data.operating_state > LARGEST_STATE
+
+
+@dataclass(slots=True)
+class Counters:
+    """What one stream held. Every byte fed is in a frame, dropped for one reason, or still pending."""
+
+    bytes: int = 0
+    live_v4: int = 0
+    live_legacy: int = 0
+    info_v4: int = 0
+    info_legacy: int = 0
+    headers: int = 0
+    """KODL or KODI seen, good frames included."""
+    crc_errors: int = 0
+    """KODL or KODI followed by enough bytes, of which no CRC fits."""
+    unknown_kinds: int = 0
+    """KOD followed by a letter other than L and I."""
+    dropped_noise: int = 0
+    """Bytes that belong to no header."""
+    dropped_crc: int = 0
+    """Bytes behind a header whose CRC failed, up to where its frame would have ended."""
+    dropped_unknown_kind: int = 0
+    """The KOD of frames of unknown kind."""
+    dropped_incomplete: int = 0
+    """Bytes behind a header when the stream ended."""
+    long_run_bytes: int = 0
+    """Dropped bytes that look like a slower line read too fast (9600 baud of an old JIVE)."""
+
+    @property
+    def live(self) -> int:
+        return self.live_v4 + self.live_legacy
+
+    @property
+    def info(self) -> int:
+        return self.info_v4 + self.info_legacy
+
+    @property
+    def dropped_bytes(self) -> int:
+        return self.dropped_noise + self.dropped_crc + self.dropped_unknown_kind + self.dropped_incomplete
+
+    def as_dict(self) -> dict[str, int]:
+        """All counters and totals by name."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {"live": self.live, "info": self.info, "dropped_bytes": self.dropped_bytes} | own
+
+    def copy(self) -> "Counters":
+        return Counters(*(getattr(self, f.name) for f in fields(self)))
+
+    def diagnosis(self, since: "Counters | None" = None) -> str | None:
+        """What is wrong with a line from which no frame comes, in words; None while frames come."""
+        old = since or Counters()
+        if self.live + self.info > old.live + old.info:
+            return None
+        received = self.bytes - old.bytes
+        if not received:
+            return (
+                "no bytes: ESC off, wire open, wrong port, or a KOSMIK that waits for one throttle pulse after power-up"
+            )
+        if self.crc_errors > old.crc_errors:
+            return "headers but no valid CRC: noise on the line, bytes lost, or another revision of the protocol"
+        if self.headers > old.headers:
+            return "a header but no whole frame yet"
+        if self.unknown_kinds > old.unknown_kinds:
+            return "KOD frames of unknown kind: a newer protocol?"
+        noise = self.dropped_noise - old.dropped_noise
+        if noise >= 64 and (self.long_run_bytes - old.long_run_bytes) * 10 >= noise * 9:
+            return "bytes but never KOD, in long runs of equal bits: a slower line, as the 9600 baud of an old JIVE (not PRO)"
+        return (
+            "bytes but never KOD: wrong parity (8E1 is needed), inverted signal, or the ESC is set to another protocol"
+        )
+
+
+_FRAME_COUNTER = {form: f"{form.kind.value}_{form.layout.value}" for form in FORMS}
+
+
+class Deframer:
+    """Finds the frames in one byte stream. Holds no mode: the layout is found from the CRC of each frame."""
+
+    __slots__ = ("_base", "_blame", "_blame_until", "_need", "_pending", "counters")
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self._pending = b""
+        self._base = 0  # stream position of _pending[0]
+        self._need = 1  # how many more bytes before anything can be decided
+        self._blame = "dropped_crc"  # why bytes before _blame_until are dropped
+        self._blame_until = 0
+
+    @property
+    def pending(self) -> int:
+        """How many bytes are held, undecided: 0..43."""
+        return len(self._pending)
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Take the next bytes; return the frames that are now certain, in stream order."""
+        size = len(data)
+        self.counters.bytes += size
+        if size < self._need:
+            self._pending += data
+            self._need -= size
+            return []
+        return self._scan(self._pending + data if self._pending else bytes(data), ended=False)
+
+    def flush(self) -> list[Frame]:
+        """The stream ended or was interrupted: search what is pending, drop the rest, be ready for a new start."""
+        buffer = self._pending
+        frames = self._scan(buffer, ended=True)
+        self._blame_until = self._base
+        return frames
+
+    def _scan(self, buffer: bytes, ended: bool) -> list[Frame]:
+        frames: list[Frame] = []
+        counters = self.counters
+        size = len(buffer)
+        at = 0
+        while True:
+            start = buffer.find(_PREFIX, at)
+            if start < 0:
+                keep = 0
+                if not ended:
+                    tail = buffer[max(at, size - 2) :]
+                    keep = 2 if tail == b"KO" else 1 if tail.endswith(b"K") else 0
+                self._drop(buffer, at, size - keep)
+                at, self._need = size - keep, 4 - keep if keep else 1
+                break
+            self._drop(buffer, at, start)
+            at = start
+            have = size - at
+            if have < 4:
+                if not ended:
+                    self._need = 4 - have
+                    break
+                self._drop(buffer, at, size, "dropped_incomplete")
+                at = size
+                break
+            forms = FORMS_BY_KIND_BYTE.get(buffer[at + 3])
+            if forms is None:
+                counters.unknown_kinds += 1
+                self._drop(buffer, at, at + 3, "dropped_unknown_kind")
+                at += 3
+                continue
+            missing = 0
+            for form in forms:
+                if have < form.length:
+                    missing = form.length - have
+                    break
+                if form.matches(buffer, at):
+                    break
+            else:  # all forms checked, none matches
+                counters.headers += 1
+                counters.crc_errors += 1
+                self._reject(buffer, at, forms[-1].length, "dropped_crc")
+                at += 4
+                continue
+            if not missing:
+                counters.headers += 1
+                name = _FRAME_COUNTER[form]
+                setattr(counters, name, getattr(counters, name) + 1)
+                frames.append(Frame(form, self._base + at, form.decode(buffer, at)))
+                at += form.length
+                self._blame_until = 0
+            elif ended:
+                counters.headers += 1
+                self._reject(buffer, at, have, "dropped_incomplete")
+                at += 4
+            else:
+                self._need = missing
+                break
+        self._pending = buffer[at:]
+        self._base += at
+        return frames
+
+    def _reject(self, buffer: bytes, at: int, length: int, reason: str) -> None:
+        """Drop a header (no frame can begin inside it) and blame ``reason`` for what is dropped up to ``length`` from its start."""
+        self._blame, self._blame_until = reason, max(self._blame_until, self._base + at + length)
+        self._drop(buffer, at, at + 4)
+
+    def _drop(self, buffer: bytes, begin: int, end: int, reason: str = "dropped_noise") -> None:
+        if begin >= end:
+            return
+        counters = self.counters
+        dropped = buffer[begin:end]
+        counters.long_run_bytes += len(dropped) - len(dropped.translate(None, _LONG_RUNS))
+        blamed = min(max(self._blame_until - self._base - begin, 0), end - begin)
+        if blamed:
+            setattr(counters, self._blame, getattr(counters, self._blame) + blamed)
+        setattr(counters, reason, getattr(counters, reason) + end - begin - blamed)

@@ -1,0 +1,154 @@
+"""One typed line per row of the sheet. Wire order, type, step, unit, stated range and absence are told here and nowhere else.
+
+LiveData and InfoData hold raw wire integers. ``physical`` and ``raw`` convert by a Row. Nothing is clipped: the stated
+range is information for people, every value that fits the wire type is passed on.
+"""
+
+import struct
+from typing import Annotated, NamedTuple, get_args, get_type_hints
+
+from kontronik_can_gw.protocol.states import Device
+
+
+class Row(NamedTuple):
+    """A row of the sheet.
+
+    ``wire`` is the struct code, ``per_unit`` how many steps make one ``unit``, low..high the stated range in steps.
+    """
+
+    wire: str
+    unit: str
+    per_unit: int = 1
+    low: int | None = None
+    high: int | None = None
+    not_on: frozenset[Device] = frozenset()
+    """Devices that do not supply this value."""
+
+    @property
+    def type_range(self) -> tuple[int, int]:
+        """Smallest and largest raw value of the wire type."""
+        bits = struct.calcsize("<" + self.wire) * 8
+        return (-(1 << bits - 1), (1 << bits - 1) - 1) if self.wire.islower() else (0, (1 << bits) - 1)
+
+    @property
+    def stated_range(self) -> tuple[int, int]:
+        """The sheet's range in steps; the type's range where the sheet is silent."""
+        low, high = self.type_range
+        return (low if self.low is None else self.low, high if self.high is None else self.high)
+
+    def physical(self, raw: int) -> int | float:
+        """The value in ``unit``: the float nearest to the exact step (24.42, never 24.419999)."""
+        return raw if self.per_unit == 1 else raw / self.per_unit
+
+    def raw(self, physical: float) -> int:
+        """The nearest step of a value in ``unit``."""
+        return round(physical * self.per_unit)
+
+
+_NOT_JIVEPRO = frozenset({Device.JIVEPRO})
+
+ElectricalSpeed = Annotated[int, Row("I", "1/min")]
+Voltage = Annotated[int, Row("H", "V", 100, 0, 10_000)]  # "10.000" in the sheet is a German ten thousand
+Current = Annotated[int, Row("h", "A", 10, -10_000, 10_000)]  # signed: regeneration is negative
+Charge = Annotated[int, Row("H", "mAh")]
+BecCurrent = Annotated[int, Row("H", "A", 1000, not_on=_NOT_JIVEPRO)]
+BecVoltage = Annotated[int, Row("H", "V", 1000)]
+PwmInput = Annotated[int, Row("H", "µs")]
+Throttle = Annotated[int, Row("b", "%", 1, -100, 100)]  # <= 0 brakes
+Opening = Annotated[int, Row("B", "%", 1, 0, 100)]
+Temperature = Annotated[int, Row("b", "°C")]
+Word = Annotated[int, Row("I", "")]
+State = Annotated[int, Row("B", "")]
+Timing = Annotated[int, Row("B", "µs")]
+Pair = Annotated[int, Row("H", "")]
+Count = Annotated[int, Row("B", "")]
+
+
+class LiveData(NamedTuple):
+    """Live frame, offsets 4 to 33, in wire order."""
+
+    electrical_speed: ElectricalSpeed = 0
+    battery_voltage: Voltage = 0
+    battery_current: Current = 0
+    motor_current: Current = 0
+    peak_current: Current = 0
+    consumed_charge: Charge = 0
+    bec_current: BecCurrent = 0
+    bec_voltage: BecVoltage = 0
+    pwm_input: PwmInput = 0
+    throttle: Throttle = 0
+    output_opening: Opening = 0
+    power_stage_temperature: Temperature = 0
+    bec_temperature: Temperature = 0
+    operating_errors: Word = 0
+    operating_state: State = 0
+    timing: Timing = 0
+
+
+class InfoData(NamedTuple):
+    """Info frame, offsets 4 to 36, in wire order. The extremes are logged since the ESC's own start of logging."""
+
+    device_and_variant: Pair = 0
+    firmware_word: Pair = 0
+    selftest_errors: Word = 0
+    cell_count: Count = 0
+    max_electrical_speed: ElectricalSpeed = 0
+    min_battery_voltage: Voltage = 0
+    max_battery_voltage: Voltage = 0
+    max_battery_current: Current = 0
+    max_motor_current: Current = 0
+    max_peak_current: Current = 0
+    max_bec_current: BecCurrent = 0
+    min_bec_voltage: BecVoltage = 0
+    max_throttle: Throttle = 0
+    max_output_opening: Opening = 0
+    min_power_stage_temperature: Temperature = 0
+    max_power_stage_temperature: Temperature = 0
+    min_bec_temperature: Temperature = 0
+    max_bec_temperature: Temperature = 0
+
+    @property
+    def device(self) -> int:
+        """Device number, 0..63: a Device where it has a name."""
+        return self.device_and_variant >> 10
+
+    @property
+    def variant(self) -> int:
+        """Variant number, 0..1023."""
+        return self.device_and_variant & 0x3FF
+
+    @property
+    def firmware(self) -> str:
+        """Main and sub version, as "1.14"."""
+        return f"{self.firmware_word >> 8}.{self.firmware_word & 0xFF}"
+
+
+Data = LiveData | InfoData
+
+
+DataType = type[LiveData] | type[InfoData]
+
+
+def _rows(data: DataType) -> dict[str, Row]:
+    hints = get_type_hints(data, include_extras=True)
+    return {name: next(a for a in get_args(hints[name]) if isinstance(a, Row)) for name in data._fields}
+
+
+_ROWS: dict[DataType, dict[str, Row]] = {LiveData: _rows(LiveData), InfoData: _rows(InfoData)}
+
+
+def rows(data: DataType) -> dict[str, Row]:
+    """Field name to Row of LiveData or InfoData, in wire order."""
+    return _ROWS[data]
+
+
+def device_and_variant(device: int, variant: int) -> int:
+    """The info frame's first word: device 0..63 in the high six bits, variant 0..1023 in the low ten."""
+    if not 0 <= device <= 63 or not 0 <= variant <= 1023:
+        raise ValueError(f"device {device} or variant {variant} does not fit 6 and 10 bits")
+    return device << 10 | variant
+
+
+def body_format(data: DataType) -> str:
+    """struct codes of the fields, without byte order, header, reserved bytes and CRC."""
+    return "".join(row.wire for row in rows(data).values())

@@ -1,0 +1,309 @@
+"""The live gateway: one selector loop over serial ports, CAN interface and time. No thread is started here.
+
+What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` may be called from elsewhere (a signal handler,
+another thread).
+"""
+
+import contextlib
+import logging
+import os
+import selectors
+import time
+from collections.abc import Callable, Sequence
+
+from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.protocol.states import device_text
+from kontronik_can_gw.runtime.can_port import CanPort, Sent
+from kontronik_can_gw.runtime.serial_port import PortLost, SerialPort
+from kontronik_can_gw.runtime.slots import Slots
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import MS, SECOND, LinkState
+
+log = logging.getLogger("kontronik_can_gw")
+
+FIRST_RETRY_NS, LONGEST_RETRY_NS = 100 * MS, SECOND
+BUSY_RETRY_NS = 2 * MS
+SUSPENDED_NS = 250 * MS
+"""A loop that comes back this much too late was suspended: what waits on the ports is old."""
+DIAGNOSIS_NS = 3 * SECOND
+
+
+class _Retry:
+    """When to try again: at once more and more seldom, up to a bound."""
+
+    def __init__(self) -> None:
+        self.due: int | None = None
+        self._pause = FIRST_RETRY_NS
+
+    def failed(self, now: int) -> None:
+        self.due = now + self._pause
+        self._pause = min(self._pause * 2, LONGEST_RETRY_NS)
+
+    def succeeded(self) -> None:
+        self.due = None
+        self._pause = FIRST_RETRY_NS
+
+
+class _Esc:
+    """One ESC's port."""
+
+    def __init__(self, index: int, name: str, path: str) -> None:
+        self.index = index
+        self.name = name
+        self.path = path
+        self.port: SerialPort | None = None
+        self.retry = _Retry()
+        self.complaint = ""
+        self.diagnosis_due = 0
+
+
+class Loop:
+    """Owns ports, interface and gateway while it runs."""
+
+    def __init__(
+        self,
+        gateway: Gateway,
+        ports: Sequence[str],
+        can_config: CanConfig,
+        wait_for_devices: bool = False,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.gateway = gateway
+        self._clock = clock
+        self._can_config = can_config
+        self._wait = wait_for_devices
+        self._escs = [
+            _Esc(i, esc.settings.name, path) for i, (esc, path) in enumerate(zip(gateway.escs, ports, strict=True))
+        ]
+        self._can: CanPort | None = None
+        self._can_retry = _Retry()
+        self._can_complaint = ""
+        self._slots = Slots()
+        self._busy_until: int | None = None
+        self._selector = selectors.DefaultSelector()
+        self._stopping = False
+        self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._selector.register(self._wake_read, selectors.EVENT_READ, None)
+
+    def stop(self) -> None:
+        """End ``run`` soon; safe in a signal handler and from another thread."""
+        self._stopping = True
+        with contextlib.suppress(OSError):
+            os.write(self._wake_write, b"\0")
+
+    def open(self) -> None:
+        """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
+        now = self._clock()
+        try:
+            self._open_can(now)
+            for esc in self._escs:
+                self._open_port(esc, now)
+        except RunError:
+            self.close()
+            raise
+
+    def run(self) -> None:
+        """Until ``stop``. Then a last status is sent and everything is closed."""
+        gateway, clock = self.gateway, self._clock
+        now = clock()
+        gateway.start(now)
+        self._transmit(now)
+        try:
+            while not self._stopping:
+                before = clock()
+                pause = max(0, self._next_deadline() - before)
+                ready = self._selector.select(pause / SECOND)
+                now = clock()
+                if now - before - pause > SUSPENDED_NS:
+                    self._discard_input(now - before - pause)
+                for key, _ in ready:
+                    self._serve(key, now)
+                self._reopen(now)
+                gateway.advance(now)
+                self._transmit(now)
+                self._report(now)
+        finally:
+            now = clock()
+            gateway.stop(now)
+            self._transmit(now)
+            self.close()
+
+    def close(self) -> None:
+        """Close everything."""
+        for esc in self._escs:
+            self._close_port(esc)
+        if self._can is not None:
+            self._close_can()
+        self._selector.close()
+        for fd in (self._wake_read, self._wake_write):
+            with contextlib.suppress(OSError):
+                os.close(fd)
+
+    def _next_deadline(self) -> int:
+        due = [self.gateway.next_deadline()]
+        due += [esc.retry.due for esc in self._escs if esc.retry.due is not None]
+        due += [when for when in (self._can_retry.due, self._busy_until) if when is not None]
+        return min(due)
+
+    def _serve(self, key: selectors.SelectorKey, now: int) -> None:
+        what = key.data
+        if isinstance(what, _Esc):
+            if what.port is None:
+                return
+            try:
+                data = what.port.read()
+            except PortLost as error:
+                self._port_lost(what, str(error), now)
+                return
+            if data:
+                self.gateway.receive_bytes(what.index, data, now)
+        elif isinstance(what, CanPort):
+            what.receive_errors()
+        else:
+            with contextlib.suppress(OSError):
+                os.read(self._wake_read, 64)
+
+    def _discard_input(self, late: int) -> None:
+        log.warning(
+            "the process was suspended for %.1f s: what waited on the serial ports is thrown away", late / SECOND
+        )
+        for esc in self._escs:
+            if esc.port is not None:
+                esc.port.discard()
+
+    # --- serial ports
+
+    def _open_port(self, esc: _Esc, now: int) -> None:
+        try:
+            port = SerialPort(esc.path)
+        except RunError as error:
+            if not self._wait and esc.retry.due is None:
+                raise RunError(f"{esc.name}: {error}") from None
+            self._port_failed(esc, str(error), now)
+            return
+        port.discard()  # what came before we listened has no time
+        esc.port = port
+        esc.retry.succeeded()
+        esc.diagnosis_due = now + DIAGNOSIS_NS
+        self._selector.register(port.fileno(), selectors.EVENT_READ, esc)
+        self.gateway.port_opened(esc.index, now)
+        log.info("%s: %s is open", esc.name, esc.path)
+        esc.complaint = ""
+
+    def _port_failed(self, esc: _Esc, reason: str, now: int) -> None:
+        esc.retry.failed(now)
+        self.gateway.port_lost(esc.index, now)
+        if reason != esc.complaint:
+            esc.complaint = reason
+            log.warning("%s: %s Trying again.", esc.name, reason)
+
+    def _port_lost(self, esc: _Esc, reason: str, now: int) -> None:
+        self._close_port(esc)
+        self._port_failed(esc, f"{esc.path}: lost ({reason}).", now)
+
+    def _close_port(self, esc: _Esc) -> None:
+        if esc.port is not None:
+            self._selector.unregister(esc.port.fileno())
+            esc.port.close()
+            esc.port = None
+
+    def _reopen(self, now: int) -> None:
+        for esc in self._escs:
+            if esc.retry.due is not None and now >= esc.retry.due:
+                self._open_port(esc, now)
+        if self._can_retry.due is not None and now >= self._can_retry.due:
+            if self._can is None:
+                self._open_can(now)
+            else:
+                self._can_retry.due = None  # an interface that was down is tried by sending
+
+    # --- CAN
+
+    def _open_can(self, now: int) -> None:
+        try:
+            port = CanPort(self._can_config)
+        except RunError as error:
+            if not self._wait and self._can_retry.due is None:
+                raise
+            self._can_failed(str(error), now)
+            return
+        self._can = port
+        self._can_retry.due = None
+        if (fd := port.fileno()) is not None:
+            self._selector.register(fd, selectors.EVENT_READ, port)
+        log.info("CAN %s %s is open", self._can_config.interface, self._can_config.channel)
+
+    def _can_failed(self, reason: str, now: int) -> None:
+        self._can_retry.failed(now)
+        if self._can_retry.due is not None:
+            self._slots.clear()
+        self.gateway.set_can_state(CanState.DOWN, now)
+        if reason != self._can_complaint:
+            self._can_complaint = reason
+            log.warning("%s Trying again.", reason)
+
+    def _close_can(self) -> None:
+        if self._can is not None:
+            if (fd := self._can.fileno()) is not None:
+                with contextlib.suppress(KeyError, ValueError):
+                    self._selector.unregister(fd)
+            self._can.close()
+            self._can = None
+
+    def _transmit(self, now: int) -> None:
+        status, slots = self.gateway.status, self._slots
+        for frame in self.gateway.take_frames():
+            slots.put(frame)
+        status.replaced_frames = slots.replaced
+        if not len(slots) or self._can is None or self._can_retry.due is not None:
+            if self._can is None or self._can_retry.due is not None:
+                slots.clear()
+            return
+        if self._busy_until is not None and now < self._busy_until:
+            return
+        self._busy_until = None
+        count, answer = slots.flush(self._can.send)
+        status.sent_frames += count
+        if answer is Sent.OK:
+            self._can_works()
+        else:
+            status.send_failures += 1
+            if answer is Sent.BUSY:
+                self._busy_until = now + BUSY_RETRY_NS
+            else:
+                name = self._can_config.channel
+                if answer is Sent.GONE:
+                    self._close_can()
+                self._can_failed(f"CAN interface {name}: {'gone' if answer is Sent.GONE else 'down'}.", now)
+                return
+        self.gateway.set_can_state(self._can.state, now)
+
+    def _can_works(self) -> None:
+        self._can_retry.succeeded()
+        if self._can_complaint:
+            self._can_complaint = ""
+            log.info("CAN %s: frames are sent again", self._can_config.channel)
+
+    # --- words
+
+    def _report(self, now: int) -> None:
+        for index in self.gateway.take_link_changes():
+            esc, port = self.gateway.escs[index], self._escs[index]
+            port.diagnosis_due = now + DIAGNOSIS_NS
+            if esc.link in (LinkState.OK, LinkState.DEGRADED):
+                layout = ("unknown layout", "V4", "legacy")[esc.layout]
+                device = device_text(esc.info.device) if esc.info else None
+                log.info(
+                    "%s: telemetry %s (%s%s)", port.name, esc.link.name.lower(), layout, f", {device}" if device else ""
+                )
+            elif esc.link is LinkState.LOST:
+                log.warning("%s: telemetry lost; its values are marked as not available", port.name)
+        for port in self._escs:
+            if port.port is not None and port.diagnosis_due and now >= port.diagnosis_due:
+                port.diagnosis_due = now + DIAGNOSIS_NS
+                diagnosis = self.gateway.escs[port.index].diagnosis()
+                if diagnosis and diagnosis != port.complaint:
+                    port.complaint = diagnosis
+                    log.warning("%s: no telemetry: %s", port.name, diagnosis)

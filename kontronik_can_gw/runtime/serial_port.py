@@ -1,0 +1,131 @@
+"""A serial port that is only ever read: 115200 baud, 8 data bits, even parity, 1 stop bit, exclusive.
+
+Nothing is written to it, ever: an answer could switch an ESC into a mode in which its parameters can be changed. This class has no
+way to write, and the line's echo is switched off before anything else.
+"""
+
+import contextlib
+import errno
+import fcntl
+import grp
+import os
+import termios
+from pathlib import Path
+
+import serial
+
+from kontronik_can_gw.errors import RunError
+
+BAUD_RATE = 115_200
+READ_SIZE = 4096
+
+
+class PortLost(Exception):
+    """The port was unplugged or hung up."""
+
+
+class SerialPort:
+    """An open port. RunError with one clear line where it cannot be opened."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        is_pty = os.path.realpath(path).startswith("/dev/pts/")
+        quiet = _open_quietly(path)
+        try:
+            self._serial = _open(path, serial.PARITY_EVEN, is_pty)
+        finally:
+            os.close(quiet)
+        self._fd = self._serial.fileno()
+        if not is_pty:
+            with contextlib.suppress(OSError):
+                fcntl.ioctl(self._fd, termios.TIOCEXCL)
+            with contextlib.suppress(OSError, ValueError, NotImplementedError):
+                self._serial.set_low_latency_mode(True)
+
+    def fileno(self) -> int:
+        return self._fd
+
+    def read(self) -> bytes:
+        """What has come; call it only when the port is readable. PortLost when the port has gone."""
+        try:
+            data = os.read(self._fd, READ_SIZE)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise PortLost(error.strerror or str(error)) from None
+        if not data:
+            raise PortLost("hung up")
+        return data
+
+    def discard(self) -> None:
+        """Throw away what waits to be read."""
+        with contextlib.suppress(OSError, termios.error):
+            termios.tcflush(self._fd, termios.TCIFLUSH)
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError, termios.error):
+            self._serial.close()
+
+
+def _open_quietly(path: str) -> int:
+    """Open and switch echo off in one breath: a terminal that was just made echoes what it receives."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise _explained(path, error.errno, str(error.strerror)) from None
+    try:
+        mode = termios.tcgetattr(fd)
+        mode[1] &= ~termios.OPOST
+        mode[3] &= ~(termios.ECHO | termios.ECHONL | termios.ICANON | termios.ISIG)
+        with contextlib.suppress(termios.error):  # pseudo terminals may refuse their own settings
+            termios.tcsetattr(fd, termios.TCSANOW, mode)
+        termios.tcflush(fd, termios.TCOFLUSH)
+    except termios.error:
+        os.close(fd)
+        raise RunError(f"{path}: is not a serial port") from None
+    return fd
+
+
+def _open(path: str, parity: str, is_pty: bool) -> serial.Serial:
+    try:
+        return serial.Serial(path, BAUD_RATE, parity=parity, timeout=0, exclusive=True)
+    except (OSError, termios.error, ValueError) as error:  # SerialException is an OSError; termios.error is not
+        number = error.args[0] if error.args and isinstance(error.args[0], int) else getattr(error, "errno", None)
+        if number == errno.EINVAL and parity == serial.PARITY_EVEN:
+            if is_pty:  # a pseudo terminal has no parity and may say so
+                return _open(path, serial.PARITY_NONE, is_pty)
+            raise RunError(
+                f"{path}: cannot do 115200 baud with even parity. A Raspberry Pi's mini-UART (ttyS0) cannot: use ttyAMA0."
+            ) from None
+        raise _explained(path, number, str(error)) from None
+
+
+def _explained(path: str, number: int | None, text: str) -> RunError:
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        ports = sorted(str(p) for p in Path("/dev/serial/by-id").glob("*"))
+        there = (
+            f"Ports there are: {', '.join(ports)}."
+            if ports
+            else "Is the adapter plugged in? See `ls /dev/serial/by-id`."
+        )
+        return RunError(f"{path}: no such serial port. {there}")
+    if number == errno.EACCES:
+        group = "dialout"
+        with contextlib.suppress(OSError, KeyError):
+            group = grp.getgrgid(Path(path).stat().st_gid).gr_name
+        return RunError(
+            f"{path}: permission denied. Join its group: sudo usermod -aG {group} $USER, then log in again."
+        )
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return RunError(f"{path}: is in use by another program (another gateway? a getty?).{_users(path)}")
+    return RunError(f"{path}: cannot be opened: {text}")
+
+
+def _users(path: str) -> str:
+    """Who has the port open, as far as we may see."""
+    target, found = os.path.realpath(path), []
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        with contextlib.suppress(OSError):
+            if str(link.readlink()) == target and (pid := link.parts[2]) != str(os.getpid()):
+                found.append(f"{Path('/proc', pid, 'comm').read_text().strip()} (pid {pid})")
+    return f" Open in: {', '.join(sorted(set(found)))}." if found else ""

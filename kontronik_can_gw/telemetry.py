@@ -1,0 +1,238 @@
+"""The state of one ESC: newest data, derived values, freshness, link. Pure: bytes and time in, events out.
+
+``now`` is integer nanoseconds of one monotonic clock. What this object shows as ``live`` or ``info`` is fresh; what is not fresh,
+or not known of the device now on the line, is None.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from fractions import Fraction
+
+from kontronik_can_gw.protocol.codec import Layout
+from kontronik_can_gw.protocol.deframer import Counters, Deframer, Frame
+from kontronik_can_gw.protocol.fields import InfoData, LiveData
+from kontronik_can_gw.protocol.states import Device
+
+MS = 1_000_000
+SECOND = 1000 * MS
+NS_PER_BYTE = 11 * SECOND // 115_200
+INFO_TIMEOUT_NS = 10 * SECOND
+"""Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
+MW_NS_PER_WH = 3_600_000 * SECOND
+"""Energy is kept in milliwatt nanoseconds: one step of voltage (10 mV) by one of current (0.1 A) is exactly 1 mW."""
+_DEGRADED_CRC_ERRORS = 5
+_DEGRADED_DROPPED_SHARE = 10  # one dropped byte in so many received
+
+
+class LinkState(IntEnum):
+    """State of one UART."""
+
+    NEVER_SEEN = 0
+    SEARCHING = 1
+    OK = 2
+    DEGRADED = 3
+    LOST = 4
+    PORT_ERROR = 5
+
+
+class Event(IntFlag):
+    """What a call changed."""
+
+    NONE = 0
+    LIVE = 1
+    INFO = 2
+    LINK = 4
+
+
+@dataclass(frozen=True)
+class EscSettings:
+    """What a person knows of one ESC and its drive train.
+
+    ``gear``: motor revolutions per output revolution. ``cell_count`` 0: as the ESC tells. ``timeout_ns`` (20 ms to 60 s):
+    live data older than this is not available.
+    """
+
+    name: str = "esc"
+    pole_pairs: int = 1
+    gear: Fraction = Fraction(1)
+    cell_count: int = 0
+    timeout_ns: int = 250 * MS
+
+
+class EscTelemetry:
+    """One ESC's stream and what is known from it.
+
+    Attributes read by the packers: ``live``, ``info`` (None where not available), ``link``, ``layout`` (0 unknown, 1 V4,
+    2 legacy), ``cells`` (0 unknown), ``frame_rate`` (live frames of the last full second, in 0.1 Hz), ``losses``,
+    ``energy`` (drawn from the battery, milliwatt nanoseconds), ``run_time`` (ns with the motor turning), ``live_ns`` (time of
+    the newest live frame's last byte, None before the first).
+    """
+
+    def __init__(self, settings: EscSettings, now: int) -> None:
+        self.settings = settings
+        self.live: LiveData | None = None
+        self.info: InfoData | None = None
+        self.link = LinkState.NEVER_SEEN
+        self.layout = 0
+        self.cells = settings.cell_count
+        self.frame_rate = 0
+        self.losses = 0
+        self.energy = 0
+        self.run_time = 0
+        self.live_ns: int | None = None
+        self.info_ns: int | None = None
+        self.suspect_frames = 0
+        self.late_frames = 0
+        self._deframer = Deframer()
+        self._arrivals: deque[tuple[int, int]] = (
+            deque()
+        )  # (stream position behind a chunk, its time) while bytes are pending
+        self._last_power = 0
+        self._window_ns = now
+        self._window_counters = Counters()
+
+    @property
+    def counters(self) -> Counters:
+        """Counters of the whole stream so far."""
+        return self._deframer.counters
+
+    @property
+    def up(self) -> bool:
+        """True while live telemetry is fresh."""
+        return self.live is not None
+
+    def bec_current_supplied(self, raw: int) -> bool:
+        """False where BEC current means nothing: on a JIVEPro, and at 0 as long as the device is not known."""
+        if self.info is None:
+            return raw != 0
+        return self.info.device != Device.JIVEPRO
+
+    def age_ms(self, now: int) -> int | None:
+        """Age of the newest live frame, None before the first."""
+        return None if self.live_ns is None else max(0, now - self.live_ns) // MS
+
+    def receive(self, data: bytes, now: int) -> Event:
+        """Take bytes that were read at ``now``. An unfinished frame older than the time-out is given up first."""
+        events = self._expire(now)
+        deframer = self._deframer
+        if self._arrivals and now - self._arrivals[0][1] > self.settings.timeout_ns:
+            self.late_frames += len(deframer.flush())
+            self._arrivals.clear()
+        frames = deframer.feed(data)
+        end = deframer.counters.bytes
+        pending = deframer.pending
+        if pending:
+            self._arrivals.append((end, now))
+            while self._arrivals[0][0] <= end - pending:
+                self._arrivals.popleft()
+        else:
+            self._arrivals.clear()
+        for frame in frames:
+            events |= self._accept(frame, now - (end - frame.offset - frame.form.length) * NS_PER_BYTE)
+        if self.link is LinkState.NEVER_SEEN:
+            events |= self._set_link(LinkState.SEARCHING)
+        return events
+
+    def port_opened(self) -> Event:
+        """The port is open (again)."""
+        if self.link is not LinkState.PORT_ERROR:
+            return Event.NONE
+        return self._set_link(LinkState.NEVER_SEEN if self.live_ns is None else LinkState.LOST)
+
+    def port_lost(self) -> Event:
+        """The port is gone: what was pending is dropped, nothing is fresh any more."""
+        self._deframer.flush()
+        self._arrivals.clear()
+        return self._lose(LinkState.PORT_ERROR)
+
+    def advance(self, now: int) -> Event:
+        """Let time pass: expire what is old, close the one-second window of rate and quality."""
+        events = self._expire(now)
+        if now - self._window_ns >= SECOND:
+            events |= self._close_window(now)
+        return events
+
+    def next_deadline(self) -> int:
+        """When ``advance`` has something to do."""
+        window = self._window_ns + SECOND
+        if self.live is None or self.live_ns is None:
+            return window
+        return min(window, self.live_ns + self.settings.timeout_ns + 1)
+
+    def diagnosis(self) -> str | None:
+        """Why no frame comes, in words, from the bytes since the last second's start; None while frames come."""
+        return None if self.up else self.counters.diagnosis(self._window_counters)
+
+    def _accept(self, frame: Frame, when: int) -> Event:
+        layout = 1 if frame.layout is Layout.V4 else 2
+        events = Event.NONE
+        if layout != self.layout:
+            self.layout = layout
+            self._forget_device()
+            events = Event.INFO | Event.LINK
+        data = frame.data
+        if isinstance(data, InfoData):
+            if self.info is not None and data.device_and_variant != self.info.device_and_variant:
+                events |= Event.LINK
+            self.info = data
+            self.info_ns = when
+            self.cells = self.settings.cell_count or data.cell_count
+            return events | Event.INFO
+        if frame.suspect:
+            self.suspect_frames += 1
+        if self.live_ns is not None and self.live is not None:
+            elapsed = when - self.live_ns
+            self.energy += max(0, self._last_power) * elapsed
+            if self.live.electrical_speed:
+                self.run_time += elapsed
+        self._last_power = data.battery_voltage * data.battery_current
+        self.live = data
+        self.live_ns = when
+        if self.link is not LinkState.OK and self.link is not LinkState.DEGRADED:
+            events |= self._set_link(LinkState.OK)
+        return events | Event.LIVE
+
+    def _forget_device(self) -> None:
+        self.info = None
+        self.info_ns = None
+        self.cells = self.settings.cell_count
+
+    def _expire(self, now: int) -> Event:
+        events = Event.NONE
+        if self.live is not None and self.live_ns is not None and now - self.live_ns > self.settings.timeout_ns:
+            self.losses += 1
+            events |= self._lose(LinkState.LOST)
+        if self.info is not None and self.info_ns is not None and now - self.info_ns > INFO_TIMEOUT_NS:
+            self._forget_device()
+            events |= Event.INFO
+        return events
+
+    def _lose(self, state: LinkState) -> Event:
+        events = self._set_link(state)
+        if self.live is not None:
+            self.live = None
+            events |= Event.LIVE
+        if self.info is not None:
+            self._forget_device()
+            events |= Event.INFO
+        self.frame_rate = 0
+        return events
+
+    def _set_link(self, state: LinkState) -> Event:
+        if state is self.link:
+            return Event.NONE
+        self.link = state
+        return Event.LINK
+
+    def _close_window(self, now: int) -> Event:
+        old, new = self._window_counters, self.counters
+        frames = new.live - old.live
+        self.frame_rate = round(frames * 10 * SECOND / (now - self._window_ns)) if self.up else 0
+        dropped, received = new.dropped_bytes - old.dropped_bytes, new.bytes - old.bytes
+        bad = new.crc_errors - old.crc_errors >= _DEGRADED_CRC_ERRORS or dropped * _DEGRADED_DROPPED_SHARE > received
+        self._window_ns = now
+        self._window_counters = new.copy()
+        if self.up:
+            return self._set_link(LinkState.DEGRADED if bad else LinkState.OK)
+        return Event.NONE

@@ -1,0 +1,207 @@
+"""``kontronik-can-gw simulate`` as a process: terminals, links, files, signals, one clear line per mistake."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.cli import main
+from kontronik_can_gw.protocol import Deframer, Device, Frame, InfoData, Layout, LiveData, OperatingError
+from kontronik_can_gw.simulator import SimulatedEsc
+
+COMMAND = [sys.executable, "-m", "kontronik_can_gw", "simulate"]
+
+
+def frames_of(file: Path) -> list[Frame]:
+    deframer = Deframer()
+    return deframer.feed(file.read_bytes()) + deframer.flush()
+
+
+def written(tmp_path: Path, *words: str) -> list[Frame]:
+    out = tmp_path / "out.bin"
+    assert main(["simulate", "--out", str(out), *words]) == 0
+    return frames_of(out)
+
+
+def test_the_bytes_of_a_file_are_those_of_the_simulator(tmp_path: Path) -> None:
+    out = tmp_path / "out.bin"
+    assert main(["simulate", "--seconds", "90", "--seed", "5", "--out", str(out)]) == 0
+    expected = SimulatedEsc(seed=5).frames_until(90 * 10**9 - 1)
+    assert out.read_bytes() == b"".join(sent.wire for sent in expected)
+
+
+def test_several_escs_of_mixed_layouts_write_a_file_each(tmp_path: Path) -> None:
+    words = ["--esc", "3", "--layout", "mixed", "--seconds", "2s", "--out", str(tmp_path / "esc{n}.bin")]
+    assert main(["simulate", *words]) == 0
+    layouts = [{frame.layout for frame in frames_of(tmp_path / f"esc{n}.bin")} for n in (1, 2, 3)]
+    assert layouts == [{Layout.V4}, {Layout.LEGACY}, {Layout.V4}]
+
+
+def test_device_variant_firmware_and_cells_are_as_told(tmp_path: Path) -> None:
+    words = ["--device", "Kontrol_X", "--variant", "7", "--firmware", "3.9", "--cells", "12"]
+    words += ["--seconds", "2", "--rate", "200", "--info-every", "50"]
+    frames = written(tmp_path, *words)
+    infos = [frame.data for frame in frames if isinstance(frame.data, InfoData)]
+    assert len(infos) == 8
+    assert len(frames) == 408
+    assert (infos[0].device, infos[0].variant, infos[0].firmware) == (Device.KONTROL_X, 7, "3.9")
+    assert infos[0].cell_count == 12
+
+
+def test_error_bits_and_device_swaps_come_when_told(tmp_path: Path) -> None:
+    words = ["--error", "undervoltage@1s+500ms", "--error", "BEC-overcurrent@2", "--swap-device", "jivepro@3s"]
+    frames = written(tmp_path, *words, "--swap-device", "uhv:legacy@4.5s", "--seconds", "6")
+    lives = [frame for frame in frames if isinstance(frame.data, LiveData)]
+    words_of_errors = [frame.data.operating_errors for frame in lives if isinstance(frame.data, LiveData)]
+    assert [word & 1 for word in words_of_errors] == [int(100 <= n < 150) for n in range(600)]
+    bec = 1 << OperatingError.BEC_OVERCURRENT
+    assert [word & bec for word in words_of_errors] == [bec if n >= 200 else 0 for n in range(600)]
+    assert [frame.layout is Layout.V4 for frame in lives] == [n < 300 for n in range(600)]
+    devices = [frame.data.device for frame in frames if isinstance(frame.data, InfoData)]
+    assert devices == [Device.KOSMIK] * 3 + [Device.JIVEPRO] + [Device.UHV]
+
+
+def test_standard_output_can_be_decoded_at_once() -> None:
+    words = [
+        "--seconds",
+        "3",
+        "--out",
+        "-",
+        "--noise",
+        "2",
+        "--lose-bytes",
+        "0.1%",
+        "--flip-bits",
+        "1e-4",
+        "--dropout",
+        "500ms/2s",
+    ]
+    result = subprocess.run([*COMMAND, *words], capture_output=True, timeout=60)
+    assert result.returncode == 0
+    assert 150 < len(Deframer().feed(result.stdout)) < 253
+
+
+def test_escs_on_terminals_are_listed_and_send_until_the_signal(tmp_path: Path) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        link = tmp_path / "esc{n}"
+        words = [*COMMAND, "--esc", "2", "--link", str(link), "--layout", "legacy"]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stdout
+            assert process.stderr
+            lines = [process.stdout.readline().split() for _ in range(2)]
+            assert [line[0] for line in lines] == ["esc1", "esc2"]
+            for name, path in lines:
+                assert str((tmp_path / name).readlink()) == path
+                fd = os.open(tmp_path / name, os.O_RDONLY | os.O_NOCTTY)
+                deframer = Deframer()
+                frames: list[Frame] = []
+                while len(frames) < 5:
+                    frames += deframer.feed(os.read(fd, 4096))
+                os.close(fd)
+                assert deframer.counters.dropped_bytes == 0
+            process.send_signal(number)
+            assert process.stdout.read() == ""
+            assert "esc1: " in process.stderr.read()
+        assert process.returncode == 0
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_gateway_that_transmits_is_reported_loudly() -> None:
+    with subprocess.Popen(COMMAND, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        assert process.stderr
+        path = process.stdout.readline().split()[1]
+        fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+        os.write(fd, b"AT")
+        assert process.stderr.readline() == f"ERROR: esc1 {path}: the gateway transmits to the ESC: 41 54\n"
+        process.send_signal(signal.SIGTERM)
+        assert "2 bytes came from the gateway, beginning with 41 54" in process.stderr.read()
+        os.close(fd)
+    assert process.returncode == 1
+
+
+def test_sixty_four_escs_keep_their_pace() -> None:
+    result = subprocess.run(
+        [*COMMAND, "--esc", "64", "--seconds", "1"], capture_output=True, timeout=60, text=True, check=True
+    )
+    assert len(result.stdout.splitlines()) == 64
+    expected = [len(SimulatedEsc(start_ns=n * 10_000_000 // 64).frames_until(10**9 - 1)) for n in range(64)]
+    sent = [line.split(" frames")[0] for line in result.stderr.splitlines()]
+    assert sent == [f"esc{n + 1}: {expected[n]}" for n in range(64)]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("--esc 0", "--esc 0: outside 1..1000."),
+        ("--esc two", "--esc two: not a whole number."),
+        ("--rate fast", "--rate fast: not a number."),
+        ("--rate nan", "--rate nan: outside 0.1..10000."),
+        ("--seed x", "--seed x: not a whole number."),
+        ("--seconds never", "--seconds never: 'never' is not a time. Give for example 5s, 200ms or 2min."),
+        ("--seconds -1", "--seconds -1: '-1' is not a time. Give for example 5s, 200ms or 2min."),
+        ("--layout v5", "--layout v5: no such layout. There are: v4, legacy, mixed."),
+        ("--device kosmic", "--device kosmic: no such name as 'kosmic'. Did you mean kosmik?"),
+        ("--firmware 4", "--firmware 4: not a version. Give for example 1.14."),
+        ("--cells 101", "--cells 101: outside 1..100."),
+        ("--variant 1024", "--variant 1024: outside 0..1023."),
+        ("--noise -1", "--noise -1: outside 0..1000."),
+        ("--lose-bytes 2", "--lose-bytes 2: outside 0..1. Give a share such as 0.001 or 0.1%."),
+        ("--flip-bits 200%", "--flip-bits 200%: outside 0..100. Give a share such as 0.001 or 0.1%."),
+        (
+            "--dropout 2s",
+            "--dropout 2s: the interval is missing. Give for example 2s/10s: 2 s of silence in every 10 s.",
+        ),
+        ("--dropout 2s/1s", "--dropout 2s/1s: the silence must be shorter than the interval. Give for example 2s/10s."),
+        ("--error undervoltag@1s", "--error undervoltag@1s: no such name as 'undervoltag'. Did you mean undervoltage?"),
+        ("--error undervoltage", "--error undervoltage: the time is missing. Give for example undervoltage@5s+2s."),
+        ("--error undervoltage@1s+", "--error undervoltage@1s+: '' is not a time. Give for example 5s, 200ms or 2min."),
+        (
+            "--swap-device uhv",
+            "--swap-device uhv: the time is missing. Give for example kolibri@20s or jivepro:legacy@20s.",
+        ),
+        ("--swap-device uhv:x@1s", "--swap-device uhv:x@1s: no such layout. There are: v4, legacy."),
+        ("--esc 2 --link esc", "--link esc: needs {n} in the path, for the number of each of the 2 ESCs."),
+        ("--out x.bin", "--out x.bin: has no end. Give --seconds."),
+        ("--out x.bin --seconds 1 --link y", "--link: there is no pseudo terminal with --out. Give one of the two."),
+    ],
+)
+def test_each_bad_value_gives_one_clear_line_and_exit_code_2(
+    words: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = words.split()
+    if arguments[1].startswith("-"):
+        arguments = [f"{arguments[0]}={arguments[1]}"]
+    assert main(["simulate", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.err == f"kontronik-can-gw simulate: {expected}\n"
+    assert captured.out == ""
+
+
+def test_a_file_that_cannot_be_written_gives_one_clear_line_and_exit_code_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "missing" / "out.bin"
+    assert main(["simulate", "--seconds", "1", "--out", str(out)]) == 1
+    expected = f"kontronik-can-gw simulate: --out {out}: cannot be written: No such file or directory.\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_a_real_file_in_the_links_place_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    link = tmp_path / "esc2"
+    link.write_text("precious")
+    assert main(["simulate", "--esc", "2", "--link", str(tmp_path / "esc{n}"), "--seconds", "1"]) == 1
+    assert "exists and is not a symbolic link" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["esc2"]
+    assert link.read_text() == "precious"
+
+
+def test_the_help_shows_every_option_and_examples(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["simulate", "--help"])
+    text = capsys.readouterr().out
+    assert "--swap-device NAME[:LAYOUT]@TIME" in text
+    assert "examples:" in text

@@ -1,0 +1,345 @@
+"""The shipped DBC is read alike by cantools, canmatrix, opendbc and asammdf, without an error or a warning."""
+
+import logging
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+from dbc_rules import EVENT_HZ, Database, Message, Signal, parse
+
+SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
+FRAMES_PER_MESSAGE = 100
+
+
+def layout() -> Database:
+    return parse(SHIPPED.read_bytes())
+
+
+def raw_value(signal: Signal, data: bytes) -> int:
+    """The raw value of an Intel signal, from the definition of the format alone."""
+    raw = int.from_bytes(data, "little") >> signal.start & ((1 << signal.length) - 1)
+    return raw - (1 << signal.length) if signal.signed and raw >> (signal.length - 1) else raw
+
+
+def frame(message: Message, raw: dict[str, int]) -> bytes:
+    """The bytes of a message from raw values, the inverse of `raw_value`."""
+    bits = 0
+    for signal in message.signals:
+        bits |= (raw[signal.name] & ((1 << signal.length) - 1)) << signal.start
+    return bits.to_bytes(message.dlc, "little")
+
+
+def not_available(message: Message) -> dict[str, int]:
+    return {s.name: 0 if s.is_flag or s.is_alive_counter else s.not_available for s in message.signals}
+
+
+def error(message: Message) -> dict[str, int]:
+    return {s.name: 0 if s.is_flag or s.is_alive_counter else s.error for s in message.signals}
+
+
+def valid(message: Message, choice: random.Random) -> dict[str, int]:
+    """Raw values that the gateway may send: within the limits, of an enum one with a name."""
+    tables = layout().tables
+    raw = {}
+    for signal in message.signals:
+        low, high = int(signal.minimum / signal.factor), int(signal.maximum / signal.factor)
+        named = [number for number in tables.get(signal.key, {}) if low <= number <= high]
+        raw[signal.name] = choice.choice(named) if named else choice.choice([low, high, choice.randint(low, high)])
+    return raw
+
+
+def random_frames(message: Message) -> list[bytes]:
+    """Any bytes whatever, and the two extremes; the same on each run."""
+    choice = random.Random(message.id)
+    return [bytes(8), b"\xff" * 8, *(choice.randbytes(8) for _ in range(FRAMES_PER_MESSAGE))]
+
+
+# --- cantools -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cantools_database() -> Any:
+    import cantools
+
+    return cantools.database.load_file(SHIPPED, database_format="dbc", strict=True)
+
+
+@pytest.mark.filterwarnings("error")
+def test_cantools_loads_the_file_strictly_and_silently(caplog: pytest.LogCaptureFixture) -> None:
+    import cantools
+
+    with caplog.at_level(logging.INFO):
+        cantools.database.load_file(SHIPPED, database_format="dbc", encoding="ascii", strict=True)
+    assert caplog.records == []
+
+
+def test_cantools_sees_what_the_lines_say(cantools_database: Any) -> None:
+    db = layout()
+    comments = dict(db.comments)
+    assert [node.name for node in cantools_database.nodes] == db.nodes
+    assert cantools_database.dbc.attributes["LayoutVersion"].value == db.attribute("LayoutVersion")
+    assert [message.frame_id for message in cantools_database.messages] == [message.id for message in db.messages]
+    for message, seen in zip(db.messages, cantools_database.messages, strict=True):
+        assert (seen.name, seen.length, seen.senders) == (message.name, message.dlc, [message.sender])
+        assert seen.comment == comments[("BO_", message.id)]
+        assert seen.send_type == db.send_type(message)
+        assert (seen.cycle_time or 0) == db.number("GenMsgCycleTime", message)
+        assert seen.dbc.attributes["GenMsgDelayTime"].value == db.number("GenMsgDelayTime", message)
+        assert (seen.is_extended_frame, seen.is_fd, seen.is_multiplexed(), seen.protocol) == (False, False, False, None)
+        for signal in message.signals:
+            its = seen.get_signal_by_name(signal.name)
+            assert (its.start, its.length, its.byte_order) == (signal.start, signal.length, "little_endian")
+            assert (its.is_signed, its.is_float, its.receivers) == (signal.signed, False, list(signal.receivers))
+            assert its.comment == comments[("SG_", *signal.key)]
+            assert (its.unit or "") == signal.unit
+            assert (its.minimum, its.maximum) == (float(signal.minimum), float(signal.maximum))
+            assert {n: str(text) for n, text in (its.choices or {}).items()} == db.tables.get(signal.key, {})
+
+
+@pytest.mark.parametrize(("text", "raw_of"), [("NotAvailable", not_available), ("Error", error)])
+def test_cantools_names_the_two_codes(cantools_database: Any, text: str, raw_of: Any) -> None:
+    for message in layout().messages:
+        decoded = cantools_database.decode_message(message.id, frame(message, raw_of(message)))
+        for signal in message.signals:
+            expected = 0 if signal.is_flag or signal.is_alive_counter else text
+            assert decoded[signal.name] == expected, signal.name
+
+
+def test_cantools_starts_every_signal_not_available(cantools_database: Any) -> None:
+    """The start value is raw: an initial value of 655.35 V would be a number, not a missing one."""
+    for message in layout().messages:
+        seen = cantools_database.get_message_by_frame_id(message.id)
+        assert {signal.name: signal.raw_initial for signal in seen.signals} == not_available(message)
+        initial = {signal.name: signal.initial for signal in seen.signals}
+        assert seen.encode(initial, strict=False) == frame(message, not_available(message))
+
+
+def test_cantools_refuses_a_number_beyond_the_limits_but_not_one_that_hits_a_code(cantools_database: Any) -> None:
+    """cantools exempts the raw values of VAL_ from the limits, even for a number: whoever packs must look himself."""
+    import cantools
+
+    seen = cantools_database.get_message_by_name("EscSpeed")
+    values = {"ElectricalSpeed": 0, "BatteryVoltage": 655.33, "ThrottlePercent": 0, "Timing": 0, "SpeedAlive": 0}
+    assert seen.decode(seen.encode(values, strict=True))["BatteryVoltage"] == pytest.approx(655.33)
+    assert seen.decode(seen.encode(values | {"BatteryVoltage": 655.34}, strict=True))["BatteryVoltage"] == "Error"
+    for name, number in (("BatteryVoltage", 655.36), ("ThrottlePercent", -129), ("SpeedAlive", 15)):
+        with pytest.raises(cantools.database.EncodeError):
+            seen.encode(values | {name: number}, strict=True)
+
+
+def test_a_file_written_again_by_cantools_means_the_same(cantools_database: Any) -> None:
+    import cantools
+
+    again: Any = cantools.database.load_string(cantools_database.as_dbc_string(), "dbc", strict=True)
+    # Of the attributes it drops only a cycle time of 0, which is the default.
+    assert again.is_similar(cantools_database, include_format_specifics=False)
+
+
+# --- canmatrix ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def canmatrix_matrix(caplog: pytest.LogCaptureFixture) -> Any:
+    import canmatrix.formats  # type: ignore[import-untyped]
+
+    with caplog.at_level(logging.WARNING):
+        matrix = canmatrix.formats.loadp_flat(str(SHIPPED))
+    assert [record.getMessage() for record in caplog.records] == []
+    assert matrix.load_errors == []
+    return matrix
+
+
+def test_canmatrix_sees_what_the_lines_say(canmatrix_matrix: Any) -> None:
+    db = layout()
+    comments = dict(db.comments)
+    assert [ecu.name for ecu in canmatrix_matrix.ecus] == db.nodes
+    assert canmatrix_matrix.attributes == {"LayoutVersion": db.attribute("LayoutVersion"), "BusType": "CAN"}
+    assert len(canmatrix_matrix.frames) == len(db.messages)
+    for message, seen in zip(db.messages, canmatrix_matrix.frames, strict=True):
+        assert (seen.name, seen.arbitration_id.id, seen.size) == (message.name, message.id, message.dlc)
+        assert (seen.arbitration_id.extended, seen.is_fd, seen.is_j1939, seen.is_multiplexed) == (False,) * 4
+        assert (seen.transmitters, seen.comment) == ([message.sender], comments[("BO_", message.id)])
+        assert seen.attributes["GenMsgSendType"] == db.send_type(message)
+        assert seen.cycle_time == db.number("GenMsgCycleTime", message)
+        for signal in message.signals:
+            its = seen.signal_by_name(signal.name)
+            assert (its.get_startbit(bit_numbering=1), its.size) == (signal.start, signal.length)
+            assert (its.is_little_endian, its.is_signed, its.is_float) == (True, signal.signed, False)
+            assert (its.min, its.max) == (signal.minimum, signal.maximum)
+            assert (its.unit, its.receivers) == (signal.unit, list(signal.receivers))
+            assert its.comment == comments[("SG_", *signal.key)]
+            assert its.values == db.tables.get(signal.key, {})
+            assert its.initial_value == not_available(message)[signal.name] * signal.factor
+
+
+def test_a_file_written_again_by_canmatrix_means_the_same(canmatrix_matrix: Any, cantools_database: Any) -> None:
+    import io
+
+    import canmatrix.formats
+    import cantools
+
+    written = io.BytesIO()
+    canmatrix.formats.dump(canmatrix_matrix, written, "dbc", dbcExportEncoding="ascii")
+    again: Any = cantools.database.load_string(written.getvalue().decode("ascii"), "dbc", strict=True)
+    for seen in again.messages:
+        data = frame(next(m for m in layout().messages if m.id == seen.frame_id), {s.name: 1 for s in seen.signals})
+        assert seen.decode(data) == cantools_database.decode_message(seen.frame_id, data)
+
+
+# --- opendbc --------------------------------------------------------------------------------------------------------
+
+
+def test_opendbc_reads_every_signal_from_the_path_of_the_file() -> None:
+    """It takes a path where one exists, else the name of a packaged file. What it does not understand it skips."""
+    from opendbc.can.dbc import DBC  # type: ignore[import-untyped]
+
+    db = layout()
+    seen = DBC(str(SHIPPED))
+    assert {address: message.name for address, message in seen.msgs.items()} == {m.id: m.name for m in db.messages}
+    for message in db.messages:
+        signals = seen.msgs[message.id].sigs
+        assert list(signals) == [signal.name for signal in message.signals]
+        for signal in message.signals:
+            its = signals[signal.name]
+            assert (its.lsb, its.size, its.is_signed) == (signal.start, signal.length, signal.signed)
+            assert (its.factor, its.offset, its.type) == (float(signal.factor), 0.0, 0)
+
+
+def test_opendbc_reads_every_value_text() -> None:
+    """It splits texts at blanks and shouts: `Bus Off` would raise, `Ok` and `OK` would meet."""
+    from opendbc.can import CANDefine  # type: ignore[import-untyped]
+
+    db = layout()
+    names = {message.id: message.name for message in db.messages}
+    defined = CANDefine(str(SHIPPED)).dv
+    for (message_id, name), table in db.tables.items():
+        assert defined[names[message_id]][name] == {number: text.upper() for number, text in table.items()}
+
+
+def test_opendbc_packs_and_parses_valid_frames() -> None:
+    from opendbc.can import CANPacker, CANParser
+
+    db = layout()
+    packer = CANPacker(str(SHIPPED))
+    parser = CANParser(str(SHIPPED), [(message.name, EVENT_HZ) for message in db.messages], 0)
+    choice = random.Random(1)
+    for moment in range(20):
+        sent = {message.name: valid(message, choice) for message in db.messages}
+        frames = []
+        for message in db.messages:
+            values = {s.name: float(sent[message.name][s.name] * s.factor) for s in message.signals}
+            frames.append(packer.make_can_msg(message.name, 0, values))
+            assert frames[-1] == (message.id, frame(message, sent[message.name]), 0)
+        parser.update([(1_000_000_000 + moment * 10_000_000, frames)])
+        assert parser.can_valid
+        for message in db.messages:
+            for signal in message.signals:
+                physical = float(sent[message.name][signal.name] * signal.factor)
+                assert parser.vl[message.name][signal.name] == pytest.approx(physical)
+
+
+# --- the same bits for all ------------------------------------------------------------------------------------------
+
+
+def test_all_readers_find_the_same_raw_values_in_any_bytes(cantools_database: Any, canmatrix_matrix: Any) -> None:
+    from opendbc.can.dbc import DBC
+    from opendbc.can.parser import get_raw_value  # type: ignore[import-untyped]
+
+    opendbc = DBC(str(SHIPPED))
+    for message in layout().messages:
+        matrix_frame = canmatrix_matrix.frame_by_name(message.name)
+        for data in random_frames(message):
+            expected = {signal.name: raw_value(signal, data) for signal in message.signals}
+            assert cantools_database.decode_message(message.id, data, decode_choices=False, scaling=False) == expected
+            assert {name: seen.raw_value for name, seen in matrix_frame.decode(data).items()} == expected
+            for name, its in opendbc.msgs[message.id].sigs.items():
+                raw = get_raw_value(data, its)
+                raw -= (raw >> (its.size - 1) << its.size) if its.is_signed else 0
+                assert raw == expected[name], name
+
+
+# --- asammdf --------------------------------------------------------------------------------------------------------
+
+
+def recorded(path: Path, moments: list[dict[str, dict[str, int]]]) -> Any:
+    """An MF4 of raw CAN frames, one of each message per moment and 0.1 s, decoded by asammdf with the shipped DBC."""
+    import can
+    from asammdf import MDF
+
+    with can.MF4Writer(path) as writer:
+        for number, moment in enumerate(moments):
+            for message in layout().messages:
+                writer.on_message_received(
+                    can.Message(
+                        timestamp=1_700_000_000 + number / 10,
+                        arbitration_id=message.id,
+                        is_extended_id=False,
+                        data=frame(message, moment[message.name]),
+                    )
+                )
+    with MDF(path) as measurement:
+        return measurement.extract_bus_logging({"CAN": [(str(SHIPPED), 0)]})
+
+
+def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path) -> None:
+    import numpy
+
+    choice = random.Random(2)
+    db = layout()
+    raw: list[dict[str, dict[str, int]]] = [{message.name: not_available(message) for message in db.messages}]
+    raw += [{message.name: error(message) for message in db.messages}]
+    raw += [{message.name: valid(message, choice) for message in db.messages} for _ in range(30)]
+    decoded = recorded(tmp_path / "raw.mf4", raw)
+    units = set()
+    for message in db.messages:
+        for signal in message.signals:
+            seen = decoded.get(signal.name)
+            sent = [moment[message.name][signal.name] for moment in raw]
+            assert list(decoded.get(signal.name, raw=True).samples) == sent, signal.name
+            assert seen.unit == signal.unit
+            units.add(seen.unit)
+            table = db.tables.get(signal.key, {})
+            if len(table) > 2:
+                assert [text.decode() for text in seen.samples] == [table[number] for number in sent]
+            else:
+                expected = [float("nan") if number in table else float(number * signal.factor) for number in sent]
+                numpy.testing.assert_allclose(seen.samples.astype(float), expected, rtol=1e-12, err_msg=signal.name)
+                assert (seen.samples.dtype.kind == "f") == bool(table), signal.name
+    assert {"V", "A", "degC", "us", "%", "1/min"} <= units
+    decoded.close()
+
+
+@pytest.mark.filterwarnings("ignore:The inplace keyword")  # asammdf's own call of pandas
+def test_asammdf_makes_a_table_of_numbers(tmp_path: Path) -> None:
+    """What a user plots: a column of floats with gaps, never a column of texts and numbers mixed."""
+    choice = random.Random(3)
+    messages = layout().messages
+    raw: list[dict[str, dict[str, int]]] = [{message.name: not_available(message) for message in messages}]
+    raw += [{message.name: valid(message, choice) for message in messages} for _ in range(5)]
+    decoded = recorded(tmp_path / "raw.mf4", raw)
+    table = decoded.to_dataframe()
+    assert {str(table[name].dtype) for name in ("BatteryVoltage", "BatteryCurrent", "Losses", "Uptime")} == {"float64"}
+    assert list(table["BatteryVoltage"].isna()) == [True, False, False, False, False, False]
+    decoded.close()
+
+
+def test_asammdf_gives_texts_for_a_column_that_was_never_available(tmp_path: Path) -> None:
+    """Without one number in the whole recording there is no NaN: the column is the text of the code."""
+    messages = layout().messages
+    raw = [{message.name: not_available(message) for message in messages}] * 3
+    decoded = recorded(tmp_path / "raw.mf4", raw)
+    for name in ("BecCurrent", "BatteryCurrent", "OperatingState"):
+        assert list(decoded.get(name).samples) == [b"NotAvailable"] * 3
+    decoded.close()
+
+
+def test_asammdf_loses_all_names_by_one_state_without_a_name(tmp_path: Path) -> None:
+    """Why enums are closed, and why the gateway sends such a state as Error."""
+    messages = layout().messages
+    raw = [{message.name: not_available(message) for message in messages} for _ in range(3)]
+    for moment, state in zip(raw, (12, 13, 4), strict=True):
+        moment["EscStatus"]["OperatingState"] = state
+    decoded = recorded(tmp_path / "raw.mf4", raw)
+    assert b"MotorOff" not in list(decoded.get("OperatingState").samples)
+    decoded.close()

@@ -1,0 +1,200 @@
+"""Records from bytes: exact values, in wire order, alike however the stream is cut."""
+
+import csv
+import io
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kontronik_can_gw.offline.decode import (
+    COLUMNS,
+    Decoder,
+    Record,
+    csv_header,
+    csv_lines,
+    json_lines,
+    physical_fields,
+    summary,
+)
+from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode, rows
+from kontronik_can_gw.protocol.fields import device_and_variant
+from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc, Swap
+
+S = 1_000_000_000
+
+# Recorded from a JIVE PRO 120, firmware 1.14, idle.
+LIVE = bytes.fromhex(
+    "4B4F444C 00000000 8A09 0000 0000 0000 0000 0000 581F E903 00 00 1D 20 00000200 0C 00 39234C14".replace(" ", "")
+)
+INFO = bytes.fromhex(
+    "4B4F4449 780C 0E01 00000000 06 00000000 6E09 0000 0000 0000 0000 0000 DF15 00 00 1B 1E 1C 21 904AE8A9".replace(
+        " ", ""
+    )
+)
+
+LIVE_JSON = (
+    '{"kind": "live", "layout": "legacy", "offset": 0, "electrical_speed": 0, "battery_voltage": 24.42, '
+    '"battery_current": 0.0, "motor_current": 0.0, "peak_current": 0.0, "consumed_charge": 0, "bec_current": 0.0, '
+    '"bec_voltage": 8.024, "pwm_input": 1001, "throttle": 0, "output_opening": 0, "power_stage_temperature": 29, '
+    '"bec_temperature": 32, "operating_errors": 131072, "operating_errors_names": ["programming_allowed"], '
+    '"operating_state": "MotorOff", "operating_state_raw": 12, "timing": 0, "suspect": false}\n'
+)
+INFO_JSON = (
+    '{"kind": "info", "layout": "legacy", "offset": 38, "device": "JIVEPro", "device_raw": 3, "variant": 120, '
+    '"firmware": "1.14", "selftest_errors": 0, "selftest_errors_names": [], "cell_count": 6, '
+    '"max_electrical_speed": 0, "min_battery_voltage": 24.14, "max_battery_voltage": 0.0, '
+    '"max_battery_current": 0.0, "max_motor_current": 0.0, "max_peak_current": 0.0, "max_bec_current": null, '
+    '"min_bec_voltage": 5.599, "max_throttle": 0, "max_output_opening": 0, "min_power_stage_temperature": 27, '
+    '"max_power_stage_temperature": 30, "min_bec_temperature": 28, "max_bec_temperature": 33}\n'
+)
+
+
+def decode(data: bytes) -> list[Record]:
+    decoder = Decoder()
+    return decoder.feed(data) + decoder.flush()
+
+
+def spoiled_stream() -> bytes:
+    """Both layouts, rubbish, a device swap."""
+    faults = Faults(noise=2, lost_bytes=0.002, flipped_bits=0.0002, swaps=(Swap(12 * S, Device.JIVEPRO),))
+    return b"".join(sent.wire for sent in SimulatedEsc(EscOptions(faults=faults)).frames_until(25 * S))
+
+
+def test_the_recorded_frames_give_exactly_this_json() -> None:
+    assert json_lines(decode(LIVE + INFO)) == LIVE_JSON + INFO_JSON
+
+
+def test_the_recorded_frames_in_the_v4_layout_give_the_same_values() -> None:
+    """Synthetic: the recorded values encoded in the other layout."""
+    (live, info) = (record.copy() for record in decode(LIVE + INFO))
+    live_raw = LiveData(0, 2442, 0, 0, 0, 0, 0, 8024, 1001, 0, 0, 29, 32, 0x20000, 12, 0)
+    info_raw = InfoData(0x0C78, 0x010E, 0, 6, 0, 2414, 0, 0, 0, 0, 0, 5599, 0, 0, 27, 30, 28, 33)
+    assert encode(live_raw, Layout.LEGACY) == LIVE
+    assert encode(info_raw, Layout.LEGACY) == INFO
+    live["layout"] = info["layout"] = "v4"
+    info["offset"] = 40
+    assert decode(encode(live_raw, Layout.V4) + encode(info_raw, Layout.V4)) == [live, info]
+
+
+def test_rubbish_only_moves_the_offsets() -> None:
+    rubbish = b"\0KOD\xff" * 3
+    records = decode(rubbish + LIVE + b"KODLKO" + INFO + rubbish)
+    assert [record["offset"] for record in records] == [15, 15 + 38 + 6]
+    assert [record["kind"] for record in records] == ["live", "info"]
+
+
+def test_negative_and_extreme_values_keep_their_sign_and_size() -> None:
+    live = LiveData(
+        2**32 - 1, 65535, -32768, -1, 32767, 65535, 65535, 65535, 65535, -128, 255, -13, -128, 2**32 - 1, 255, 255
+    )
+    (record,) = decode(encode(live, Layout.V4))
+    assert record["battery_current"] == -3276.8
+    assert record["motor_current"] == -0.1
+    assert record["power_stage_temperature"] == -13
+    assert record["operating_state"] is None
+    assert record["operating_state_raw"] == 255
+    names = record["operating_errors_names"]
+    assert isinstance(names, list)
+    assert names[0] == "undervoltage"
+    assert names[24:] == [f"bit{bit}" for bit in range(24, 32)]
+
+
+def test_an_unnamed_device_is_null_with_its_number_beside() -> None:
+    (record,) = decode(encode(InfoData(device_and_variant(42, 7)), Layout.V4))
+    assert (record["device"], record["device_raw"], record["variant"]) == (None, 42, 7)
+
+
+def test_bec_current_is_null_once_the_device_is_known_as_jivepro() -> None:
+    assert [record.get("bec_current", "absent") for record in decode(LIVE + INFO + LIVE)] == [0.0, "absent", None]
+
+
+def test_the_device_is_forgotten_when_the_layout_changes() -> None:
+    v4 = encode(LiveData(bec_current=1500), Layout.V4)
+    currents = [record["bec_current"] for record in decode(INFO + LIVE + v4 + LIVE) if record["kind"] == "live"]
+    assert currents == [None, 1.5, 0.0]
+
+
+def test_another_device_in_the_same_layout_is_taken_over() -> None:
+    kosmik = encode(InfoData(device_and_variant(Device.KOSMIK, 1), max_bec_current=2500), Layout.LEGACY)
+    records = decode(INFO + LIVE + kosmik + LIVE)
+    assert records[1]["bec_current"] is None
+    assert records[2]["max_bec_current"] == 2.5
+    assert records[3]["bec_current"] == 0.0
+
+
+def test_an_impossible_state_in_the_unprotected_bytes_is_marked_suspect() -> None:
+    spoiled = bytearray(LIVE)
+    spoiled[32] = 200
+    assert [record["suspect"] for record in decode(LIVE + spoiled)] == [False, True]
+
+
+@given(raw=st.integers(0, 65535), signed=st.integers(-32768, 32767))
+def test_printed_floats_read_back_to_the_exact_step(raw: int, signed: int) -> None:
+    data = LiveData(battery_voltage=raw, battery_current=signed, bec_voltage=raw)
+    record = json.loads(json.dumps(physical_fields(data)))
+    for name in ("battery_voltage", "battery_current", "bec_voltage"):
+        assert rows(LiveData)[name].raw(record[name]) == getattr(data, name)
+        assert len(repr(record[name]).partition(".")[2]) <= 3
+
+
+def test_csv_holds_what_json_holds() -> None:
+    records = decode(spoiled_stream())
+    assert {record["layout"] for record in records} == {"v4", "legacy"}
+    table = list(csv.DictReader(io.StringIO(csv_header() + csv_lines(records))))
+    lines = [json.loads(line) for line in json_lines(records).splitlines()]
+    assert len(table) == len(lines) == len(records)
+    for row, line in zip(table, lines, strict=True):
+        assert tuple(row) == COLUMNS
+        for column in COLUMNS:
+            value = line.get(column)
+            if isinstance(value, list):
+                assert row[column] == "|".join(value)
+            elif isinstance(value, str):
+                assert row[column] == value
+            else:
+                assert row[column] == ("" if value is None else json.dumps(value))
+
+
+def test_several_names_are_joined_by_a_bar() -> None:
+    text = csv_lines(decode(encode(LiveData(operating_errors=0b11), Layout.V4)))
+    assert ",3,undervoltage|overvoltage," in text
+
+
+def test_each_column_stands_once_and_in_wire_order() -> None:
+    assert len(set(COLUMNS)) == len(COLUMNS)
+    assert COLUMNS[:5] == ("kind", "layout", "offset", "electrical_speed", "battery_voltage")
+    plain = [name for name in COLUMNS if name in LiveData._fields]
+    assert plain == list(LiveData._fields)
+
+
+@given(st.lists(st.integers(1, 400), min_size=1, max_size=30))
+@settings(max_examples=20, deadline=None)
+def test_the_records_do_not_depend_on_how_the_stream_is_cut(sizes: list[int]) -> None:
+    stream = spoiled_stream()[:20_000]
+    decoder, records, at, turn = Decoder(), [], 0, 0
+    while at < len(stream):
+        size = sizes[turn % len(sizes)]
+        records += decoder.feed(stream[at : at + size])
+        at, turn = at + size, turn + 1
+    assert records + decoder.flush() == decode(stream)
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        (b"", "0 bytes: the input is empty"),
+        (LIVE + INFO, "79 bytes: 1 live and 1 info frames (2 legacy), 0 bytes dropped, 0 CRC errors"),
+        (
+            b"\x55" * 100,
+            "100 bytes: 0 live and 0 info frames, 100 bytes dropped, 0 CRC errors\nno frame found: bytes but",
+        ),
+        (LIVE[:-1] + b"\0" * 9, "headers but no valid CRC"),
+    ],
+)
+def test_the_summary_says_what_was_found_or_what_may_be_wrong(data: bytes, expected: str) -> None:
+    decoder = Decoder()
+    decoder.feed(data)
+    decoder.flush()
+    assert expected in summary(decoder.counters)

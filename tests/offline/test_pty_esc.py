@@ -1,0 +1,174 @@
+"""The ESC's pseudo terminal: bytes pass unchanged one way, and whatever comes back is noticed."""
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.offline.pty import PtyEsc, run
+from kontronik_can_gw.protocol import Deframer
+from kontronik_can_gw.simulator import EscOptions, Sent, SimulatedEsc
+
+ALL_BYTES = bytes(range(256))
+
+
+@pytest.fixture
+def esc() -> Iterator[PtyEsc]:
+    with PtyEsc() as terminal:
+        yield terminal
+
+
+def read_exactly(path: str | Path, size: int) -> bytes:
+    fd = os.open(path, os.O_RDONLY | os.O_NOCTTY)
+    try:
+        data = b""
+        while len(data) < size:
+            data += os.read(fd, size - len(data))
+        return data
+    finally:
+        os.close(fd)
+
+
+def test_every_byte_value_passes_unchanged_and_nothing_is_echoed(esc: PtyEsc) -> None:
+    assert esc.write(ALL_BYTES)
+    assert read_exactly(esc.path, 256) == ALL_BYTES
+    assert esc.check() == 0
+    assert esc.received == 0
+
+
+def test_the_reader_may_come_and_go(esc: PtyEsc) -> None:
+    for _ in range(3):
+        esc.write(b"KODL\n\r\x03\x04")
+        assert read_exactly(esc.path, 8) == b"KODL\n\r\x03\x04"
+
+
+def test_a_transmitting_gateway_is_noticed(esc: PtyEsc) -> None:
+    fd = os.open(esc.path, os.O_RDWR | os.O_NOCTTY)
+    os.write(fd, b"ATSN?\r\n")
+    os.close(fd)
+    assert esc.check() == 7
+    assert esc.check() == 0
+    assert esc.received == 7
+    assert esc.first_received == b"ATSN?\r\n"
+
+
+def test_an_echo_switched_on_by_the_gateway_is_noticed(esc: PtyEsc) -> None:
+    import termios
+
+    fd = os.open(esc.path, os.O_RDWR | os.O_NOCTTY)
+    mode = termios.tcgetattr(fd)
+    mode[3] |= termios.ECHO
+    termios.tcsetattr(fd, termios.TCSANOW, mode)
+    esc.write(b"KODL")
+    assert read_exactly(esc.path, 4) == b"KODL"
+    os.close(fd)
+    assert esc.check() == 4
+
+
+def test_what_nobody_reads_is_dropped_and_counted_and_never_blocks(esc: PtyEsc) -> None:
+    written = 0
+    while esc.write(bytes(1000)):
+        written += 1000
+        assert written < 10_000_000
+    before = esc.dropped_bytes
+    assert 0 < before <= 1000
+    assert not esc.write(bytes(500))
+    assert esc.dropped_bytes == before + 500
+
+
+def test_the_link_leads_to_the_terminal_and_goes_with_it(tmp_path: Path) -> None:
+    link = tmp_path / "esc1"
+    with PtyEsc(link) as terminal:
+        assert str(link.readlink()) == terminal.path
+        terminal.write(b"x")
+        assert read_exactly(link, 1) == b"x"
+    assert not link.is_symlink()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_old_link_is_replaced_even_a_dangling_one(tmp_path: Path) -> None:
+    link = tmp_path / "esc1"
+    link.symlink_to("/nowhere/at/all")
+    with PtyEsc(link) as terminal:
+        assert str(link.readlink()) == terminal.path
+
+
+def test_a_link_that_another_has_taken_over_stays(tmp_path: Path) -> None:
+    link = tmp_path / "esc1"
+    with PtyEsc(link):
+        second = PtyEsc(link)
+    assert str(link.readlink()) == second.path
+    second.close()
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize("kind", ["file", "directory"])
+def test_a_real_file_is_never_overwritten(tmp_path: Path, kind: str) -> None:
+    link = tmp_path / "precious"
+    if kind == "file":
+        link.write_text("data")
+    else:
+        link.mkdir()
+    with pytest.raises(RunError, match="precious: exists and is not a symbolic link"):
+        PtyEsc(link)
+    assert link.exists()
+    assert not link.is_symlink()
+    assert list(tmp_path.iterdir()) == [link]
+
+
+def test_a_link_in_a_missing_directory_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="no link can be made: No such file"):
+        PtyEsc(tmp_path / "missing" / "esc1")
+
+
+def test_a_relative_link_is_removed_though_the_directory_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    terminal = PtyEsc("esc1")
+    monkeypatch.chdir("/")
+    terminal.close()
+    terminal.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_several_escs_run_in_one_thread_and_every_frame_arrives() -> None:
+    options = EscOptions(period_ns=2_000_000, info_every=10)
+    terminals = [PtyEsc() for _ in range(4)]
+    sent: list[list[Sent]] = [[] for _ in terminals]
+    pairs = [(SimulatedEsc(options, seed=n), terminal) for n, terminal in enumerate(terminals)]
+
+    def record(index: int, one: Sent, taken: bool) -> None:
+        assert taken
+        sent[index].append(one)
+
+    run(pairs, seconds=0.1, on_sent=record)
+    for terminal, frames in zip(terminals, sent, strict=True):
+        assert len(frames) == 55
+        wire = b"".join(one.wire for one in frames)
+        found = Deframer().feed(read_exactly(terminal.path, len(wire)))
+        assert [frame.data for frame in found] == [one.data for one in frames]
+        assert terminal.dropped_bytes == terminal.received == 0
+        terminal.close()
+
+
+def test_the_run_ends_when_told_and_reports_what_a_gateway_sends(esc: PtyEsc) -> None:
+    over = threading.Event()
+    guilty: list[int] = []
+
+    def on_received(index: int) -> None:
+        guilty.append(index)
+        over.set()
+
+    fd = os.open(esc.path, os.O_RDWR | os.O_NOCTTY)
+    os.write(fd, b"+++")
+    begin = time.monotonic()
+    run([(SimulatedEsc(), esc)], seconds=30, stop=over.is_set, on_received=on_received)
+    os.close(fd)
+    assert time.monotonic() - begin < 10
+    assert guilty == [0]
+    assert esc.received == 3

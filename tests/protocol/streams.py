@@ -1,0 +1,145 @@
+"""Byte streams for the deframer's tests: random ones for hypothesis, and a model of a UART line. All synthetic but the two recorded frames."""
+
+import random
+
+from hypothesis import strategies as st
+
+from . import reference, sheet
+from .reference import ambiguous, random_frame, seal
+from .sheet import FORM_ROWS, FormRow
+
+FRAGMENTS = [b"K", b"KO", b"KOD", b"KODL", b"KODI", b"KODK", b"KODX", b"KOKO", b"KKOD", b"KODKODI", b"\0", b"\xff"]
+
+
+def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: random.Random) -> bytes:
+    """Two frames, both valid, the second beginning ``shared`` bytes before the first ends: the first takes the bytes."""
+    start = first.length - shared
+    assert 4 <= start <= first.covered - 4
+    body = bytearray(source.randbytes(first.crc_at - 4))
+    body[start - 4 : start] = second.header
+    outer = seal(first, bytes(body))
+    inner_begin = outer[start + 4 :]
+    return outer[:start] + seal(second, inner_begin + source.randbytes(second.crc_at - 4 - len(inner_begin)))
+
+
+def random_piece(source: random.Random) -> bytes:
+    """A piece of a stream: frames most of the time, else what hurts a deframer."""
+    row = source.choice(FORM_ROWS)
+    frame = random_frame(row, source)
+    choice = source.randrange(16)
+    if choice < 6:
+        return frame
+    if choice == 6:
+        return source.choice([sheet.RECORDED_LIVE, sheet.RECORDED_INFO])
+    if choice == 7:
+        return source.choice([ambiguous("live"), ambiguous("info")])
+    if choice == 8:  # truncated, at either end
+        cut = source.randrange(1, len(frame))
+        return source.choice([frame[:cut], frame[cut:]])
+    if choice == 9:  # a whole frame behind a header that is none
+        return source.choice([b"KODL", b"KODI"]) + source.randbytes(source.randrange(0, 40)) + frame
+    if choice == 10:  # headers behind headers
+        return source.choice([b"KODL", b"KODI", b"KOD"]) * source.randrange(1, 12)
+    if choice == 11:
+        shared = source.randrange(8, 32)
+        first = source.choice([row for row in FORM_ROWS if 4 <= row.length - shared <= row.covered - 4])
+        return overlapping_pair(first, row, shared, source)
+    if choice == 12:
+        return source.randbytes(source.randrange(0, 60))
+    if choice == 13:  # fragments as a frame's content
+        content = b"".join(source.choices(FRAGMENTS, k=20))
+        return seal(row, content.ljust(40, b"K")[: row.crc_at - 4])
+    if choice == 14:  # one bad bit
+        at = source.randrange(len(frame))
+        return frame[:at] + bytes([frame[at] ^ 1 << source.randrange(8)]) + frame[at + 1 :]
+    return source.choice(FRAGMENTS)
+
+
+def damaged(stream: bytes, source: random.Random, times: int) -> bytes:
+    """The stream with bytes lost, bits flipped and bytes inserted."""
+    result = bytearray(stream)
+    for _ in range(times):
+        at = source.randrange(len(result) + 1)
+        harm = source.randrange(3)
+        if harm == 0:
+            del result[at : at + source.choice([1, 1, 1, 5])]
+        elif harm == 1 and at < len(result):
+            result[at] ^= 1 << source.randrange(8)
+        else:
+            result[at:at] = source.choice([source.randbytes(1), source.choice(FRAGMENTS)])
+    return bytes(result)
+
+
+def random_stream(source: random.Random, pieces: int) -> bytes:
+    stream = b"".join(random_piece(source) for _ in range(pieces))
+    return damaged(stream, source, source.choice([0, 0, 1, 3, 10]))
+
+
+def random_chunks(stream: bytes, source: random.Random) -> list[bytes]:
+    """The stream cut anywhere, empty chunks included."""
+    largest = source.choice([2, 5, 40, 100])
+    chunks = []
+    at = 0
+    while at < len(stream):
+        size = source.randrange(largest + 1)
+        chunks.append(stream[at : at + size])
+        at += size
+    return chunks
+
+
+sources = st.randoms(use_true_random=False)
+
+pieces = st.one_of(
+    st.sampled_from(FRAGMENTS),
+    st.binary(max_size=50),
+    st.sampled_from([sheet.RECORDED_LIVE, sheet.RECORDED_INFO]),
+    st.integers(0, 1 << 32).map(lambda seed: random_piece(random.Random(seed))),
+)
+streams = st.lists(pieces, max_size=12).map(b"".join)
+
+
+class Uart:
+    """A line in time steps of a quarter of a 115200 baud bit; idle is high."""
+
+    STEPS = 4
+
+    def __init__(self) -> None:
+        self.levels: list[int] = [1] * 100
+
+    def idle(self, steps: int) -> None:
+        self.levels += [1] * steps
+
+    def send(self, data: bytes, slower: int = 1, parity: bool = True) -> None:
+        """Start bit, eight data bits lowest first, even parity if asked for, stop bit; ``slower`` 12 is 9600 baud."""
+        for byte in data:
+            bits = [0, *(byte >> bit & 1 for bit in range(8)), *([byte.bit_count() & 1] if parity else []), 1]
+            for bit in bits:
+                self.levels += [bit] * (self.STEPS * slower)
+
+    def received(self, parity: bool, resume_at_low_stop: bool) -> bytes:
+        """What a receiver at 115200 baud reads; bytes with parity or framing errors are passed on as they are.
+
+        After a low stop bit it either waits for the line to become high, or takes that bit as the next start bit (as a 16550).
+        """
+        levels = [*self.levels, *([1] * 200)]
+        result = bytearray()
+        stop = 10 if parity else 9
+        at = 1
+        while at + (stop + 1) * self.STEPS < len(levels):
+            if levels[at] == 1 or levels[at - 1] == 0:
+                at += 1
+                continue
+            while True:  # at is where a start bit begins
+                middle = at + self.STEPS // 2
+                result.append(sum(levels[middle + (1 + bit) * self.STEPS] << bit for bit in range(8)))
+                at += stop * self.STEPS
+                if levels[at + self.STEPS // 2] == 1 or not resume_at_low_stop:
+                    break
+                if at + (stop + 1) * self.STEPS >= len(levels):
+                    break
+            if levels[at + self.STEPS // 2] == 1:
+                at += self.STEPS // 2
+        return bytes(result)
+
+
+assert reference.LONGEST_OF == {b"KODL": 40, b"KODI": 44}

@@ -1,0 +1,337 @@
+"""Frame bytes <-> data. Recorded frames are named so; every other vector here is synthetic."""
+
+import binascii
+import random
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kontronik_can_gw.protocol import Deframer, Form, InfoData, Kind, Layout, LiveData, encode, find_form, rows
+from kontronik_can_gw.protocol.codec import FORMS
+from kontronik_can_gw.protocol.fields import Data, DataType, device_and_variant
+
+from . import reference, sheet
+from .sheet import Field, FormRow
+
+PROPERTY = settings(deadline=None, max_examples=150, database=None)
+
+RECORDED_LIVE_VALUES = {
+    "electrical_speed": 0,
+    "battery_voltage": 24.42,
+    "battery_current": 0.0,
+    "motor_current": 0.0,
+    "peak_current": 0.0,
+    "consumed_charge": 0,
+    "bec_current": 0.0,
+    "bec_voltage": 8.024,
+    "pwm_input": 1001,
+    "throttle": 0,
+    "output_opening": 0,
+    "power_stage_temperature": 29,
+    "bec_temperature": 32,
+    "operating_errors": 0x00020000,
+    "operating_state": 12,
+    "timing": 0,
+}
+RECORDED_INFO_VALUES = {
+    "device_and_variant": 3 * 1024 + 120,
+    "firmware_word": 0x010E,
+    "selftest_errors": 0,
+    "cell_count": 6,
+    "max_electrical_speed": 0,
+    "min_battery_voltage": 24.14,
+    "max_battery_voltage": 0.0,
+    "max_battery_current": 0.0,
+    "max_motor_current": 0.0,
+    "max_peak_current": 0.0,
+    "max_bec_current": 0.0,
+    "min_bec_voltage": 5.599,
+    "max_throttle": 0,
+    "max_output_opening": 0,
+    "min_power_stage_temperature": 27,
+    "max_power_stage_temperature": 30,
+    "min_bec_temperature": 28,
+    "max_bec_temperature": 33,
+}
+
+# Synthetic: no recording of the V4 layout or of a running motor is public. Made from the sheet, CRC by the bitwise reference.
+SYNTHETIC_V4_LIVE = LiveData(
+    electrical_speed=123_456,
+    battery_voltage=4_812,
+    battery_current=-123,
+    motor_current=987,
+    peak_current=1_650,
+    consumed_charge=2_345,
+    bec_current=1_234,
+    bec_voltage=7_999,
+    pwm_input=1_750,
+    throttle=-42,
+    output_opening=77,
+    power_stage_temperature=-13,
+    bec_temperature=-1,
+    operating_errors=0x00400001,
+    operating_state=21,
+    timing=9,
+)
+SYNTHETIC_V4_LIVE_FRAME = bytes.fromhex(
+    "4B4F444C 40E20100 CC12 85FF DB03 7206 2909 D204 3F1F D606 D6 4D F3 FF 01004000 15 09 0000"
+)
+SYNTHETIC_V4_INFO = InfoData(
+    device_and_variant=(1 << 10) | 5,
+    firmware_word=0x0411,
+    selftest_errors=0x00040001,
+    cell_count=12,
+    max_electrical_speed=234_567,
+    min_battery_voltage=4_000,
+    max_battery_voltage=5_040,
+    max_battery_current=-1,
+    max_motor_current=1_500,
+    max_peak_current=-10_000,
+    max_bec_current=20_000,
+    min_bec_voltage=5_001,
+    max_throttle=-100,
+    max_output_opening=100,
+    min_power_stage_temperature=-20,
+    max_power_stage_temperature=99,
+    min_bec_temperature=-128,
+    max_bec_temperature=127,
+)
+SYNTHETIC_V4_INFO_FRAME = bytes.fromhex(
+    "4B4F4449 0504 1104 01000400 0C 47940300 A00F B013 FFFF DC05 F0D8 204E 8913 9C 64 EC 63 80 7F 000000"
+)
+
+
+def form_of(row: FormRow) -> Form:
+    return next(form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout))
+
+
+def fields_of(kind: str) -> list[Field]:
+    return sheet.LIVE_FIELDS if kind == "live" else sheet.INFO_FIELDS
+
+
+def pack(row: FormRow, values: tuple[int, ...]) -> bytes:
+    """The frame by the second list: struct codes, zeros for the reserved bytes, and the reference CRC."""
+    body = struct.pack(sheet.LIVE_STRUCT if row.kind == "live" else sheet.INFO_STRUCT, *values)
+    return reference.seal(row, body.ljust(row.crc_at - 4, b"\0"))
+
+
+def decode(frame: bytes) -> Data:
+    form = find_form(frame)
+    assert form is not None
+    assert form.length == len(frame)
+    return form.decode(frame)
+
+
+def physical_values(data: Data) -> dict[str, int | float]:
+    return {name: row.physical(getattr(data, name)) for name, row in rows(type(data)).items()}
+
+
+def raw_values(data_type: DataType, values: dict[str, int | float]) -> Data:
+    return data_type(**{name: rows(data_type)[name].raw(value) for name, value in values.items()})
+
+
+def raw_strategy(kind: str) -> st.SearchStrategy[tuple[int, ...]]:
+    return st.tuples(*(st.integers(*sheet.TYPE_RANGES[field.code]) for field in fields_of(kind)))
+
+
+form_rows = pytest.mark.parametrize("row", sheet.FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
+
+
+def test_the_references_crc_is_the_standard_one() -> None:
+    assert reference.crc32_of_bits(b"123456789") == 0xCBF43926
+    source = random.Random(1)
+    for size in range(64):
+        data = source.randbytes(size)
+        assert reference.crc32_of_bits(data) == reference.crc32(data) == binascii.crc32(data)
+
+
+@pytest.mark.parametrize(
+    ("frame", "values", "kind"),
+    [
+        (sheet.RECORDED_LIVE, RECORDED_LIVE_VALUES, Kind.LIVE),
+        (sheet.RECORDED_INFO, RECORDED_INFO_VALUES, Kind.INFO),
+    ],
+    ids=["live", "info"],
+)
+def test_a_recorded_frame_decodes_to_the_stated_values(
+    frame: bytes, values: dict[str, int | float], kind: Kind
+) -> None:
+    form = find_form(frame)
+    assert form is not None
+    assert (form.kind, form.layout) == (kind, Layout.LEGACY)
+    decoded = physical_values(form.decode(frame))
+    assert decoded == values
+    assert {name: repr(value) for name, value in decoded.items()} == {n: repr(value) for n, value in values.items()}
+
+
+def test_the_recorded_info_frame_tells_device_variant_and_firmware() -> None:
+    info = decode(sheet.RECORDED_INFO)
+    assert isinstance(info, InfoData)
+    assert (info.device, info.variant, info.firmware) == (3, 120, "1.14")
+    assert info.max_battery_voltage < info.min_battery_voltage, "as recorded before the motor has run"
+    assert info.device_and_variant == device_and_variant(3, 120)
+
+
+@pytest.mark.parametrize(
+    ("data_type", "values", "frame"),
+    [(LiveData, RECORDED_LIVE_VALUES, sheet.RECORDED_LIVE), (InfoData, RECORDED_INFO_VALUES, sheet.RECORDED_INFO)],
+    ids=["live", "info"],
+)
+def test_the_stated_values_encode_to_the_recorded_bytes(
+    data_type: DataType, values: dict[str, int | float], frame: bytes
+) -> None:
+    assert encode(raw_values(data_type, values), Layout.LEGACY) == frame
+
+
+@pytest.mark.parametrize(
+    ("data", "frame_without_crc"),
+    [(SYNTHETIC_V4_LIVE, SYNTHETIC_V4_LIVE_FRAME), (SYNTHETIC_V4_INFO, SYNTHETIC_V4_INFO_FRAME)],
+    ids=["live", "info"],
+)
+def test_the_synthetic_v4_vectors_in_both_directions(data: Data, frame_without_crc: bytes) -> None:
+    frame = frame_without_crc + reference.crc32_of_bits(frame_without_crc).to_bytes(4, "little")
+    assert len(frame) in (40, 44)
+    assert encode(data, Layout.V4) == frame
+    assert decode(frame) == data
+
+
+def test_negative_values_of_the_synthetic_vector_stay_negative() -> None:
+    values = physical_values(decode(encode(SYNTHETIC_V4_LIVE, Layout.V4)))
+    assert values["battery_current"] == -12.3
+    assert values["power_stage_temperature"] == -13
+    assert values["throttle"] == -42
+
+
+@form_rows
+@PROPERTY
+@given(choice=st.data())
+def test_every_combination_of_raw_values_survives_the_round_trip(row: FormRow, choice: st.DataObject) -> None:
+    values = choice.draw(raw_strategy(row.kind))
+    data_type: DataType = LiveData if row.kind == "live" else InfoData
+    data = data_type(*values)
+    frame = encode(data, Layout(row.layout))
+    assert frame == pack(row, values)
+    form = find_form(frame)
+    assert form is form_of(row)
+    decoded = form.decode(frame)
+    assert decoded == data
+    assert type(decoded) is data_type
+    assert raw_values(data_type, physical_values(decoded)) == data
+
+
+@form_rows
+@pytest.mark.parametrize("end", [0, 1], ids=["smallest", "largest"])
+def test_the_ends_of_every_type_are_passed_on_unclipped(row: FormRow, end: int) -> None:
+    values = tuple(sheet.TYPE_RANGES[field.code][end] for field in fields_of(row.kind))
+    frame = pack(row, values)
+    data = decode(frame)
+    assert tuple(data) == values
+    assert encode(data, Layout(row.layout)) == frame
+
+
+@form_rows
+def test_a_value_that_does_not_fit_is_refused_by_the_name_of_its_field(row: FormRow) -> None:
+    data_type: DataType = LiveData if row.kind == "live" else InfoData
+    for field in fields_of(row.kind):
+        low, high = sheet.TYPE_RANGES[field.code]
+        for value in (low - 1, high + 1, 1 << 70):
+            with pytest.raises(ValueError, match=f"^{field.name}: {value} is outside {low}\\.\\.{high}$"):
+                encode(data_type(**{field.name: value}), Layout(row.layout))
+
+
+@form_rows
+@PROPERTY
+@given(choice=st.data())
+def test_the_reserved_bytes_are_sent_as_zero_and_accepted_with_any_value(row: FormRow, choice: st.DataObject) -> None:
+    size = row.crc_at - row.body_end
+    reserved = choice.draw(st.binary(min_size=size, max_size=size))
+    values = choice.draw(raw_strategy(row.kind))
+    sent = pack(row, values)
+    assert sent[row.body_end : row.crc_at] == bytes(size)
+    frame = reference.seal(row, sent[4 : row.body_end] + reserved)
+    assert tuple(decode(frame)) == values
+
+
+@form_rows
+def test_every_flipped_bit_under_the_crc_is_found(row: FormRow) -> None:
+    frame = reference.random_frame(row, random.Random(7))
+    form = form_of(row)
+    assert form.matches(frame)
+    for offset in range(row.length):
+        unprotected = row.covered <= offset < row.crc_at
+        for bit in range(8):
+            flipped = bytearray(frame)
+            flipped[offset] ^= 1 << bit
+            assert form.matches(bytes(flipped)) == unprotected, f"byte {offset} bit {bit}"
+
+
+def test_only_the_legacy_layout_leaves_fields_outside_the_crc() -> None:
+    uncovered = {
+        (row.kind, row.layout): [field.name for field in fields_of(row.kind) if field.offset >= row.covered]
+        for row in sheet.FORM_ROWS
+    }
+    assert uncovered == {
+        ("live", "legacy"): ["operating_state", "timing"],
+        ("info", "legacy"): ["max_bec_temperature"],
+        ("live", "v4"): [],
+        ("info", "v4"): [],
+    }
+
+
+@pytest.mark.parametrize(
+    ("frame", "offset", "name"),
+    [
+        (sheet.RECORDED_LIVE, 32, "operating_state"),
+        (sheet.RECORDED_LIVE, 33, "timing"),
+        (sheet.RECORDED_INFO, 36, "max_bec_temperature"),
+    ],
+)
+def test_an_altered_unprotected_byte_of_a_recorded_frame_is_delivered(frame: bytes, offset: int, name: str) -> None:
+    whole = decode(frame)
+    for value in range(256):
+        altered = frame[:offset] + bytes([value]) + frame[offset + 1 :]
+        expected = value - 256 if name == "max_bec_temperature" and value > 127 else value
+        received = Deframer().feed(altered)
+        assert [frame.data for frame in received] == [whole._replace(**{name: expected})]
+        assert received[0].suspect == (name == "operating_state" and value > 26)
+
+
+def test_in_the_v4_layout_no_state_is_suspect() -> None:
+    for state in range(256):
+        data = LiveData(operating_state=state)
+        frames = Deframer().feed(encode(data, Layout.V4))
+        assert [(frame.data, frame.suspect) for frame in frames] == [(data, False)]
+
+
+@pytest.mark.parametrize("layout", Layout)
+def test_an_info_frame_is_never_suspect(layout: Layout) -> None:
+    frames = Deframer().feed(encode(InfoData(selftest_errors=0xFFFFFFFF, max_bec_temperature=127), layout))
+    assert [(frame.kind, frame.layout, frame.suspect) for frame in frames] == [(Kind.INFO, layout, False)]
+
+
+@form_rows
+def test_a_frame_is_found_only_where_it_stands_and_only_whole(row: FormRow) -> None:
+    frame = reference.random_frame(row, random.Random(11))
+    form = form_of(row)
+    buffer = b"\x4b\x4f\x44" + frame + b"\x4b"
+    assert [at for at in range(len(buffer) + 2) if form.matches(buffer, at)] == [3]
+    assert [at for at in range(len(buffer) + 2) if find_form(buffer, at) is form] == [3]
+    assert form.decode(buffer, 3) == form.decode(frame)
+    for size in range(row.length):
+        assert not form.matches(frame[:size])
+        assert find_form(frame[:size]) is None
+
+
+@pytest.mark.parametrize("kind", ["live", "info"])
+def test_where_both_layouts_fit_the_shorter_is_taken(kind: str) -> None:
+    frame = reference.ambiguous(kind)
+    fitting = [form for form in FORMS if form.matches(frame)]
+    assert [(form.kind.value, form.layout) for form in fitting] == [(kind, Layout.LEGACY), (kind, Layout.V4)]
+    assert find_form(frame) is fitting[0]
+
+
+def test_the_crc_is_sent_little_endian() -> None:
+    frame = encode(LiveData(), Layout.V4)
+    assert int.from_bytes(frame[36:], "little") == reference.crc32_of_bits(frame[:36])

@@ -1,0 +1,278 @@
+"""Every row of the sheet, compared with the list of sheet.py, which was typed a second time from the description of the wire."""
+
+import struct
+from collections.abc import Sequence
+
+import pytest
+
+from kontronik_can_gw.protocol import (
+    Device,
+    InfoData,
+    LiveData,
+    OperatingError,
+    OperatingState,
+    Row,
+    SelfTestError,
+    rows,
+)
+from kontronik_can_gw.protocol.codec import FORMS, Form
+from kontronik_can_gw.protocol.fields import Data, DataType, body_format, device_and_variant
+from kontronik_can_gw.protocol.states import (
+    LARGEST_STATE,
+    ErrorBit,
+    bit_texts,
+    device_text,
+    peak_current_of,
+    state_text,
+)
+
+from . import sheet
+from .sheet import Bit, Field, FormRow
+
+ALL_FIELDS = [(LiveData, field) for field in sheet.LIVE_FIELDS] + [(InfoData, field) for field in sheet.INFO_FIELDS]
+
+
+def row_of(data: DataType, field: Field) -> Row:
+    return rows(data)[field.name]
+
+
+def form_of(row: FormRow) -> Form:
+    return next(form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout))
+
+
+def unpack(form: Form, body: bytes) -> Data:
+    return form.decode(body)
+
+
+@pytest.mark.parametrize(
+    ("data", "fields"), [(LiveData, sheet.LIVE_FIELDS), (InfoData, sheet.INFO_FIELDS)], ids=["live", "info"]
+)
+def test_the_fields_stand_in_the_order_of_the_sheet(data: DataType, fields: Sequence[Field]) -> None:
+    assert list(rows(data)) == list(data._fields) == [field.name for field in fields]
+
+
+def test_the_second_list_is_without_gaps() -> None:
+    for fields, codes, end in (
+        (sheet.LIVE_FIELDS, sheet.LIVE_STRUCT, 34),
+        (sheet.INFO_FIELDS, sheet.INFO_STRUCT, 37),
+    ):
+        sizes = [struct.calcsize("<" + field.code) for field in fields]
+        assert [field.offset for field in fields] == [4 + sum(sizes[:index]) for index in range(len(fields))]
+        assert fields[-1].offset + sizes[-1] == end
+        assert "<" + "".join(field.code for field in fields) == codes
+
+
+@pytest.mark.parametrize(("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", ""))
+def test_a_field_has_the_type_unit_and_step_of_the_sheet(data: DataType, field: Field) -> None:
+    row = row_of(data, field)
+    assert (row.wire, row.unit, row.per_unit) == (field.code, field.unit, field.steps)
+    assert row.type_range == sheet.TYPE_RANGES[field.code]
+
+
+@pytest.mark.parametrize(("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", ""))
+def test_the_offset_derived_from_the_fields_before_it_is_that_of_the_sheet(data: DataType, field: Field) -> None:
+    names = list(rows(data))
+    before = "".join(row.wire for row in list(rows(data).values())[: names.index(field.name)])
+    assert 4 + struct.calcsize("<" + before) == field.offset
+    assert body_format(data).startswith(before)
+
+
+@pytest.mark.parametrize("form_row", sheet.FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
+def test_a_field_is_read_from_its_own_bytes_and_no_others(form_row: FormRow) -> None:
+    fields = sheet.LIVE_FIELDS if form_row.kind == "live" else sheet.INFO_FIELDS
+    form = form_of(form_row)
+    blank = unpack(form, bytes(form_row.length))
+    assert blank == (0,) * len(fields)
+    for offset in range(form_row.length):
+        changed = bytearray(form_row.length)
+        changed[offset] = 0x5A
+        data = unpack(form, bytes(changed))
+        differing = [field for field in fields if getattr(data, field.name) != 0]
+        owners = [f for f in fields if f.offset <= offset < f.offset + struct.calcsize("<" + f.code)]
+        assert differing == owners, f"byte {offset}"
+        for owner in owners:
+            assert getattr(data, owner.name) == 0x5A << 8 * (offset - owner.offset), "little-endian"
+
+
+def test_only_the_stated_fields_are_signed() -> None:
+    signed_fields = {
+        *("battery_current", "motor_current", "peak_current", "throttle", "power_stage_temperature", "bec_temperature"),
+        *("max_battery_current", "max_motor_current", "max_peak_current", "max_throttle"),
+        *("min_power_stage_temperature", "max_power_stage_temperature", "min_bec_temperature", "max_bec_temperature"),
+    }
+    assert {field.name for data, field in ALL_FIELDS if row_of(data, field).type_range[0] < 0} == signed_fields
+
+
+def test_the_info_frames_maximum_electrical_speed_is_unaligned_at_13() -> None:
+    body = bytearray(44)
+    body[13:17] = bytes.fromhex("78563412")
+    for form_row in sheet.FORM_ROWS:
+        if form_row.kind == "info":
+            assert unpack(form_of(form_row), bytes(body)) == InfoData(max_electrical_speed=0x12345678)
+
+
+@pytest.mark.parametrize(("name", "expected"), sheet.STATED_RANGES.items())
+def test_a_stated_range_is_that_of_the_sheet(name: str, expected: tuple[int, int]) -> None:
+    row = (rows(LiveData) | rows(InfoData))[name]
+    assert row.stated_range == expected
+
+
+def test_a_range_the_sheet_does_not_state_is_that_of_the_type() -> None:
+    row = rows(LiveData)["power_stage_temperature"]
+    assert (row.low, row.high) == (None, None)
+    assert row.stated_range == (-128, 127)
+
+
+def test_bec_current_alone_is_not_supplied_and_only_on_the_jivepro() -> None:
+    absent = {field.name: row_of(data, field).not_on for data, field in ALL_FIELDS if row_of(data, field).not_on}
+    assert absent == {"bec_current": {3}, "max_bec_current": {3}}
+
+
+def test_a_device_has_the_name_of_the_sheet_or_none() -> None:
+    assert [device_text(number) for number in range(64)] == [sheet.DEVICES.get(number) for number in range(64)]
+
+
+def test_no_device_is_missing_or_added() -> None:
+    assert {device.value: device.text for device in Device} == sheet.DEVICES
+
+
+def test_the_peak_current_belongs_to_motor_or_battery_by_device() -> None:
+    assert [peak_current_of(number) for number in range(64)] == [sheet.PEAK_CURRENT_OF.get(n) for n in range(64)]
+
+
+def test_an_operating_state_has_the_name_of_the_sheet_or_none() -> None:
+    assert [state_text(number) for number in range(256)] == [sheet.OPERATING_STATES.get(n) for n in range(256)]
+
+
+def test_no_operating_state_is_missing_or_added() -> None:
+    assert {state.value: state.text for state in OperatingState} == sheet.OPERATING_STATES
+    assert LARGEST_STATE == 26
+
+
+@pytest.mark.parametrize(
+    ("bits", "names", "used"),
+    [(sheet.OPERATING_BITS, OperatingError, 24), (sheet.SELFTEST_BITS, SelfTestError, 19)],
+    ids=["operating", "selftest"],
+)
+def test_the_error_words_have_the_stated_number_of_bits(bits: list[Bit], names: type[ErrorBit], used: int) -> None:
+    assert [bit.number for bit in bits] == list(range(used))
+    assert [int(bit) for bit in names] == list(range(used))
+    assert [bit.value for bit in names] == list(range(used))
+
+
+@pytest.mark.parametrize(
+    ("names", "bit"),
+    [(OperatingError, bit) for bit in sheet.OPERATING_BITS] + [(SelfTestError, bit) for bit in sheet.SELFTEST_BITS],
+    ids=lambda value: str(value.number) if isinstance(value, Bit) else value.__name__,
+)
+def test_an_error_bit_means_what_the_sheet_says(names: type[ErrorBit], bit: Bit) -> None:
+    member = names(bit.number)
+    text = f"{member.text} {member.meaning}".lower()
+    assert [word for word in bit.words if word not in text] == []
+    if bit.severity is not None:
+        assert member.severity.value == bit.severity
+
+
+def test_programming_allowed_is_a_status_and_no_alarm() -> None:
+    assert OperatingError(17).severity.value == "status"
+
+
+def test_running_down_is_not_a_rudder() -> None:
+    assert "rudder" not in f"{OperatingError(10).text} {OperatingError(10).meaning}".lower()
+
+
+def test_the_battery_and_the_bec_are_not_confused_in_the_thresholds() -> None:
+    for number in (18, 19, 20, 23):
+        assert "bec" not in f"{OperatingError(number).text} {OperatingError(number).meaning}".lower()
+
+
+def test_the_text_of_a_bit_is_unique_over_both_words() -> None:
+    texts = [bit.text for names in (OperatingError, SelfTestError) for bit in names]
+    assert len(set(texts)) == 24 + 19
+    assert all(text == text.lower() and text.isidentifier() for text in texts)
+
+
+@pytest.mark.parametrize("names", [OperatingError, SelfTestError])
+def test_bits_without_a_name_are_listed_by_number(names: type[ErrorBit]) -> None:
+    used = len(names)
+    texts = bit_texts(0xFFFFFFFF, names)
+    assert texts == [bit.text for bit in names] + [f"bit{number}" for number in range(used, 32)]
+    assert bit_texts(0, names) == []
+    for number in range(32):
+        assert bit_texts(1 << number, names) == [texts[number]]
+
+
+def test_the_recorded_error_word_is_the_programming_bit_alone() -> None:
+    assert bit_texts(0x00020000, OperatingError) == [OperatingError(17).text]
+
+
+def test_there_are_four_forms_the_shorter_of_a_kind_first() -> None:
+    assert len(FORMS) == 4
+    for kind in ("live", "info"):
+        lengths = [form.length for form in FORMS if form.kind.value == kind]
+        assert lengths == sorted(row.length for row in sheet.FORM_ROWS if row.kind == kind)
+
+
+@pytest.mark.parametrize("row", sheet.FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
+def test_a_form_has_the_length_and_crc_of_the_sheet(row: FormRow) -> None:
+    form = form_of(row)
+    assert (form.header, form.length, form.covered, form.crc_at) == (row.header, row.length, row.covered, row.crc_at)
+    assert form.data_type is (LiveData if row.kind == "live" else InfoData)
+    assert repr(form) == f"Form({row.kind}, {row.layout}, {row.length} bytes)"
+
+
+def test_the_crc_ends_the_frame_and_covers_the_largest_multiple_of_four_in_front_of_it() -> None:
+    for row in sheet.FORM_ROWS:
+        assert row.length == row.crc_at + 4
+        assert row.covered == max(size for size in range(0, row.crc_at + 1, 4))
+
+
+@pytest.mark.parametrize(("device", "variant", "word"), [(3, 120, 0x0C78), (0, 0, 0), (63, 1023, 0xFFFF), (1, 0, 0x400)])
+def test_device_and_variant_share_a_word_six_bits_high_ten_low(device: int, variant: int, word: int) -> None:
+    assert device_and_variant(device, variant) == word
+    info = InfoData(device_and_variant=word)
+    assert (info.device, info.variant) == (device, variant)
+
+
+@pytest.mark.parametrize(("device", "variant"), [(64, 0), (-1, 0), (0, 1024), (0, -1)])
+def test_a_device_or_variant_that_does_not_fit_is_refused(device: int, variant: int) -> None:
+    with pytest.raises(ValueError, match=f"device {device} or variant {variant}"):
+        device_and_variant(device, variant)
+
+
+@pytest.mark.parametrize(("word", "text"), [(0x010E, "1.14"), (0x0411, "4.17"), (0x0300, "3.0"), (0xFFFF, "255.255")])
+def test_the_firmware_is_main_and_sub_version(word: int, text: str) -> None:
+    assert InfoData(firmware_word=word).firmware == text
+
+
+@pytest.mark.parametrize(("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", ""))
+def test_every_step_survives_the_way_to_the_unit_and_back(data: DataType, field: Field) -> None:
+    row = row_of(data, field)
+    low, high = sheet.TYPE_RANGES[field.code]
+    steps = range(low, high + 1) if high < 1 << 16 else [low, low + 1, 1 << 31, (1 << 24) + 1, high - 1, high]
+    for raw in steps:
+        assert row.raw(row.physical(raw)) == raw
+
+
+@pytest.mark.parametrize(
+    ("field", "raw", "physical"),
+    [
+        ("battery_voltage", 2442, 24.42),
+        ("battery_voltage", 10_000, 100.0),
+        ("battery_voltage", 65_535, 655.35),
+        ("battery_current", -10_000, -1000.0),
+        ("battery_current", -1, -0.1),
+        ("battery_current", -32_768, -3276.8),
+        ("peak_current", 1650, 165.0),
+        ("bec_current", 1234, 1.234),
+        ("bec_voltage", 8024, 8.024),
+        ("power_stage_temperature", -13, -13),
+        ("electrical_speed", 4_294_967_295, 4_294_967_295),
+        ("throttle", -100, -100),
+    ],
+)
+def test_a_value_in_its_unit_is_the_nearest_float_and_is_not_clipped(field: str, raw: int, physical: float) -> None:
+    row = rows(LiveData)[field]
+    assert row.physical(raw) == physical
+    assert str(row.physical(raw)) == str(physical)
+    assert row.raw(physical) == raw

@@ -1,0 +1,263 @@
+"""All checks of the project, one after the other: what `make test` calls.
+
+    python tests/run.py [--only lint|types|unit|vcan]... [-- PYTEST-ARGUMENTS...]
+
+lint   ruff: mistakes and format
+types  mypy --strict
+unit   pytest on this machine, all but tests/vcan
+vcan   pytest tests/vcan on real vcan interfaces: here if this kernel has them, else in a VM (tests/vm/run)
+
+Exits with 0 when all that ran passed. Says what was not run, why, and the line that enables it; with CI=true in the
+environment whatever was not run, each skipped test included, is a failure. The last line printed has the totals of
+all tests: `N passed, M failed, K skipped`.
+"""
+
+import argparse
+import os
+import platform
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+from xml.etree import ElementTree as ET
+
+PROJECT = Path(__file__).resolve().parent.parent
+STEPS = ("lint", "types", "unit", "vcan")
+VM_RUN = PROJECT / "tests" / "vm" / "vm_run.py"
+VCAN_TIMEOUT_S = 900
+STEP_TIMEOUT_S = 1500
+SEARCH_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
+
+ENABLE_VM = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
+ENABLE_VCAN_UBUNTU = f"sudo apt-get install linux-modules-extra-{platform.release()} can-utils iproute2"
+ENABLE_TOOLS = "sudo apt-get install can-utils iproute2"
+ENABLE_VENV = "python3 -m pip install -e '.[test]'"
+
+
+@dataclass
+class Suite:
+    """What one pytest run counted."""
+
+    passed: int = 0
+    failed: int = 0
+    xfailed: int = 0
+    skipped: list[str] = field(default_factory=list)  # "test: reason"
+
+
+@dataclass
+class Result:
+    step: str
+    state: str  # "passed", "FAILED" or "not run"
+    seconds: float = 0.0
+    detail: str = ""
+    reason: str = ""
+    enable: str = ""
+    suite: Suite | None = None
+
+
+def read_junit(report: Path) -> Suite | None:
+    """The counts of a JUnit report, None if there is no readable one."""
+    try:
+        root = ET.parse(report).getroot()
+    except (OSError, ET.ParseError):
+        return None
+    suite = Suite()
+    for case in root.iter("testcase"):
+        name = f"{case.get('classname', '')}.{case.get('name', '')}".lstrip(".")
+        skipped = case.find("skipped")
+        if case.find("failure") is not None or case.find("error") is not None:
+            suite.failed += 1
+        elif skipped is None:
+            suite.passed += 1
+        elif skipped.get("type") == "pytest.xfail":
+            suite.xfailed += 1
+        else:
+            suite.skipped.append(f"{name}: {skipped.get('message', '')}")
+    return suite
+
+
+def say(line: str) -> None:
+    print(line, flush=True)
+
+
+def call(command: Sequence[str], environment: Mapping[str, str] | None = None) -> int:
+    """Runs a command with our stdout and stderr and the environment's programs; its exit code, 124 if it took too long."""
+    say("$ " + shlex.join(command))
+    path = os.pathsep.join([str(Path(sys.executable).parent), SEARCH_PATH])
+    with subprocess.Popen(
+        command, cwd=PROJECT, env={**os.environ, "PATH": path, **(environment or {})}, stdin=subprocess.DEVNULL
+    ) as process:
+        try:
+            return process.wait(STEP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            say(f"{command[0]}: no end within {STEP_TIMEOUT_S} s")
+            return 124
+        finally:  # ours to end, also when we are interrupted
+            if process.poll() is None:
+                process.terminate()
+                try:
+                    process.wait(10)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+
+
+def missing(module: str) -> bool:
+    command = [sys.executable, "-c", f"import importlib.util, sys; sys.exit(not importlib.util.find_spec({module!r}))"]
+    return subprocess.run(command, check=False).returncode != 0
+
+
+def timed(step: str, commands: Sequence[Sequence[str]]) -> Result:
+    start = time.monotonic()
+    codes = [call(command) for command in commands]
+    return Result(step, "FAILED" if any(codes) else "passed", time.monotonic() - start)
+
+
+def lint() -> Result:
+    if missing("ruff"):
+        return Result("lint", "not run", reason="ruff is not installed", enable=ENABLE_VENV)
+    ruff = [sys.executable, "-m", "ruff"]
+    return timed("lint", [[*ruff, "check", "."], [*ruff, "format", "--check", "."]])
+
+
+def types() -> Result:
+    if missing("mypy"):
+        return Result("types", "not run", reason="mypy is not installed", enable=ENABLE_VENV)
+    return timed("types", [[sys.executable, "-m", "mypy"]])
+
+
+def pytest(step: str, command: Sequence[str], report: Path, environment: Mapping[str, str]) -> Result:
+    start = time.monotonic()
+    code = call([*command, f"--junitxml={report}"], environment)
+    seconds = time.monotonic() - start
+    suite = read_junit(report)
+    if suite is None:  # it did not come to its end: that is not "0 failed"
+        suite = Suite(failed=1)
+        detail = f"ended with {code} and without a report"
+    else:
+        detail = f"{suite.passed} passed, {suite.failed} failed, {len(suite.skipped)} skipped"
+        if suite.xfailed:
+            detail += f", {suite.xfailed} failed as expected"
+        if code == 5:
+            detail = "no tests found"
+        elif code and not suite.failed:
+            detail += f"; pytest ended with {code}"
+    return Result(step, "FAILED" if code or suite.failed else "passed", seconds, detail, suite=suite)
+
+
+def unit(arguments: Sequence[str], scratch: Path) -> Result:
+    if missing("pytest"):
+        return Result("unit", "not run", reason="pytest is not installed", enable=ENABLE_VENV)
+    command = [sys.executable, "-m", "pytest", "-q", "-rs", "tests", "--ignore=tests/vcan", *arguments]
+    return pytest("unit", command, scratch / "unit.xml", {})
+
+
+def vcan(arguments: Sequence[str], scratch: Path) -> Result:
+    if missing("pytest"):
+        return Result("vcan", "not run", reason="pytest is not installed", enable=ENABLE_VENV)
+    if not list(PROJECT.glob("tests/vcan/**/test_*.py")):
+        return Result("vcan", "not run", reason="there are no tests in tests/vcan", enable="git checkout tests/vcan")
+    which = subprocess.run(
+        [sys.executable, str(VM_RUN), "--which"], stdout=subprocess.PIPE, text=True, check=False
+    ).stdout.strip()
+    if which not in ("native", "uml", "qemu"):
+        reason = "this kernel has no vcan that we may use, and there is no VM that has"
+        return Result("vcan", "not run", reason=reason, enable=enable_vcan())
+    tools = [tool for tool in ("ip", "candump") if not shutil.which(tool, path=SEARCH_PATH)]
+    if tools:
+        return Result("vcan", "not run", reason=f"there is no {' and no '.join(tools)}", enable=ENABLE_TOOLS)
+    # python-can imports asammdf where it is installed, and with it numpy and pandas: 4 s of each process in UML.
+    without = scratch / "without"
+    without.mkdir()
+    (without / "asammdf.py").write_text('raise ImportError("kept out of the vcan tests by tests/run.py")\n')
+    # The project is read-only in a VM; only the scratch folder is written to.
+    environment = {
+        "PYTHONPATH": os.pathsep.join(filter(None, (str(without), os.environ.get("PYTHONPATH")))),
+        "KCG_VCAN": "1",
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "HYPOTHESIS_STORAGE_DIRECTORY": str(scratch / "hypothesis"),
+    }
+    command = [sys.executable, str(VM_RUN), f"--timeout={VCAN_TIMEOUT_S}", "--verbose", f"--rw={scratch}", "--"]
+    command += [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "tests/vcan", *arguments]
+    result = pytest("vcan", command, scratch / "vcan.xml", environment)
+    result.detail += f" ({which})"
+    return result
+
+
+def enable_vcan() -> str:
+    """Ubuntu keeps vcan in a package of its own; elsewhere a kernel without it needs a VM."""
+    try:
+        ubuntu = platform.freedesktop_os_release().get("ID") == "ubuntu"
+    except OSError:
+        ubuntu = False
+    return ENABLE_VCAN_UBUNTU if ubuntu else ENABLE_VM
+
+
+def summarize(results: Sequence[Result], strict: bool) -> int:
+    """Prints the summary; the exit code of it all."""
+    failed = any(result.state == "FAILED" for result in results)
+    not_run = [result for result in results if result.state == "not run"]
+    skipped = [test for result in results if result.suite for test in result.suite.skipped]
+    say("\n== summary")
+    for result in results:
+        say(f"{result.step:6} {result.state:8} {result.seconds:7.1f} s  {result.detail}".rstrip())
+    for result in not_run:
+        say(f"not run: {result.step}: {result.reason}\n    to enable it:  {result.enable}")
+    for test in skipped:
+        say(f"skipped: {test}")
+    if strict and (not_run or skipped):
+        say("CI=true: what was not run is a failure")
+        failed = True
+    suites = [result.suite for result in results if result.suite]
+    passed_count, failed_count = sum(suite.passed for suite in suites), sum(suite.failed for suite in suites)
+    say(f"{passed_count} passed, {failed_count} failed, {len(skipped)} skipped")
+    return 1 if failed else 0
+
+
+def leave(number: int, _frame: FrameType | None) -> NoReturn:
+    sys.exit(128 + number)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        usage="run.py [--only STEP]... [-- PYTEST-ARGUMENTS]", description=__doc__.partition("\n")[0] if __doc__ else ""
+    )
+    parser.add_argument("--only", action="append", choices=STEPS, help="run this step only; may be repeated")
+    own, separator, pytest_arguments = list(sys.argv[1:]), "--" in sys.argv[1:], list[str]()
+    if separator:
+        at = own.index("--")
+        own, pytest_arguments = own[:at], own[at + 1 :]
+    only = parser.parse_args(own).only or STEPS
+    strict = os.environ.get("CI", "").lower() not in ("", "0", "false", "no")
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, leave)
+    results: list[Result] = []
+    with tempfile.TemporaryDirectory(prefix="kcg-test.", ignore_cleanup_errors=True) as folder:
+        scratch = Path(folder)
+        for step in STEPS:
+            if step not in only:
+                continue
+            say(f"\n== {step}")
+            if step == "lint":
+                result = lint()
+            elif step == "types":
+                result = types()
+            elif step == "unit":
+                result = unit(pytest_arguments, scratch)
+            else:
+                result = vcan(pytest_arguments, scratch)
+            say(f"== {step}: {result.state}, {result.seconds:.1f} s")
+            results.append(result)
+    return summarize(results, strict)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+#!/bin/sh
+# Installs what tests/vm/run needs on Debian and Ubuntu:  setup.sh [uml] [qemu]
+#   (nothing)  can-utils, iproute2: enough where the running kernel has vcan
+#   uml        User Mode Linux, 41 MB: what `make test` uses where the kernel has no vcan
+#   qemu       QEMU and Debian's stock kernel, 90 MB: serial ports and CAN controllers besides vcan
+# Needs root or a sudo that asks nothing. The kernel for QEMU is downloaded and unpacked, not installed.
+# VM_CACHE: where it goes (tests/vm/.cache). VM_APT_UPDATED=1: the package lists are fresh.
+set -eu
+
+here=$(cd "$(dirname "$0")" && pwd)
+cache=${VM_CACHE:-$here/.cache}
+packages="can-utils iproute2"
+qemu=no
+for part in "$@"; do
+    case $part in
+        uml) packages="$packages busybox-static user-mode-linux" ;;
+        qemu) packages="$packages busybox-static qemu-system-x86 kmod cpio xz-utils zstd" qemu=yes ;;
+        *) echo "usage: setup.sh [uml] [qemu]" >&2; exit 2 ;;
+    esac
+done
+
+if [ "$(id -u)" = 0 ]; then
+    sudo=
+elif sudo -n true 2>/dev/null; then
+    sudo="sudo -n"
+else
+    echo "setup.sh: needs root:  sudo apt-get install $packages" >&2
+    exit 1
+fi
+
+apt() { $sudo env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 "$@" </dev/null; }
+
+work=
+trap '[ -z "$work" ] || rm -rf "$work"' EXIT
+
+# Quiet, but the whole log when it fails.
+log=$(mktemp)
+if { [ -n "${VM_APT_UPDATED:-}" ] || apt update; apt install -y --no-install-recommends $packages; } >"$log" 2>&1; then
+    rm -f "$log"
+else
+    cat "$log" >&2
+    rm -f "$log"
+    echo "setup.sh: apt-get install $packages: failed" >&2
+    exit 1
+fi
+[ $qemu = yes ] || exit 0
+
+# --- QEMU: the distribution's kernel and an initrd that hands over to the host's file system
+package=$(apt-cache depends linux-image-amd64 | awk '/Depends: linux-image-/ { print $2; exit }')
+version=${package#linux-image-}
+if [ -z "$version" ]; then
+    echo "setup.sh: no linux-image-amd64 in this distribution; the QEMU part is for Debian on amd64" >&2
+    exit 1
+fi
+[ -e "$cache/$version/initrd.cpio" ] && exit 0
+
+mkdir -p "$cache"
+work=$(mktemp -d "$cache/work.XXXXXX")
+(cd "$work" && apt-get -qq -o APT::Sandbox::User=root download "$package")
+dpkg-deb --fsys-tarfile "$work"/*.deb | tar -x -C "$work" --wildcards './boot/vmlinuz-*' '*lib/modules/*'
+[ -d "$work/lib" ] || ln -s usr/lib "$work/lib"
+PATH=$PATH:/usr/sbin:/sbin
+depmod -b "$work" "$version"
+
+mkdir "$work/out"
+python3 - "$work/boot/vmlinuz-$version" "$work/out/vmlinux" <<'PYTHON'
+# The uncompressed ELF file boots by PVH: nothing is decompressed under emulation.
+import subprocess
+import sys
+
+image = open(sys.argv[1], "rb").read()
+for magic, command in ((b"\xfd7zXZ\0", ["xz", "-dc", "--single-stream"]), (b"\x28\xb5\x2f\xfd", ["zstd", "-dc"])):
+    at = image.find(magic)
+    while at >= 0:
+        done = subprocess.run(command, input=image[at:], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        if done.stdout[:4] == b"\x7fELF" and len(done.stdout) > 1 << 20:
+            open(sys.argv[2], "wb").write(done.stdout)
+            sys.exit()
+        at = image.find(magic, at + 1)
+sys.exit("setup.sh: no vmlinux in " + sys.argv[1])
+PYTHON
+
+root=$work/root
+mkdir -p "$root/bin" "$root/proc" "$root/sys" "$root/dev" "$root/modules" "$root/new"
+cp "$(command -v busybox)" "$root/bin/busybox"
+: >"$root/modules/order"
+for module in virtio_pci virtio_console 9pnet_virtio 9p \
+    can can_raw can_bcm can_gw can_isotp can_j1939 vcan vxcan slcan sch_tbf sch_netem kvaser_pci xhci_pci ftdi_sio; do
+    modprobe -d "$work" -S "$version" --show-depends "$module" | while read -r word file _; do
+        [ "$word" = insmod ] || continue
+        name=$(basename "$file" .xz)
+        [ -e "$root/modules/$name" ] && continue
+        case $file in
+            *.xz) xz -dc "$file" >"$root/modules/$name" ;;
+            *) cp "$file" "$root/modules/$name" ;;
+        esac
+        echo "$name" >>"$root/modules/order"
+    done
+done
+cat >"$root/init" <<'INIT'
+#!/bin/busybox sh
+b=/bin/busybox
+$b mount -t proc proc /proc
+$b mount -t sysfs sys /sys
+$b mount -t devtmpfs dev /dev
+while read -r m; do $b insmod "/modules/$m" || echo "insmod $m: failed"; done </modules/order
+$b mount -t 9p -o trans=virtio,version=9p2000.L,msize=512000,ro,cache=loose root /new || $b poweroff -f
+for d in proc sys dev; do $b mount -o move /$d /new/$d; done
+exec $b switch_root /new "$GUEST_INIT"
+INIT
+chmod +x "$root/init"
+(cd "$root" && find . | cpio -o -H newc --quiet) >"$work/out/initrd.cpio"
+rm -rf "${cache:?}/$version"
+mv "$work/out" "$cache/$version"

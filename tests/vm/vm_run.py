@@ -1,0 +1,407 @@
+"""Run a command under a Linux kernel that has vcan: this one if it has, else User Mode Linux, else QEMU.
+
+    tests/vm/run [--backend auto|native|uml|qemu] [--timeout S] [--rw DIR]... -- COMMAND...
+    tests/vm/run --which            which of them `auto` takes, or none
+
+Prints what COMMAND prints, stdout and stderr apart, and exits with its exit code; 124: time-out; 125: the VM failed.
+
+native  COMMAND itself. Without the right to make interfaces: in a network namespace of its own, by `unshare` or `sudo`.
+uml     User Mode Linux, 2 s to boot, Python at full speed. vcan, CAN FD, vxcan, gateway, BCM, J1939, slcan, tbf, netem.
+qemu    Emulated, Python 15 times slower. The same and ISO-TP; two kvaser_pci controllers on one bus (can0, can1);
+        a 16550A UART (/dev/ttyS1, its other end /dev/virtio-ports/com1); an FTDI USB serial adapter (/dev/ttyUSB0, its
+        other end /dev/virtio-ports/ftdi) that QMP at /dev/virtio-ports/qmp unplugs (device_del, device_add usbser0).
+        device_add takes driver=usb-serial id=usbser0 bus=xhci.0 chardev=ftdis always-plugged=true; right after a
+        device_del it has to be tried again after 0.1 s.
+
+A VM sees the host's file system read-only at the same paths, with an empty /tmp, /var/tmp, /run and /dev/shm; each
+--rw DIR is writable. It is root in there, lo is up, the CAN modules are loaded, and there is no vcan interface yet.
+Of the environment it gets PATH, HOME, LANG, CI, VIRTUAL_ENV and what starts with KCG_, PYTHON, PYTEST_, HYPOTHESIS_
+or COVERAGE_.
+
+Kept in mind in here: UML does not save the AVX-512 registers over a signal, so glibc, OpenSSL and numpy are told to
+leave them alone, and other number crunchers with a dispatcher of their own must stay outside. /dev/kvm may be there
+and not work: QEMU always emulates. SIGKILL leaves UML's children behind: SIGTERM comes first, then the whole group.
+"""
+
+import argparse
+import contextlib
+import glob
+import importlib.metadata
+import os
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from types import FrameType
+from typing import BinaryIO, NoReturn
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+PROJECT = os.path.dirname(os.path.dirname(HERE))
+TIMED_OUT = 124
+VM_FAILED = 125
+
+PASSED_ON = re.compile(r"(PATH|HOME|LANG|LC_ALL|CI|VIRTUAL_ENV)$|KCG_|PYTHON|PYTEST_|HYPOTHESIS_|COVERAGE_")
+TMPFS = ("/tmp", "/var/tmp", "/run", "/dev/shm")  # guest-init.sh mounts an empty one on each
+
+UML_MEMORY_MIB = 512
+QEMU_MEMORY_MIB = 1024
+START_TIMEOUT_S = {"uml": 30.0, "qemu": 180.0}
+
+GLIBC_WITHOUT_AVX512 = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW"
+# CPUID leaf 7, EBX: the bits of AVX512 F, DQ, IFMA, PF, ER, CD, BW, VL
+OPENSSL_WITHOUT_AVX512 = ":~0xdc230000"
+
+
+def passed_on(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables that COMMAND gets where it does not simply inherit them; PATH with the folders of `ip` and `tc`."""
+    kept = {name: value for name, value in environment.items() if PASSED_ON.match(name)}
+    kept["PATH"] = with_sbin(kept.get("PATH", ""))
+    return kept
+
+
+def with_sbin(path: str) -> str:
+    folders = path.split(os.pathsep) if path else []
+    return os.pathsep.join(folders + [d for d in ("/usr/sbin", "/usr/bin", "/sbin", "/bin") if d not in folders])
+
+
+# --- this kernel
+
+
+def native_prefix() -> list[str] | None:
+    """What to put before a command so that it can make vcan interfaces here ([] if nothing); None if it cannot."""
+    try:
+        socket.socket(29, socket.SOCK_RAW, 1).close()  # AF_CAN, CAN_RAW, also where Python was built without them
+    except OSError:
+        return None
+    here: list[str] = []
+    with_lo = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
+    namespace = ["unshare", "--user", "--map-root-user", "--net", *with_lo]
+    as_root = ["sudo", "-n", "unshare", "--net", "setpriv", f"--reuid={os.getuid()}", f"--regid={os.getgid()}"]
+    as_root += ["--init-groups", "--inh-caps=+net_admin,+net_raw", "--ambient-caps=+net_admin,+net_raw", "env"]
+    as_root += [f"{name}={value}" for name, value in passed_on(os.environ).items()] + with_lo
+    interface = f"vm{os.getpid()}"
+    probe = ["sh", "-c", f"ip link add dev {interface} type vcan && ip link del {interface}"]
+    for prefix in (here, namespace, as_root):
+        with contextlib.suppress(OSError):
+            done = subprocess.run(prefix + probe, check=False, stdin=subprocess.DEVNULL, capture_output=True)
+            if done.returncode == 0:
+                return prefix
+    return None
+
+
+# --- the two kinds of VM
+
+
+def uml_command(job: str, out: int, err: int) -> list[str]:
+    return [
+        "linux.uml",
+        f"mem={UML_MEMORY_MIB}M",
+        "root=/dev/root",
+        "rootfstype=hostfs",
+        "rootflags=/",
+        "ro",
+        f"init={job}/guest-init.sh",
+        f"VM_JOB={job}",
+        "VM_BACKEND=uml",
+        f"GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512}",
+        "con=null",
+        "ssl=null",
+        f"ssl0=null,fd:{out}",
+        f"ssl1=null,fd:{err}",
+        f"uml_dir={job}",
+        "umid=uml",
+        "noreboot",
+        "quiet",
+        "loglevel=3",
+    ]
+
+
+def uml_guest_environment() -> dict[str, str]:
+    environment = {"GLIBC_TUNABLES": GLIBC_WITHOUT_AVX512, "OPENSSL_ia32cap": OPENSSL_WITHOUT_AVX512}
+    with contextlib.suppress(OSError, importlib.metadata.PackageNotFoundError, ValueError):
+        with open("/proc/cpuinfo") as cpuinfo:
+            has_avx512 = "avx512f" in cpuinfo.read()
+        major, minor = importlib.metadata.version("numpy").split(".")[:2]
+        if has_avx512 and (int(major), int(minor)) >= (2, 4):  # numpy warns of a name that it does not know
+            environment["NPY_DISABLE_CPU_FEATURES"] = "X86_V4 AVX512_ICL AVX512_SPR"
+        elif has_avx512:
+            names = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+            environment["NPY_DISABLE_CPU_FEATURES"] = names
+    return environment
+
+
+def uml_memory_folder(job: str) -> str:
+    """Where UML keeps its memory file: /dev/shm if it has the room and allows to execute, as in a container it may not."""
+    with contextlib.suppress(OSError):
+        shm = os.statvfs("/dev/shm")
+        room = shm.f_bavail * shm.f_frsize >= (UML_MEMORY_MIB + 32) << 20
+        if room and not shm.f_flag & os.ST_NOEXEC and os.access("/dev/shm", os.W_OK):
+            return "/dev/shm"
+    return job
+
+
+def qemu_kernel() -> str | None:
+    """The newest kernel that setup.sh has unpacked."""
+    kernels = glob.glob(os.path.join(os.environ.get("VM_CACHE") or os.path.join(HERE, ".cache"), "*", "vmlinux"))
+    return max(kernels, key=os.path.getmtime, default=None)
+
+
+def qemu_command(job: str, out: int, err: int) -> list[str]:
+    kernel = qemu_kernel()
+    if kernel is None:
+        raise OSError("no kernel unpacked: run tests/vm/setup.sh qemu")
+    append = "console=ttyS0 panic=-1 quiet loglevel=3 tsc=reliable no_timer_check mitigations=off nokaslr"
+    append += f" random.trust_cpu=on VM_BACKEND=qemu GUEST_INIT={job}/guest-init.sh"
+    command = ["qemu-system-x86_64", "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot"]
+    command += ["-machine", "q35", "-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max", "-m", str(QEMU_MEMORY_MIB)]
+    command += ["-kernel", kernel, "-initrd", os.path.join(os.path.dirname(kernel), "initrd.cpio"), "-append", append]
+    command += ["-serial", f"file:{job}/klog", "-device", "virtio-serial-pci"]
+
+    def port(name: str, chardev: str) -> list[str]:
+        return ["-chardev", f"{chardev},id={name}", "-device", f"virtserialport,chardev={name},name={name}"]
+
+    for name, fd in (("stdout", out), ("stderr", err)):
+        command += ["-add-fd", f"fd={fd},set={fd}", *port(name, f"file,path=/dev/fdset/{fd},append=on")]
+    for tag, path, options in (("root", "/", ",readonly=on,multidevs=remap"), ("host", "/", ",multidevs=remap"),
+                               ("job", job, "")):  # fmt: skip
+        command += ["-fsdev", f"local,id={tag},path={path},security_model=none{options}"]
+        command += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
+
+    command += ["-object", "can-bus,id=canbus0"]
+    command += ["-device", "kvaser_pci,canbus=canbus0", "-device", "kvaser_pci,canbus=canbus0"]
+
+    # One end is the device that the guest's driver sees, the other a virtio port that a test plays the device with.
+    for name, device in (
+        ("com1", ["-device", "isa-serial,chardev=com1s,index=1"]),
+        ("ftdi", ["-device", "qemu-xhci,id=xhci",
+                  "-device", "usb-serial,id=usbser0,bus=xhci.0,chardev=ftdis,always-plugged=on"]),
+        ("qmp", ["-mon", "chardev=qmps,mode=control"]),
+    ):  # fmt: skip
+        command += ["-chardev", f"socket,id={name}s,path={job}/{name},server=on,wait=off", *device]
+        command += port(name, f"socket,path={job}/{name}")
+    return command
+
+
+# --- one run in a VM
+
+
+def under_tmpfs(folder: str) -> bool:
+    return any(folder == tmpfs or folder.startswith(tmpfs + "/") for tmpfs in TMPFS)
+
+
+def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence[str]) -> None:
+    """Fills the job folder: what the guest runs and which of the host's folders it mounts."""
+    environment = passed_on(os.environ) | {"VM_BACKEND": backend, "TMPDIR": "/tmp", "NO_COLOR": "1"}
+    if backend == "uml":
+        environment |= uml_guest_environment()
+    lines = [f"export {name}={shlex.quote(value)}" for name, value in environment.items()]
+    lines += ["echo >/run/job/started", f"cd {shlex.quote(os.getcwd())} && exec {shlex.join(command)}"]
+    # Where the project or Python is in a folder that the guest hides under a tmpfs, it is mounted there again.
+    needed = {os.getcwd(), PROJECT, sys.prefix, sys.base_prefix, os.path.dirname(os.path.abspath(command[0]))}
+    hidden = sorted(folder for folder in needed if under_tmpfs(folder) and folder not in TMPFS)
+    for name, content in (("job.sh", lines), ("ro", hidden), ("rw", writable)):
+        with open(os.path.join(job, name), "w") as file:
+            file.writelines(line + "\n" for line in content)
+    # A copy: the kernel's command line cannot carry a path with a blank.
+    shutil.copy(os.path.join(HERE, "guest-init.sh"), job)
+
+
+def pump(fd: int, to: BinaryIO) -> None:
+    """Passes all that comes from the guest; goes on reading, so that the guest ends, when nobody wants it any more."""
+    with open(fd, "rb", buffering=0) as pipe:
+        while data := pipe.read(65536):
+            with contextlib.suppress(OSError):
+                to.write(data)
+                to.flush()
+
+
+def guard(group: int, job: str) -> int:
+    """Forks a process that ends the VM when this one was killed outright; returns the fd to write to when all is well."""
+    read, write = os.pipe()
+    if os.fork():
+        os.close(read)
+        return write
+    try:
+        os.setsid()
+        os.dup2(os.open(os.devnull, os.O_RDWR), 1)
+        os.dup2(1, 2)
+        os.close(write)
+        if not os.read(read, 1):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(group, signal.SIGTERM)
+                time.sleep(0.5)
+                os.killpg(group, signal.SIGKILL)
+            shutil.rmtree(job, ignore_errors=True)
+    finally:
+        os._exit(0)
+
+
+def stop(process: subprocess.Popen[bytes]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    if process.poll() is None:
+        process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(5)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, leave)
+
+
+def leave(number: int, _frame: FrameType | None) -> NoReturn:
+    sys.exit(128 + number)
+
+
+def run_in_vm(backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float) -> tuple[int, bool]:
+    """Returns the exit code, and whether the command was started at all."""
+    job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
+    try:
+        write_job(job, backend, command, writable)
+        (out_read, out_write), (err_read, err_write) = os.pipe(), os.pipe()
+        pumps = [
+            threading.Thread(target=pump, args=(out_read, sys.stdout.buffer), daemon=True),
+            threading.Thread(target=pump, args=(err_read, sys.stderr.buffer), daemon=True),
+        ]
+        start = time.monotonic()
+        late = ""
+        with contextlib.ExitStack() as ends:
+            for fd in (out_write, err_write):
+                ends.callback(os.close, fd)
+            vm_command = (uml_command if backend == "uml" else qemu_command)(job, out_write, err_write)
+            log = ends.enter_context(open(os.path.join(job, "log"), "wb"))
+            process = subprocess.Popen(
+                vm_command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                pass_fds=(out_write, err_write),
+                start_new_session=True,
+                env={**os.environ, "TMPDIR": uml_memory_folder(job), "PATH": with_sbin(os.environ.get("PATH", ""))},
+            )
+        guard_fd = guard(process.pid, job)
+        try:
+            for thread in pumps:
+                thread.start()
+            started = False
+            while True:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(max(0.0, start + timeout_s - time.monotonic()) if started else 0.1)
+                    break
+                started = started or os.path.exists(os.path.join(job, "started"))
+                elapsed_s = time.monotonic() - start
+                if elapsed_s >= timeout_s:
+                    late = f"no end within {timeout_s:g} s"
+                elif not started and elapsed_s >= START_TIMEOUT_S[backend]:
+                    late = f"no start within {elapsed_s:.0f} s"
+                if late:
+                    break
+        finally:
+            stop(process)
+            os.write(guard_fd, b".")
+            os.close(guard_fd)
+        for thread in pumps:
+            thread.join(5)
+        started = os.path.exists(os.path.join(job, "started"))
+        if late:
+            print(f"vm/run: {backend}: {late}", file=sys.stderr)
+            return (TIMED_OUT if started else VM_FAILED), started
+        try:
+            with open(os.path.join(job, "rc")) as file:
+                return int(file.read()), True
+        except (OSError, ValueError):
+            print(f"vm/run: {backend}: the VM ended without a result; its last words:", file=sys.stderr)
+            for name in ("log", "klog"):
+                with contextlib.suppress(OSError), open(os.path.join(job, name), errors="replace") as file:
+                    sys.stderr.write(file.read()[-4000:])
+            return VM_FAILED, started
+    except OSError as error:
+        print(f"vm/run: {backend}: {error}", file=sys.stderr)
+        return VM_FAILED, False
+    finally:
+        shutil.rmtree(job, ignore_errors=True)
+
+
+# --- the command line
+
+
+def installed() -> list[str]:
+    """The kinds of VM that can be tried, the better one first."""
+    path = with_sbin(os.environ.get("PATH", ""))
+    if not os.path.exists("/usr/bin/busybox"):
+        return []
+    vms = ["uml"] if shutil.which("linux.uml", path=path) else []
+    return vms + (["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64", path=path) else [])
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(usage=__doc__, add_help=True)
+    parser.add_argument("--backend", default=os.environ.get("KCG_VM_BACKEND") or "auto")
+    parser.add_argument("--timeout", type=float, default=600.0)
+    parser.add_argument("--rw", action="append", default=[])
+    parser.add_argument("--which", action="store_true")
+    parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("command", nargs="*")
+    args = parser.parse_args()
+    if args.backend not in ("auto", "native", "uml", "qemu"):
+        parser.error(f"--backend {args.backend}: auto, native, uml or qemu")
+    args.rw = [os.path.realpath(folder) for folder in args.rw]
+    for folder in args.rw:
+        if not os.path.isdir(folder):
+            parser.error(f"--rw {folder}: no such folder")
+    if not args.command and not args.which:
+        parser.error("COMMAND is missing")
+    return args
+
+
+def main() -> int:
+    args = arguments()
+    prefix = None
+    if args.backend in ("auto", "native"):
+        os.environ["PATH"] = with_sbin(os.environ.get("PATH", ""))
+        prefix = native_prefix()
+        if prefix is None and args.backend == "native" and not args.which:
+            print("vm/run: native: this kernel has no vcan, or not for us", file=sys.stderr)
+            return VM_FAILED
+    vms = installed() if args.backend == "auto" else [args.backend]
+    if args.which:
+        names = ["native"] if prefix is not None else [vm for vm in vms if vm in installed()]
+        print(names[0] if names else "none")
+        return 0 if names else 1
+    if prefix is not None:
+        return run_native([*prefix, *args.command], args.timeout)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, leave)
+    for vm in vms:
+        start = time.monotonic()
+        code, started = run_in_vm(vm, args.command, args.rw, args.timeout)
+        if args.verbose:
+            print(f"vm/run: {vm}: exit {code}, {time.monotonic() - start:.1f} s", file=sys.stderr)
+        if code != VM_FAILED or started:
+            return code
+    if not vms:
+        print("vm/run: this kernel has no vcan and there is no VM: run tests/vm/setup.sh uml", file=sys.stderr)
+    return VM_FAILED
+
+
+def run_native(command: Sequence[str], timeout_s: float) -> int:
+    """Becomes the command; `timeout` keeps the time."""
+    sys.stdout.flush()
+    limited = ["timeout", "--foreground", "--kill-after=10", f"{timeout_s:g}", *command]
+    try:
+        os.execvp(limited[0], limited)
+    except OSError as error:
+        print(f"vm/run: {limited[0]}: {error}", file=sys.stderr)
+        return 127
+
+
+if __name__ == "__main__":
+    sys.exit(main())
