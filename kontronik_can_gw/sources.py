@@ -121,7 +121,7 @@ def sources(settings: EscSettings) -> dict[str, Source]:
         Source("link_state", "", link, "esc.link", low=0, high=5, names={s: _pascal(s.name) for s in LinkState}),
         Source("layout", "", link, "esc.layout", low=0, high=2, names={0: "Unknown", 1: "V4", 2: "Legacy"}),
         Source("data_age", "ms", link, "esc.age_ms(now)", low=0, supplied="esc.live_ns is not None"),
-        Source("frame_rate", "Hz", link, "esc.frame_rate", Fraction(10), 0),
+        Source("frame_rate", "Hz", link, "esc.frame_rate", Fraction(10), 0, supplied="esc.frame_rate is not None"),
         *(
             Source(name, "", link, f"esc.{path}", low=0, rolls=True)
             for name, path in (

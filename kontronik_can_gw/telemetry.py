@@ -64,7 +64,7 @@ class EscTelemetry:
     """One ESC's stream and what is known from it.
 
     Attributes read by the packers: ``live``, ``info`` (None where not available), ``link``, ``layout`` (0 unknown, 1 V4,
-    2 legacy), ``cells`` (0 unknown), ``frame_rate`` (live frames of the last full second, in 0.1 Hz), ``losses``,
+    2 legacy), ``cells`` (0 unknown), ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``,
     ``energy`` (drawn from the battery, milliwatt nanoseconds), ``run_time`` (ns with the motor turning), ``live_ns`` (time of
     the newest live frame's last byte, None before the first).
     """
@@ -76,7 +76,7 @@ class EscTelemetry:
         self.link = LinkState.NEVER_SEEN
         self.layout = 0
         self.cells = settings.cell_count
-        self.frame_rate = 0
+        self.frame_rate: int | None = 0
         self.losses = 0
         self.energy = 0
         self.run_time = 0
@@ -191,6 +191,9 @@ class EscTelemetry:
         self.live_ns = when
         if self.link is not LinkState.OK and self.link is not LinkState.DEGRADED:
             events |= self._set_link(LinkState.OK)
+            self.frame_rate = None
+            self._window_ns = when
+            self._window_counters = self.counters.copy()
         return events | Event.LIVE
 
     def _forget_device(self) -> None:

@@ -6,6 +6,7 @@ logger with the DBC decodes from that bus. Nothing on the screen comes from anyw
 
 import argparse
 import contextlib
+import logging
 import os
 import sys
 import threading
@@ -113,6 +114,7 @@ def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.offline.pty import PtyEsc
     from kontronik_can_gw.runtime.loop import Loop
 
+    logging.getLogger("kontronik_can_gw").addHandler(logging.NullHandler())  # the screen tells what the log would
     channel = f"demo-{os.getpid()}"
     stop = threading.Event()
     failures: list[BaseException] = []
@@ -237,7 +239,7 @@ def _screen(logger: Logger, seconds: float) -> "Group":
     )
     body = Table.grid(padding=(0, 2), expand=True)
     for _ in range(2):
-        body.add_column(ratio=5, no_wrap=True)
+        body.add_column(min_width=21, ratio=5, no_wrap=True)
         body.add_column(ratio=2, justify="right", no_wrap=True)
         body.add_column(ratio=2, style="dim", no_wrap=True)
     for left, right in zip(*_SHOWN, strict=True):
@@ -252,5 +254,5 @@ def _screen(logger: Logger, seconds: float) -> "Group":
         f"{seconds:.0f} s, {logger.frames} CAN frames decoded by kontronik_esc.dbc, uptime {logger.text('Uptime')} s. Ctrl-C ends.",
         "dim",
     )
-    title = "kontronik-can-gw demo: simulated ESC -> pty -> gateway -> CAN -> logger with the DBC"
+    title = "demo: simulated ESC -> UART -> gateway -> CAN -> logger with the DBC"
     return Group(Panel(Group(head, "", body, "", faults), title=title, title_align="left"), foot)

@@ -14,6 +14,10 @@ from .sheet import FORM_ROWS, FormRow
 LONGEST_OF = {b"KODL": 40, b"KODI": 44}
 SHORTEST_FIRST = sorted(FORM_ROWS, key=lambda row: row.length)
 LONG_RUNS = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
+COUNTED = [
+    *("live_v4", "live_legacy", "info_v4", "info_legacy", "headers", "crc_errors", "unknown_kinds"),
+    *("dropped_noise", "dropped_crc", "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes"),
+]
 
 
 def _shift_eight(remainder: int) -> int:
@@ -104,11 +108,7 @@ def counters_of(stream: bytes) -> dict[str, int]:
     """What must have been counted once the whole stream was fed and flushed, classified byte by byte."""
     found = frames_of(stream)
     size = len(stream)
-    count = dict.fromkeys(
-        "headers crc_errors unknown_kinds dropped_noise dropped_crc dropped_unknown_kind dropped_incomplete"
-        " long_run_bytes live_v4 live_legacy info_v4 info_legacy".split(),
-        0,
-    )
+    count = dict.fromkeys(COUNTED, 0)
     for frame in found:
         count[f"{frame.kind}_{frame.layout}"] += 1
         count["headers"] += 1

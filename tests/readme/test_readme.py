@@ -1,0 +1,102 @@
+"""The README is true: its tables are those of the sources, its commands run, its examples are valid."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import cantools.database
+import pytest
+from readme_tables import README, with_tables
+
+from kontronik_can_gw.cli import COMMANDS
+from kontronik_can_gw.config import parse, shipped
+
+TEXT = README.read_text(encoding="utf-8")
+PROJECT = README.parent
+
+
+def test_its_tables_are_those_of_the_sources() -> None:
+    assert with_tables(TEXT) == TEXT, "run: python tests/readme/readme_tables.py"
+
+
+def test_its_configuration_is_valid() -> None:
+    for block in re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL):
+        parse(tomllib.loads(block), "README.md")
+
+
+def test_every_command_is_named() -> None:
+    assert all(f"`kontronik-can-gw {command}" in TEXT for command in COMMANDS)
+
+
+def test_every_command_it_names_exists() -> None:
+    for command in re.findall(r"kontronik-can-gw ([a-z]+)\b(?! gateway)", TEXT):
+        assert command in COMMANDS, command
+
+
+def test_every_make_target_it_names_exists() -> None:
+    makefile = (PROJECT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"`?make ([a-z]+)", TEXT):
+        if target not in ("sure", "no"):
+            assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+
+
+def test_files_it_links_to_exist() -> None:
+    for link in re.findall(r"\]\(([^)#:]+)\)", TEXT):
+        assert (PROJECT / link).exists(), link
+
+
+def test_a_wheel_carries_dbc_and_example_and_finds_them(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    shutil.copytree(
+        PROJECT, source, ignore=shutil.ignore_patterns(".venv", ".git", ".cache", "__pycache__", ".*_cache", "tests")
+    )
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
+        cwd=source,
+        check=True,
+        capture_output=True,
+    )
+    installed = tmp_path / "installed"
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
+        wheel.extractall(installed)
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; sys.path.insert(0, sys.argv.pop(1)); from kontronik_can_gw.cli import main; sys.exit(main())",
+    ]
+    where = subprocess.run(
+        [
+            sys.executable,
+            "-I",
+            "-c",
+            f"import sys; sys.path.insert(0, {str(installed)!r}); import kontronik_can_gw as k; print(k.__file__)",
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert str(installed) in where.stdout
+    written = subprocess.run(
+        [*command, str(installed), "dbc"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    loaded = cantools.database.load_string(written.stdout, "dbc")
+    original = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
+    assert isinstance(loaded, cantools.database.Database)
+    assert isinstance(original, cantools.database.Database)
+    assert [m.name for m in loaded.messages] == [m.name for m in original.messages]
+    example = subprocess.run(
+        [*command, str(installed), "init", "-"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert "[[esc]]" in example.stdout
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_of_every_command_says_what_it_is(command: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "kontronik_can_gw", command, "--help"], capture_output=True, text=True, check=True
+    )
+    assert COMMANDS[command].split()[0].lower() in done.stdout.lower()

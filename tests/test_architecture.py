@@ -1,0 +1,121 @@
+"""The structure that the README promises: imports run one way, and only the edge touches time, files and threads."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "kontronik_can_gw"
+NAME = "kontronik_can_gw"
+# A room may import those before it, and itself.
+ORDER = (
+    ("protocol",),
+    ("errors", "frames"),
+    ("telemetry",),
+    ("sources",),
+    ("dbc_output",),
+    ("gateway",),
+    ("config",),
+    ("simulator",),
+    ("runtime", "offline"),
+    ("cli",),
+)
+EDGE = ("runtime", "offline", "cli")
+BLOCKING = {"time", "asyncio", "threading", "socket", "selectors", "select", "subprocess", "os", "signal"}
+ONLY_IN = {
+    "cantools": ("dbc_output/layout.py", "dbc_output/expand.py", "dbc_output/prepare.py", "cli"),
+    "serial": ("runtime",),
+    "can": ("runtime", "cli/demo.py", "offline"),
+    "rich": ("cli",),
+    "canopen": (),
+}
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def _room(path: Path) -> str:
+    relative = path.relative_to(PACKAGE)
+    return relative.parts[0] if len(relative.parts) > 1 else relative.stem
+
+
+def _imports(path: Path) -> set[str]:
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            found.add(node.module)
+    return found
+
+
+def _names(path: Path) -> list[str]:
+    return [str(path.relative_to(PACKAGE))]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_run_one_way(path: Path) -> None:
+    room = _room(path)
+    if room in ("__init__", "__main__"):
+        return
+    level = next(i for i, rooms in enumerate(ORDER) if room in rooms)
+    allowed = {r for rooms in ORDER[: level + 1] for r in rooms} - (set(ORDER[level]) - {room})
+    for module in _imports(path):
+        if module.startswith(f"{NAME}."):
+            assert module.split(".")[1] in allowed, f"{room} imports {module}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_only_the_edge_blocks(path: Path) -> None:
+    if _room(path) in EDGE or path.name == "__main__.py":
+        return
+    assert not _imports(path) & BLOCKING
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            assert node.func.id != "open", f"{path} opens a file"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_each_library_stays_in_its_room(path: Path) -> None:
+    name = str(path.relative_to(PACKAGE))
+    for module in _imports(path):
+        library = module.split(".")[0]
+        if library in ONLY_IN:
+            assert name.startswith(ONLY_IN[library]), f"{name} imports {library}"
+
+
+def test_the_protocol_needs_nothing_but_the_standard_library() -> None:
+    for path in (PACKAGE / "protocol").glob("*.py"):
+        for module in _imports(path):
+            top = module.split(".")[0]
+            assert top in sys.stdlib_module_names or module.startswith(f"{NAME}.protocol"), f"{path.name}: {module}"
+
+
+def test_no_serial_port_is_ever_written() -> None:
+    """No call of a write method, and no way to one, in the module that owns the port."""
+    tree = ast.parse((PACKAGE / "runtime" / "serial_port.py").read_text(encoding="utf-8"))
+    called = {
+        node.func.attr for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+    }
+    assert not called & {"write", "writelines", "send_break", "sendBreak"}
+    defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    assert not any("write" in name or "send" in name for name in defined)
+
+
+def test_no_can_id_and_no_bit_position_stands_in_the_package() -> None:
+    """Ids of the shipped DBC appear in no module that runs."""
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and type(node.value) is int:
+                assert not 0x680 <= node.value <= 0x6DF, f"{path}: {node.value:#x}"
+
+
+def test_the_run_path_imports_nothing_heavy() -> None:
+    """What only some commands need is not imported at start (asammdf comes with python-can where it is installed)."""
+    code = (
+        "import sys; import kontronik_can_gw.cli.run, kontronik_can_gw.gateway, kontronik_can_gw.runtime.loop; "
+        "print([m for m in ('rich', 'canopen', 'cantools', 'can', 'asyncio', 'jsonschema') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
