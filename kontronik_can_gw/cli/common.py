@@ -46,7 +46,9 @@ def set_up_log(verbose: bool = False) -> None:
         handler.setFormatter(_JournalFormatter("%(message)s"))
     else:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
-    logging.getLogger("can").addHandler(logging.NullHandler())  # what python-can says is said again by us, with the remedy
+    logging.getLogger("can").addHandler(
+        logging.NullHandler()
+    )  # what python-can says is said again by us, with the remedy
     logger = logging.getLogger("kontronik_can_gw")
     logger.addHandler(handler)
     logger.setLevel(logging.DEBUG if verbose else logging.INFO)

@@ -33,6 +33,7 @@ _ALIVE_ENDINGS = (
     "sequencecounter",
 )
 _CRC_ENDINGS = ("crc", "crc8", "checksum")
+FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 EXPECTED_LIVE_HZ = 100
 """What a UART is expected to bring, for the computed bus load only; the gateway sends as frames come."""
 
@@ -371,6 +372,10 @@ class _Compiler:
         if is_fd and not self.fd_allowed:
             self.problems.append(
                 f"{where}: is a CAN FD message ({message.length} bytes). Set can.fd = true, or shorten it."
+            )
+        if is_fd and message.length not in FD_LENGTHS:
+            self.problems.append(
+                f"{where}: CAN FD has no frames of {message.length} bytes, but {', '.join(map(str, FD_LENGTHS[9:]))}."
             )
         if message.is_container or message.length == 0 or not message.signals:
             self.problems.append(f"{where}: has no signal that could be sent. Remove it or give it signals.")

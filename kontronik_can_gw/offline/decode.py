@@ -20,6 +20,7 @@ from kontronik_can_gw.protocol.states import (
     SelfTestError,
     bit_texts,
     device_text,
+    peak_current_of,
     state_text,
 )
 
@@ -37,7 +38,8 @@ def _names(word: int, kind: type[ErrorBit]) -> list[str]:
 def physical_fields(data: Data, device: int | None = None) -> Record:
     """The fields of a frame in wire order, in physical units; None where the known ``device`` does not supply one.
 
-    Error words also as names, states and devices as names with the number beside, firmware as "1.14".
+    Error words also as names, states and devices as names with the number beside, firmware as "1.14"; of an info frame also
+    whose peak current the device reports (motor, battery, None where unknown).
     """
     record: Record = {}
     for (name, row), raw in zip(rows(type(data)).items(), data, strict=True):
@@ -53,6 +55,7 @@ def physical_fields(data: Data, device: int | None = None) -> Record:
                 record["device"] = device_text(data.device)
                 record["device_raw"] = data.device
                 record["variant"] = data.variant
+                record["peak_current_of"] = peak_current_of(data.device)
             case "firmware_word" if isinstance(data, InfoData):
                 record["firmware"] = data.firmware
             case _:

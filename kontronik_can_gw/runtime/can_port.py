@@ -9,6 +9,7 @@ import socket
 import struct
 import sys
 from enum import Enum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config import CanConfig
@@ -26,7 +27,6 @@ _EXTENDED = 0x80000000
 _ERROR_FLAG = 0x20000000
 _ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
 _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x0C, 0x30, 0x40
-_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 
 class Sent(Enum):
@@ -112,7 +112,6 @@ class CanPort:
         can_id = frame.can_id | _EXTENDED if frame.extended else frame.can_id
         size = len(frame.data)
         if frame.fd:
-            size = next(length for length in _FD_LENGTHS if length >= size)
             packet = _FD.pack(can_id, size, _FD_BRS, frame.data)
         else:
             packet = _CLASSIC.pack(can_id, size, frame.data)
@@ -145,6 +144,13 @@ def _open(config: CanConfig) -> "can.BusABC":
     import can
 
     options: dict[str, Any] = {}
+    mtu = Path("/sys/class/net", config.channel, "mtu")
+    if config.interface == "socketcan" and config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
+        name = config.channel
+        raise RunError(
+            f"CAN interface {name}: does not do CAN FD. Adapter: sudo ip link set {name} up type can bitrate {config.bitrate} "
+            f"dbitrate {config.data_bitrate} fd on; vcan: sudo ip link set {name} mtu {_FD.size}; or set can.fd = false."
+        )
     if config.interface != "socketcan":
         options["bitrate"] = config.bitrate
     if config.fd:

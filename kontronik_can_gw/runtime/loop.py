@@ -118,6 +118,7 @@ class Loop:
                 now = clock()
                 if now - before - pause > SUSPENDED_NS:
                     self._discard_input(now - before - pause)
+                    ready = []  # what they announced is gone; a hang-up comes again
                 for key, _ in ready:
                     self._serve(key, now)
                 self._reopen(now)

@@ -43,6 +43,7 @@ LIVE_JSON = (
 )
 INFO_JSON = (
     '{"kind": "info", "layout": "legacy", "offset": 38, "device": "JIVEPro", "device_raw": 3, "variant": 120, '
+    '"peak_current_of": "battery", '
     '"firmware": "1.14", "selftest_errors": 0, "selftest_errors_names": [], "cell_count": 6, '
     '"max_electrical_speed": 0, "min_battery_voltage": 24.14, "max_battery_voltage": 0.0, '
     '"max_battery_current": 0.0, "max_motor_current": 0.0, "max_peak_current": 0.0, "max_bec_current": null, '

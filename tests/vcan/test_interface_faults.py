@@ -1,5 +1,6 @@
 """What happens to the CAN interface happens to the gateway, and heals."""
 
+import signal
 import subprocess
 import time
 from collections.abc import Callable
@@ -146,4 +147,34 @@ def test_foreign_traffic_does_not_wake_the_process(vcan: str, start_gateway: Sta
         before = wakeups()
         subprocess.run(["cangen", vcan, "-g", "0", "-n", "5000", "-I", "123", "-L", "8", "-i"], check=True)
         assert wakeups() - before < 2000
+        assert gateway.end() == 0
+
+
+def test_an_interface_without_can_fd_is_refused_for_it_with_the_remedy(vcan: str, start_gateway: Start) -> None:
+    ip("link", "set", vcan, "down")
+    ip("link", "set", vcan, "mtu", "16")
+    with bench(EscOptions()) as run:
+        gateway = start_gateway(configuration(vcan, [run.ports[0].path], dbc="fd = true"))
+        assert gateway.process.wait(20) == 1
+        wait_for(lambda: f"ip link set {vcan} mtu 72" in gateway.log, 2, "the remedy")
+
+
+def test_a_suspended_process_sends_nothing_old_as_new(vcan: str, start_gateway: Start) -> None:
+    with bench(EscOptions(profile=QUICK)) as run, Candump(vcan) as dump:
+        gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
+        gateway.wait_for_line("esc1: /dev/pts")
+        run.start()
+        wait_for(lambda: len(dump.of(0x688)) > 50, 5, "EscSpeed")
+        gateway.process.send_signal(signal.SIGSTOP)
+        time.sleep(3)
+        resumed = time.time()
+        gateway.process.send_signal(signal.SIGCONT)
+        gateway.wait_for_line("suspended")
+        wait_for(lambda: len([f for f in dump.of(0x688) if f.time > resumed]) > 50, 5, "EscSpeed again")
+        time.sleep(0.4)  # until all that was sent is noted
+        for frame in [f for f in dump.of(0x688) if f.time > resumed and f.data[5] != 0x80][:50]:
+            hits = [
+                when for when, live in run.live(0) if abs(frame.time - when) < 0.3 and agrees_speed(frame.data, live)
+            ]
+            assert hits, "a value from before the suspension"
         assert gateway.end() == 0

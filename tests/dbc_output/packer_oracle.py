@@ -1,0 +1,686 @@
+"""An independent reckoning of what a signal must hold, and a maker of random DBC layouts and random telemetry.
+
+Nothing here uses the package's tables of fields, units or positions: they are typed again from the telemetry sheet, and bits are
+counted one by one. The package is used only to make telemetry objects out of encoded frames.
+"""
+
+import math
+import random
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any
+
+from kontronik_can_gw.protocol.codec import Layout, encode
+from kontronik_can_gw.protocol.fields import InfoData, LiveData
+from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus
+from kontronik_can_gw.telemetry import MS, EscSettings, EscTelemetry
+
+# --- bits, counted one by one -------------------------------------------------------------------------------------------
+
+
+def bit_places(start: int, length: int, little: bool) -> list[tuple[int, int]]:
+    """(byte, bit in the byte) of each bit of a signal, the least significant first."""
+    if little:
+        return [divmod(start + n, 8) for n in range(length)]
+    first = start // 8 * 8 + 7 - start % 8  # in the order of transmission
+    return [(n // 8, 7 - n % 8) for n in range(first + length - 1, first - 1, -1)]
+
+
+def put(data: bytearray, raw: int, start: int, length: int, little: bool) -> None:
+    """Write a raw value bit by bit; negative ones in two's complement."""
+    for number, (byte, bit) in enumerate(bit_places(start, length, little)):
+        if raw % (1 << length) >> number & 1:
+            data[byte] |= 1 << bit
+
+
+def get(data: bytes, start: int, length: int, little: bool, signed: bool = False) -> int:
+    """Read a raw value bit by bit."""
+    places = bit_places(start, length, little)
+    raw = sum((data[byte] >> bit & 1) << number for number, (byte, bit) in enumerate(places))
+    return raw - (1 << length) if signed and raw >> length - 1 else raw
+
+
+# --- what can be published, typed from the sheet ------------------------------------------------------------------------
+
+Reader = Callable[[EscTelemetry, GatewayStatus, int], "Fraction | None"]
+
+
+@dataclass(frozen=True)
+class Known:
+    """A source as the oracle knows it: unit, how to read it in that unit (None: not available), names of its numbers."""
+
+    unit: str
+    read: Reader
+    names: Mapping[int, str] = field(default_factory=dict)
+    rolls: bool = False
+    gateway: bool = False
+    exact: bool = True
+
+
+STATES = dict(
+    zip(
+        (1, 2, 3, 7, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26),
+        (
+            "WaitForSignal WaitForMotorOff WaitForMotorOn Selftest Error_Selftest CutOffDuringOperation AcousticSignal MotorOff "
+            "StandBy Brake BrakeTargetBackward BrakeTargetForward Programming Sync_Forward Sync_Backward Sync_StandBy Forward "
+            "Backward SpoolUpFromStill SpoolUpFromTurn SpoolUpQuick RPMControl"
+        ).split(),
+        strict=True,
+    )
+)
+DEVICES = {1: "KOSMIK", 2: "KOLIBRI", 3: "JIVEPro", 4: "KONTROL-X", 5: "UHV"}
+LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
+LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
+GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay")))
+CAN_STATES = dict(enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down")))
+
+ERROR_BITS = (
+    "undervoltage overvoltage overcurrent_integral_error overcurrent_integral_warning power_stage_overtemp_warning "
+    "power_stage_overtemp_error bec_undervoltage bec_overvoltage bec_overcurrent bec_overtemperature "
+    "switched_off_by_running_down capacity_limit_reached operating_error_found operating_warning_found selftest_error "
+    "eeprom_error watchdog_error_tripped programming_allowed limit_battery_voltage_minimum limit_current_maximum "
+    "limit_power_stage_temperature limit_bec_temperature limit_bec_current limit_discharged_capacity"
+).split()
+TEST_BITS = (
+    "test_phase_low_side test_phase_high_side test_short_to_ground test_back_emf_offset test_current_zero_point "
+    "test_undervoltage test_overvoltage test_bec_undervoltage test_bec_overvoltage test_reverse_polarity_fuse "
+    "test_overvoltage_fuse test_power_stage_overtemp test_bec_overtemperature test_motor_phase_missing test_eeprom_empty "
+    "test_eeprom_stick_positions test_eeprom_checksum test_eeprom_size test_eeprom_version"
+).split()
+
+JIVEPRO = 3
+
+
+def _live(name: str, step: str = "1") -> Reader:
+    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
+        return None if esc.live is None else getattr(esc.live, name) * Fraction(step)
+
+    return read
+
+
+def _info(name: str, step: str = "1") -> Reader:
+    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
+        return None if esc.info is None else getattr(esc.info, name) * Fraction(step)
+
+    return read
+
+
+def _bit(word: str, number: int) -> Reader:
+    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
+        data: Any = esc.live if word == "operating_errors" else esc.info
+        return None if data is None else Fraction(getattr(data, word) >> number & 1)
+
+    return read
+
+
+def _calculated(
+    reckon: Callable[[EscTelemetry, LiveData], "Fraction | None"],
+) -> Reader:
+    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
+        return None if esc.live is None else reckon(esc, esc.live)
+
+    return read
+
+
+def _of_esc(reckon: Callable[[EscTelemetry], "int | Fraction | None"]) -> Reader:
+    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
+        value = reckon(esc)
+        return None if value is None else Fraction(value)
+
+    return read
+
+
+def _of_gateway(reckon: Callable[[GatewayStatus, int], "int | Fraction"]) -> Reader:
+    def read(_esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction | None:
+        return Fraction(reckon(gateway, now))
+
+    return read
+
+
+def _device_word(reckon: Callable[[int], int], word: str = "device_and_variant") -> Reader:
+    return _of_esc(lambda esc: None if esc.info is None else reckon(getattr(esc.info, word)))
+
+
+def _bec_current(esc: EscTelemetry, live: LiveData) -> Fraction | None:
+    if esc.info is None:
+        return Fraction(live.bec_current, 1000) if live.bec_current else None
+    return None if esc.info.device_and_variant >> 10 == JIVEPRO else Fraction(live.bec_current, 1000)
+
+
+def _max_bec_current(esc: EscTelemetry) -> Fraction | None:
+    if esc.info is None or esc.info.device_and_variant >> 10 == JIVEPRO:
+        return None
+    return Fraction(esc.info.max_bec_current, 1000)
+
+
+def _age(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> Fraction | None:
+    return None if esc.live_ns is None else Fraction(max(0, now - esc.live_ns) // 1_000_000)
+
+
+KNOWN: dict[str, Known] = {
+    "electrical_speed": Known("1/min", _live("electrical_speed")),
+    "battery_voltage": Known("V", _live("battery_voltage", "0.01")),
+    "battery_current": Known("A", _live("battery_current", "0.1")),
+    "motor_current": Known("A", _live("motor_current", "0.1")),
+    "peak_current": Known("A", _live("peak_current", "0.1")),
+    "consumed_charge": Known("mAh", _live("consumed_charge")),
+    "bec_current": Known("A", _calculated(_bec_current)),
+    "bec_voltage": Known("V", _live("bec_voltage", "0.001")),
+    "pwm_input": Known("us", _live("pwm_input")),
+    "throttle": Known("%", _live("throttle")),
+    "output_opening": Known("%", _live("output_opening")),
+    "power_stage_temperature": Known("degC", _live("power_stage_temperature")),
+    "bec_temperature": Known("degC", _live("bec_temperature")),
+    "operating_errors": Known("", _live("operating_errors")),
+    "operating_state": Known("", _live("operating_state"), STATES),
+    "operating_state_raw": Known("", _live("operating_state")),
+    "timing": Known("us", _live("timing")),
+    **{name: Known("", _bit("operating_errors", number)) for number, name in enumerate(ERROR_BITS)},
+    "selftest_errors": Known("", _info("selftest_errors")),
+    **{name: Known("", _bit("selftest_errors", number)) for number, name in enumerate(TEST_BITS)},
+    "cell_count": Known("", _info("cell_count")),
+    "max_electrical_speed": Known("1/min", _info("max_electrical_speed")),
+    "min_battery_voltage": Known("V", _info("min_battery_voltage", "0.01")),
+    "max_battery_voltage": Known("V", _info("max_battery_voltage", "0.01")),
+    "max_battery_current": Known("A", _info("max_battery_current", "0.1")),
+    "max_motor_current": Known("A", _info("max_motor_current", "0.1")),
+    "max_peak_current": Known("A", _info("max_peak_current", "0.1")),
+    "max_bec_current": Known("A", _of_esc(_max_bec_current)),
+    "min_bec_voltage": Known("V", _info("min_bec_voltage", "0.001")),
+    "max_throttle": Known("%", _info("max_throttle")),
+    "max_output_opening": Known("%", _info("max_output_opening")),
+    "min_power_stage_temperature": Known("degC", _info("min_power_stage_temperature")),
+    "max_power_stage_temperature": Known("degC", _info("max_power_stage_temperature")),
+    "min_bec_temperature": Known("degC", _info("min_bec_temperature")),
+    "max_bec_temperature": Known("degC", _info("max_bec_temperature")),
+    "device": Known("", _device_word(lambda word: word >> 10), DEVICES),
+    "device_raw": Known("", _device_word(lambda word: word >> 10)),
+    "variant": Known("", _device_word(lambda word: word & 1023)),
+    "firmware_main": Known("", _device_word(lambda word: word >> 8, "firmware_word")),
+    "firmware_sub": Known("", _device_word(lambda word: word & 255, "firmware_word")),
+    "motor_speed": Known("1/min", _calculated(lambda e, v: Fraction(v.electrical_speed, e.settings.pole_pairs))),
+    "output_speed": Known(
+        "1/min", _calculated(lambda e, v: v.electrical_speed / (e.settings.pole_pairs * e.settings.gear))
+    ),
+    "battery_power": Known("W", _calculated(lambda _e, v: Fraction(v.battery_voltage * v.battery_current, 1000))),
+    "mean_cell_voltage": Known(
+        "V", _calculated(lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None), exact=False
+    ),
+    "energy_used": Known("Wh", _of_esc(lambda e: Fraction(e.energy, 3600 * 1000 * 10**9))),
+    "motor_run_time": Known("s", _of_esc(lambda e: Fraction(e.run_time, 10**9))),
+    "link_state": Known("", _of_esc(lambda e: int(e.link)), LINKS),
+    "layout": Known("", _of_esc(lambda e: e.layout), LAYOUTS),
+    "data_age": Known("ms", _age),
+    "frame_rate": Known("Hz", _of_esc(lambda e: None if e.frame_rate is None else Fraction(e.frame_rate, 10))),
+    "losses": Known("", _of_esc(lambda e: e.losses), rolls=True),
+    "crc_errors": Known("", _of_esc(lambda e: e.counters.crc_errors), rolls=True),
+    "dropped_bytes": Known("", _of_esc(lambda e: e.counters.dropped_bytes), rolls=True),
+    "live_frames": Known("", _of_esc(lambda e: e.counters.live), rolls=True),
+    "info_frames": Known("", _of_esc(lambda e: e.counters.info), rolls=True),
+    "received_bytes": Known("", _of_esc(lambda e: e.counters.bytes), rolls=True),
+    "suspect_frames": Known("", _of_esc(lambda e: e.suspect_frames), rolls=True),
+    "gateway_state": Known("", _of_gateway(lambda g, _: int(g.state)), GATEWAY_STATES, gateway=True),
+    "can_state": Known("", _of_gateway(lambda g, _: int(g.can_state)), CAN_STATES, gateway=True),
+    "esc_count": Known("", _of_gateway(lambda g, _: g.esc_count), gateway=True),
+    "escs_ok": Known("", _of_gateway(lambda g, _: g.escs_ok), gateway=True),
+    "uptime": Known("s", _of_gateway(lambda g, now: Fraction((now - g.started_ns) // 10**6, 1000)), gateway=True),
+    "sent_frames": Known("", _of_gateway(lambda g, _: g.sent_frames), rolls=True, gateway=True),
+    "replaced_frames": Known("", _of_gateway(lambda g, _: g.replaced_frames), rolls=True, gateway=True),
+    "send_failures": Known("", _of_gateway(lambda g, _: g.send_failures), rolls=True, gateway=True),
+}
+
+# unit -> other unit -> (text, factor, shift): value in other = value * factor + shift
+UNITS: dict[str, list[tuple[str, str, str]]] = {
+    "V": [("V", "1", "0"), ("mV", "1000", "0"), ("kV", "1/1000", "0"), ("", "1", "0")],
+    "A": [("A", "1", "0"), ("mA", "1000", "0"), ("kA", "1/1000", "0")],
+    "W": [("W", "1", "0"), ("kW", "1/1000", "0"), ("mW", "1000", "0")],
+    "Wh": [("Wh", "1", "0"), ("kWh", "1/1000", "0"), ("J", "3600", "0"), ("kJ", "18/5", "0"), ("mWh", "1000", "0")],
+    "mAh": [("mAh", "1", "0"), ("Ah", "1/1000", "0"), ("As", "18/5", "0")],
+    "s": [("s", "1", "0"), ("ms", "1000", "0"), ("min", "1/60", "0"), ("h", "1/3600", "0"), ("us", "1000000", "0")],
+    "us": [("us", "1", "0"), ("ms", "1/1000", "0"), ("s", "1/1000000", "0")],
+    "ms": [("ms", "1", "0"), ("s", "1/1000", "0"), ("us", "1000", "0")],
+    "Hz": [("Hz", "1", "0"), ("kHz", "1/1000", "0")],
+    "1/min": [("1/min", "1", "0"), ("rpm", "1", "0"), ("rps", "1/60", "0"), ("1/s", "1/60", "0"), ("U/min", "1", "0")],
+    "%": [("%", "1", "0"), ("percent", "1", "0")],
+    "degC": [("degC", "1", "0"), ("C", "1", "0"), ("K", "1", "273.15"), ("degF", "9/5", "32"), ("Celsius", "1", "0")],
+    "": [("", "1", "0"), ("-", "1", "0"), ("count", "1", "0"), ("1", "1", "0")],
+}
+
+
+# --- a signal and what it must hold -------------------------------------------------------------------------------------
+
+
+@dataclass
+class Sig:
+    """A signal as it is written into the DBC. Numbers that stand in the file are decimal texts."""
+
+    name: str
+    start: int
+    length: int
+    little: bool = True
+    signed: bool = False
+    is_float: bool = False
+    factor: str = "1"
+    offset: str = "0"
+    minimum: str = "0"
+    maximum: str = "0"
+    unit: str = ""
+    mux: str = ""
+    texts: dict[int, str] = field(default_factory=dict)
+    start_value: int | None = None
+    source: str = ""
+    esc: int = 0
+    bind: str | float | None = None
+    conversion: tuple[str, str] = ("1", "0")
+    constant: int | None = None
+
+    @property
+    def line(self) -> str:
+        sign, order = "-" if self.signed else "+", 1 if self.little else 0
+        mux = f" {self.mux}" if self.mux else ""
+        return (
+            f" SG_ {self.name}{mux} : {self.start}|{self.length}@{order}{sign} ({self.factor},{self.offset})"
+            f' [{self.minimum}|{self.maximum}] "{self.unit}" Logger'
+        )
+
+    @property
+    def range(self) -> tuple[int, int]:
+        return (-(1 << self.length - 1), (1 << self.length - 1) - 1) if self.signed else (0, (1 << self.length) - 1)
+
+    def code(self, text: str) -> int | None:
+        return next((number for number, name in self.texts.items() if name == text), None)
+
+    @property
+    def not_available(self) -> int:
+        listed = self.code("NotAvailable")
+        if listed is not None:
+            return listed
+        if self.start_value is not None:
+            return self.start_value
+        return self.range[0] if self.signed else self.range[1]
+
+    @property
+    def error(self) -> int:
+        listed = self.code("Error")
+        return self.not_available if listed is None else listed
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """Smallest and largest raw value that is a value."""
+        low, high = self.range
+        factor, offset = Fraction(self.factor), Fraction(self.offset)
+        least, most = Fraction(self.minimum), Fraction(self.maximum)
+        if (least, most) != (0, 0):
+            ends = sorted(((least - offset) / factor, (most - offset) / factor))
+            low, high = max(low, math.ceil(ends[0])), min(high, math.floor(ends[1]))
+        codes = {self.code("NotAvailable"), self.code("Error")}
+        while high in codes:
+            high -= 1
+        while low in codes:
+            low += 1
+        return low, high
+
+    def physical(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction | None:
+        """The value in the signal's unit."""
+        value = KNOWN[self.source].read(esc, gateway, now)
+        return None if value is None else value * Fraction(self.conversion[0]) + Fraction(self.conversion[1])
+
+    def allowed(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> set[int]:
+        """The raw values that are right: one, or two where the value lies halfway (or within a float's rounding of it)."""
+        known = KNOWN[self.source]
+        value = self.physical(esc, gateway, now)
+        if value is None:
+            return {self.not_available}
+        by_text = {n: c for n, t in known.names.items() for c, name in self.texts.items() if plain(name) == plain(t)}
+        if by_text:
+            return {by_text.get(int(value), self.error)}
+        low, high = self.limits
+        if known.rolls:
+            return {int(value) % (high + 1)}
+        exact = (value - Fraction(self.offset)) / Fraction(self.factor)
+        slack = Fraction(0) if known.exact else abs(exact) / 10**12 + Fraction(1, 10**9)
+        nearest = {math.floor(exact + Fraction(1, 2) + slack), math.ceil(exact - Fraction(1, 2) - slack)}
+        return {self._sent(raw, low, high) for raw in nearest}
+
+    def _sent(self, raw: int, low: int, high: int) -> int:
+        if not low <= raw <= high:
+            return self.error
+        one_bit_flag = self.length == 1
+        hides = raw == self.not_available and self.error != self.not_available and not one_bit_flag
+        return self.error if hides else raw
+
+    def float_is_right(self, raw: int, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> bool:
+        """True if the IEEE 754 bits are the value within the rounding of a double and of the type; NaN for not available."""
+        kind = "f" if self.length == 32 else "d"
+        sent: float = struct.unpack("<" + kind, raw.to_bytes(self.length // 8, "little"))[0]
+        value = self.physical(esc, gateway, now)
+        if value is None:
+            return math.isnan(sent)
+        exact = (value - Fraction(self.offset)) / Fraction(self.factor)
+        if math.isnan(sent) or math.isinf(sent):
+            return math.isnan(sent) and self.length == 32 and abs(exact) > Fraction(3.4028234e38)
+        size = max(abs(exact), abs(Fraction(self.offset) / Fraction(self.factor)), abs(Fraction(self.conversion[1])))
+        tolerance = (
+            abs(exact) * Fraction(2) ** (-24 if self.length == 32 else -52) + size / 10**14 + Fraction(1, 10**40)
+        )
+        return abs(Fraction(sent) - exact) <= tolerance
+
+
+def plain(name: str) -> str:
+    """Letters and digits in lower case."""
+    return "".join(c for c in name.lower() if c.isalnum())
+
+
+@dataclass
+class Msg:
+    """A message as it is written into the DBC."""
+
+    name: str
+    can_id: int
+    length: int
+    signals: list[Sig]
+    extended: bool = False
+    sender: str = "Gateway"
+
+    @property
+    def dbc_id(self) -> int:
+        return self.can_id | (0x80000000 if self.extended else 0)
+
+    @property
+    def pages(self) -> list[int | None]:
+        pages: set[int] = {int(s.mux[1:]) for s in self.signals if s.mux.startswith("m")}
+        return sorted(pages) if pages else [None]
+
+    def page_of(self, number: int | None) -> list[Sig]:
+        """The signals that stand in a frame of this page."""
+        return [s for s in self.signals if not s.mux.startswith("m") or s.mux == f"m{number}"]
+
+
+def dbc_text(messages: Iterable[Msg], more: str = "") -> str:
+    """The messages as a DBC. ``more`` goes behind the attribute definitions."""
+    messages = list(messages)
+    lines = ['VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_: Gateway Logger Other", ""]
+    for message in messages:
+        lines.append(f"BO_ {message.dbc_id} {message.name}: {message.length} {message.sender}")
+        lines += [signal.line for signal in message.signals]
+        lines.append("")
+    lines += [
+        'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;',
+        'BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;',
+        'BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange","None","Wrong";',
+        'BA_DEF_ SG_ "GenSigStartValue" FLOAT -9223372036854775808 18446744073709551615;',
+        'BA_DEF_DEF_ "GenMsgCycleTime" 0;',
+        'BA_DEF_DEF_ "GenMsgDelayTime" 0;',
+        'BA_DEF_DEF_ "GenMsgSendType" "None";',
+        'BA_DEF_DEF_ "GenSigStartValue" 0;',
+    ]
+    pairs = [(message, signal) for message in messages for signal in message.signals]
+    lines += [
+        f'BA_ "GenSigStartValue" SG_ {message.dbc_id} {signal.name} {signal.start_value};'
+        for message, signal in pairs
+        if signal.start_value is not None
+    ]
+    lines += more.splitlines()
+    for message, signal in pairs:
+        if signal.texts:
+            texts = " ".join(f'{number} "{text}"' for number, text in signal.texts.items())
+            lines.append(f"VAL_ {message.dbc_id} {signal.name} {texts} ;")
+    lines += [
+        f"SIG_VALTYPE_ {message.dbc_id} {signal.name} : {1 if signal.length == 32 else 2};"
+        for message, signal in pairs
+        if signal.is_float
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def bindings(messages: Iterable[Msg]) -> dict[str, str | float]:
+    """What ``[dbc.bind]`` has to say about them."""
+    return {
+        f"{message.name}.{signal.name}": signal.bind
+        for message in messages
+        for signal in message.signals
+        if signal.bind is not None
+    }
+
+
+# --- random layouts -----------------------------------------------------------------------------------------------------
+
+FACTORS = [
+    "1",
+    "1",
+    "1",
+    "0.1",
+    "0.01",
+    "0.001",
+    "0.5",
+    "2",
+    "5",
+    "-1",
+    "-0.1",
+    "0.25",
+    "0.0625",
+    "100",
+    "3",
+    "0.3",
+    "-7",
+]
+OFFSETS = ["0", "0", "0", "0", "-40", "100", "0.5", "-273.15", "1000", "-0.05", "32768"]
+
+
+def pascal(source: str) -> str:
+    return "".join(part.capitalize() for part in source.split("_"))
+
+
+def spelled(rng: random.Random, text: str) -> str:
+    """A name as people write it."""
+    ways = [text, text.upper(), text.lower(), text.replace("_", ""), f"{text[:2]}_{text[2:]}"]
+    return rng.choice(ways)
+
+
+class LayoutMaker:
+    """Makes random messages whose signals are bound to random sources of the ESCs."""
+
+    def __init__(self, rng: random.Random, escs: Sequence[EscSettings], fd: bool = True) -> None:
+        self.rng, self.escs, self.fd = rng, escs, fd
+        self.ids: set[tuple[int, bool]] = set()
+        self.count = 0
+
+    def message(self) -> Msg:
+        """One message with 1 to 8 signals."""
+        rng = self.rng
+        self.count += 1
+        extended = rng.random() < 0.3
+        can_id = rng.randrange(1 << 29 if extended else 1 << 11)
+        while (can_id, extended) in self.ids:
+            can_id = rng.randrange(1 << 29 if extended else 1 << 11)
+        self.ids.add((can_id, extended))
+        length = rng.choice((12, 16, 20, 24, 32, 48, 64)) if self.fd and rng.random() < 0.15 else rng.randint(1, 8)
+        message = Msg(f"M{self.count}", can_id, length, [], extended)
+        common: set[tuple[int, int]] = set()
+        wanted = rng.randint(1, 8)
+        if rng.random() < 0.2:
+            width = rng.randint(1, 8)
+            if (selector := self._position(common, width, length)) is not None:
+                message.signals.append(Sig("Selector", selector[0], width, selector[1], mux="M"))
+                used: set[tuple[int, int]] = set()
+                for page in rng.sample(range(1 << width), min(1 << width, rng.randint(1, 3))):
+                    taken = set(common)  # pages may lie over each other
+                    for _ in range(rng.randint(1, 3)):
+                        self._add(message, taken, f"m{page}")
+                    used |= taken
+                common |= used
+        for _ in range(wanted):
+            self._add(message, common, "")
+        if not message.signals or all(s.mux == "M" for s in message.signals):
+            self.ids.discard((can_id, extended))
+            self.count -= 1
+            return self.message()
+        return message
+
+    def _position(self, taken: set[tuple[int, int]], width: int, length: int) -> tuple[int, bool] | None:
+        rng = self.rng
+        for _ in range(12):
+            start, little = rng.randrange(length * 8), rng.random() < 0.5
+            places = bit_places(start, width, little)
+            if all(0 <= byte < length for byte, _ in places) and not taken & set(places):
+                taken.update(places)
+                return start, little
+        return None
+
+    def _add(self, message: Msg, taken: set[tuple[int, int]], mux: str) -> None:
+        rng = self.rng
+        source = rng.choice(list(KNOWN))
+        known = KNOWN[source]
+        is_float = rng.random() < 0.12 and not known.rolls and not known.names
+        signed = is_float or (rng.random() < 0.5 and not known.rolls)
+        length = (
+            rng.choice((32, 64))
+            if is_float
+            else rng.choice((1, 2, 4, 7, 8, 8, 12, 15, 16, 16, 17, 24, 32, 33, 48, 63, 64))
+        )
+        if length == 1 and (signed or known.rolls or known.names):
+            length = 8
+        if (place := self._position(taken, length, message.length)) is None:
+            return
+        signal = Sig(f"S{len(message.signals)}", place[0], length, place[1], signed, is_float, mux=mux, source=source)
+        signal.esc = rng.randrange(len(self.escs))
+        unit, scale, shift = rng.choice(UNITS[known.unit])
+        signal.unit, signal.conversion = unit, (scale, shift)
+        if not known.rolls and not known.names and length > 1:
+            signal.factor, signal.offset = rng.choice(FACTORS), rng.choice(OFFSETS)
+        if not is_float and length > 1:
+            self._codes(signal, known)
+            if not known.names:
+                self._limits(signal, known)
+        prefix = "" if known.gateway else self.escs[signal.esc].name
+        if rng.random() < 0.3:
+            name = pascal(f"{prefix}_{source}") if rng.random() < 0.5 else spelled(rng, f"{prefix}_{source}".strip("_"))
+            if unit == "%" and rng.random() < 0.5:
+                name += "Percent"
+            if all(s.name != name for s in message.signals) and name[0].isalpha():
+                signal.name = name
+        if signal.name == f"S{len(message.signals)}":
+            signal.bind = f"{prefix}.{source}" if prefix else source
+        message.signals.append(signal)
+
+    def _codes(self, signal: Sig, known: Known) -> None:
+        rng = self.rng
+        low, high = signal.range
+        usual = (low, low + 1) if signal.signed else (high, high - 1)
+        free = [code for code in range(low, min(high, low + 4000) + 1) if code not in usual]
+        if known.names and rng.random() < 0.7 and len(free) >= len(known.names):
+            codes = rng.sample(free, len(known.names))
+            for text, code in zip(known.names.values(), codes, strict=True):
+                if rng.random() < 0.85:
+                    signal.texts[code] = spelled(rng, text)
+        if rng.random() < 0.5:
+            signal.texts[usual[0]] = "NotAvailable"
+        elif rng.random() < 0.3 and not known.rolls and length_is_enough(signal):
+            middle = [code for code in free if code not in signal.texts]
+            if middle:
+                signal.texts[rng.choice(middle)] = "NotAvailable"
+        if rng.random() < 0.5 and usual[1] not in signal.texts:
+            signal.texts[usual[1]] = "Error"
+        if rng.random() < 0.3 and signal.length <= 50:
+            start = rng.randint(low, high)
+            if start != signal.code("Error"):
+                signal.start_value = start
+
+    def _limits(self, signal: Sig, known: Known) -> None:
+        rng = self.rng
+        if signal.length > 32 or rng.random() < 0.5:
+            return
+        low, high = signal.range
+        if known.rolls:
+            ends = [0, rng.randint(max(1, high // 2), high)]
+        else:
+            ends = sorted((rng.randint(low, high), rng.randint(low, high)))
+        factor, offset = Decimal(signal.factor), Decimal(signal.offset)
+        least, most = sorted(end * factor + offset for end in ends)
+        signal.minimum, signal.maximum = str(least), str(most)
+
+
+def length_is_enough(signal: Sig) -> bool:
+    """Codes amid the values make sense only where there are many values."""
+    return signal.length >= 7
+
+
+# --- random telemetry ---------------------------------------------------------------------------------------------------
+
+
+def random_integer(rng: random.Random, low: int, high: int) -> int:
+    """Ends and neighbours of zero often, anything else else."""
+    if rng.random() < 0.3:
+        return rng.choice([v for v in (low, low + 1, -1, 0, 1, 99, 100, high - 1, high) if low <= v <= high])
+    if rng.random() < 0.5:
+        return rng.randint(max(low, -200), min(high, 3000))
+    return rng.randint(low, high)
+
+
+LIVE_TYPES = "IHhhhHHHHbBbbIBB"
+INFO_TYPES = "HHIBIHHhhhHHbBbbbb"
+
+
+def random_fields(rng: random.Random, types: str) -> list[int]:
+    values = []
+    for code in types:
+        bits = 8 * struct.calcsize("<" + code)
+        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if code.islower() else (0, (1 << bits) - 1)
+        values.append(random_integer(rng, low, high))
+    return values
+
+
+def random_live(rng: random.Random) -> LiveData:
+    values = random_fields(rng, LIVE_TYPES)
+    if rng.random() < 0.8:
+        values[14] = rng.randint(0, 30)
+    return LiveData(*values)
+
+
+def random_info(rng: random.Random) -> InfoData:
+    values = random_fields(rng, INFO_TYPES)
+    values[0] = rng.randint(0, 7) << 10 | rng.randrange(1024)
+    values[3] = rng.choice((0, 1, 3, 6, 7, 12, 255))
+    return InfoData(*values)
+
+
+def random_escs(rng: random.Random, settings: Sequence[EscSettings], now: int) -> tuple[list[EscTelemetry], int]:
+    """ESCs that were fed random frames: some up, some stale, some with info, some never seen. And the time after that."""
+    escs = [EscTelemetry(each, now) for each in settings]
+    for _ in range(rng.randint(0, 3)):
+        for esc in escs:
+            layout = rng.choice((Layout.V4, Layout.LEGACY))
+            kind = rng.random()
+            if kind < 0.7:
+                esc.receive(encode(random_live(rng), layout), now)
+            if rng.random() < 0.4:
+                esc.receive(encode(random_info(rng), layout), now)
+            if rng.random() < 0.2:
+                esc.receive(rng.randbytes(rng.randint(1, 50)), now)
+        now += rng.choice((1, 10, 33, 200)) * MS + rng.randrange(MS)
+    if rng.random() < 0.15:
+        now += 400 * MS
+    for esc in escs:
+        esc.advance(now)
+        if rng.random() < 0.3:
+            esc.energy = rng.choice((1, -1)) * rng.randrange(10**19) if rng.random() < 0.5 else rng.randrange(10**17)
+            esc.run_time = rng.randrange(10**14)
+            esc.losses = rng.randrange(10**6)
+            esc.frame_rate = rng.choice((None, 0, 5, 999, 1004))
+    return escs, now
+
+
+def random_gateway(rng: random.Random, now: int) -> GatewayStatus:
+    return GatewayStatus(
+        state=rng.choice(list(GatewayState)),
+        can_state=rng.choice(list(CanState)),
+        esc_count=rng.randint(0, 9),
+        escs_ok=rng.randint(0, 9),
+        started_ns=now - rng.randrange(10**14),
+        sent_frames=rng.randrange(10**10),
+        replaced_frames=rng.randrange(1000),
+        send_failures=rng.randrange(100000),
+    )
