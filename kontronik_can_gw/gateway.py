@@ -73,10 +73,10 @@ class Gateway:
         changes, self._link_changes = self._link_changes, []
         return changes
 
-    def _follow(self, esc: int, events: Event, now: int) -> None:
+    def _follow(self, esc: int, events: int, now: int) -> None:
         if events:
             self._output.on_event(esc, events, now)
-        if Event.LINK in events:
+        if events & Event.LINK:
             self._link_changes.append(esc)
             escs_ok = sum(e.up for e in self.escs)
             if escs_ok != self.status.escs_ok:

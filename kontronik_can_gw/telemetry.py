@@ -6,7 +6,7 @@ or not known of the device now on the line, is None.
 
 from collections import deque
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from fractions import Fraction
 
 from kontronik_can_gw.protocol.codec import Layout
@@ -36,8 +36,8 @@ class LinkState(IntEnum):
     PORT_ERROR = 5
 
 
-class Event(IntFlag):
-    """What a call changed."""
+class Event:
+    """What a call changed: bits of a plain int, because an IntFlag would be a third of the cost of a frame."""
 
     NONE = 0
     LIVE = 1
@@ -112,7 +112,7 @@ class EscTelemetry:
         """Age of the newest live frame, None before the first."""
         return None if self.live_ns is None else max(0, now - self.live_ns) // MS
 
-    def receive(self, data: bytes, now: int) -> Event:
+    def receive(self, data: bytes, now: int) -> int:
         """Take bytes that were read at ``now``. An unfinished frame older than the time-out is given up first."""
         events = self._expire(now)
         deframer = self._deframer
@@ -134,19 +134,19 @@ class EscTelemetry:
             events |= self._set_link(LinkState.SEARCHING)
         return events
 
-    def port_opened(self) -> Event:
+    def port_opened(self) -> int:
         """The port is open (again)."""
         if self.link is not LinkState.PORT_ERROR:
             return Event.NONE
         return self._set_link(LinkState.NEVER_SEEN if self.live_ns is None else LinkState.LOST)
 
-    def port_lost(self) -> Event:
+    def port_lost(self) -> int:
         """The port is gone: what was pending is dropped, nothing is fresh any more."""
         self._deframer.flush()
         self._arrivals.clear()
         return self._lose(LinkState.PORT_ERROR)
 
-    def advance(self, now: int) -> Event:
+    def advance(self, now: int) -> int:
         """Let time pass: expire what is old, close the one-second window of rate and quality."""
         events = self._expire(now)
         if now - self._window_ns >= SECOND:
@@ -164,7 +164,7 @@ class EscTelemetry:
         """Why no frame comes, in words, from the bytes since the last second's start; None while frames come."""
         return None if self.up else self.counters.diagnosis(self._window_counters)
 
-    def _accept(self, frame: Frame, when: int) -> Event:
+    def _accept(self, frame: Frame, when: int) -> int:
         layout = 1 if frame.layout is Layout.V4 else 2
         events = Event.NONE
         if layout != self.layout:
@@ -201,7 +201,7 @@ class EscTelemetry:
         self.info_ns = None
         self.cells = self.settings.cell_count
 
-    def _expire(self, now: int) -> Event:
+    def _expire(self, now: int) -> int:
         events = Event.NONE
         if self.live is not None and self.live_ns is not None and now - self.live_ns > self.settings.timeout_ns:
             self.losses += 1
@@ -211,7 +211,7 @@ class EscTelemetry:
             events |= Event.INFO
         return events
 
-    def _lose(self, state: LinkState) -> Event:
+    def _lose(self, state: LinkState) -> int:
         events = self._set_link(state)
         if self.live is not None:
             self.live = None
@@ -222,13 +222,13 @@ class EscTelemetry:
         self.frame_rate = 0
         return events
 
-    def _set_link(self, state: LinkState) -> Event:
+    def _set_link(self, state: LinkState) -> int:
         if state is self.link:
             return Event.NONE
         self.link = state
         return Event.LINK
 
-    def _close_window(self, now: int) -> Event:
+    def _close_window(self, now: int) -> int:
         old, new = self._window_counters, self.counters
         frames = new.live - old.live
         self.frame_rate = round(frames * 10 * SECOND / (now - self._window_ns)) if self.up else 0

@@ -16,7 +16,19 @@ _EVENT_OF_GROUP = {Group.LIVE: Event.LIVE, Group.INFO: Event.INFO, Group.LINK: E
 class _Message:
     """One message at work. ``last`` holds the bits of the last frame of each page, without alive counter and CRC."""
 
-    __slots__ = ("alive", "alive_modulus", "crc_at", "last", "pack", "page", "plan", "silent_able", "triggers")
+    __slots__ = (
+        "alive",
+        "alive_modulus",
+        "by_event",
+        "crc_at",
+        "last",
+        "on_change",
+        "pack",
+        "page",
+        "plan",
+        "silent_able",
+        "triggers",
+    )
 
     def __init__(self, plan: MessagePlan, silent: bool) -> None:
         self.plan = plan
@@ -29,11 +41,13 @@ class _Message:
         self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 1
         self.last: dict[int | None, int] = {}
         self.silent_able = silent and bool(plan.groups & {Group.LIVE, Group.INFO})
+        self.by_event = SendType.EVENT in plan.send_type
+        self.on_change = SendType.ON_CHANGE in plan.send_type
         self.triggers = Event.NONE
-        if plan.send_type & (SendType.EVENT | SendType.ON_CHANGE):
+        if self.by_event or self.on_change:
             for group in plan.groups:
                 self.triggers |= _EVENT_OF_GROUP[group]
-            if Event.LIVE in self.triggers and plan.send_type & SendType.EVENT:
+            if self.triggers & Event.LIVE and self.by_event:
                 self.triggers &= ~Event.LINK  # live frames set the pace; a loss is a live event too
 
 
@@ -51,7 +65,7 @@ class DbcOutput:
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
         self._schedule = Schedule(layout.messages, now)
-        self._listeners: list[list[tuple[int, Event]]] = [[] for _ in escs]
+        self._listeners: list[list[tuple[int, int]]] = [[] for _ in escs]
         for index, message in enumerate(self._messages):
             for esc in message.plan.escs:
                 if message.triggers:
@@ -63,12 +77,12 @@ class DbcOutput:
             if not message.plan.cycle_ns and self._schedule.request(index, now):
                 self._send(index, now)
 
-    def on_event(self, esc: int, events: Event, now: int) -> None:
+    def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
         for index, triggers in self._listeners[esc]:
             if triggers & events:
                 message = self._messages[index]
-                if SendType.EVENT not in message.plan.send_type and not self._changed(message, now):
+                if not message.by_event and not self._changed(message, now):
                     continue
                 if self._schedule.request(index, now):
                     self._send(index, now)
@@ -79,10 +93,9 @@ class DbcOutput:
         ``at_once``: without regard to their minimum distance, for the last word.
         """
         for index, message in enumerate(self._messages):
-            send_type = message.plan.send_type
             if Group.GATEWAY not in message.plan.groups:
                 continue
-            wanted = SendType.EVENT in send_type or (SendType.ON_CHANGE in send_type and self._changed(message, now))
+            wanted = message.by_event or (message.on_change and self._changed(message, now))
             if wanted and (at_once or self._schedule.request(index, now)):
                 self._send(index, now)
 
@@ -90,7 +103,7 @@ class DbcOutput:
         """Send what is due."""
         for index, cyclic in self._schedule.due(now):
             message = self._messages[index]
-            if cyclic or SendType.EVENT in message.plan.send_type or self._changed(message, now):
+            if cyclic or message.by_event or self._changed(message, now):
                 self._send(index, now)
 
     def next_deadline(self) -> int | None:
@@ -113,7 +126,7 @@ class DbcOutput:
         if message.silent_able and not any(self._escs[esc].up for esc in plan.escs):
             return
         if len(plan.pages) > 1:  # one page after the other; a changed one first where changes matter
-            changed = self._changed_page(message, now) if SendType.ON_CHANGE in plan.send_type else None
+            changed = self._changed_page(message, now) if message.on_change else None
             place = message.page if changed is None else changed
             message.page = (place + 1) % len(plan.pages)
             page = plan.pages[place]
@@ -121,7 +134,7 @@ class DbcOutput:
             page = plan.pages[0]
         pack = message.pack
         bits = pack(self._escs, self._gateway, now, message.alive, page or 0)
-        if SendType.ON_CHANGE in plan.send_type:
+        if message.on_change:
             message.last[page] = pack(self._escs, self._gateway, now, 0, page or 0)
         message.alive = (message.alive + 1) % message.alive_modulus
         data = bits.to_bytes(plan.length, "little")

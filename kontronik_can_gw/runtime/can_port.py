@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import difflib
 import errno
 import socket
 import struct
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config import CanConfig
-from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import CanState
 
@@ -143,6 +144,10 @@ class CanPort:
 def _open(config: CanConfig) -> "can.BusABC":
     import can
 
+    if config.interface not in can.VALID_INTERFACES:
+        near = difflib.get_close_matches(config.interface, can.VALID_INTERFACES, n=1)
+        hint = f" Did you mean {near[0]}?" if near else f" Known: {', '.join(sorted(can.VALID_INTERFACES))}."
+        raise UserError(f"can.interface: {config.interface!r} is no interface of python-can.{hint}")
     options: dict[str, Any] = {}
     mtu = Path("/sys/class/net", config.channel, "mtu")
     if config.interface == "socketcan" and config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:

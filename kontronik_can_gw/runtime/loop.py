@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from kontronik_can_gw.config import CanConfig
-from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.can_port import CanPort, Sent
@@ -83,6 +83,7 @@ class Loop:
         self._slots = Slots()
         self._busy_until: int | None = None
         self._selector = selectors.DefaultSelector()
+        self._held: list[str] | None = []  # what was opened is said when all is: an error at start is the only line
         self._stopping = False
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._selector.register(self._wake_read, selectors.EVENT_READ, None)
@@ -100,9 +101,12 @@ class Loop:
             self._open_can(now)
             for esc in self._escs:
                 self._open_port(esc, now)
-        except RunError:
+        except UserError:
             self.close()
             raise
+        for line in self._held or ():
+            log.info(line)
+        self._held = None
 
     def run(self) -> None:
         """Until ``stop``. Then a last status is sent and everything is closed."""
@@ -190,7 +194,7 @@ class Loop:
         esc.diagnosis_due = now + DIAGNOSIS_NS
         self._selector.register(port.fileno(), selectors.EVENT_READ, esc)
         self.gateway.port_opened(esc.index, now)
-        log.info("%s: %s is open", esc.name, esc.path)
+        self._say_open(f"{esc.name}: {esc.path} is open")
         esc.complaint = ""
 
     def _port_failed(self, esc: _Esc, reason: str, now: int) -> None:
@@ -234,7 +238,7 @@ class Loop:
         self._can_retry.due = None
         if (fd := port.fileno()) is not None:
             self._selector.register(fd, selectors.EVENT_READ, port)
-        log.info("CAN %s %s is open", self._can_config.interface, self._can_config.channel)
+        self._say_open(f"CAN {self._can_config.interface} {self._can_config.channel} is open")
 
     def _can_failed(self, reason: str, now: int) -> None:
         self._can_retry.failed(now)
@@ -288,6 +292,12 @@ class Loop:
             log.info("CAN %s: frames are sent again", self._can_config.channel)
 
     # --- words
+
+    def _say_open(self, line: str) -> None:
+        if self._held is None:
+            log.info(line)
+        else:
+            self._held.append(line)
 
     def _report(self, now: int) -> None:
         for index in self.gateway.take_link_changes():
