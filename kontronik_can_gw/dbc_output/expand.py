@@ -1,7 +1,7 @@
 """A one-ESC DBC -> the DBC of several ESCs: names prefixed, ids moved, nothing lost. Also the only place that writes a DBC."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import TYPE_CHECKING
 
@@ -21,9 +21,11 @@ def esc_prefix(name: str) -> str:
     return "".join(part[:1].upper() + part[1:] for part in re.split(r"[^A-Za-z0-9]+", name) if part)
 
 
-def needs_expansion(database: "Database", node: str, escs: Sequence[EscSettings]) -> bool:
+def needs_expansion(
+    database: "Database", node: str, escs: Sequence[EscSettings], bind: Mapping[str, str | float]
+) -> bool:
     """True for several ESCs and a DBC that describes one."""
-    return len(escs) > 1 and is_one_esc_layout(database, node, Binder(escs, {}))
+    return len(escs) > 1 and is_one_esc_layout(database, node, Binder(escs, bind))
 
 
 def expand(

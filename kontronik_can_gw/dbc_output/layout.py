@@ -296,16 +296,16 @@ class Binder:
 
 
 def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
-    """True if a signal of ours means an ESC's value without saying which ESC."""
+    """True if signals of ours mean an ESC's values, and none says of which ESC."""
+    escs = set()
     for message in database.messages:
         if node in message.senders:
             for signal in message.signals:
                 bound = binder.bound(message.name, signal.name)
-                name = bound if isinstance(bound, str) else signal.name
-                found = binder.by_name(name)
-                if found and found[1] is None and found[0].group is not Group.GATEWAY:
-                    return True
-    return False
+                found = binder.by_name(bound if isinstance(bound, str) else signal.name)
+                if found and found[0].group is not Group.GATEWAY:
+                    escs.add(found[1])
+    return escs == {None}
 
 
 def compile_layout(

@@ -25,7 +25,7 @@ def prepare(
 ) -> tuple["Database", Layout]:
     """The exact database of what a gateway with these ESCs sends, and the compiled layout. UserError with every mistake."""
     node = choose_node(database, settings.node, file)
-    if needs_expansion(database, node, escs) or settings.base_id is not None:
+    if needs_expansion(database, node, escs, settings.bind) or settings.base_id is not None:
         database, bind = expand(database, node, escs, file, dict(settings.bind), settings.base_id, settings.id_step)
         settings = replace(settings, bind=bind)
     return database, compile_layout(database, file, escs, settings, taken_ids, fd_allowed)
