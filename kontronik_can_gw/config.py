@@ -4,9 +4,11 @@ Each key is defined once, below, with its range and its text; validation and the
 """
 
 import difflib
+import json
+import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields
 from fractions import Fraction
 from functools import cached_property
@@ -20,6 +22,8 @@ from kontronik_can_gw.telemetry import MS, EscSettings
 
 T = TypeVar("T")
 SHIPPED = "shipped"
+_RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
+_NOT_BLANK = r"\S"
 
 
 def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
@@ -155,7 +159,7 @@ def shipped(name: str) -> Path:
 def load(path: Path) -> Config:
     """Read and check a configuration file. UserError with every mistake, each with file, key and remedy."""
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = path.read_bytes().decode("utf-8-sig")  # Windows' editors put a mark in front
     except OSError as error:
         raise UserError(
             f"{path}: cannot be read: {error.strerror}. `kontronik-can-gw init` writes an example."
@@ -164,7 +168,7 @@ def load(path: Path) -> Config:
         raise UserError(f"{path}: is not a text file in UTF-8, so no TOML configuration") from None
     try:
         tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # beside TOMLDecodeError: numbers of 5000 digits, 1000 brackets
         raise UserError(f"{path}: is not valid TOML: {error}") from None
     return parse(tables, str(path))
 
@@ -188,15 +192,15 @@ def parse(tables: Mapping[str, Any], file: str) -> Config:
         problems.append(
             f"{file}: esc: at least one [[esc]] with its port is needed. `kontronik-can-gw init` shows one."
         )
-    escs = []
+    escs: dict[int, EscConfig] = {}
     for number, entry in enumerate(listed, 1):
         named = {"name": f"esc{number}"} | entry
         if (esc := _table(named, EscConfig, f"esc[{number}]", file, problems)) is not None:
-            escs.append(esc)
+            escs[number] = esc
     _check_escs(escs, file, problems)
     if problems:
         raise UserError(*problems)
-    return Config(**cast(Any, made), esc=tuple(escs), file=file)
+    return Config(**cast(Any, made), esc=tuple(escs.values()), file=file)
 
 
 def schema() -> dict[str, Any]:
@@ -268,7 +272,8 @@ def _value(value: Any, f: Field[Any]) -> Any:
         case "bindings" | "ids":
             if not isinstance(value, dict):
                 raise ValueError(f"{value!r} is not a table")
-            return {name: _entry(name, entry, limits) for name, entry in _flat(value).items()}
+            flat = _flat(value) if limits["kind"] == "bindings" else value
+            return {name: _entry(name, entry, limits) for name, entry in flat.items()}
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"{value!r} is not a text")
     choices = limits.get("choices")
@@ -282,14 +287,11 @@ def _value(value: Any, f: Field[Any]) -> Any:
     return value
 
 
-def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
     """``Message.Signal = x`` without quotes is a nested table in TOML: taken as meant."""
     found: dict[str, Any] = {}
     for name, value in table.items():
-        if isinstance(value, dict):
-            found |= _flat(value, f"{prefix}{name}.")
-        else:
-            found[prefix + name] = value
+        found |= {f"{name}.{key}": inner for key, inner in value.items()} if isinstance(value, dict) else {name: value}
     return found
 
 
@@ -299,7 +301,11 @@ def _entry(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
             return _integer(value, limits)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
-    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+    a_text, a_number = (
+        isinstance(value, str) and value.strip(),
+        isinstance(value, (int, float)) and value not in (math.inf, -math.inf),
+    )
+    if isinstance(value, bool) or value != value or not (a_text or a_number):  # nan is not itself
         raise ValueError(f"{name}: {value!r} is neither the name of a source nor a number")
     return value
 
@@ -314,9 +320,15 @@ def _integer(value: Any, limits: Mapping[str, Any]) -> int:
 
 def _ratio(value: Any) -> Fraction:
     try:
-        if isinstance(value, bool):
+        if isinstance(value, str):
+            if not re.fullmatch(_RATIO, value):
+                raise ValueError
+            numerator, _, denominator = value.partition("/")
+            ratio = Fraction(numerator) / Fraction(denominator or 1)
+        elif isinstance(value, bool):
             raise ValueError
-        ratio = Fraction(value) if isinstance(value, str) else Fraction(repr(value))
+        else:
+            ratio = Fraction(repr(value))
     except (ValueError, ZeroDivisionError):
         raise ValueError(f"{value!r} is neither a number nor 'numerator/denominator'") from None
     if not Fraction(1, 1000) <= ratio <= 1000:
@@ -324,22 +336,33 @@ def _ratio(value: Any) -> Fraction:
     return ratio
 
 
-def _check_escs(escs: list[EscConfig], file: str, problems: list[str]) -> None:
+def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -> None:
+    """``escs`` by their number in the file: those with mistakes of their own are missing."""
     names = {normalize(name) for name in sources(EscSettings())}
     for what in ("name", "port"):
         seen: dict[str, int] = {}
-        for number, esc in enumerate(escs, 1):
+        for number, esc in escs.items():
             text = getattr(esc, what)
             key = normalize(text) if what == "name" else text
             if key in seen:
                 problems.append(f"{file}: esc[{number}].{what}: {text!r} is also that of esc[{seen[key]}]")
             seen.setdefault(key, number)
-    for number, esc in enumerate(escs, 1):
+    for number, esc in escs.items():
         key = normalize(esc.name)
-        if any(other.startswith(key) and other.removeprefix(key) in names for other in names):
+        # "max" and "electrical_speed" is "max_electrical_speed"; so is "a_max" beside "a"
+        starts = {"", *(normalize(other.name) for other in escs.values())}
+        rests = {key.removeprefix(start) for start in starts if key.startswith(start) and key != start}
+        if any(other.startswith(rest) and other.removeprefix(rest) in names for rest in rests for other in names):
             problems.append(
                 f"{file}: esc[{number}].name: {esc.name!r} makes signal names ambiguous. Choose another name."
             )
+
+
+def name_problem(names: Sequence[str]) -> str | None:
+    """Why ESCs with these names cannot be told apart; None where they can."""
+    problems: list[str] = []
+    _check_escs({n: EscConfig(port=str(n), name=name) for n, name in enumerate(names, 1)}, "", problems)
+    return problems[0].partition(".name: ")[2] if problems else None
 
 
 def _nearest(name: str, known: Any) -> str:
@@ -357,11 +380,11 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
             entry |= {
                 "anyOf": [
                     {"type": "number", "minimum": 0.001, "maximum": 1000},
-                    {"type": "string", "pattern": r"^\s*\d+(\.\d+)?\s*(/\s*\d+\s*)?$"},
+                    {"type": "string", "pattern": f"^{_RATIO}$"},
                 ]
             }
         case "bindings":
-            value = {"type": ["string", "number"]}
+            value = {"anyOf": [{"type": "string", "pattern": _NOT_BLANK}, {"type": "number"}]}
             entry |= {
                 "type": "object",
                 "additionalProperties": {"anyOf": [value, {"type": "object", "additionalProperties": value}]},
@@ -372,7 +395,7 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
         case kind:
             entry["type"] = kind
             if kind == "string":
-                entry["minLength"] = 1
+                entry["pattern"] = _NOT_BLANK
     if "choices" in limits:
         entry["enum"] = list(limits["choices"])
     if "pattern" in limits:
@@ -401,5 +424,5 @@ def _toml(value: Any) -> str:
     if isinstance(value, Fraction):
         return repr(float(value)) if Fraction(repr(float(value))) == value else f'"{value}"'
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)

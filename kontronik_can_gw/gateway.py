@@ -20,6 +20,8 @@ class Gateway:
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
         self._output = DbcOutput(layout, self.escs, self.status, now, silent_on_loss)
         self._link_changes: list[int] = []
+        self._next_expiry = 0
+        """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
     def start(self, now: int) -> None:
         """The runtime has opened what it could: run."""
@@ -33,6 +35,7 @@ class Gateway:
 
     def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
         """Bytes of one ESC's UART, read at ``now``."""
+        self._expire(now, but=esc)  # a message may hold values of several ESCs
         self._follow(esc, self.escs[esc].receive(data, now), now)
 
     def port_opened(self, esc: int, now: int) -> None:
@@ -45,22 +48,21 @@ class Gateway:
 
     def set_can_state(self, state: CanState, now: int) -> None:
         """What the runtime knows of the CAN controller."""
+        self._expire(now)
         if state is not self.status.can_state:
             self.status.can_state = state
             self._output.on_gateway_change(now)
 
     def advance(self, now: int) -> None:
         """Let time pass: time-outs, cyclic messages."""
-        for index, esc in enumerate(self.escs):
-            if now >= esc.next_deadline():
-                self._follow(index, esc.advance(now), now)
+        self._expire(now)
         self._output.advance(now)
 
     def next_deadline(self) -> int:
         """When ``advance`` is to be called at the latest."""
-        deadlines = [esc.next_deadline() for esc in self.escs]
+        expiry = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
         output = self._output.next_deadline()
-        return min(deadlines) if output is None else min(output, *deadlines)
+        return expiry if output is None else min(output, expiry)
 
     def take_frames(self) -> list[CanFrame]:
         """The frames to send, oldest first; the list is handed over."""
@@ -73,10 +75,20 @@ class Gateway:
         changes, self._link_changes = self._link_changes, []
         return changes
 
+    def _expire(self, now: int, but: int | None = None) -> None:
+        """What is too old by now goes before anything is sent."""
+        if now < self._next_expiry:
+            return
+        for index, esc in enumerate(self.escs):
+            if index != but and now >= esc.next_deadline():
+                self._follow(index, esc.advance(now), now)
+        self._next_expiry = min(esc.next_deadline() for esc in self.escs)
+
     def _follow(self, esc: int, events: int, now: int) -> None:
         if events:
             self._output.on_event(esc, events, now)
         if events & Event.LINK:
+            self._next_expiry = 0
             self._link_changes.append(esc)
             escs_ok = sum(e.up for e in self.escs)
             if escs_ok != self.status.escs_ok:

@@ -91,6 +91,7 @@ class EscTelemetry:
         self._last_power = 0
         self._window_ns = now
         self._window_counters = Counters()
+        self._diagnosis_counters = Counters()  # at the start of the window before
 
     @property
     def counters(self) -> Counters:
@@ -128,8 +129,10 @@ class EscTelemetry:
                 self._arrivals.popleft()
         else:
             self._arrivals.clear()
-        for frame in frames:
-            events |= self._accept(frame, now - (end - frame.offset - frame.form.length) * NS_PER_BYTE)
+        if frames:
+            for frame in frames:
+                events |= self._accept(frame, now - (end - frame.offset - frame.form.length) * NS_PER_BYTE)
+            events |= self._expire(now)  # a frame with many bytes behind it in one read may be old already
         if self.link is LinkState.NEVER_SEEN:
             events |= self._set_link(LinkState.SEARCHING)
         return events
@@ -155,14 +158,16 @@ class EscTelemetry:
 
     def next_deadline(self) -> int:
         """When ``advance`` has something to do."""
-        window = self._window_ns + SECOND
-        if self.live is None or self.live_ns is None:
-            return window
-        return min(window, self.live_ns + self.settings.timeout_ns + 1)
+        deadline = self._window_ns + SECOND
+        if self.live is not None and self.live_ns is not None:
+            deadline = min(deadline, self.live_ns + self.settings.timeout_ns + 1)
+        if self.info_ns is not None:
+            deadline = min(deadline, self.info_ns + INFO_TIMEOUT_NS + 1)
+        return deadline
 
     def diagnosis(self) -> str | None:
-        """Why no frame comes, in words, from the bytes since the last second's start; None while frames come."""
-        return None if self.up else self.counters.diagnosis(self._window_counters)
+        """Why no frame comes, in words, from the bytes of one to two seconds; None while frames come."""
+        return None if self.up else self.counters.diagnosis(self._diagnosis_counters)
 
     def _accept(self, frame: Frame, when: int) -> int:
         layout = 1 if frame.layout is Layout.V4 else 2
@@ -181,11 +186,13 @@ class EscTelemetry:
             return events | Event.INFO
         if frame.suspect:
             self.suspect_frames += 1
-        if self.live_ns is not None and self.live is not None:
-            elapsed = when - self.live_ns
-            self.energy += max(0, self._last_power) * elapsed
-            if self.live.electrical_speed:
-                self.run_time += elapsed
+        if self.live_ns is not None:
+            when = max(when, self.live_ns)  # a pseudo terminal is faster than the wire
+            if self.live is not None:
+                elapsed = when - self.live_ns
+                self.energy += max(0, self._last_power) * elapsed
+                if self.live.electrical_speed:
+                    self.run_time += elapsed
         self._last_power = data.battery_voltage * data.battery_current
         self.live = data
         self.live_ns = when
@@ -193,7 +200,7 @@ class EscTelemetry:
             events |= self._set_link(LinkState.OK)
             self.frame_rate = None
             self._window_ns = when
-            self._window_counters = self.counters.copy()
+            self._window_counters = self._diagnosis_counters = self.counters.copy()
         return events | Event.LIVE
 
     def _forget_device(self) -> None:
@@ -235,6 +242,7 @@ class EscTelemetry:
         dropped, received = new.dropped_bytes - old.dropped_bytes, new.bytes - old.bytes
         bad = new.crc_errors - old.crc_errors >= _DEGRADED_CRC_ERRORS or dropped * _DEGRADED_DROPPED_SHARE > received
         self._window_ns = now
+        self._diagnosis_counters = old
         self._window_counters = new.copy()
         if self.up:
             return self._set_link(LinkState.DEGRADED if bad else LinkState.OK)

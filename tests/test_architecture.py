@@ -12,7 +12,9 @@ NAME = "kontronik_can_gw"
 # A room may import those before it, and itself.
 ORDER = (
     ("protocol",),
-    ("errors", "frames"),
+    ("errors",),
+    ("frames",),
+    ("lean",),
     ("telemetry",),
     ("sources",),
     ("dbc_output",),
@@ -25,7 +27,13 @@ ORDER = (
 EDGE = ("runtime", "offline", "cli")
 BLOCKING = {"time", "asyncio", "threading", "socket", "selectors", "select", "subprocess", "os", "signal"}
 ONLY_IN = {
-    "cantools": ("dbc_output/layout.py", "dbc_output/expand.py", "dbc_output/prepare.py", "cli"),
+    "cantools": (
+        "dbc_output/layout.py",
+        "dbc_output/expand.py",
+        "dbc_output/prepare.py",
+        "dbc_output/writer.py",
+        "cli",
+    ),
     "serial": ("runtime",),
     "can": ("runtime", "cli/demo.py", "offline"),
     "rich": ("cli",),
@@ -116,6 +124,17 @@ def test_the_run_path_imports_nothing_heavy() -> None:
     code = (
         "import sys; import kontronik_can_gw.cli.run, kontronik_can_gw.gateway, kontronik_can_gw.runtime.loop; "
         "print([m for m in ('rich', 'canopen', 'cantools', 'can', 'asyncio', 'jsonschema') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_what_runs_does_not_import_asammdf() -> None:
+    code = (
+        "import sys; from pathlib import Path; from kontronik_can_gw.config import CanConfig, shipped; "
+        "from kontronik_can_gw.dbc_output.layout import load_database; from kontronik_can_gw.runtime.can_port import CanPort; "
+        "load_database(shipped('dbc/kontronik_esc.dbc')); CanPort(CanConfig('virtual', 'x')).close(); "
+        "print([m for m in ('asammdf', 'numpy', 'pandas', 'rich', 'canopen') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

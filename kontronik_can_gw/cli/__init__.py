@@ -4,6 +4,7 @@ Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data
 """
 
 import argparse
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -44,13 +45,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(words)
     try:
         code: int = args.main(args)
-        sys.stdout.flush()
+        if sys.stdout is not None:  # None where it was closed, as by `>&-`
+            sys.stdout.flush()
     except UserError as error:
         for problem in error.problems:
             print(f"kontronik-can-gw {args.command}: {problem}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is buffered has nowhere to go
+        print(f"kontronik-can-gw {args.command}: standard output: cannot be written: {error.strerror}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

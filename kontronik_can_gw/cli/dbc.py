@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from kontronik_can_gw.cli.common import load_all, say
-from kontronik_can_gw.config import shipped
+from kontronik_can_gw.config import name_problem, shipped
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.telemetry import EscSettings
 
@@ -72,8 +72,8 @@ def _database(args: argparse.Namespace):  # type: ignore[no-untyped-def]  # cant
     if names and len(names) != count:
         raise UserError(f"--name is given {len(names)} times for {count} ESCs")
     names = names or [f"esc{number}" for number in range(1, count + 1)]
-    if len({name.casefold() for name in names}) != len(names):
-        raise UserError(f"--name: the names are not all different: {', '.join(names)}")
+    if problem := name_problem(names):
+        raise UserError(f"--name: {problem}")
     escs = [EscSettings(name) for name in names]
     file = args.source or shipped("dbc/kontronik_esc.dbc")
     database = load_database(file)
@@ -86,16 +86,26 @@ def _database(args: argparse.Namespace):  # type: ignore[no-untyped-def]  # cant
 
 
 def _write(path: Path, text: str) -> None:
-    """All or nothing: a reader never sees half a file."""
+    """All or nothing: a reader never sees half a file. What is no plain file (a pipe, /dev/stdout) is written to, not replaced."""
+    beside: Path | None = None
     try:
+        target = path.resolve()
+        if target.exists() and not target.is_file():
+            target.write_text(text, encoding="utf-8", newline="")
+            return
         with tempfile.NamedTemporaryFile(
-            "w", dir=path.parent, prefix=f".{path.name}.", delete=False, encoding="utf-8", newline=""
+            "w", dir=target.parent, prefix=f".{path.name}.", delete=False, encoding="utf-8", newline=""
         ) as file:
+            beside = Path(file.name)
             file.write(text)
-        Path(file.name).chmod(0o644)
-        Path(file.name).replace(path)
+        beside.chmod(0o644)
+        beside.replace(target)
+        beside = None
     except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror}") from None
+        raise RunError(f"{path}: cannot be written: {error.strerror}. Give another -o.") from None
+    finally:
+        if beside is not None:
+            beside.unlink(missing_ok=True)
 
 
 def _count(text: str) -> int:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.lean import without_asammdf
 
 if TYPE_CHECKING:
     import can
@@ -106,7 +107,8 @@ class Logger:
 
 
 def main(args: argparse.Namespace) -> int:
-    import can
+    with without_asammdf():
+        import can
 
     from kontronik_can_gw.cli.common import layout_of
     from kontronik_can_gw.config import parse

@@ -1,18 +1,22 @@
-"""A one-ESC DBC -> the DBC of several ESCs: names prefixed, ids moved, nothing lost. Also the only place that writes a DBC."""
+"""A one-ESC DBC -> the DBC of several ESCs: names prefixed, ids moved, nothing lost."""
 
 import re
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc_output.layout import Binder, is_one_esc_layout
+from kontronik_can_gw.dbc_output.writer import dbc_text, frame_id
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.sources import Group
 from kontronik_can_gw.telemetry import EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
+    from cantools.database.can.formats.dbc import DbcSpecifics
 
+__all__ = ["dbc_text", "esc_prefix", "expand", "needs_expansion"]
 _NAME_LIMIT = 32
 
 
@@ -22,10 +26,10 @@ def esc_prefix(name: str) -> str:
 
 
 def needs_expansion(
-    database: "Database", node: str, escs: Sequence[EscSettings], bind: Mapping[str, str | float]
+    database: "Database", node: str, escs: Sequence[EscSettings], bind: Mapping[str, str | float] | None = None
 ) -> bool:
     """True for several ESCs and a DBC that describes one."""
-    return len(escs) > 1 and is_one_esc_layout(database, node, Binder(escs, bind))
+    return len(escs) > 1 and is_one_esc_layout(database, node, Binder(escs, bind or {}))
 
 
 def expand(
@@ -53,8 +57,9 @@ def expand(
     taken = {(m.frame_id + (shift if m in ours else 0), m.is_extended_frame) for m in once}
     step = _step([(m.frame_id + shift, m.is_extended_frame) for m in per_esc], taken, len(escs), id_step, file)
     messages: list[Message] = []
+    moved: dict[int, list[tuple[int, dict[str, str]]]] = {}
     problems: list[str] = []
-    out_bind: dict[str, str | float] = {k: v for k, v in bind.items() if "." not in k}
+    out_bind = dict(bind)  # what is left of it belongs to no signal, which the compiler reports
     for message in database.messages:
         copies = enumerate(escs) if message in per_esc else [(0, None)]
         for index, esc in copies:
@@ -70,14 +75,16 @@ def expand(
                 _rename(copy, esc_prefix(esc.name), problems, file)
             for old, new in zip(message.signals, copy.signals, strict=True):
                 for key in (f"{message.name}.{old.name}", old.name):
-                    if key in bind:
+                    if key in bind and message in ours:
                         value = bind[key]
-                        out_bind.pop(old.name, None)
+                        out_bind.pop(key, None)
                         if esc is not None and isinstance(value, str):
                             value = f"{esc.name}.{value}"
                         out_bind[f"{copy.name}.{new.name}"] = value
                         break
             messages.append(copy)
+            names = {old.name: new.name for old, new in zip(message.signals, copy.signals, strict=True)}
+            moved.setdefault(frame_id(message), []).append((frame_id(copy), names))
     if problems:
         raise UserError(*problems)
     result = cantools.database.can.Database(
@@ -85,21 +92,31 @@ def expand(
         nodes=database.nodes,
         buses=database.buses,
         version=database.version,
-        dbc_specifics=database.dbc,
+        dbc_specifics=_relations(database.dbc, moved),
         strict=False,
         sort_signals=None,
     )
     return result, out_bind
 
 
-def dbc_text(database: "Database") -> str:
-    """The database as DBC text by the rules that every tool reads: empty NS_, LF, signals in the order of their bits."""
-    text = database.as_dbc_string(
-        sort_signals=lambda signals: sorted(signals, key=lambda s: s.start), shorten_long_names=False
-    )
-    text = text.replace("\r\n", "\n")
-    text = re.sub(r"^NS_ ?:[^\n]*\n(?:\t[^\n]*\n)*", "NS_ :\n", text, count=1, flags=re.MULTILINE)
-    return re.sub(r"\n{3,}", "\n\n", text).strip("\n") + "\n"
+def _relations(
+    specifics: "DbcSpecifics | None", moved: Mapping[int, list[tuple[int, dict[str, str]]]]
+) -> "DbcSpecifics | None":
+    """Attributes of relations (BA_REL_) point at messages and signals by id and name: they go with each copy."""
+    specifics = deepcopy(specifics)
+    relations = specifics.relation_attributes if specifics is not None else None
+    if relations is not None:
+        signals, messages = relations.node_signal_relations, relations.node_message_relations
+        old_signals, old_messages = dict(signals), dict(messages)
+        signals.clear()
+        messages.clear()
+        for number, by_signal in old_signals.items():
+            for new, names in moved.get(number, [(number, {})]):
+                signals[new] = OrderedDict((names.get(name, name), nodes) for name, nodes in by_signal.items())
+        for number, by_node in old_messages.items():
+            for new, _ in moved.get(number, [(number, {})]):
+                messages[new] = by_node
+    return specifics
 
 
 def _speaks_of_an_esc(message: "Message", bind: dict[str, str | float]) -> bool:
@@ -117,8 +134,8 @@ def _step(
 ) -> int:
     if not ids:
         return 0
-    span = max(i for i, _ in ids) - min(i for i, _ in ids) + 1
-    for step in [wanted] if wanted is not None else range(1, span + 2):
+    every = [i for i, _ in ids] + [i for i, _ in taken]
+    for step in [wanted] if wanted is not None else range(1, max(every) - min(every) + 2):
         moved = [(i + n * step, extended) for i, extended in ids for n in range(count)]
         if len(set(moved)) == len(moved) and not taken & set(moved):
             return step

@@ -6,6 +6,8 @@ limits, value tables and timing come from the file and from nowhere else.
 
 import difflib
 import math
+import struct
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, Flag
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kontronik_can_gw.dbc_output import units
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.sources import Group, Source, sources
 from kontronik_can_gw.telemetry import MS, EscSettings
 
@@ -191,7 +194,8 @@ def normalize(name: str) -> str:
 
 def load_database(path: Path) -> "Database":
     """Read a DBC file. UserError with one line for a file that cannot be read or is no DBC."""
-    import cantools.database
+    with without_asammdf():
+        import cantools.database
 
     try:
         raw = path.read_bytes()
@@ -296,16 +300,16 @@ class Binder:
 
 
 def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
-    """True if signals of ours mean an ESC's values, and none says of which ESC."""
-    escs = set()
+    """True if a signal of ours means an ESC's value without saying which ESC."""
     for message in database.messages:
         if node in message.senders:
             for signal in message.signals:
                 bound = binder.bound(message.name, signal.name)
-                found = binder.by_name(bound if isinstance(bound, str) else signal.name)
-                if found and found[0].group is not Group.GATEWAY:
-                    escs.add(found[1])
-    return escs == {None}
+                name = bound if isinstance(bound, str) else signal.name
+                found = binder.by_name(name)
+                if found and found[1] is None and found[0].group is not Group.GATEWAY:
+                    return True
+    return False
 
 
 def compile_layout(
@@ -350,14 +354,22 @@ class _Compiler:
         self.warnings: list[str] = []
 
     def check_ids(self, ours: Sequence["Message"], taken: Mapping[int, str]) -> None:
-        seen: dict[tuple[int, bool], str] = {}
+        mine = {id(message) for message in ours}
+        ids: dict[tuple[int, bool], Message] = {}
+        names: dict[str, Message] = {}
         for message in self.database.messages:
-            key = (message.frame_id, message.is_extended_frame)
-            other = seen.setdefault(key, message.name)
-            if other != message.name and (message in ours or any(m.name == other for m in ours)):
+            other = ids.setdefault((message.frame_id, message.is_extended_frame), message)
+            if other is not message and mine & {id(message), id(other)}:
                 self.problems.append(
-                    f"{self.file}: {message.name}: id {message.frame_id:X}h is also that of {other}. Change one of them."
+                    f"{self.file}: {message.name}: id {message.frame_id:X}h is also that of {other.name}. Change one of them."
                 )
+            other = names.setdefault(message.name, message)
+            if other is not message and mine & {id(message), id(other)}:
+                self.problems.append(f"{self.file}: {message.name}: two messages have this name. Rename one of them.")
+            if id(message) in mine:
+                counted = Counter(signal.name for signal in message.signals)
+                for name in (name for name, count in counted.items() if count > 1):
+                    self.problems.append(f"{self.file}: {message.name}.{name}: two signals have this name. Rename one.")
         for message in ours:
             if not message.is_extended_frame and message.frame_id in taken:
                 self.problems.append(
@@ -392,6 +404,15 @@ class _Compiler:
                 if (plan := self._signal(message, signal, page)) is not None:
                     signals.append(plan)
         self._check_overlap(message, where)
+        for multiplexer in multiplexers:
+            room = (1 << multiplexer.length - (1 if multiplexer.is_signed else 0)) if not multiplexer.is_float else 0
+            for page in sorted(p for p in pages if p >= room):
+                self.problems.append(f"{where}.{multiplexer.name}: cannot hold the multiplexer value {page} (m{page}).")
+        for paged in signals:
+            if paged.page is not None and paged.role in (Role.ALIVE, Role.CRC):
+                self.problems.append(
+                    f"{where}.{paged.name}: is a multiplexed {paged.role.value}; it has to be in every frame. Take the m{paged.page} away."
+                )
         crcs = [s for s in signals if s.role is Role.CRC]
         if len(crcs) > 1:
             self.problems.append(f"{where}: has several CRC signals: {', '.join(s.name for s in crcs)}. Keep one.")
@@ -428,7 +449,7 @@ class _Compiler:
                 if float(value) < 0:
                     raise ValueError
                 return round(float(value))
-            except ValueError:
+            except (ValueError, OverflowError):
                 self.problems.append(f"{where}: {name} is {value!r}, which is no time in ms.")
                 return 0
 
@@ -470,19 +491,30 @@ class _Compiler:
         if is_float and length not in (32, 64):
             self.problems.append(f"{where}: a float of {length} bits cannot be sent; 32 and 64 can.")
             return None
+        told = (signal.scale, signal.offset, signal.minimum or 0, signal.maximum or 0)
+        if not all(math.isfinite(number) for number in told):
+            self.problems.append(f"{where}: has a factor, offset or limit that is no finite number.")
+            return None
         factor, offset = _exact(signal.scale), _exact(signal.offset)
         if factor == 0:
             self.problems.append(f"{where}: has factor 0.")
             return None
         codes = {normalize(str(text)): int(raw) for raw, text in (signal.choices or {}).items()}
         low, high = (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        wide = [f"{raw} {str(text)!r}" for raw, text in (signal.choices or {}).items() if not low <= int(raw) <= high]
+        if wide and not is_float:
+            self.problems.append(
+                f"{where}: cannot hold {', '.join(wide)} of its value table; its values are {low} to {high}."
+            )
+            return None
         start = attribute(signal, "GenSigStartValue", self.database)
         not_available = next((codes[t] for t in codes if t in _NOT_AVAILABLE_TEXTS), None)
         error = next((codes[t] for t in codes if t in _ERROR_TEXTS), None)
         if not_available is None:
             start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
-            if start_is_set and start is not None and float(start).is_integer() and low <= float(start) <= high:
-                not_available = int(float(start))
+            usable = start_is_set and isinstance(start, (int, float)) and math.isfinite(start) and start == int(start)
+            if usable and low <= start <= high:
+                not_available = int(start)
             else:
                 not_available = low if signed else high
         if error is None:
@@ -517,17 +549,19 @@ class _Compiler:
             return SignalPlan(role=Role.MULTIPLEXER, **base)
         bound = self.binder.bound(message.name, signal.name)
         if isinstance(bound, (int, float)):
-            raw = (_exact(bound) - offset) / factor
-            if not (raw.denominator == 1 and (-(1 << length - 1) if signed else 0) <= raw < 1 << length):
+            constant = _constant(bound, factor, offset, length, signed, is_float)
+            if constant is None:
                 self.problems.append(f"{where}: the constant {bound} bound to it cannot be sent exactly.")
                 return None
-            return SignalPlan(role=Role.CONSTANT, constant=int(raw), **base)
+            return SignalPlan(role=Role.CONSTANT, constant=constant, **base)
         name = signal.name if bound is None else bound
         found = self.binder.by_name(name)
         key = normalize(name)
         if found is None and key.endswith(_ALIVE_ENDINGS):
-            if is_float or length < 2:
-                self.problems.append(f"{where}: an alive counter needs a whole number of 2 bits or more.")
+            if is_float or base["low"] > 0 or base["high"] < 2:
+                self.problems.append(
+                    f"{where}: an alive counter needs a whole number of 2 bits or more that begins at 0."
+                )
                 return None
             return SignalPlan(role=Role.ALIVE, **base)
         if found is None and key.endswith(_CRC_ENDINGS):
@@ -594,7 +628,7 @@ class _Compiler:
                     text = f"{_number(low * factor + offset)} to {_number(high * factor + offset)} {signal.unit or ''}".rstrip()
                     notes.append(f"range {text}, beyond it Error")
         if source.rolls:
-            if slope != 1 or intercept != 0 or low != 0:
+            if slope != 1 or intercept != 0 or low != 0 or high < 1 or signal.is_float:
                 self.problems.append(
                     f"{where}: {source.name} is a counter; it needs factor 1, offset 0 and a minimum of 0."
                 )
@@ -615,6 +649,22 @@ class _Compiler:
 def _exact(number: Any) -> Fraction:
     """The decimal that stands in the file, not the float nearest to it."""
     return Fraction(repr(number)) if isinstance(number, float) else Fraction(number)
+
+
+def _constant(
+    value: float, factor: Fraction, offset: Fraction, length: int, signed: bool, is_float: bool
+) -> int | None:
+    """The raw bits of a constant physical value; None where the signal cannot hold it (a float: within its precision)."""
+    if not math.isfinite(value):
+        return None
+    raw = (_exact(value) - offset) / factor
+    if is_float:
+        try:
+            return int.from_bytes(struct.pack("<f" if length == 32 else "<d", float(raw)), "little")
+        except OverflowError:
+            return None
+    low, high = (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+    return int(raw) if raw.denominator == 1 and low <= raw <= high else None
 
 
 def _number(value: Fraction) -> str:

@@ -4,6 +4,7 @@ Python source is generated from the plan once, at start. A value that does not f
 available its NotAvailable code; nothing wraps, nothing is clipped. Bit 0 of the integer is bit 0 of byte 0.
 """
 
+import math
 import struct
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -73,7 +74,7 @@ def source_text(plan: MessagePlan) -> str:
 
 def compile_pack(plan: MessagePlan) -> Pack:
     """The function of ``source_text``, compiled."""
-    names: dict[str, object] = {"float_bits": float_bits}
+    names: dict[str, object] = {"float_bits": float_bits, "nan": math.nan}
     exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
     return names["pack"]  # type: ignore[return-value]
 
@@ -140,6 +141,9 @@ def _value(signal: SignalPlan) -> list[str]:
     source = signal.source
     assert source is not None
     expression = source.expression if source.bit is None else f"{source.expression} >> {source.bit} & 1"
+    if signal.is_float and signal.numbers is not None:
+        table = f"{_table_name(signal)}.get({expression}, nan)"
+        return [f"v = float_bits({table}, {signal.length})", f"bits |= {_placed(signal)}"]
     if signal.is_float:
         slope, intercept = float(signal.slope), float(signal.intercept)
         scaled = f"({expression}) * {slope!r} + {intercept!r}"

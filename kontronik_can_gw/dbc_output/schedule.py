@@ -20,8 +20,9 @@ class Schedule:
         self._last = [_NEVER] * len(plans)
         self._waiting = [False] * len(plans)
         self._heap = [
-            (now + phase, index, True) for index, phase in enumerate(phases(self._cycle)) if self._cycle[index]
+            (now + phase, index, False) for index, phase in enumerate(phases(self._cycle)) if self._cycle[index]
         ]
+        """(when, message, True for a request that had to wait): of one instant and message the cycle comes first."""
         heapq.heapify(self._heap)
 
     def request(self, index: int, now: int) -> bool:
@@ -29,10 +30,11 @@ class Schedule:
         earliest = self._last[index] + self._delay[index]
         if now >= earliest:
             self._last[index] = now
+            self._waiting[index] = False  # this frame is the one that was waited for
             return True
         if not self._waiting[index]:
             self._waiting[index] = True
-            heapq.heappush(self._heap, (earliest, index, False))
+            heapq.heappush(self._heap, (earliest, index, True))
         return False
 
     def due(self, now: int) -> list[tuple[int, bool]]:
@@ -43,14 +45,16 @@ class Schedule:
         found: list[tuple[int, bool]] = []
         heap = self._heap
         while heap and heap[0][0] <= now:
-            when, index, cyclic = heap[0]
-            if cyclic:
+            when, index, waited = heap[0]
+            if not waited:
                 cycle = self._cycle[index]
-                heapq.heapreplace(heap, (when + cycle * ((now - when) // cycle + 1), index, True))
+                heapq.heapreplace(heap, (when + cycle * ((now - when) // cycle + 1), index, False))
                 if self.request(index, now):
                     found.append((index, True))
             else:
                 heapq.heappop(heap)
+                if not self._waiting[index]:
+                    continue
                 self._waiting[index] = False
                 if self.request(index, now):
                     found.append((index, False))

@@ -79,6 +79,12 @@ class Counters:
     def dropped_bytes(self) -> int:
         return self.dropped_noise + self.dropped_crc + self.dropped_unknown_kind + self.dropped_incomplete
 
+    @property
+    def pending(self) -> int:
+        """Bytes that are not decided yet; four or more begin with KODL or KODI."""
+        in_frames: int = sum(form.length * getattr(self, name) for form, name in _FRAME_COUNTER.items())
+        return self.bytes - self.dropped_bytes - in_frames
+
     def as_dict(self) -> dict[str, int]:
         """All counters and totals by name."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -99,7 +105,7 @@ class Counters:
             )
         if self.crc_errors > old.crc_errors:
             return "headers but no valid CRC: noise on the line, bytes lost, or another revision of the protocol"
-        if self.headers > old.headers:
+        if self.headers > old.headers or self.pending >= 4:
             return "a header but no whole frame yet"
         if self.unknown_kinds > old.unknown_kinds:
             return "KOD frames of unknown kind: a newer protocol?"
@@ -154,6 +160,7 @@ class Deframer:
         counters = self.counters
         size = len(buffer)
         at = 0
+        self._need = 1
         while True:
             start = buffer.find(_PREFIX, at)
             if start < 0:
@@ -162,17 +169,15 @@ class Deframer:
                     tail = buffer[max(at, size - 2) :]
                     keep = 2 if tail == b"KO" else 1 if tail.endswith(b"K") else 0
                 self._drop(buffer, at, size - keep)
-                at, self._need = size - keep, 4 - keep if keep else 1
+                at = size - keep
                 break
             self._drop(buffer, at, start)
             at = start
             have = size - at
             if have < 4:
-                if not ended:
-                    self._need = 4 - have
-                    break
-                self._drop(buffer, at, size, "dropped_incomplete")
-                at = size
+                if ended:
+                    self._drop(buffer, at, size, "dropped_incomplete")
+                    at = size
                 break
             forms = FORMS_BY_KIND_BYTE.get(buffer[at + 3])
             if forms is None:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.sources import CanState
 
 if TYPE_CHECKING:
@@ -142,7 +143,8 @@ class CanPort:
 
 
 def _open(config: CanConfig) -> "can.BusABC":
-    import can
+    with without_asammdf():
+        import can
 
     if config.interface not in can.VALID_INTERFACES:
         near = difflib.get_close_matches(config.interface, can.VALID_INTERFACES, n=1)

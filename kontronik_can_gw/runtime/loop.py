@@ -145,6 +145,9 @@ class Loop:
         for fd in (self._wake_read, self._wake_write):
             with contextlib.suppress(OSError):
                 os.close(fd)
+        self._wake_read = (
+            self._wake_write
+        ) = -1  # ``stop`` may still come: it must not write to a descriptor of another's
 
     def _next_deadline(self) -> int:
         due = [self.gateway.next_deadline()]

@@ -82,7 +82,7 @@ def _open_quietly(path: str) -> int:
         termios.tcflush(fd, termios.TCOFLUSH)
     except termios.error:
         os.close(fd)
-        raise RunError(f"{path}: is not a serial port") from None
+        raise RunError(f"{path}: is not a serial port. Name the adapter's: see `ls /dev/serial/by-id`.") from None
     return fd
 
 
@@ -110,9 +110,13 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
         )
         return RunError(f"{path}: no such serial port. {there}")
     if number == errno.EACCES:
-        group = "dialout"
+        group, shared = "dialout", True
         with contextlib.suppress(OSError, KeyError):
-            group = grp.getgrgid(Path(path).stat().st_gid).gr_name
+            status = Path(path).stat()
+            shared = status.st_mode & 0o060 == 0o060
+            group = grp.getgrgid(status.st_gid).gr_name
+        if not shared:  # to join the group would not help
+            return RunError(f"{path}: permission denied, to its group {group} too: sudo chmod g+rw {path}.")
         return RunError(
             f"{path}: permission denied. Join its group: sudo usermod -aG {group} $USER, then log in again."
         )

@@ -283,7 +283,7 @@ def recorded(path: Path, moments: list[dict[str, dict[str, int]]]) -> Any:
 
 
 def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path) -> None:
-    import numpy
+    import numpy as np
 
     choice = random.Random(2)
     db = layout()
@@ -304,7 +304,7 @@ def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path) -> None:
                 assert [text.decode() for text in seen.samples] == [table[number] for number in sent]
             else:
                 expected = [float("nan") if number in table else float(number * signal.factor) for number in sent]
-                numpy.testing.assert_allclose(seen.samples.astype(float), expected, rtol=1e-12, err_msg=signal.name)
+                np.testing.assert_allclose(seen.samples.astype(float), expected, rtol=1e-12, err_msg=signal.name)
                 assert (seen.samples.dtype.kind == "f") == bool(table), signal.name
     assert {"V", "A", "degC", "us", "%", "1/min"} <= units
     decoded.close()

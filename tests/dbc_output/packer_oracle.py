@@ -63,11 +63,30 @@ class Known:
 STATES = dict(
     zip(
         (1, 2, 3, 7, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26),
-        (
-            "WaitForSignal WaitForMotorOff WaitForMotorOn Selftest Error_Selftest CutOffDuringOperation AcousticSignal MotorOff "
-            "StandBy Brake BrakeTargetBackward BrakeTargetForward Programming Sync_Forward Sync_Backward Sync_StandBy Forward "
-            "Backward SpoolUpFromStill SpoolUpFromTurn SpoolUpQuick RPMControl"
-        ).split(),
+        [
+            "WaitForSignal",
+            "WaitForMotorOff",
+            "WaitForMotorOn",
+            "Selftest",
+            "Error_Selftest",
+            "CutOffDuringOperation",
+            "AcousticSignal",
+            "MotorOff",
+            "StandBy",
+            "Brake",
+            "BrakeTargetBackward",
+            "BrakeTargetForward",
+            "Programming",
+            "Sync_Forward",
+            "Sync_Backward",
+            "Sync_StandBy",
+            "Forward",
+            "Backward",
+            "SpoolUpFromStill",
+            "SpoolUpFromTurn",
+            "SpoolUpQuick",
+            "RPMControl",
+        ],
         strict=True,
     )
 )
@@ -77,19 +96,53 @@ LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
 GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay")))
 CAN_STATES = dict(enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down")))
 
-ERROR_BITS = (
-    "undervoltage overvoltage overcurrent_integral_error overcurrent_integral_warning power_stage_overtemp_warning "
-    "power_stage_overtemp_error bec_undervoltage bec_overvoltage bec_overcurrent bec_overtemperature "
-    "switched_off_by_running_down capacity_limit_reached operating_error_found operating_warning_found selftest_error "
-    "eeprom_error watchdog_error_tripped programming_allowed limit_battery_voltage_minimum limit_current_maximum "
-    "limit_power_stage_temperature limit_bec_temperature limit_bec_current limit_discharged_capacity"
-).split()
-TEST_BITS = (
-    "test_phase_low_side test_phase_high_side test_short_to_ground test_back_emf_offset test_current_zero_point "
-    "test_undervoltage test_overvoltage test_bec_undervoltage test_bec_overvoltage test_reverse_polarity_fuse "
-    "test_overvoltage_fuse test_power_stage_overtemp test_bec_overtemperature test_motor_phase_missing test_eeprom_empty "
-    "test_eeprom_stick_positions test_eeprom_checksum test_eeprom_size test_eeprom_version"
-).split()
+ERROR_BITS = [
+    "undervoltage",
+    "overvoltage",
+    "overcurrent_integral_error",
+    "overcurrent_integral_warning",
+    "power_stage_overtemp_warning",
+    "power_stage_overtemp_error",
+    "bec_undervoltage",
+    "bec_overvoltage",
+    "bec_overcurrent",
+    "bec_overtemperature",
+    "switched_off_by_running_down",
+    "capacity_limit_reached",
+    "operating_error_found",
+    "operating_warning_found",
+    "selftest_error",
+    "eeprom_error",
+    "watchdog_error_tripped",
+    "programming_allowed",
+    "limit_battery_voltage_minimum",
+    "limit_current_maximum",
+    "limit_power_stage_temperature",
+    "limit_bec_temperature",
+    "limit_bec_current",
+    "limit_discharged_capacity",
+]
+TEST_BITS = [
+    "test_phase_low_side",
+    "test_phase_high_side",
+    "test_short_to_ground",
+    "test_back_emf_offset",
+    "test_current_zero_point",
+    "test_undervoltage",
+    "test_overvoltage",
+    "test_bec_undervoltage",
+    "test_bec_overvoltage",
+    "test_reverse_polarity_fuse",
+    "test_overvoltage_fuse",
+    "test_power_stage_overtemp",
+    "test_bec_overtemperature",
+    "test_motor_phase_missing",
+    "test_eeprom_empty",
+    "test_eeprom_stick_positions",
+    "test_eeprom_checksum",
+    "test_eeprom_size",
+    "test_eeprom_version",
+]
 
 JIVEPRO = 3
 
@@ -313,7 +366,7 @@ class Sig:
         low, high = self.range
         factor, offset = Fraction(self.factor), Fraction(self.offset)
         least, most = Fraction(self.minimum), Fraction(self.maximum)
-        if (least, most) != (0, 0):
+        if least or most:
             ends = sorted(((least - offset) / factor, (most - offset) / factor))
             low, high = max(low, math.ceil(ends[0])), min(high, math.floor(ends[1]))
         codes = {self.code("NotAvailable"), self.code("Error")}
@@ -392,7 +445,7 @@ class Msg:
     @property
     def pages(self) -> list[int | None]:
         pages: set[int] = {int(s.mux[1:]) for s in self.signals if s.mux.startswith("m")}
-        return sorted(pages) if pages else [None]
+        return [*sorted(pages)] if pages else [None]
 
     def page_of(self, number: int | None) -> list[Sig]:
         """The signals that stand in a frame of this page."""

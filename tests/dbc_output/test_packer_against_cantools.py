@@ -159,7 +159,7 @@ def test_the_oracle_knows_every_source_and_no_other() -> None:
 
 def test_the_oracle_says_the_same_units() -> None:
     for name, source in all_sources(ESCS[0]).items():
-        assert conversion(source.unit, KNOWN[name].unit) == (1, 0), name
+        assert conversion(source.unit, KNOWN[name].unit) == (Fraction(1), Fraction(0)), name
 
 
 # --- each source alone, each unit alone ---------------------------------------------------------------------------------

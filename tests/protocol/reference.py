@@ -113,7 +113,7 @@ def counters_of(stream: bytes) -> dict[str, int]:
         count[f"{frame.kind}_{frame.layout}"] += 1
         count["headers"] += 1
     for begin, end in _gaps(size, found):
-        failed_until = incomplete_until = unknown_until = begin
+        failed_until = incomplete_until = unknown_until = cut_until = begin
         for at in range(begin, end):
             header = stream[at : at + 4]
             if header in LONGEST_OF:
@@ -126,14 +126,16 @@ def counters_of(stream: bytes) -> dict[str, int]:
             elif header[:3] == b"KOD" and len(header) == 4:
                 count["unknown_kinds"] += 1
                 unknown_until = at + 3
-            elif header == b"KOD" and at >= failed_until:
-                incomplete_until = size
+            elif header == b"KOD":
+                cut_until = size
             if at < incomplete_until:
                 count["dropped_incomplete"] += 1
             elif at < failed_until:
                 count["dropped_crc"] += 1
             elif at < unknown_until:
                 count["dropped_unknown_kind"] += 1
+            elif at < cut_until:
+                count["dropped_incomplete"] += 1
             else:
                 count["dropped_noise"] += 1
             count["long_run_bytes"] += stream[at] in LONG_RUNS

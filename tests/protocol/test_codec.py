@@ -324,6 +324,14 @@ def test_a_frame_is_found_only_where_it_stands_and_only_whole(row: FormRow) -> N
         assert find_form(frame[:size]) is None
 
 
+@form_rows
+def test_a_frame_without_its_last_byte_is_no_frame_even_where_that_byte_is_zero(row: FormRow) -> None:
+    source = random.Random(12)
+    frame = next(frame for frame in iter(lambda: reference.random_frame(row, source), b"") if frame.endswith(b"\0"))
+    assert find_form(frame) is form_of(row)
+    assert find_form(frame[:-1]) is None
+
+
 @pytest.mark.parametrize("kind", ["live", "info"])
 def test_where_both_layouts_fit_the_shorter_is_taken(kind: str) -> None:
     frame = reference.ambiguous(kind)

@@ -1,0 +1,609 @@
+"""The configuration: each key, each kind of mistake, the shipped example, the JSON Schema against the parser."""
+
+import json
+import math
+import re
+import tomllib
+from copy import deepcopy
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+import kontronik_can_gw
+from kontronik_can_gw.config import Config, as_toml, load, parse, schema, shipped
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.telemetry import MS
+
+EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
+TABLES: dict[str, tuple[str, ...]] = {
+    "can": ("interface", "channel", "bitrate", "fd", "data_bitrate"),
+    "dbc": ("file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids"),
+    "run": ("wait_for_devices",),
+    "esc": ("port", "name", "pole_pairs", "gear", "cell_count", "telemetry_timeout_ms"),
+}
+DEFAULTS: dict[str, dict[str, object]] = {
+    "can": {"interface": "socketcan", "channel": "can0", "bitrate": 500_000, "fd": False, "data_bitrate": 2_000_000},
+    "dbc": {"file": "shipped", "node": None, "on_loss": "not_available", "base_id": None, "id_step": None}
+    | {"bind": {}, "e2e_data_ids": {}},
+    "run": {"wait_for_devices": False},
+    "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250},
+}
+RANGES = {
+    ("can", "bitrate"): (10_000, 1_000_000),
+    ("can", "data_bitrate"): (10_000, 8_000_000),
+    ("dbc", "base_id"): (0, 0x1FFFFFFF),
+    ("dbc", "id_step"): (1, 0x1FFFFFFF),
+    ("esc", "pole_pairs"): (1, 100),
+    ("esc", "cell_count"): (0, 255),
+    ("esc", "telemetry_timeout_ms"): (20, 60_000),
+}
+STRINGS = [("can", "interface"), ("can", "channel"), ("dbc", "file"), ("dbc", "node"), ("esc", "port")]
+BOOLEANS = [("can", "fd"), ("run", "wait_for_devices")]
+
+
+def tables(table: str = "", key: str = "", value: object = None) -> dict[str, Any]:
+    """The least configuration, with one key more."""
+    made: dict[str, Any] = {"esc": [{"port": "/dev/ttyUSB0"}]}
+    if table == "esc":
+        made["esc"][0][key] = value
+    elif table:
+        made[table] = {key: value}
+    return made
+
+
+def taken(table: str, key: str, value: object) -> Any:
+    """What the parser makes of one key."""
+    config = parse(tables(table, key, value), "a.toml")
+    return getattr(config.esc[0] if table == "esc" else getattr(config, table), key)
+
+
+def problems(given_tables: Any) -> list[str]:
+    with pytest.raises(UserError) as caught:
+        parse(given_tables, "a.toml")
+    assert caught.value.exit_code == 2
+    return list(caught.value.problems)
+
+
+def refused(table: str, key: str, value: object) -> str:
+    """The one line that says why."""
+    said = problems(tables(table, key, value))
+    where = "esc[1]" if table == "esc" else table
+    assert len(said) == 1
+    assert said[0].startswith(f"a.toml: {where}.{key}: ")
+    assert "\n" not in said[0]
+    return said[0]
+
+
+def at_load(path: Path, content: bytes) -> list[str]:
+    path.write_bytes(content)
+    with pytest.raises(UserError) as caught:
+        load(path)
+    assert caught.value.exit_code == 2
+    assert all(problem.startswith(f"{path}: ") for problem in caught.value.problems)
+    return list(caught.value.problems)
+
+
+# --- each key
+
+
+@pytest.mark.parametrize("table", list(TABLES))
+def test_a_key_that_is_left_out_has_its_default(table: str) -> None:
+    config = parse(tables(), "a.toml")
+    made = config.esc[0] if table == "esc" else getattr(config, table)
+    for key, default in DEFAULTS[table].items():
+        assert getattr(made, key) == default, key
+    assert {*DEFAULTS[table], *(["port"] if table == "esc" else [])} == set(TABLES[table])
+
+
+@pytest.mark.parametrize(("table", "key"), list(RANGES))
+def test_a_whole_number_is_taken_up_to_both_ends_of_its_range_and_refused_beyond(table: str, key: str) -> None:
+    low, high = RANGES[table, key]
+    assert taken(table, key, low) == low
+    assert taken(table, key, high) == high
+    for outside in (low - 1, high + 1, -(10**30), 10**30):
+        assert f"{outside} is outside {low}..{high}" in refused(table, key, outside)
+    others: list[object] = [7.0, "7", True, [7], {}, math.nan]
+    for value in others:
+        assert "is not a whole number" in refused(table, key, value)
+
+
+@pytest.mark.parametrize(("table", "key"), STRINGS)
+def test_a_text_is_a_text_and_not_blank(table: str, key: str) -> None:
+    assert taken(table, key, "a b") == "a b"
+    others: list[object] = ["", "  ", "\n", 7, True, ["x"], {}]
+    for value in others:
+        assert "is not a text" in refused(table, key, value)
+
+
+@pytest.mark.parametrize(("table", "key"), BOOLEANS)
+def test_a_switch_is_true_or_false(table: str, key: str) -> None:
+    assert taken(table, key, True) is True
+    assert taken(table, key, False) is False
+    others: list[object] = [0, 1, "true", [], {}]
+    for value in others:
+        assert "is not true or false" in refused(table, key, value)
+
+
+def test_on_loss_is_one_of_two_and_a_near_miss_is_corrected() -> None:
+    assert taken("dbc", "on_loss", "silent") == "silent"
+    assert "Did you mean silent?" in refused("dbc", "on_loss", "silence")
+    assert "none of not_available, silent" in refused("dbc", "on_loss", "x")
+    assert "is not a text" in refused("dbc", "on_loss", 1)
+
+
+@pytest.mark.parametrize("name", ["a", "Left", "esc_1", "A23456789012"])
+def test_a_name_of_letters_digits_and_underscores_is_taken(name: str) -> None:
+    assert taken("esc", "name", name) == name
+
+
+@pytest.mark.parametrize("name", ["1a", "_a", "a-b", "a b", "ä", "A234567890123", "a\n", "a."])
+def test_a_name_that_is_no_identifier_is_refused(name: str) -> None:
+    assert "1 to 12 letters" in refused("esc", "name", name)
+
+
+@pytest.mark.parametrize(
+    ("given_gear", "gear"),
+    [
+        (1, Fraction(1)),
+        (9.8, Fraction(98, 10)),
+        ("9.8", Fraction(98, 10)),
+        ("98/10", Fraction(98, 10)),
+        ("9.8/10", Fraction(98, 100)),
+        ("1/3", Fraction(1, 3)),
+        ("007", Fraction(7)),
+        (0.001, Fraction(1, 1000)),
+        ("1/1000", Fraction(1, 1000)),
+        (1000, Fraction(1000)),
+        (1e3, Fraction(1000)),
+    ],
+)
+def test_a_gear_is_a_number_or_a_fraction_and_exact(given_gear: object, gear: Fraction) -> None:
+    assert taken("esc", "gear", given_gear) == gear
+
+
+@pytest.mark.parametrize("gear", [0, 0.0009, 1000.1, -1, "0", "1001/1", "1/1001", 1e300, 10**400])
+def test_a_gear_outside_its_range_is_refused(gear: object) -> None:
+    assert "is outside 0.001..1000" in refused("esc", "gear", gear)
+
+
+@pytest.mark.parametrize(
+    "gear",
+    [
+        *("", "x", "1/0", "0/0", "1/", "/2", "1/2/3", "98 / 10", " 9.8", "+1", "-1", ".5", "9.", "1_0", "1e1"),
+        *("1e999999999", "٣", "9,8", "9:8", True, math.nan, math.inf, -math.inf, [1], {}, "1" * 5000),
+    ],
+)
+def test_what_is_no_gear_is_refused_at_once(gear: object) -> None:
+    assert "is neither a number nor 'numerator/denominator'" in refused("esc", "gear", gear)
+
+
+def test_the_time_out_reaches_the_telemetry_in_nanoseconds() -> None:
+    made = parse(tables("esc", "telemetry_timeout_ms", 20), "a.toml").escs[0]
+    assert made.timeout_ns == 20 * MS
+
+
+# --- bindings
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[dbc.bind]\n"EscPower.BattVolt" = "battery_voltage"\nSpare = 0\nHalf = 0.5',
+        '[dbc.bind]\nEscPower.BattVolt = "battery_voltage"\nSpare = 0\nHalf = 0.5',
+        '[dbc.bind.EscPower]\nBattVolt = "battery_voltage"\n[dbc.bind]\nSpare = 0\nHalf = 0.5',
+        'dbc.bind.EscPower.BattVolt = "battery_voltage"\ndbc.bind.Spare = 0\ndbc.bind.Half = 0.5',
+        '[dbc]\nbind = { EscPower = { BattVolt = "battery_voltage" }, Spare = 0, Half = 0.5 }',
+    ],
+)
+def test_bindings_may_be_quoted_dotted_or_nested(text: str) -> None:
+    config = parse(tomllib.loads(text + '\n[[esc]]\nport = "x"'), "a.toml")
+    assert dict(config.dbc.bind) == {"EscPower.BattVolt": "battery_voltage", "Spare": 0, "Half": 0.5}
+
+
+@pytest.mark.parametrize("value", [True, [], math.inf, -math.inf, math.nan, "", " "])
+def test_a_binding_that_is_neither_a_source_nor_a_number_is_refused(value: object) -> None:
+    assert "A.B: " in refused("dbc", "bind", {"A": {"B": value}})
+    assert "neither the name of a source nor a number" in refused("dbc", "bind", {"A": value})
+
+
+def test_a_binding_of_more_than_message_and_signal_is_refused() -> None:
+    assert "A.B: " in refused("dbc", "bind", {"A": {"B": {"C": 1}}})
+    assert "is not a table" in refused("dbc", "bind", "A")
+
+
+def test_a_data_id_is_a_whole_number_of_16_bits_beside_a_message_name() -> None:
+    assert taken("dbc", "e2e_data_ids", {"EscSpeed": 0, "EscStatus": 0xFFFF}) == {"EscSpeed": 0, "EscStatus": 0xFFFF}
+    assert "EscSpeed: 65536 is outside 0..65535" in refused("dbc", "e2e_data_ids", {"EscSpeed": 0x10000})
+    assert "EscSpeed: -1 is outside" in refused("dbc", "e2e_data_ids", {"EscSpeed": -1})
+    for value in ("x", 1.0, True, {"a": 1}):
+        assert "is not a whole number" in refused("dbc", "e2e_data_ids", {"EscSpeed": value})
+    assert "is not a table" in refused("dbc", "e2e_data_ids", 3)
+
+
+# --- mistakes
+
+
+@pytest.mark.parametrize(
+    ("given_tables", "said"),
+    [
+        ({"cann": {}}, "a.toml: cann: unknown table. Did you mean can?"),
+        ({"xyzzy": {}}, "a.toml: xyzzy: unknown table. Known: can, dbc, run, esc."),
+        ({"can": {"bitrte": 1}}, "a.toml: can.bitrte: unknown key. Did you mean bitrate?"),
+        ({"run": {"x": 1}}, "a.toml: run.x: unknown key. Known: wait_for_devices."),
+        ({"can": 3}, "a.toml: can: is a table, written [can]"),
+        ({"dbc": []}, "a.toml: dbc: is a table, written [dbc]"),
+    ],
+)
+def test_what_is_unknown_is_named_with_what_was_meant(given_tables: dict[str, Any], said: str) -> None:
+    assert problems(tables() | given_tables) == [said]
+
+
+def test_a_misspelt_key_of_an_esc_is_named_with_its_number() -> None:
+    made = {"esc": [{"port": "a"}, {"port": "b", "polepairs": 7}]}
+    assert problems(made) == ["a.toml: esc[2].polepairs: unknown key. Did you mean pole_pairs?"]
+
+
+@pytest.mark.parametrize("value", [{}, {"port": "x"}, 3, "x", [1]])
+def test_escs_that_are_no_list_of_tables_are_shown_how_to_write(value: object) -> None:
+    assert problems({"esc": value}) == ["a.toml: esc: is written [[esc]], once for each ESC"]
+
+
+@pytest.mark.parametrize("given_tables", [{}, {"esc": []}, {"can": {}}])
+def test_at_least_one_esc_is_needed(given_tables: dict[str, Any]) -> None:
+    said = problems(given_tables)
+    assert len(said) == 1
+    assert "at least one [[esc]]" in said[0]
+    assert "kontronik-can-gw init" in said[0]
+
+
+def test_the_port_is_required_and_its_meaning_said() -> None:
+    assert problems({"esc": [{}]}) == ["a.toml: esc[1].port: is required: serial port, best by /dev/serial/by-id/..."]
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    wrong = {
+        "canbus": {},
+        "can": {"bitrate": 3, "chanel": "can0"},
+        "dbc": {"on_loss": "x", "bind": {"A": True}},
+        "run": 1,
+        "esc": [{"prot": "a"}, {"port": "b", "gear": "x"}, {"port": "c"}, {"port": "c"}],
+    }
+    said = problems(wrong)
+    starts = [line.split(": ")[1] for line in said]
+    expected = ["canbus", "can.bitrate", "can.chanel", "dbc.on_loss", "dbc.bind", "run", "esc[1].prot", "esc[1].port"]
+    assert starts == [*expected, "esc[2].gear", "esc[4].port"]
+
+
+def test_the_same_port_twice_is_told_with_the_numbers_in_the_file() -> None:
+    two = {"esc": [{"port": "x"}, {"port": "y", "gear": 0}, {"port": "z"}, {"port": "z"}]}
+    assert "a.toml: esc[4].port: 'z' is also that of esc[3]" in problems(two)
+
+
+@pytest.mark.parametrize("names", [("left", "left"), ("left", "LEFT"), ("left_1", "left1"), ("esc2", None)])
+def test_names_that_differ_only_in_case_and_underscores_are_the_same(names: tuple[str, str | None]) -> None:
+    listed = [{"port": "a", "name": names[0]}, {"port": "b"} | ({"name": names[1]} if names[1] else {})]
+    said = problems({"esc": listed})
+    assert len(said) == 1
+    assert said[0].startswith("a.toml: esc[2].name: ")
+    assert "is also that of esc[1]" in said[0]
+
+
+@pytest.mark.parametrize("name", ["max", "Min", "m_a_x", "bec"])
+def test_a_name_that_makes_one_source_of_another_is_refused(name: str) -> None:
+    assert "makes signal names ambiguous" in refused("esc", "name", name)
+
+
+@pytest.mark.parametrize("names", [("a", "a_max"), ("aMin", "a"), ("left", "leftMax"), ("a", "b", "b_max")])
+def test_a_name_that_makes_one_source_of_another_behind_another_name_is_refused(names: tuple[str, ...]) -> None:
+    """``AMaxElectricalSpeed`` would be the greatest speed of a, and the speed of a_max."""
+    said = problems({"esc": [{"port": f"p{n}", "name": name} for n, name in enumerate(names)]})
+    assert len(said) == 1
+    assert "makes signal names ambiguous. Choose another name." in said[0]
+
+
+@pytest.mark.parametrize("names", [("a", "ab"), ("left", "left2"), ("esc1", "esc10", "esc11"), ("nose", "rear")])
+def test_names_that_begin_alike_but_can_be_told_apart_are_taken(names: tuple[str, ...]) -> None:
+    config = parse({"esc": [{"port": f"p{n}", "name": name} for n, name in enumerate(names)]}, "a.toml")
+    assert [esc.name for esc in config.escs] == list(names)
+
+
+# --- files
+
+
+def test_an_empty_file_says_that_an_esc_is_needed(tmp_path: Path) -> None:
+    for content in (b"", b"\n\n", b"# nothing\n"):
+        assert "at least one [[esc]]" in at_load(tmp_path / "a.toml", content)[0]
+
+
+@pytest.mark.parametrize("content", [b"\x7fELF\x02\x01\x01\0\0\xff\xfe", bytes(range(256)), b'port = "caf\xe9"\n'])
+def test_a_binary_file_is_no_text(tmp_path: Path, content: bytes) -> None:
+    assert at_load(tmp_path / "a.toml", content) == [
+        f"{tmp_path}/a.toml: is not a text file in UTF-8, so no TOML configuration"
+    ]
+
+
+@pytest.mark.parametrize("content", [b"\0\0\0\0", b"\x01\x02"])
+def test_a_binary_file_that_happens_to_be_utf_8_is_no_toml(tmp_path: Path, content: bytes) -> None:
+    assert "is not valid TOML" in at_load(tmp_path / "a.toml", content)[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (b"[can]\nbitrate = \n", 2),
+        (b"[can]\n\n[can]\n", 3),
+        (b"[can]\nfd = yes\n", 2),
+        (b'[can]\nchannel = "can0\n', 2),
+        (b"channel: can0\n", 1),
+    ],
+)
+def test_broken_toml_is_told_with_its_line(tmp_path: Path, content: bytes, line: int) -> None:
+    said = at_load(tmp_path / "a.toml", content)
+    assert len(said) == 1
+    assert "is not valid TOML: " in said[0]
+    assert f"(at line {line}, " in said[0]
+
+
+@pytest.mark.parametrize("content", [b"a = " + b"1" * 5000, b"a = " + b"[" * 5000], ids=["digits", "brackets"])
+def test_toml_that_overwhelms_its_reader_is_refused_too(tmp_path: Path, content: bytes) -> None:
+    assert "is not valid TOML: " in at_load(tmp_path / "a.toml", content)[0]
+
+
+def test_a_byte_order_mark_and_windows_line_ends_do_not_matter(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_bytes(b'\xef\xbb\xbf[[esc]]\r\nport = "COM3"\r\n')
+    assert load(file).esc[0].port == "COM3"
+
+
+def test_a_missing_file_and_a_directory_are_told_with_the_command_that_writes_an_example(tmp_path: Path) -> None:
+    for path, reason in ((tmp_path / "none.toml", "No such file or directory"), (tmp_path, "Is a directory")):
+        with pytest.raises(UserError) as caught:
+            load(path)
+        assert caught.value.exit_code == 2
+        assert list(caught.value.problems) == [
+            f"{path}: cannot be read: {reason}. `kontronik-can-gw init` writes an example."
+        ]
+
+
+def test_the_dbc_file_is_relative_to_the_configuration(tmp_path: Path) -> None:
+    file = tmp_path / "deep" / "a.toml"
+    assert parse(tables("dbc", "file", "my.dbc"), str(file)).dbc_path == tmp_path / "deep" / "my.dbc"
+    assert parse(tables("dbc", "file", "../my.dbc"), str(file)).dbc_path == tmp_path / "deep" / ".." / "my.dbc"
+    assert parse(tables("dbc", "file", "/etc/my.dbc"), str(file)).dbc_path == Path("/etc/my.dbc")
+    assert parse(tables(), str(file)).dbc_path == shipped("dbc/kontronik_esc.dbc")
+    assert shipped("dbc/kontronik_esc.dbc").is_file()
+
+
+# --- the shipped example
+
+
+def uncommented() -> str:
+    """The example with each line uncommented that is a key or the head of a table."""
+    return re.sub(r'^#(?=\[|"?[A-Za-z_.0-9]+"? = )', "", EXAMPLE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+
+
+def test_the_shipped_example_is_valid_and_says_the_defaults() -> None:
+    config = load(EXAMPLE)
+    assert len(config.esc) == 1
+    assert config.esc[0].pole_pairs == 7
+    for table in ("can", "dbc", "run"):
+        for key, default in DEFAULTS[table].items():
+            assert getattr(getattr(config, table), key) == default
+
+
+def test_the_shipped_example_with_every_line_uncommented_is_valid() -> None:
+    text = uncommented()
+    assert not re.search(r"^#\S", text, re.MULTILINE)
+    config = parse(tomllib.loads(text), str(EXAMPLE))
+    assert [esc.name for esc in config.esc] == ["esc1", "right"]
+    assert config.dbc.node == "KontronikGateway"
+    assert config.dbc.base_id == 0x680
+    assert dict(config.dbc.e2e_data_ids) == {"EscSpeed": 0x123}
+    assert len(config.dbc.bind) == 3
+
+
+def test_the_shipped_example_has_every_key_of_every_table() -> None:
+    made = tomllib.loads(uncommented())
+    properties = schema()["properties"]
+    for table, keys in TABLES.items():
+        entries = properties[table].get("items", properties[table])
+        assert set(entries["properties"]) == set(keys)
+        found = {key for entry in made["esc"] for key in entry} if table == "esc" else set(made[table])
+        assert found == set(keys)
+    assert set(properties) == set(TABLES) == set(made)
+
+
+def test_what_the_example_shows_as_default_is_the_default() -> None:
+    made = tomllib.loads(uncommented())
+    shown = {(table, key): value for table in ("can", "dbc", "run") for key, value in made[table].items()}
+    shown |= {("esc", key): value for key, value in made["esc"][0].items()}
+    examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
+    examples |= {("esc", "port"), ("esc", "pole_pairs")}
+    for (table, key), value in shown.items():
+        if (table, key) not in examples:
+            assert value == DEFAULTS[table][key], f"{table}.{key}"
+
+
+# --- the schema against the parser
+
+VALIDATOR = jsonschema.Draft202012Validator(schema())
+
+
+def accepted(made: Any) -> bool:
+    try:
+        parse(made, "a.toml")
+    except UserError:
+        return False
+    return True
+
+
+def test_the_schema_is_valid_draft_2020_12_and_json() -> None:
+    jsonschema.Draft202012Validator.check_schema(schema())
+    assert json.loads(json.dumps(schema(), allow_nan=False)) == schema()
+    assert schema()["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+
+
+def test_every_key_of_the_schema_is_described_and_its_default_is_the_parsers() -> None:
+    for table, entry in schema()["properties"].items():
+        properties = entry.get("items", entry)["properties"]
+        for key, described in properties.items():
+            assert described["description"]
+            if "default" in described:
+                VALIDATOR.evolve(schema=described).validate(described["default"])
+                given_default = described["default"]
+                default = Fraction(given_default) if key == "gear" else given_default
+                assert default == DEFAULTS[table][key]
+
+
+def samples() -> list[tuple[str, dict[str, Any]]]:
+    """Configurations in which one key has one value: of each kind, each end, each wrong type."""
+    values: list[Any] = [0, 1, -1, 7, 19, 20, 100, 101, 255, 256, 9999, 10_000, 60_000, 60_001, 10**6, 10**6 + 1]
+    values += [8 * 10**6, 8 * 10**6 + 1, 0x1FFFFFFF, 0x20000000, 10**30, 0.0005, 0.001, 0.5, 9.8, 1000.5, -0.5]
+    values += ["", " ", "x", "silent", "not_available", "1/3", "98/10", "9.8/2", " 1/3", "1 / 3", "1e1", ".5", "+1"]
+    values += ["-1", "٣", "a b", "1a", "A234567890123", "max", True, False, [], [1], {}, {"a": 1}, {"a": "x"}]
+    values += [{"a": ""}, {"a": True}, {"a": 1.5}, {"a": -1}, {"a": 65_535}, {"a": 65_536}, {"a": {"b": 1}}]
+    values += [{"a": {"b": "x"}}, {"a": {"b": {"c": 1}}}, {"a": {"b": []}}, {"a": {}}, {"a": []}]
+    made = [
+        (f"{t}.{k}={v!r}"[:60], tables(t, k, v)) for t, keys in TABLES.items() for k in (*keys, "x") for v in values
+    ]
+    kinds: list[Any] = [{}, [], 1, "x", [{}], [1], [{"port": "a"}, {"port": "b"}], [{}, {}]]
+    made += [(f"{t}={v!r}", tables() | {t: v}) for t in (*TABLES, "x") for v in kinds]
+    return made
+
+
+def test_the_schema_takes_and_refuses_what_the_parser_takes_and_refuses() -> None:
+    """But for what a schema cannot say: the range of a gear written as text, and names that are ambiguous."""
+    beyond_a_schema = {"esc.name='max'"}
+    differences = [
+        name
+        for name, made in samples()
+        if name not in beyond_a_schema and VALIDATOR.is_valid(made) != accepted(deepcopy(made))
+    ]
+    assert differences == []
+
+
+def test_what_only_the_parser_can_refuse_is_known() -> None:
+    only_parser: list[dict[str, Any]] = [
+        tables("esc", "gear", "5000"),
+        tables("esc", "gear", "1/0"),
+        tables("esc", "pole_pairs", 7.0),  # to JSON 7.0 is a whole number, to TOML it is a float
+        tables("esc", "name", "max"),
+        tables("esc", "name", "a\n"),  # "$" of Python's expressions, which an editor's do not share
+        tables("dbc", "bind", {"a": math.inf}),  # JSON has no infinity
+        {"esc": [{"port": "a"}, {"port": "a"}]},
+        {"esc": [{"port": "a", "name": "x"}, {"port": "b", "name": "X"}]},
+    ]
+    for made in only_parser:
+        assert VALIDATOR.is_valid(made)
+        assert not accepted(made)
+
+
+_TEXT = st.text(max_size=8)
+_IDS = st.one_of(st.integers(-2, 0x10001), st.integers(0, 0x20000000))
+_ANY = st.one_of(
+    st.booleans(),
+    st.integers(-(10**7), 10**7),
+    st.floats(allow_nan=False, allow_infinity=False).filter(lambda value: not value.is_integer()),
+    _TEXT,
+    st.lists(st.integers(), max_size=2),
+    st.dictionaries(_TEXT, st.one_of(st.integers(), _TEXT), max_size=2),
+)
+_RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
+    **{place: st.integers(*ends) for place, ends in RANGES.items()},
+    **dict.fromkeys(STRINGS, st.text(min_size=1, max_size=8).map(lambda text: text.strip() or "x")),
+    **dict.fromkeys(BOOLEANS, st.booleans()),
+    ("dbc", "on_loss"): st.sampled_from(["not_available", "silent"]),
+    ("dbc", "bind"): st.dictionaries(
+        _TEXT,
+        st.one_of(
+            st.text(min_size=1),
+            st.integers(),
+            st.floats(allow_nan=False, allow_infinity=False),
+            st.dictionaries(_TEXT, st.integers(), max_size=2),
+        ),
+        max_size=3,
+    ),
+    ("dbc", "e2e_data_ids"): st.dictionaries(_TEXT, st.integers(0, 0xFFFF), max_size=3),
+    ("esc", "name"): st.from_regex(r"\A[b-z][A-Za-z0-9_]{0,11}\Z"),
+    ("esc", "gear"): st.one_of(
+        st.floats(0.001, 1000).filter(lambda value: not value.is_integer()),
+        st.integers(1, 1000),
+        st.builds(lambda a, b: f"{a}/{b}", st.integers(1, 1000), st.integers(1, 1000)),
+    ),
+}
+
+
+@st.composite
+def configurations(draw: st.DrawFn, wrong: bool) -> dict[str, Any]:
+    """TOML tables; with ``wrong`` now and then a value of another kind or a key that is none."""
+
+    def table(name: str) -> dict[str, Any]:
+        made = {}
+        for key in TABLES[name]:
+            if draw(st.booleans()) or key == "port":
+                value = draw(_ANY) if wrong and draw(st.integers(0, 9)) == 0 else draw(_RIGHT[name, key])
+                made[key] = value
+        if wrong and draw(st.integers(0, 15)) == 0:
+            made[draw(_TEXT)] = 1
+        return made
+
+    made: dict[str, Any] = {name: table(name) for name in ("can", "dbc", "run") if draw(st.booleans())}
+    return made | {"esc": [table("esc") for _ in range(draw(st.integers(1, 3)))]}
+
+
+def only_the_parser_can_tell(made: dict[str, Any]) -> bool:
+    """True where nothing is wrong but names or ports that do not go together, or the range of a gear written as text."""
+    try:
+        parse(made, "a.toml")
+    except UserError as error:
+        signs = ("is also that of", "makes signal names ambiguous", "is outside 0.001..1000", "1 to 12 letters")
+        return all(any(sign in problem for sign in signs) for problem in error.problems)
+    return False
+
+
+@settings(max_examples=300, deadline=None)
+@given(configurations(wrong=True))
+def test_schema_and_parser_agree_on_random_configurations(made: dict[str, Any]) -> None:
+    valid = VALIDATOR.is_valid(made)
+    if valid != accepted(made):
+        assert valid
+        assert only_the_parser_can_tell(made)
+
+
+def equal(config: Config) -> None:
+    text = as_toml(config)
+    assert parse(tomllib.loads(text), config.file) == config
+    assert as_toml(parse(tomllib.loads(text), config.file)) == text
+
+
+@settings(max_examples=300, deadline=None)
+@given(configurations(wrong=False))
+def test_the_effective_configuration_as_toml_is_read_back_equal(made: dict[str, Any]) -> None:
+    for number, entry in enumerate(made["esc"]):
+        entry |= {"name": f"e{number}", "port": f"{number}{entry['port']}"}
+    assume(accepted(made))
+    equal(parse(made, "a.toml"))
+
+
+def test_texts_with_quotes_backslashes_and_control_characters_are_read_back_equal() -> None:
+    for port in ('a"b', "C:\\x", "a\nb", "\t\x00\x1f\x7f\x85", "ü€😀", "'''", '"""', "#", "a = [b]"):
+        equal(parse({"esc": [{"port": port}], "dbc": {"bind": {port: port}, "file": port}}, "a.toml"))
+
+
+def test_the_example_is_read_back_equal() -> None:
+    equal(load(EXAMPLE))
+    equal(parse(tomllib.loads(uncommented()), str(EXAMPLE)))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=200))
+def test_no_content_of_a_file_makes_anything_but_a_user_error(tmp_path_factory: Any, content: bytes) -> None:
+    file = tmp_path_factory.getbasetemp() / "any.toml"
+    file.write_bytes(content)
+    with pytest.raises(UserError):
+        load(file)

@@ -1,0 +1,406 @@
+"""What a signal is bound to: by its name, by ``[dbc.bind]``, as a constant, alive counter or CRC; and how enumerations map."""
+
+import struct
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import Any
+
+import cantools.database
+import pytest
+from cantools.database.can import Database
+from e2e import p01
+from hypothesis import given
+from hypothesis import strategies as st
+from packer_oracle import DEVICES, STATES, Msg, Sig, dbc_text, get, pascal
+
+from kontronik_can_gw.dbc_output import e2e
+from kontronik_can_gw.dbc_output.layout import Binder, DbcSettings, Layout, Role
+from kontronik_can_gw.dbc_output.packer import compile_pack
+from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.protocol.codec import Layout as WireLayout
+from kontronik_can_gw.protocol.codec import encode
+from kontronik_can_gw.protocol.fields import InfoData, LiveData, device_and_variant
+from kontronik_can_gw.sources import sources
+from kontronik_can_gw.telemetry import MS, EscSettings
+
+LIVE = LiveData(
+    electrical_speed=70_000,
+    battery_voltage=4442,
+    battery_current=-123,
+    bec_current=1500,
+    throttle=-7,
+    power_stage_temperature=-13,
+    operating_errors=0b1010_0000,
+    operating_state=21,
+)
+
+
+def layout_of(
+    messages: Sequence[Msg],
+    bind: Mapping[str, str | float] | None = None,
+    names: Sequence[str] = ("esc1",),
+    **more: Any,
+) -> Layout:
+    database = cantools.database.load_string(dbc_text(messages), "dbc")
+    assert isinstance(database, Database)
+    escs = [EscSettings(name, 7) for name in names]
+    return prepare(database, "my.dbc", escs, DbcSettings(bind or {}, **more), fd_allowed=True)[1]
+
+
+def frames_of(layout: Layout, lives: Sequence[LiveData | None], info: InfoData | None = None) -> list[CanFrame]:
+    """What every message holds when each ESC has just sent this."""
+    names = [f"esc{n + 1}" for n in range(len(lives))]
+    gateway = Gateway([EscSettings(name, 7) for name in names], layout, 0)
+    for index, live in enumerate(lives):
+        if info is not None:
+            gateway.receive_bytes(index, encode(info, WireLayout.V4), 50 * MS)
+        if live is not None:
+            gateway.receive_bytes(index, encode(live, WireLayout.V4), 50 * MS)
+    return [
+        CanFrame(
+            plan.can_id, compile_pack(plan)(gateway.escs, gateway.status, 50 * MS, 0, 0).to_bytes(plan.length, "little")
+        )
+        for plan in layout.messages
+    ]
+
+
+def raw_of(signal: Sig, bind: str | float | None = None, live: LiveData = LIVE, info: InfoData | None = None) -> int:
+    """The raw value that a lone signal carries."""
+    signal.start, message = 8, Msg("M", 0x100, 20, [signal])
+    layout = layout_of([message], None if bind is None else {"M." + signal.name: bind})
+    (frame,) = frames_of(layout, [live], info)
+    return get(frame.data, 8, signal.length, True, signal.signed)
+
+
+# --- names --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "BatteryVoltage",
+        "battery_voltage",
+        "BATTERY_VOLTAGE",
+        "batteryvoltage",
+        "Battery_Voltage_",
+        "_BatteryVoltage",
+        "Esc1BatteryVoltage",
+        "ESC1_battery_voltage",
+        "esc_1_BatteryVoltage",
+    ],
+)
+def test_a_name_is_found_whatever_its_case_underscores_and_prefix(name: str) -> None:
+    assert raw_of(Sig(name, 0, 16, unit="V", factor="0.01")) == 4442
+
+
+@pytest.mark.parametrize("name", ["ThrottlePercent", "throttle_percent", "Throttle", "Esc1ThrottlePercent"])
+def test_percent_at_the_end_of_a_name_is_ignored(name: str) -> None:
+    assert raw_of(Sig(name, 0, 8, signed=True, unit="%")) == -7
+
+
+@pytest.mark.parametrize("source", sorted(sources(EscSettings())))
+def test_every_source_is_found_by_its_pascal_case_name_with_and_without_prefix(source: str) -> None:
+    one = Binder([EscSettings("left")], {})
+    two = Binder([EscSettings("left"), EscSettings("right_rear")], {})
+    for binder, name, esc in (
+        (one, pascal(source), 0),
+        (one, "Left" + pascal(source), 0),
+        (two, "Left" + pascal(source), 0),
+        (two, "RightRear" + pascal(source), 1),
+        (two, f"right_rear.{source}", 1),
+        (two, pascal(source), None),
+    ):
+        found = binder.by_name(name)
+        assert found is not None, name
+        assert found[0].name == source
+        assert found[1] == (None if found[0].group.value == "gateway" else esc)
+
+
+def test_of_two_prefixes_the_longer_wins() -> None:
+    binder = Binder([EscSettings("left"), EscSettings("left_rear"), EscSettings("l")], {})
+    found = binder.by_name("LeftRearBatteryVoltage")
+    assert found is not None and found[1] == 1
+
+
+def test_a_source_name_with_the_escs_name_in_front_is_the_source_where_there_is_one_esc() -> None:
+    found = Binder([EscSettings("max")], {}).by_name("MaxBatteryVoltage")
+    assert found is not None and found[0].name == "max_battery_voltage"
+
+
+# --- [dbc.bind] ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_binding_overrides_the_name() -> None:
+    assert raw_of(Sig("Throttle", 0, 16, unit="V", factor="0.01"), "battery_voltage") == 4442
+
+
+def test_a_binding_of_the_message_and_signal_beats_one_of_the_signal_alone() -> None:
+    messages = [Msg(name, number, 8, [Sig("U", 0, 16)]) for number, name in enumerate(("A", "B"), 1)]
+    layout = layout_of(messages, {"U": "battery_voltage", "B.U": "operating_state_raw"})
+    assert [p.signals[0].source.name for p in layout.messages if p.signals[0].source] == [
+        "battery_voltage",
+        "operating_state_raw",
+    ]
+
+
+def test_a_source_of_a_named_esc_can_be_bound() -> None:
+    message = Msg("Both", 1, 8, [Sig("A", 0, 16, unit="V"), Sig("B", 16, 16, unit="V"), Sig("C", 32, 16, unit="s")])
+    bind = {"A": "esc2.battery_voltage", "B": "esc1.battery_voltage", "C": "uptime"}
+    layout = layout_of([message], bind, ("esc1", "esc2"))
+    assert [signal.esc for signal in layout.messages[0].signals] == [1, 0, None]
+
+
+def test_bindings_of_a_one_esc_layout_go_to_every_esc() -> None:
+    message = Msg(
+        "Power", 0x100, 8, [Sig("U", 0, 16, unit="V", factor="0.01"), Sig("Id", 16, 8), Sig("Up", 24, 32, unit="s")]
+    )
+    for key in ("U", "Power.U"):
+        layout = layout_of([message], {key: "battery_voltage", "Id": 7, "Up": "uptime"}, ("esc1", "esc2"))
+        frames = frames_of(layout, [LIVE, LIVE._replace(battery_voltage=1)])
+        assert [frame.can_id for frame in frames] == [0x100, 0x101]
+        assert [get(frame.data, 0, 16, True) for frame in frames] == [4442, 1]
+        assert [get(frame.data, 16, 8, True) for frame in frames] == [7, 7]
+
+
+@pytest.mark.parametrize(
+    ("signal", "constant", "raw"),
+    [
+        (Sig("X", 0, 8), 255, 255),
+        (Sig("X", 0, 8), 0, 0),
+        (Sig("X", 0, 8, signed=True), -128, -128),
+        (Sig("X", 0, 8, signed=True), 127, 127),
+        (Sig("X", 0, 16, factor="0.1", offset="-40"), 12.3, 523),
+        (Sig("X", 0, 8, factor="-1"), -200, 200),
+        (Sig("X", 0, 64), (1 << 64) - 1, (1 << 64) - 1),
+        (Sig("X", 0, 8, minimum="0", maximum="10"), 255, 255),
+    ],
+)
+def test_a_constant_is_sent_as_its_physical_value(signal: Sig, constant: float, raw: int) -> None:
+    assert raw_of(signal, constant) == raw
+
+
+@pytest.mark.parametrize(("length", "code"), [(32, "<f"), (64, "<d")])
+@pytest.mark.parametrize(
+    ("constant", "factor", "stored"), [(1, "1", 1.0), (1.5, "1", 1.5), (-3, "0.5", -6.0), (0, "1", 0.0)]
+)
+def test_a_constant_in_a_float_is_sent_as_a_float(
+    length: int, code: str, constant: float, factor: str, stored: float
+) -> None:
+    raw = raw_of(Sig("X", 0, length, signed=True, is_float=True, factor=factor), constant)
+    assert struct.unpack(code, (raw % (1 << length)).to_bytes(length // 8, "little"))[0] == stored
+
+
+@pytest.mark.parametrize(
+    ("signal", "raw"),
+    [
+        (Sig("BatteryVoltage", 0, 16, unit="V", factor="0.04"), 1111),  # 1110.5
+        (Sig("BatteryCurrent", 0, 16, signed=True, unit="A", factor="0.2"), -61),  # -61.5
+        (Sig("BatteryCurrent", 0, 16, signed=True, unit="A", factor="-0.2"), 62),  # 61.5
+        (Sig("Throttle", 0, 8, signed=True, unit="%", factor="2"), -3),  # -3.5
+    ],
+)
+def test_a_value_halfway_between_two_steps_goes_to_the_upper_one(signal: Sig, raw: int) -> None:
+    assert raw_of(signal) == raw
+
+
+@pytest.mark.parametrize(
+    ("minimum", "maximum", "raw"),
+    [
+        ("0", "44.42", 4442),
+        ("0", "44.424", 4442),
+        ("0", "44.419", 9),
+        ("44.42", "100", 4442),
+        ("44.416", "100", 4442),
+        ("44.421", "100", 9),
+        ("44.43", "100", 9),
+        ("0", "0", 4442),
+    ],
+)
+def test_limits_that_lie_between_two_steps_leave_out_what_is_beyond_them(minimum: str, maximum: str, raw: int) -> None:
+    texts = {9: "Error"}
+    assert (
+        raw_of(Sig("BatteryVoltage", 0, 16, unit="V", factor="0.01", minimum=minimum, maximum=maximum, texts=texts))
+        == raw
+    )
+
+
+# --- enumerations -------------------------------------------------------------------------------------------------------
+
+
+def state(number: int) -> LiveData:
+    return LIVE._replace(operating_state=number)
+
+
+def test_an_enumeration_is_mapped_by_text_to_the_numbers_of_the_dbc() -> None:
+    texts = {200 + n: text for n, text in enumerate(STATES.values())} | {254: "Error", 255: "NotAvailable"}
+    for place, number in enumerate(STATES):
+        assert raw_of(Sig("OperatingState", 0, 8, texts=texts), live=state(number)) == 200 + place
+    for number in set(range(256)) - set(STATES):
+        if number < 30 or number > 250:
+            assert raw_of(Sig("OperatingState", 0, 8, texts=texts), live=state(number)) == 254
+
+
+def test_texts_of_an_enumeration_are_compared_without_case_and_underscores() -> None:
+    texts = {1: "SYNC_FORWARD", 2: "syncBackward", 3: "error_selftest", 9: "RpmControl"}
+    for number, raw in ((18, 1), (19, 2), (9, 3), (26, 9)):
+        assert raw_of(Sig("OperatingState", 0, 8, texts=texts), live=state(number)) == raw
+
+
+def test_a_state_that_is_not_listed_is_sent_as_error_else_as_not_available() -> None:
+    assert raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff", 77: "Error"}), live=state(21)) == 77
+    assert raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff", 88: "NotAvailable"}), live=state(21)) == 88
+    assert raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff"}), live=state(21)) == 255
+
+
+def test_without_texts_of_ours_the_number_itself_is_sent() -> None:
+    assert raw_of(Sig("OperatingState", 0, 8), live=state(21)) == 21
+    assert raw_of(Sig("OperatingState", 0, 8), live=state(5)) == 5
+    assert raw_of(Sig("OperatingStateRaw", 0, 8, texts={254: "Error", 255: "NotAvailable"}), live=state(99)) == 99
+
+
+@pytest.mark.parametrize("device", range(8))
+def test_devices_are_mapped_like_states(device: int) -> None:
+    texts = {10 - number: text for number, text in DEVICES.items()} | {14: "Error", 15: "NotAvailable"}
+    info = InfoData(device_and_variant=device_and_variant(device, 1))
+    assert raw_of(Sig("Device", 0, 4, texts=texts), info=info) == (10 - device if device in DEVICES else 14)
+
+
+def test_an_enumeration_in_a_float_keeps_its_table() -> None:
+    signal = Sig("OperatingState", 0, 32, signed=True, is_float=True, texts={5: "Forward"})
+    raw = raw_of(signal) % (1 << 32)
+    assert struct.unpack("<f", raw.to_bytes(4, "little"))[0] == 5.0
+    raw = raw_of(signal, live=state(1)) % (1 << 32)
+    number = struct.unpack("<f", raw.to_bytes(4, "little"))[0]
+    assert number != number
+
+
+@pytest.mark.parametrize("text", ["NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"])
+def test_not_available_is_known_by_its_usual_names(text: str) -> None:
+    signal = Sig("MaxBatteryVoltage", 0, 8, texts={9: text})
+    assert raw_of(signal) == 9  # no info yet
+
+
+@pytest.mark.parametrize("text", ["Error", "ERR", "Invalid"])
+def test_error_is_known_by_its_usual_names(text: str) -> None:
+    assert raw_of(Sig("BatteryVoltage", 0, 8, unit="mV", texts={9: text})) == 9
+
+
+@pytest.mark.parametrize(
+    ("signal", "raw"),
+    [
+        (Sig("MaxThrottle", 0, 8, texts={254: "NotAvailable"}, start_value=3), 254),
+        (Sig("MaxThrottle", 0, 8, start_value=3), 3),
+        (Sig("MaxThrottle", 0, 8, start_value=300), 255),
+        (Sig("MaxThrottle", 0, 8), 255),
+        (Sig("MaxThrottle", 0, 8, signed=True), -128),
+        (Sig("MaxThrottle", 0, 8, signed=True, start_value=-1), -1),
+        (Sig("SelftestErrors", 0, 64), (1 << 64) - 1),
+        (Sig("TestEepromSize", 0, 1), 1),
+        (Sig("TestEepromSize", 0, 1, start_value=0), 0),
+    ],
+)
+def test_not_available_is_the_value_table_else_the_start_value_else_the_end_of_the_type(signal: Sig, raw: int) -> None:
+    assert raw_of(signal) == raw
+
+
+# --- several ESCs in one message ----------------------------------------------------------------------------------------
+
+
+def test_one_message_can_hold_values_of_several_escs_and_of_the_gateway() -> None:
+    signals = [Sig(f"Esc{n}BatteryVoltage", 16 * n - 16, 16, unit="mV", factor="10") for n in (1, 2, 3)]
+    signals += [Sig("EscsOk", 48, 8), Sig("BusAlive", 56, 8)]
+    layout = layout_of([Msg("All", 0x100, 8, signals)], names=("esc1", "esc2", "esc3"))
+    (plan,) = layout.messages
+    assert plan.escs == {0, 1, 2}
+    (frame,) = frames_of(layout, [LIVE, None, LIVE._replace(battery_voltage=7)])
+    assert [get(frame.data, at, 16, True) for at in (0, 16, 32)] == [4442, 65535, 7]
+    assert get(frame.data, 48, 8, True) == 2
+
+
+# --- alive counter and E2E profile 1 ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Alive",
+        "AliveCounter",
+        "alive_counter",
+        "StatusAlive",
+        "PowerRollingCounter",
+        "MessageCounter",
+        "SequenceCounter",
+    ],
+)
+def test_an_alive_counter_is_known_by_its_name(name: str) -> None:
+    layout = layout_of([Msg("M", 1, 8, [Sig(name, 0, 4)])])
+    assert layout.messages[0].signals[0].role is Role.ALIVE
+
+
+@pytest.mark.parametrize("name", ["Crc", "CRC8", "Power_Crc", "Checksum"])
+def test_a_crc_is_known_by_its_name(name: str) -> None:
+    layout = layout_of([Msg("M", 1, 8, [Sig(name, 0, 8), Sig("Alive", 8, 4)])])
+    assert layout.messages[0].signals[0].role is Role.CRC
+
+
+def test_alive_counter_and_crc_can_be_bound_by_name_too() -> None:
+    layout = layout_of([Msg("M", 1, 8, [Sig("C", 0, 8), Sig("Z", 8, 4)])], {"C": "crc", "M.Z": "alive_counter"})
+    assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
+
+
+def test_crc_errors_is_no_crc_and_live_frames_no_alive_counter() -> None:
+    layout = layout_of([Msg("M", 1, 8, [Sig("CrcErrors", 0, 8), Sig("LiveFrames", 8, 8)])])
+    assert all(signal.role is Role.SOURCE for signal in layout.messages[0].signals)
+
+
+def theirs(data: bytes, at: int, data_id: int) -> bytes:
+    """The frame as the autosar-e2e package protects it, the counter left as it is."""
+    buffer = bytearray(data)
+    p01.e2e_p01_protect(buffer, data_id, offset=at, increment_counter=False)
+    return bytes(buffer)
+
+
+@given(st.binary(min_size=2, max_size=64), st.integers(0, 0xFFFF), st.data())
+def test_the_crc_is_that_of_the_autosar_package_at_every_place(data: bytes, data_id: int, draw: st.DataObject) -> None:
+    at = draw.draw(st.integers(0, len(data) - 2))
+    assert e2e.crc(data, at, data_id) == theirs(data, at, data_id)[at]
+
+
+def test_the_crc_has_the_check_value_of_sae_j1850_with_start_and_final_xor_0() -> None:
+    import crcmod  # type: ignore[import-untyped]  # has no types
+
+    reckon = crcmod.mkCrcFun(0x11D, initCrc=0, rev=False, xorOut=0)
+    assert e2e.crc(b"x123456789", 0, 0) == reckon(b"\0\x00123456789")
+
+
+@pytest.mark.parametrize(("at", "data_ids"), [(0, {}), (3, {}), (7, {"M": 0xABCD}), (1, {"M": 0})])
+def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(at: int, data_ids: dict[str, int]) -> None:
+    counter_at = (at + 1) % 8 * 8
+    value_at = 16 * ((at // 2 + 2) % 4)
+    signals = [Sig("Crc8", at * 8, 8), Sig("Alive", counter_at, 4), Sig("BatteryVoltage", value_at, 16, unit="V")]
+    layout = layout_of([Msg("M", 0x12345, 8, signals, extended=True)], data_ids=data_ids)
+    data_id = data_ids.get("M", 0x2345)
+    gateway = Gateway([EscSettings("esc1", 7, Fraction(1))], layout, 0)
+    gateway.start(0)
+    for n in range(40):
+        gateway.receive_bytes(0, encode(LIVE._replace(battery_voltage=n * 100), WireLayout.V4), (50 + n * 10) * MS)
+    frames = gateway.take_frames()
+    assert [get(frame.data, counter_at, 4, True) for frame in frames] == [n % 15 for n in range(41)]
+    for frame in frames:
+        if at < 7:  # the package wants a byte behind the CRC
+            assert theirs(frame.data, at, data_id) == frame.data
+            assert p01.e2e_p01_check(bytearray(frame.data), data_id, offset=at)
+        moved = frame.data[at : at + 1] + frame.data[:at] + frame.data[at + 1 :]
+        assert theirs(moved, 0, data_id) == moved
+
+
+@pytest.mark.parametrize(("length", "modulus"), [(2, 4), (4, 15), (8, 15)])
+def test_with_a_crc_the_alive_counter_never_shows_15(length: int, modulus: int) -> None:
+    layout = layout_of([Msg("M", 1, 8, [Sig("Crc8", 0, 8), Sig("Alive", 8, length), Sig("BatteryVoltage", 16, 16)])])
+    gateway = Gateway([EscSettings("esc1")], layout, 0)
+    for n in range(40):
+        gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), (50 + n * 10) * MS)
+    frames = gateway.take_frames()
+    assert [get(frame.data, 8, length, True) for frame in frames] == [n % modulus for n in range(40)]

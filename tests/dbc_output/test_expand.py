@@ -1,0 +1,647 @@
+"""The DBC of several ESCs from that of one, and of a configuration: loss-free, by the rules, and exactly what is sent."""
+
+import random
+import re
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cantools.database
+import pytest
+from cantools.database.can import Database, Message, Signal
+from dbc_rules import ENUMS, RULES, findings, parse
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text
+
+from kontronik_can_gw.cli import main
+from kontronik_can_gw.config import load
+from kontronik_can_gw.dbc_output import expand
+from kontronik_can_gw.dbc_output.layout import DbcSettings, MessagePlan, compile_layout, load_database
+from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.telemetry import EscSettings
+
+SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
+EIGHT = [EscSettings(f"esc{number}") for number in range(1, 9)]
+PAIR = [EscSettings("left"), EscSettings("right")]
+
+
+def read(text: str) -> Database:
+    database = cantools.database.load_string(text, "dbc", strict=True)
+    assert isinstance(database, Database)
+    return database
+
+
+def written(database: Database) -> str:
+    text: str = expand.dbc_text(database)
+    return text
+
+
+def multiplied(text: str, escs: list[EscSettings], node: str, **more: Any) -> tuple[Database, str]:
+    database, _ = expand.expand(read(text), node, escs, "my.dbc", **more)
+    out = written(database)
+    return read(out), out
+
+
+# --- the shipped file for eight -----------------------------------------------------------------------------------------
+
+
+def eight() -> tuple[Database, str]:
+    return multiplied(SHIPPED.read_text(), EIGHT, "KontronikGateway")
+
+
+def test_the_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
+    assert written(load_database(SHIPPED)) == SHIPPED.read_text()
+
+
+def test_the_shipped_file_for_eight_escs_has_each_line_of_the_one_with_name_and_id_changed() -> None:
+    one = parse(SHIPPED.read_bytes())
+    per_esc = {message.id: message for message in one.messages if message.is_of_an_esc}
+    expected: Counter[str] = Counter()
+    message_id = -1
+    for line in one.lines:
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == "BO_":
+            message_id = int(words[1])
+        numbers = [int(word) for word in words[1:5] if word.isdigit()]
+        about = message_id if words[0] in ("BO_", "SG_") else next((n for n in numbers if n in per_esc), -1)
+        if words[0] not in ("BO_", "SG_", "CM_", "BA_", "VAL_") or about not in per_esc:
+            expected[line] += 1
+            continue
+        message = per_esc[about]
+        for number in range(1, 9):
+            copy = re.sub(rf"\b{about}\b", str(about + number - 1), line, count=1) if words[0] != "SG_" else line
+            head, quote, tail = copy.partition('"') if words[0] != "BA_" else (copy, "", "")
+            head = re.sub(rf"\b{message.name}\b", f"Esc{number}{message.name.removeprefix('Esc')}", head)
+            for signal in message.signals:
+                head = re.sub(rf"(?<![\w\"]){signal.name}(?!\w)", f"Esc{number}{signal.name}", head)
+            expected[head + quote + tail] += 1
+    assert Counter(line for line in eight()[1].split("\n") if line) == expected
+
+
+def test_the_file_for_eight_escs_keeps_the_rules() -> None:
+    text = eight()[1].encode()
+    db = parse(text)
+    only_for_one = {"eight_escs_fit", "one_esc_loads_the_bus_below_ten_percent", "enums_are_closed"}
+    assert only_for_one < set(RULES)
+    for line in findings(text):
+        rule = line.partition(":")[0]
+        assert rule in only_for_one or line.endswith("is longer than 28"), line
+    assert all(len(name) <= 32 for name in [m.name for m in db.messages] + [s.name for s in db.signals])
+    ids = [message.id for message in db.messages]
+    assert len(set(ids)) == len(ids)
+    seen = Counter[str]()
+    for signal in db.signals:
+        stem = re.sub("^Esc[1-8]", "", signal.name)
+        named = {n: t for n, t in db.tables.get(signal.key, {}).items() if t not in ("Error", "NotAvailable")}
+        assert named == ENUMS.get(stem, {}), signal.name
+        seen[stem] += stem in ENUMS
+    assert {stem: n for stem, n in seen.items() if n} == {
+        name: 1 if name in ("GatewayState", "CanState") else 8 for name in ENUMS
+    }
+
+
+def test_every_property_of_each_of_eight_escs_is_that_of_the_one() -> None:
+    one, many = read(SHIPPED.read_text()), eight()[0]
+    assert len(many.messages) == 8 * (len(one.messages) - 2) + 2
+    for message in one.messages:
+        prefixes = [f"Esc{n}" for n in range(1, 9)] if message.name.startswith("Esc") else [""]
+        for index, prefix in enumerate(prefixes):
+            stem = message.name.removeprefix("Esc") if prefix else message.name
+            copy = many.get_message_by_name(prefix + stem)
+            assert copy.frame_id == message.frame_id + index
+            assert facts_of_message(copy, prefix) == facts_of_message(message, "")
+    assert facts_of_database(many) == facts_of_database(one)
+
+
+# --- everything cantools can hold, as plain data ------------------------------------------------------------------------
+
+
+def attributes(thing: Any) -> dict[str, Any]:
+    dbc = getattr(thing, "dbc", None)
+    return {name: a.value for name, a in dbc.attributes.items() if "LongSymbol" not in name} if dbc else {}
+
+
+def facts_of_signal(signal: Signal, prefix: str) -> dict[str, Any]:
+    assert signal.name.startswith(prefix)
+    selector = signal.multiplexer_signal
+    return {
+        "name": signal.name.removeprefix(prefix),
+        "place": (signal.start, signal.length, signal.byte_order, signal.is_signed, signal.is_float),
+        "scale": (signal.scale, signal.offset, signal.minimum, signal.maximum, signal.unit),
+        "texts": {number: str(text) for number, text in (signal.choices or {}).items()},
+        "comment": signal.comment,
+        "receivers": signal.receivers,
+        "mux": (signal.is_multiplexer, signal.multiplexer_ids, selector and selector.removeprefix(prefix)),
+        "attributes": attributes(signal),
+        "start": signal.raw_initial,
+    }
+
+
+def facts_of_message(message: Message, prefix: str) -> dict[str, Any]:
+    assert all(name.startswith(prefix) for group in message.signal_groups or [] for name in group.signal_names)
+    return {
+        "form": (message.is_extended_frame, message.is_fd, message.length, message.cycle_time, message.send_type),
+        "comment": message.comment,
+        "senders": message.senders,
+        "attributes": attributes(message),
+        "signals": [facts_of_signal(s, prefix) for s in sorted(message.signals, key=lambda s: (s.start, s.name))],
+        "groups": [
+            (g.name, g.repetitions, [name.removeprefix(prefix) for name in g.signal_names])
+            for g in message.signal_groups or []
+        ],
+    }
+
+
+def facts_of_database(database: Database) -> dict[str, Any]:
+    dbc = database.dbc
+    assert dbc is not None
+    definitions = [*dbc.attribute_definitions.values(), *dbc.relation_attribute_definitions.values()]
+    return {
+        "version": database.version,
+        "nodes": [(node.name, node.comment, attributes(node)) for node in database.nodes],
+        "comments": [bus.comment for bus in database.buses],
+        "attributes": attributes(database),
+        "definitions": {
+            d.name: (d.type_name, d.kind, d.default_value, d.minimum, d.maximum, d.choices) for d in definitions
+        },
+        "tables": {name: {n: str(t) for n, t in table.items()} for name, table in dbc.value_tables.items()},
+        "environment": [
+            (
+                (v.name, v.env_type, v.minimum, v.maximum, v.unit, v.initial_value, v.env_id, v.access_type),
+                (v.access_nodes, v.data_size, v.comment, attributes(v)),
+            )
+            for v in dbc.environment_variables.values()
+        ],
+    }
+
+
+RICH = r"""VERSION "4.2 \"beta\""
+
+NS_ :
+
+BS_:
+
+BU_: Gw Logger Other
+
+VAL_TABLE_ OnOff 1 "On" 0 "Off" ;
+
+BO_ 2147484672 EscPower: 16 Gw
+ SG_ Page M : 0|4@1+ (1,0) [0|0] "" Logger
+ SG_ BatteryVoltage m0 : 15|16@0+ (0.01,0) [0|655.33] "V" Logger,Other
+ SG_ BatteryCurrent m1 : 8|32@1- (1,0) [-1000|1000] "A" Logger
+ SG_ MotorSpeed m3 : 8|64@1- (0.0001,-5.5) [0|0] "rps" Vector__XXX
+ SG_ OperatingState : 72|8@1+ (1,0) [0|26] "" Logger
+ SG_ BecTemperature : 80|8@1- (0.5,-40) [0|0] "degC" Logger
+
+BO_ 256 Flow: 8 Gw
+ SG_ ConsumedCharge : 7|16@0+ (0.001,0) [0|65.533] "Ah" Logger
+ SG_ BecVoltage : 16|16@1+ (1E-05,0) [0|0] "kV" Logger
+
+BO_ 512 GatewayHealth: 4 Gw
+ SG_ Uptime : 0|32@1+ (1,0) [0|0] "s" Logger
+
+BO_ 770 Foreign: 8 Other
+ SG_ Anything : 0|12@1+ (1,0) [0|0] "furlong" Gw
+
+BO_TX_BU_ 770 : Other,Logger;
+
+EV_ Ambient: 1 [-40|85.5] "degC" 21.5 1 DUMMY_NODE_VECTOR0 Logger;
+EV_ Mode: 0 [0|3] "" 2 2 DUMMY_NODE_VECTOR1 Vector__XXX;
+
+CM_ "Made by hand.
+It has \"quotes\", a ; semicolon,
+
+
+two empty lines and BO_ 5 words.";
+CM_ BU_ Gw "The gateway
+on two lines";
+CM_ BO_ 2147484672 "Power \"of\" one ESC.
+
+
+
+After three empty lines.";
+CM_ SG_ 2147484672 BatteryVoltage "At the terminals.  ";
+CM_ SG_ 770 Anything "Not ours.";
+CM_ EV_ Ambient "Around the car";
+
+BA_DEF_ "NetText" STRING ;
+BA_DEF_ "NetNumber" INT -5 5;
+BA_DEF_ "NetFloat" FLOAT -1.5 2.5;
+BA_DEF_ BU_ "NodeHex" HEX 0 65535;
+BA_DEF_ BU_ "NodeKind" ENUM "Small","Large";
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndOnChange","NoMsgSendType";
+BA_DEF_ BO_ "MsgFloat" FLOAT 0 1;
+BA_DEF_ BO_ "MsgText" STRING ;
+BA_DEF_ BO_ "MsgHex" HEX 0 255;
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG","r4","r5","r6","StandardCAN_FD","ExtendedCAN_FD";
+BA_DEF_ SG_ "GenSigStartValue" INT 0 65535;
+BA_DEF_ SG_ "SigEnum" ENUM "Low","Mid","High";
+BA_DEF_ SG_ "SigText" STRING ;
+BA_DEF_ EV_ "EnvNumber" INT 0 10;
+BA_DEF_REL_ BU_SG_REL_ "Timeout" INT 0 1000;
+BA_DEF_REL_ BU_BO_REL_ "Filter" INT 0 3;
+BA_DEF_DEF_ "NetText" "";
+BA_DEF_DEF_ "NetNumber" 0;
+BA_DEF_DEF_ "NetFloat" 0.5;
+BA_DEF_DEF_ "NodeHex" 0;
+BA_DEF_DEF_ "NodeKind" "Small";
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_DEF_DEF_ "GenMsgDelayTime" 0;
+BA_DEF_DEF_ "GenMsgSendType" "NoMsgSendType";
+BA_DEF_DEF_ "MsgFloat" 0;
+BA_DEF_DEF_ "MsgText" "none";
+BA_DEF_DEF_ "MsgHex" 0;
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
+BA_DEF_DEF_ "GenSigStartValue" 0;
+BA_DEF_DEF_ "SigEnum" "Low";
+BA_DEF_DEF_ "SigText" "";
+BA_DEF_DEF_ "EnvNumber" 0;
+BA_DEF_DEF_REL_ "Timeout" 100;
+BA_DEF_DEF_REL_ "Filter" 0;
+BA_ "NetText" "a \"quoted\" text; BA_ \"x\"";
+BA_ "NetNumber" -3;
+BA_ "NetFloat" 1.25;
+BA_ "NodeHex" BU_ Gw 4660;
+BA_ "NodeKind" BU_ Logger 1;
+BA_ "GenMsgCycleTime" BO_ 256 0;
+BA_ "GenMsgSendType" BO_ 256 1;
+BA_ "GenMsgDelayTime" BO_ 256 7;
+BA_ "GenMsgCycleTime" BO_ 2147484672 20;
+BA_ "GenMsgSendType" BO_ 2147484672 3;
+BA_ "MsgFloat" BO_ 2147484672 0.125;
+BA_ "MsgText" BO_ 2147484672 "line";
+BA_ "MsgHex" BO_ 256 171;
+BA_ "VFrameFormat" BO_ 2147484672 8;
+BA_ "GenSigStartValue" SG_ 256 ConsumedCharge 65535;
+BA_ "GenSigStartValue" SG_ 256 BecVoltage 0;
+BA_ "SigEnum" SG_ 256 BecVoltage 2;
+BA_ "SigText" SG_ 2147484672 BatteryVoltage "V \"bat\"";
+BA_ "EnvNumber" EV_ Ambient 4;
+BA_REL_ "Timeout" BU_SG_REL_ Logger SG_ 256 ConsumedCharge 250;
+BA_REL_ "Filter" BU_BO_REL_ Logger 256 2;
+BA_REL_ "Filter" BU_BO_REL_ Gw 770 1;
+
+VAL_ 2147484672 OperatingState 1 "WaitForSignal" 12 "MotorOff" 21 "Forward" 254 "Error" 255 "NotAvailable" ;
+VAL_ 256 ConsumedCharge 65534 "Error" 65535 "NotAvailable" ;
+VAL_ 770 Anything 1 "a text with \"quotes\"" 0 "plain" ;
+
+SIG_GROUP_ 256 Charge 1 : ConsumedCharge BecVoltage;
+SIG_GROUP_ 2147484672 Slow 2 : OperatingState BecTemperature;
+
+SIG_VALTYPE_ 2147484672 BatteryCurrent : 1;
+SIG_VALTYPE_ 2147484672 MotorSpeed : 2;
+"""
+
+
+def relations(database: Database) -> set[tuple[Any, ...]]:
+    dbc = database.dbc
+    assert dbc is not None and dbc.relation_attributes is not None
+    found: set[tuple[Any, ...]] = set()
+    for number, by_signal in dbc.relation_attributes.node_signal_relations.items():
+        for signal, by_node in by_signal.items():
+            found |= {(number, signal, n, a.name, a.value) for n, each in by_node.items() for a in each.values()}
+    for number, by_node in dbc.relation_attributes.node_message_relations.items():
+        found |= {(number, n, a.name, a.value) for n, each in by_node.items() for a in each.values()}
+    return found
+
+
+def test_a_rich_dbc_is_written_for_one_esc_without_a_loss() -> None:
+    before = read(RICH)
+    after, text = multiplied(RICH, [EscSettings("esc1")], "Gw")
+    assert facts_of_database(after) == facts_of_database(before)
+    assert [m.name for m in after.messages] == [m.name for m in before.messages]
+    for old, new in zip(before.messages, after.messages, strict=True):
+        assert new.frame_id == old.frame_id
+        assert facts_of_message(new, "") == facts_of_message(old, "")
+    assert relations(after) == relations(before)
+    assert written(after) == text
+
+
+def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
+    before = read(RICH)
+    after, text = multiplied(RICH, PAIR, "Gw")
+    assert facts_of_database(after) == facts_of_database(before)
+    for prefix in ("Left", "Right"):
+        for old, stem in (("EscPower", "Power"), ("Flow", "Flow")):
+            copy, original = after.get_message_by_name(prefix + stem), before.get_message_by_name(old)
+            assert facts_of_message(copy, prefix) == facts_of_message(original, "")
+    for name in ("GatewayHealth", "Foreign"):
+        copy, original = after.get_message_by_name(name), before.get_message_by_name(name)
+        assert copy.frame_id == original.frame_id
+        assert facts_of_message(copy, "") == facts_of_message(original, "")
+    assert [m.name for m in after.messages] == [
+        "LeftPower",
+        "RightPower",
+        "LeftFlow",
+        "RightFlow",
+        "GatewayHealth",
+        "Foreign",
+    ]
+    assert relations(after) == {
+        (256, "LeftConsumedCharge", "Logger", "Timeout", 250),
+        (257, "RightConsumedCharge", "Logger", "Timeout", 250),
+        (256, "Logger", "Filter", 2),
+        (257, "Logger", "Filter", 2),
+        (770, "Gw", "Filter", 1),
+    }
+    assert written(after) == text
+    assert text.endswith(";\n") and "\r" not in text and "\n\nBO_ 256 LeftFlow" in text
+    assert '"NS_DESC' not in text and "\nNS_ :\n" in text
+
+
+def test_the_database_that_is_multiplied_is_left_as_it_was() -> None:
+    database = read(RICH)
+    before = (facts_of_database(database), [facts_of_message(m, "") for m in database.messages], relations(database))
+    expand.expand(database, "Gw", PAIR, "my.dbc", None, 0x300)
+    after = (facts_of_database(database), [facts_of_message(m, "") for m in database.messages], relations(database))
+    assert after == before
+
+
+def test_extended_multiplexing_of_one_level_comes_through() -> None:
+    text = dbc_text(
+        [
+            Msg(
+                "EscX",
+                5,
+                8,
+                [Sig("Page", 0, 4, mux="M"), Sig("BatteryVoltage", 8, 16, mux="m0"), Sig("Timing", 32, 8, mux="m2")],
+            )
+        ]
+    )
+    text += "SG_MUL_VAL_ 5 BatteryVoltage Page 0-1, 3-3;\nSG_MUL_VAL_ 5 Timing Page 2-2;\n"
+    after, _ = multiplied(text, PAIR, "Gateway")
+    voltage = after.get_message_by_name("RightX").get_signal_by_name("RightBatteryVoltage")
+    assert voltage.multiplexer_ids == [0, 1, 3]
+    assert voltage.multiplexer_signal == "RightPage"
+
+
+def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_they_were() -> None:
+    more = (
+        'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_DEF_DEF_ "SystemSignalLongSymbol" "";\n'
+        'BA_ "SystemSignalLongSymbol" SG_ 5 U "BatteryVoltage";'
+    )
+    after, text = multiplied(dbc_text([Msg("EscX", 5, 8, [Sig("U", 0, 16, unit="V")])], more), PAIR, "Gateway")
+    assert [s.name for m in after.messages for s in m.signals] == ["LeftBatteryVoltage", "RightBatteryVoltage"]
+    assert 'BA_ "SystemSignalLongSymbol"' not in text
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_layouts_are_written_without_a_loss(seed: int) -> None:
+    maker = LayoutMaker(random.Random(seed), PAIR)
+    text = dbc_text([maker.message() for _ in range(5)])
+    before = read(text)
+    after = read(written(before))
+    assert facts_of_database(after) == facts_of_database(before)
+    assert [facts_of_message(m, "") for m in after.messages] == [facts_of_message(m, "") for m in before.messages]
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.text(st.sampled_from('aB1 \n";:,_()[]|é.'), max_size=40).filter(lambda text: not text.endswith("\\")))
+def test_any_comment_and_any_text_come_through(words: str) -> None:
+    escaped = words.replace('"', '\\"')
+    text = dbc_text(
+        [Msg("EscX", 5, 8, [Sig("BatteryVoltage", 0, 16, unit="V")])],
+        f'CM_ "{escaped}";\nCM_ BO_ 5 "{escaped}";\nCM_ SG_ 5 BatteryVoltage "{escaped}";\n'
+        f'BA_DEF_ "T" STRING ;\nBA_DEF_DEF_ "T" "";\nBA_ "T" "{escaped}";',
+    )
+    before, (after, _) = read(text), multiplied(text, PAIR, "Gateway")
+    assert [bus.comment for bus in after.buses] == [bus.comment for bus in before.buses]
+    assert attributes(after) == attributes(before)
+    old, new = before.messages[0], after.messages[1]
+    assert (new.comment, new.signals[0].comment) == (old.comment, old.signals[0].comment)
+
+
+# --- names and ids ------------------------------------------------------------------------------------------------------
+
+
+def simple(*ids: int, extended: bool = False, gateway: tuple[int, ...] = ()) -> str:
+    messages = [Msg(f"EscM{n}", i, 8, [Sig("BatteryVoltage", 0, 16, unit="V")], extended) for n, i in enumerate(ids)]
+    messages += [Msg(f"Gw{n}", i, 8, [Sig("Uptime", 0, 32, unit="s")], extended) for n, i in enumerate(gateway)]
+    return dbc_text(messages)
+
+
+def ids_of(database: Database) -> list[int]:
+    return [message.frame_id for message in database.messages]
+
+
+@pytest.mark.parametrize(
+    ("own", "gateway", "base", "step", "expected"),
+    [
+        ((0x100, 0x108), (), None, None, [0x100, 0x101, 0x108, 0x109]),
+        ((0x100, 0x101, 0x102), (), None, None, [0x100, 0x103, 0x101, 0x104, 0x102, 0x105]),
+        ((0x100, 0x101), (0x102,), None, None, [0x100, 0x103, 0x101, 0x104, 0x102]),
+        ((0x100,), (0x101, 0x102, 0x103), None, None, [0x100, 0x104, 0x101, 0x102, 0x103]),
+        ((0x100,), (0x110,), 0x200, None, [0x200, 0x201, 0x210]),
+        ((0x110,), (0x100,), 0x000, None, [0x010, 0x011, 0x000]),
+        ((0x100, 0x101), (), None, 0x20, [0x100, 0x120, 0x101, 0x121]),
+    ],
+)
+def test_ids_are_moved_by_the_smallest_step_without_a_clash(
+    own: tuple[int, ...], gateway: tuple[int, ...], base: int | None, step: int | None, expected: list[int]
+) -> None:
+    after, _ = multiplied(simple(*own, gateway=gateway), PAIR, "Gateway", base_id=base, id_step=step)
+    assert ids_of(after) == expected
+
+
+def compiled(text: str, escs: list[EscSettings], **more: Any) -> None:
+    database, bind = expand.expand(read(text), "Gateway", escs, "my.dbc", **more)
+    compile_layout(database, "my.dbc", escs, DbcSettings(bind))
+
+
+def refused(text: str, escs: list[EscSettings] = PAIR, **more: Any) -> str:
+    with pytest.raises(UserError) as caught:
+        compiled(text, escs, **more)
+    for line in caught.value.problems:
+        assert line.startswith("my.dbc: ") and "\n" not in line
+    return "\n".join(caught.value.problems)
+
+
+def test_a_step_that_makes_ids_clash_is_refused() -> None:
+    assert "moved by 1" in refused(simple(0x100, 0x101), id_step=1)
+    assert "clash" in refused(simple(0x100, gateway=(0x110,)), id_step=0x10)
+    assert "clash" in refused(simple(0x100), id_step=0)
+
+
+def test_ids_that_leave_their_range_are_refused() -> None:
+    assert "EscM0: id 7FFh moved to 800h is outside 0..7FFh" in refused(simple(0x7FF))
+    assert "outside 0..1FFFFFFFh" in refused(simple(0x1FFFFFFF, extended=True))
+    assert "outside 0..7FFh" in refused(simple(0x100), base_id=0x7FF, id_step=1)
+    assert "outside 0..7FFh" in refused(simple(0x100, 0x200), [EscSettings("one")], base_id=0x700)
+    assert ids_of(multiplied(simple(0x1FFFFFFE, extended=True), PAIR, "Gateway")[0]) == [0x1FFFFFFE, 0x1FFFFFFF]
+
+
+def test_names_of_more_than_32_characters_are_refused() -> None:
+    name = "limit_battery_voltage_minimum"
+    text = dbc_text([Msg("EscM", 1, 8, [Sig("LimitBatteryVoltageMinimum", 0, 1)])])
+    assert multiplied(text, [EscSettings("abcdef"), EscSettings("b")], "Gateway")[0]
+    line = refused(text, [EscSettings("abcdefg"), EscSettings("b")])
+    assert "EscM: AbcdefgLimitBatteryVoltageMinimum is longer than 32" in line
+    assert len(name.replace("_", "")) == 26
+
+
+def test_two_messages_that_would_get_one_name_are_refused() -> None:
+    text = dbc_text([Msg(n, i, 8, [Sig("BatteryVoltage", 0, 16)]) for i, n in enumerate(("EscPower", "Power"), 0x100)])
+    assert "LeftPower" in refused(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "prefix"),
+    [("left", "Left"), ("left_front", "LeftFront"), ("esc1", "Esc1"), ("FR", "FR"), ("a_b_1", "AB1"), ("x__y_", "XY")],
+)
+def test_the_prefix_of_an_esc_is_its_name_in_pascal_case(name: str, prefix: str) -> None:
+    assert expand.esc_prefix(name) == prefix
+
+
+# --- what is written is what is sent ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 8])
+def test_plans_from_the_written_file_are_those_of_the_gateway(count: int) -> None:
+    escs = EIGHT[:count]
+    database, layout = prepare(load_database(SHIPPED), "x", escs, DbcSettings())
+    again, layout_again = prepare(read(written(database)), "x", escs, DbcSettings())
+    assert layout_again.messages == layout.messages
+    assert written(again) == written(database)
+
+
+def plain_plan(plan: MessagePlan) -> MessagePlan:
+    """With the signals in one order: that of the file is sorted by the writer."""
+    return replace(plan, signals=tuple(sorted(plan.signals, key=lambda signal: signal.name)))
+
+
+def test_plans_from_a_rich_file_are_those_of_the_gateway() -> None:
+    for escs in ([EscSettings("esc1")], PAIR):
+        database, layout = prepare(read(RICH), "x", escs, DbcSettings(node="Gw", base_id=0x10), fd_allowed=True)
+        _, again = prepare(read(written(database)), "x", escs, DbcSettings(node="Gw"), fd_allowed=True)
+        assert [plain_plan(plan) for plan in again.messages] == [plain_plan(plan) for plan in layout.messages]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_plans_from_random_files_written_again_are_the_same(seed: int) -> None:
+    maker = LayoutMaker(random.Random(seed), PAIR)
+    messages = [maker.message() for _ in range(5)]
+    bind = DbcSettings(bindings(messages))
+    database = read(dbc_text(messages))
+    by_name = [
+        {
+            (p.name, s.name, s.page): s
+            for p in compile_layout(d, "x", PAIR, bind, fd_allowed=True).messages
+            for s in p.signals
+        }
+        for d in (database, read(written(database)))
+    ]
+    assert by_name[0] == by_name[1]
+
+
+# --- the command --------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_eight_escs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "eight.dbc"
+    assert main(["dbc", "--esc", "8", "-o", str(out)]) == 0
+    assert out.read_text() == eight()[1]
+    assert [p.name for p in tmp_path.iterdir()] == ["eight.dbc"]
+    capsys.readouterr()
+    assert main(["dbc", "--esc", "8"]) == 0
+    assert capsys.readouterr().out == eight()[1]
+
+
+def test_the_command_takes_names_base_step_and_another_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = tmp_path / "mine.dbc"
+    source.write_text(RICH)
+    line = [
+        "dbc",
+        "--from",
+        str(source),
+        "--node",
+        "Gw",
+        "--name",
+        "left",
+        "--name",
+        "right",
+        "--base-id",
+        "0x20",
+        "--id-step",
+        "4",
+    ]
+    assert main(line) == 0
+    after = read(capsys.readouterr().out)
+    assert [(m.name, m.frame_id) for m in after.messages][:5] == [
+        ("LeftPower", 0x320),
+        ("RightPower", 0x324),
+        ("LeftFlow", 0x20),
+        ("RightFlow", 0x24),
+        ("GatewayHealth", 0x120),
+    ]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--esc", "0"],
+        ["--esc", "two"],
+        ["--esc", "2", "--name", "left"],
+        ["--name", "left", "--name", "LEFT"],
+        ["--name", "left_1", "--name", "left1"],
+        ["--name", "1st"],
+        ["--base-id", "0x20000000"],
+        ["--base-id", "0x7f0"],
+        ["--base-id", "here"],
+        ["--esc", "2", "--id-step", "8"],
+        ["--esc", "9"],
+        ["--node", "Nobody"],
+        ["--from", "none.dbc"],
+        ["-c", "none.toml"],
+        ["-c", "none.toml", "--esc", "2"],
+        ["--esc", "2", "--name", "abcdefghijkl", "--name", "b"],
+    ],
+)
+def test_the_command_refuses_what_cannot_be(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code = main(["dbc", *arguments])
+    except SystemExit as end:
+        code = end.code  # type: ignore[assignment]  # argparse gives numbers
+    caught = capsys.readouterr()
+    if arguments == [
+        "--esc",
+        "9",
+    ]:  # the shipped ids leave room for eight; a greater step makes room for more, or none does
+        assert code in (0, 2)
+    else:
+        assert code == 2
+        assert not caught.out
+    assert "Traceback" not in caught.err
+
+
+def test_the_command_writes_what_a_configuration_sends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mine = tmp_path / "mine.dbc"
+    mine.write_text(dbc_text([Msg("EscPower", 0x100, 8, [Sig("U", 0, 16, factor="0.01", unit="V"), Sig("Id", 16, 8)])]))
+    toml = tmp_path / "gateway.toml"
+    toml.write_text(
+        '[dbc]\nfile = "mine.dbc"\nbase_id = 0x680\n[dbc.bind]\nU = "battery_voltage"\nId = 5\n'
+        '[[esc]]\nport = "/dev/ttyA"\nname = "left"\n[[esc]]\nport = "/dev/ttyB"\nname = "right"\n'
+    )
+    assert main(["dbc", "-c", str(toml)]) == 0
+    text = capsys.readouterr().out
+    config = load(toml)
+    database, layout = prepare(load_database(mine), "x", config.escs, config.dbc_settings)
+    assert text == written(database)
+    assert [(p.name, p.can_id) for p in layout.messages] == [("LeftPower", 0x680), ("RightPower", 0x681)]
+    assert [(m.name, m.frame_id) for m in read(text).messages] == [("LeftPower", 0x680), ("RightPower", 0x681)]
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing_behind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder").mkdir()
+    assert main(["dbc", "-o", str(tmp_path / "none" / "x.dbc")]) == 1
+    assert main(["dbc", "-o", str(tmp_path / "folder")]) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+    assert "cannot be written" in capsys.readouterr().err

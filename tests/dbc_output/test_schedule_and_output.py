@@ -1,0 +1,710 @@
+"""When frames go out and what stands in them, with time passed in."""
+
+import random
+from collections.abc import Sequence
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+
+import cantools.database
+import pytest
+from cantools.database.can import Database
+from e2e import p01
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from packer_oracle import KNOWN, Msg, Sig, dbc_text, get, random_info, random_live
+
+from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, load_database
+from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.dbc_output.schedule import phases
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.protocol.codec import Layout as WireLayout
+from kontronik_can_gw.protocol.codec import encode
+from kontronik_can_gw.protocol.fields import InfoData, LiveData, device_and_variant
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
+
+SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
+CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)
+TIMEOUT = 250 * MS
+VOLTAGE = Sig("BatteryVoltage", 0, 16, unit="V", factor="0.01")
+LIVE = LiveData(battery_voltage=2442, operating_state=12)
+
+
+def volts(number: int) -> LiveData:
+    return LIVE._replace(battery_voltage=number)
+
+
+class Bench:
+    """A gateway whose time is turned by hand. Every frame is kept with the time at which it was handed out."""
+
+    def __init__(
+        self,
+        messages: Sequence[tuple[Msg, int, int, int]],
+        names: Sequence[str] = ("esc1",),
+        silent: bool = False,
+        start: bool = False,
+    ) -> None:
+        more = "\n".join(
+            f'BA_ "GenMsgSendType" BO_ {m.dbc_id} {kind};\nBA_ "GenMsgCycleTime" BO_ {m.dbc_id} {cycle};\n'
+            f'BA_ "GenMsgDelayTime" BO_ {m.dbc_id} {delay};'
+            for m, kind, cycle, delay in messages
+        )
+        database = cantools.database.load_string(dbc_text([m for m, *_ in messages], more), "dbc")
+        assert isinstance(database, Database)
+        escs = [EscSettings(name, timeout_ns=TIMEOUT) for name in names]
+        self.database, self.layout = prepare(database, "my.dbc", escs, DbcSettings())
+        self.gateway = Gateway(escs, self.layout, 0, silent)
+        self.now = 0
+        self.sent: list[tuple[int, CanFrame]] = []
+        if start:
+            self.gateway.start(0)
+            self.take()
+
+    def take(self) -> None:
+        self.sent += [(self.now, frame) for frame in self.gateway.take_frames()]
+
+    def until(self, when: int) -> None:
+        """Let time pass as a perfect runtime does: awake at each deadline."""
+        while (deadline := self.gateway.next_deadline()) <= when:
+            self.now = max(self.now, deadline)
+            self.gateway.advance(self.now)
+            self.take()
+        self.now = when
+
+    def jump(self, when: int) -> None:
+        """Be late: one call only."""
+        self.now = when
+        self.gateway.advance(when)
+        self.take()
+
+    def live(self, data: LiveData = LIVE, esc: int = 0) -> None:
+        self.gateway.receive_bytes(esc, encode(data, WireLayout.V4), self.now)
+        self.take()
+
+    def info(self, data: InfoData, esc: int = 0) -> None:
+        self.gateway.receive_bytes(esc, encode(data, WireLayout.V4), self.now)
+        self.take()
+
+    def feed(self, until: int, period: int = 10 * MS, data: LiveData = LIVE) -> None:
+        """Live frames of the first ESC at a steady pace."""
+        while self.now + period <= until:
+            self.until(self.now + period)
+            self.live(data)
+
+    def times(self, can_id: int = 0x100) -> list[int]:
+        return [when // MS for when, frame in self.sent if frame.can_id == can_id]
+
+    def raws(self, length: int = 16, start: int = 0, can_id: int = 0x100) -> list[int]:
+        return [get(frame.data, start, length, True) for _, frame in self.sent if frame.can_id == can_id]
+
+    def forget(self) -> None:
+        self.sent.clear()
+
+
+def lone(kind: int, cycle: int = 0, delay: int = 0, *more: Sig, silent: bool = False, start: bool = False) -> Bench:
+    return Bench([(Msg("EscPower", 0x100, 8, [VOLTAGE, *more]), kind, cycle, delay)], silent=silent, start=start)
+
+
+# --- cyclic -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_cyclic_message_keeps_its_cycle_with_and_without_telemetry() -> None:
+    bench = lone(CYCLIC, 100)
+    bench.until(1000 * MS)
+    assert all(b - a == 100 for a, b in pairwise(bench.times()))
+    assert len(bench.times()) == 11 and set(bench.raws()) == {65535}
+    bench.feed(2 * SECOND)
+    assert all(b - a == 100 for a, b in pairwise(bench.times()))
+
+
+def test_a_cyclic_message_is_not_sent_on_events() -> None:
+    bench = lone(CYCLIC, 1000)
+    bench.feed(500 * MS)
+    assert bench.times() == [0]
+
+
+@pytest.mark.parametrize("late", [101, 150, 1000, 60_000])
+def test_a_late_call_sends_one_frame_and_the_grid_stays(late: int) -> None:
+    bench = lone(CYCLIC, 100)
+    bench.until(0)
+    bench.forget()
+    bench.jump(late * MS)
+    assert bench.times() == [late]
+    bench.jump(late * MS)
+    assert bench.times() == [late]
+    bench.until((late + 300) * MS)
+    assert all(when % 100 == 0 for when in bench.times()[1:])
+    assert len(bench.times()) == 4
+
+
+@pytest.mark.parametrize("count", [2, 3, 8])
+def test_the_same_message_of_several_escs_never_goes_at_one_instant(count: int) -> None:
+    escs = [EscSettings(f"esc{n + 1}") for n in range(count)]
+    _, layout = prepare(load_database(SHIPPED), "x", escs, DbcSettings())
+    gateway = Gateway(escs, layout, 0)
+    instants: dict[tuple[str, int], set[int]] = {}
+    names = {plan.can_id: plan.name for plan in layout.messages}
+    most = 0
+    while (now := gateway.next_deadline()) < 3 * SECOND:
+        gateway.advance(now)
+        frames = gateway.take_frames()
+        most = max(most, len(frames))
+        for frame in frames:
+            stem = names[frame.can_id][4:] if names[frame.can_id].startswith("Esc") else names[frame.can_id]
+            key = (stem, now)
+            instants.setdefault(key, set()).add(frame.can_id)
+    assert instants
+    assert all(len(ids) == 1 for ids in instants.values())
+    assert most <= 2
+
+
+@given(st.lists(st.sampled_from([0, 10 * MS, 20 * MS, 50 * MS, 100 * MS, 1000 * MS, 7 * MS]), min_size=1, max_size=100))
+def test_phases_lie_within_the_cycle_and_evenly_apart(cycles: list[int]) -> None:
+    found = phases(cycles)
+    for cycle in set(cycles) - {0}:
+        own = sorted(phase for phase, c in zip(found, cycles, strict=True) if c == cycle)
+        assert own[0] >= 0 and own[-1] < cycle
+        assert len(set(own)) == len(own)
+        gaps = [b - a for a, b in pairwise([*own, own[0] + cycle])]
+        assert max(gaps) - min(gaps) <= 1
+
+
+# --- event --------------------------------------------------------------------------------------------------------------
+
+
+def test_an_event_message_goes_with_each_live_frame_and_no_other() -> None:
+    bench = lone(EVENT)
+    for n in range(1, 6):
+        bench.until(n * 10 * MS)
+        bench.live(volts(n))
+        bench.info(InfoData())
+    assert bench.times() == [10, 20, 30, 40, 50]
+    assert bench.raws() == [1, 2, 3, 4, 5]
+
+
+def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too() -> None:
+    bench = Bench([(Msg("EscPower", 0x100, 8, [VOLTAGE, Sig("LinkState", 16, 8)]), EVENT, 0, 0)])
+    lives = 0
+    for _ in range(250):
+        bench.until(bench.now + 10 * MS)
+        if bench.now < SECOND:
+            bench.gateway.receive_bytes(0, b"noise " * 5, bench.now)
+            bench.take()
+        bench.live()
+        lives += 1
+    assert {2, 3} <= set(bench.raws(8, 16))  # Ok and Degraded
+    assert len(bench.times()) == lives
+
+
+def test_an_event_message_of_info_values_goes_with_info_frames_only() -> None:
+    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("CellCount", 0, 8)]), EVENT, 0, 0)])
+    bench.now = 50 * MS
+    bench.live()
+    bench.forget()
+    bench.info(InfoData(cell_count=6))
+    assert bench.raws(8) == [6]
+    bench.until(100 * MS)
+    bench.live()
+    assert bench.raws(8) == [6]
+
+
+def test_events_closer_than_the_minimum_distance_are_put_off_and_the_newest_value_goes() -> None:
+    bench = lone(EVENT, 0, 25)
+    bench.feed(9 * MS, 3 * MS)
+    assert bench.times() == [3]
+    bench.until(10 * MS)
+    bench.live(volts(7))
+    bench.until(100 * MS)
+    assert bench.times() == [3, 28]
+    assert bench.raws() == [2442, 7]
+
+
+def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> None:
+    for kind, cycle in ((EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 40), (CYCLIC_AND_ON_CHANGE, 30), (CYCLIC, 50)):
+        bench = lone(kind, cycle, 15)
+        rng = random.Random(kind)
+        for n in range(300):
+            bench.until(bench.now + rng.randrange(1, 12 * MS))
+            bench.live(volts(n))
+        times = [when for when, _ in bench.sent]
+        assert len(times) > 30
+        assert all(b - a >= 15 * MS for a, b in pairwise(times)), kind
+
+
+def test_one_event_makes_one_frame_also_where_another_was_put_off_before() -> None:
+    bench = lone(EVENT, 0, 5)
+    bench.now = 10 * MS
+    bench.live(volts(1))
+    bench.until(13 * MS)
+    bench.live(volts(2))  # put off to 15
+    bench.now = 16 * MS  # the runtime reads the port before it looks at the clock
+    bench.live(volts(3))
+    bench.until(200 * MS)
+    assert bench.raws() == [1, 3]
+
+
+def test_a_cycle_and_an_event_that_was_put_off_make_one_frame() -> None:
+    bench = lone(CYCLIC_AND_EVENT, 12, 5)
+    bench.until(7 * MS)
+    bench.live(volts(1))  # 0: cycle, 7: event
+    bench.until(9 * MS)
+    bench.live(volts(2))  # put off to 12, when the cycle is due
+    bench.until(23 * MS)
+    assert bench.times() == [0, 7, 12]
+
+
+# --- on change ----------------------------------------------------------------------------------------------------------
+
+
+def test_on_change_goes_only_when_a_raw_value_changes() -> None:
+    bench = lone(ON_CHANGE, 0, 0, Sig("AliveCounter", 56, 4))
+    for n, number in enumerate((1, 1, 1, 2, 2, 1, 1), 1):
+        bench.until(n * 10 * MS)
+        bench.live(LiveData(battery_voltage=number, electrical_speed=n))
+    assert bench.times() == [10, 40, 60]
+    assert bench.raws(4, 56) == [0, 1, 2]
+
+
+def test_a_change_that_is_taken_back_before_it_may_go_is_not_sent() -> None:
+    bench = lone(ON_CHANGE, 0, 25)
+    for n, number in ((10, 1), (20, 2), (30, 1)):
+        bench.until(n * MS)
+        bench.live(volts(number))
+    bench.until(200 * MS)
+    assert bench.raws() == [1]
+
+
+def test_cyclic_and_on_change_does_both() -> None:
+    bench = lone(CYCLIC_AND_ON_CHANGE, 100, 10)
+    bench.until(5 * MS)
+    bench.live(volts(1))
+    bench.feed(95 * MS, 10 * MS, volts(1))
+    bench.feed(305 * MS, 10 * MS, volts(2))
+    assert bench.times() == [0, 10, 100, 200, 300] or bench.times() == [0, 10, 100, 110, 200, 300]
+    assert bench.raws()[:3] == [65535, 1, 1]
+
+
+def test_cyclic_and_event_does_both() -> None:
+    bench = lone(CYCLIC_AND_EVENT, 100)
+    bench.until(50 * MS)
+    bench.live(volts(1))
+    bench.until(120 * MS)
+    bench.live(volts(2))
+    bench.until(210 * MS)
+    assert bench.times() == [0, 50, 100, 120, 200]
+    assert bench.raws() == [65535, 1, 1, 2, 2]
+
+
+# --- loss and return ----------------------------------------------------------------------------------------------------
+
+
+def test_on_loss_a_cyclic_message_goes_on_with_not_available_from_the_first_frame_after_the_time_out() -> None:
+    bench = lone(CYCLIC, 10)
+    bench.feed(500 * MS)
+    bench.forget()
+    bench.until(2 * SECOND)
+    for when, frame in bench.sent:
+        fresh = when - 500 * MS <= TIMEOUT
+        assert get(frame.data, 0, 16, True) == (2442 if fresh else 65535), when
+    assert len(bench.sent) == 150
+
+
+@pytest.mark.parametrize("kind", [EVENT, ON_CHANGE])
+@pytest.mark.parametrize("delay", [0, 5, 100])
+@pytest.mark.parametrize("late", [False, True])
+def test_on_loss_an_event_message_is_sent_exactly_once_with_not_available(kind: int, delay: int, late: bool) -> None:
+    bench = lone(kind, 0, delay, start=True)
+    bench.feed(500 * MS, 10 * MS)
+    bench.until(505 * MS)
+    bench.live(volts(5))
+    bench.until(506 * MS)
+    bench.live(volts(6))
+    if late:
+        bench.jump(2 * SECOND)
+    bench.until(5 * SECOND)
+    assert bench.raws().count(65535) == 2  # at the start and on the loss
+    assert bench.raws()[-1] == 65535
+    if not late:
+        assert bench.times()[-1] == 756
+        assert bench.raws()[-2] == 6
+
+
+def test_a_lost_port_is_a_loss_at_once() -> None:
+    bench = lone(EVENT)
+    bench.feed(100 * MS)
+    bench.until(103 * MS)
+    bench.gateway.port_lost(0, bench.now)
+    bench.take()
+    bench.until(2 * SECOND)
+    assert bench.times()[-1] == 103 and bench.raws()[-1] == 65535
+    assert bench.raws().count(65535) == 1
+
+
+def escs_message(n: int) -> Msg:
+    return Msg(
+        f"EscLink{n}", 0x200 + n, 8, [Sig("LinkState", 0, 8), Sig("Losses", 8, 8), Sig("DataAge", 16, 16, unit="ms")]
+    )
+
+
+def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() -> None:
+    kinds = [(CYCLIC, 20), (EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 50), (CYCLIC_AND_ON_CHANGE, 30)]
+    messages = [(Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]), kind, cycle, 0) for n, (kind, cycle) in enumerate(kinds)]
+    messages += [(escs_message(n), kind, cycle, 0) for n, (kind, cycle) in enumerate(kinds)]
+    for silent in (False, True):
+        bench = Bench(messages, silent=silent, start=True)
+        bench.feed(500 * MS)
+        bench.until(500 * MS + TIMEOUT)
+        bench.forget()
+        bench.until(3 * SECOND)
+        with_values = [frame for _, frame in bench.sent if frame.can_id < 0x200]
+        assert (not with_values) == silent
+        for n, (kind, cycle) in enumerate(kinds):
+            link = [(when, frame) for when, frame in bench.sent if frame.can_id == 0x200 + n]
+            assert link, (n, silent)
+            assert get(link[-1][1].data, 0, 8, True) == 4  # Lost
+            assert get(link[-1][1].data, 8, 8, True) == 1
+            if kind in (EVENT, ON_CHANGE):
+                assert len(link) == 1
+            else:
+                assert len(link) >= 2250 // cycle - 1
+
+
+def test_silent_says_nothing_before_the_first_frame_but_for_the_link() -> None:
+    bench = Bench(
+        [(Msg("EscPower", 0x100, 8, [VOLTAGE]), CYCLIC, 10, 0), (escs_message(0), CYCLIC, 100, 0)],
+        silent=True,
+        start=True,
+    )
+    bench.until(SECOND)
+    assert {frame.can_id for _, frame in bench.sent} == {0x200}
+
+
+def test_silent_lets_a_message_of_several_escs_go_on_as_long_as_one_is_up() -> None:
+    signals = [Sig("LeftBatteryVoltage", 0, 16), Sig("RightBatteryVoltage", 16, 16)]
+    bench = Bench([(Msg("Both", 0x100, 8, signals), CYCLIC, 50, 0)], ("left", "right"), silent=True)
+    bench.live(esc=0)
+    bench.feed(400 * MS)
+    assert bench.raws(16, 16) == [65535] * 9
+    bench.until(2 * SECOND)
+    assert bench.times()[-1] == 650
+
+
+def test_values_are_back_with_the_first_frame_after_a_loss() -> None:
+    for silent in (False, True):
+        for kind in (EVENT, CYCLIC_AND_EVENT):
+            bench = lone(kind, 40 if kind == CYCLIC_AND_EVENT else 0, 0, silent=silent)
+            bench.feed(100 * MS)
+            bench.until(2 * SECOND + 5 * MS)
+            bench.forget()
+            bench.live(volts(77))
+            assert bench.times() == [2005] and bench.raws() == [77]
+            bench.until(2 * SECOND + 200 * MS)
+            assert set(bench.raws()) == {77}
+
+
+def test_frames_that_only_half_arrive_never_bring_a_value() -> None:
+    bench = lone(CYCLIC_AND_EVENT, 20)
+    data = encode(volts(1234), WireLayout.V4)
+    for n in range(50):
+        bench.until(n * 20 * MS)
+        bench.gateway.receive_bytes(0, data[: 1 + n % 39], bench.now)
+        bench.take()
+    assert set(bench.raws()) == {65535}
+
+
+def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
+    signals = [Sig("LeftBatteryVoltage", 0, 16, factor="0.01"), Sig("RightBatteryVoltage", 16, 16, factor="0.01")]
+    bench = Bench([(Msg("Both", 0x100, 8, signals), EVENT, 0, 0)], ("left", "right"))
+    bench.live(volts(1), 0)
+    bench.live(volts(2), 1)
+    bench.now = 200 * MS
+    bench.live(volts(3), 0)
+    bench.now = 200 * MS + TIMEOUT - 1 * MS  # nobody has looked at the clock since
+    bench.forget()
+    bench.live(volts(4), 0)
+    assert bench.raws(16, 0)[-1] == 4
+    assert set(bench.raws(16, 16)) == {65535}
+
+
+def test_info_is_not_available_as_soon_as_it_is_too_old() -> None:
+    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("CellCount", 0, 8)]), CYCLIC, 100, 0)])
+    bench.feed(330 * MS)
+    bench.info(InfoData(cell_count=6))
+    bench.feed(15 * SECOND)
+    for when, frame in bench.sent:
+        known = 330 * MS <= when <= 330 * MS + INFO_TIMEOUT_NS
+        assert get(frame.data, 0, 8, True) == (6 if known else 255), when
+
+
+def test_info_of_another_device_is_gone_with_the_telemetry() -> None:
+    bench = Bench([(Msg("EscInfo", 0x100, 8, [Sig("DeviceRaw", 0, 8)]), EVENT, 0, 0)])
+    bench.now = 10 * MS
+    bench.live()
+    bench.info(InfoData(device_and_variant=device_and_variant(3, 120)))
+    bench.until(SECOND)
+    assert bench.raws(8) == [255, 3, 255] or bench.raws(8) == [3, 255]
+    assert bench.times()[-1] == 260
+
+
+# --- alive counter, pages, E2E ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("length", "maximum", "modulus"), [(4, "0", 16), (4, "14", 15), (8, "0", 256), (2, "0", 4), (3, "5", 6)]
+)
+def test_the_alive_counter_goes_up_by_one_with_each_frame_and_wraps(length: int, maximum: str, modulus: int) -> None:
+    bench = lone(CYCLIC_AND_EVENT, 33, 0, Sig("PowerAlive", 24, length, maximum=maximum), start=True)
+    bench.feed(2 * SECOND)
+    bench.until(4 * SECOND)
+    bench.feed(7 * SECOND)
+    assert bench.raws(length, 24) == [n % modulus for n in range(len(bench.sent))]
+    assert len(bench.sent) > modulus
+
+
+def paged(kind: int, cycle: int) -> Bench:
+    signals = [
+        Sig("Page", 0, 8, mux="M"),
+        Sig("BatteryVoltage", 8, 16, mux="m1", factor="0.01"),
+        Sig("Throttle", 8, 8, signed=True, mux="m5"),
+        Sig("BecTemperature", 8, 8, signed=True, mux="m9"),
+        Sig("AliveCounter", 56, 8),
+    ]
+    return Bench([(Msg("EscPaged", 0x100, 8, signals), kind, cycle, 0)])
+
+
+def test_multiplexer_pages_take_turns() -> None:
+    for kind, cycle in ((CYCLIC, 10), (EVENT, 0)):
+        bench = paged(kind, cycle)
+        bench.until(15 * MS)
+        bench.forget()
+        bench.feed(300 * MS, 10 * MS, LIVE._replace(throttle=-3, bec_temperature=40))
+        pages = bench.raws(8)
+        assert len(pages) >= 28
+        assert all((a, b) in {(1, 5), (5, 9), (9, 1)} for a, b in pairwise(pages))
+        alive = bench.raws(8, 56)
+        assert all(b - a == 1 for a, b in pairwise(alive))
+        if kind == EVENT:
+            value = {1: 2442, 5: 0xFD, 9: 40}
+            assert all(get(f.data, 8, 16, True) == value[f.data[0]] for _, f in bench.sent)
+
+
+def test_of_multiplexed_pages_sent_on_change_the_changed_one_goes() -> None:
+    bench = paged(ON_CHANGE, 0)
+    bench.now = 10 * MS
+    for _ in range(4):
+        bench.until(bench.now + 10 * MS)
+        bench.live()
+    bench.forget()
+    bench.until(bench.now + 10 * MS)
+    bench.live(LIVE._replace(bec_temperature=99))
+    bench.until(bench.now + 10 * MS)
+    bench.live(LIVE._replace(bec_temperature=99))
+    bench.until(bench.now + 10 * MS)
+    bench.live(LIVE._replace(bec_temperature=99, throttle=1))
+    assert bench.raws(8) == [9, 5]
+
+
+def test_frames_with_e2e_protection_pass_the_check_through_losses_and_returns() -> None:
+    crc, alive = Sig("Crc8", 0, 8), Sig("AliveCounter", 8, 4)
+    bench = Bench([(Msg("EscPower", 0x100, 8, [crc, alive, Sig("BatteryVoltage", 16, 16)]), CYCLIC_AND_EVENT, 20, 0)])
+    for _ in range(3):
+        bench.feed(bench.now + 200 * MS)
+        bench.until(bench.now + 600 * MS)
+    assert len(bench.sent) > 100
+    for number, (_, frame) in enumerate(bench.sent):
+        assert frame.data[1] & 15 == number % 15
+        assert p01.e2e_p01_check(bytearray(frame.data), 0x100)
+        assert not p01.e2e_p01_check(bytearray(frame.data), 0x101)
+
+
+# --- the gateway itself -------------------------------------------------------------------------------------------------
+
+
+def health(kind: int, cycle: int = 0, delay: int = 0) -> Bench:
+    signals = [Sig("GatewayState", 0, 8), Sig("CanState", 8, 8), Sig("EscsOk", 16, 8), Sig("EscCount", 24, 8)]
+    return Bench([(Msg("Health", 0x300, 8, signals), kind, cycle, delay)], ("left", "right"), start=True)
+
+
+@pytest.mark.parametrize("kind", [ON_CHANGE, EVENT, CYCLIC_AND_ON_CHANGE])
+def test_the_gateway_status_goes_when_it_changes(kind: int) -> None:
+    bench = health(kind, 10_000 if kind == CYCLIC_AND_ON_CHANGE else 0)
+    bench.until(5 * MS)
+    bench.forget()
+    bench.gateway.set_can_state(CanState.ERROR_ACTIVE, 10 * MS)
+    bench.gateway.set_can_state(CanState.ERROR_ACTIVE, 20 * MS)
+    bench.take()
+    bench.now = 30 * MS
+    bench.live(esc=1)
+    bench.until(40 * MS)
+    bench.live(esc=1)
+    bench.until(SECOND)
+    bench.gateway.stop(bench.now)
+    bench.take()
+    data = [tuple(frame.data[:4]) for _, frame in bench.sent]
+    assert data == [(1, 1, 0, 2), (1, 1, 1, 2), (1, 1, 0, 2), (2, 1, 0, 2)]
+    assert bench.times(0x300)[2] == 290
+
+
+def test_the_last_word_ignores_the_minimum_distance() -> None:
+    bench = health(ON_CHANGE, 0, 500)
+    bench.forget()
+    bench.gateway.set_can_state(CanState.BUS_OFF, 1 * MS)
+    bench.gateway.stop(2 * MS)
+    bench.take()
+    assert [tuple(frame.data[:2]) for _, frame in bench.sent] == [(2, 4)]
+
+
+def test_messages_without_a_cycle_are_sent_once_at_the_start() -> None:
+    messages = [
+        (Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]), kind, cycle, 0)
+        for n, (kind, cycle) in enumerate(((0, 50), (1, 0), (2, 0), (3, 50)))
+    ]
+    bench = Bench(messages, start=True)
+    assert [frame.can_id for _, frame in bench.sent] == [0x101, 0x102]
+
+
+# --- a long random run --------------------------------------------------------------------------------------------------
+
+
+def bind_names(layout: Layout) -> dict[int, list[tuple[str, str, int]]]:
+    """CAN id to (signal name, source, ESC) of every signal that has a source."""
+    return {
+        plan.can_id: [(s.name, s.source.name, s.esc or 0) for s in plan.signals if s.source is not None]
+        for plan in layout.messages
+    }
+
+
+class Judge:
+    """Decodes frames by cantools and compares each signal with the telemetry of that very instant."""
+
+    def __init__(self, database: Database, layout: Layout, gateway: Gateway) -> None:
+        self.database, self.gateway = database, gateway
+        self.names = bind_names(layout)
+        self.last_live: dict[int, tuple[int, LiveData]] = {}
+        self.count = 0
+
+    def look(self, now: int) -> None:
+        for frame in self.gateway.take_frames():
+            self.count += 1
+            message = self.database.get_message_by_frame_id(frame.can_id)
+            decoded = message.decode(frame.data, decode_choices=True)
+            assert isinstance(decoded, dict)
+            for name, source, esc in self.names[frame.can_id]:
+                self._signal(message.get_signal_by_name(name), decoded[name], source, esc, now)
+
+    def _signal(self, signal: cantools.database.can.Signal, value: object, source: str, esc: int, now: int) -> None:
+        known = KNOWN[source]
+        exact = known.read(self.gateway.escs[esc], self.gateway.status, now)
+        about = f"{signal.name} is {value} at {now}, exact {exact}"
+        if source in self.live_names:
+            heard = self.last_live.get(esc)
+            fresh = heard is not None and now - heard[0] <= TIMEOUT
+            assert (exact is not None) <= fresh, about  # exact may be missing: BEC current of a JIVEPro
+            if fresh and heard is not None and hasattr(heard[1], source) and source != "bec_current":
+                scale = {"V": Fraction(1, 1000) if source == "bec_voltage" else Fraction(1, 100), "A": Fraction(1, 10)}
+                assert exact == getattr(heard[1], source) * scale.get(known.unit, Fraction(1)), about
+        if exact is None:
+            assert str(value) == "NotAvailable" or (signal.length == 1 and value == 0), about
+            return
+        if known.names:
+            text = known.names.get(int(exact))
+            plain = "" if text is None else "".join(c for c in text.lower() if c.isalnum())
+            assert str(value).lower() == (plain or "error"), about
+            return
+        step, low, high = Fraction(repr(float(signal.scale))), signal.minimum, signal.maximum
+        if known.rolls:
+            assert value == int(exact) % (int(high or 0) + 1), about
+        elif not isinstance(value, (int, float)):
+            assert str(value) == "Error", about
+            assert not (Fraction(low or 0) < exact - step / 2 and exact + step / 2 < Fraction(high or 0)), about
+        else:
+            assert abs(Fraction(value) - exact) <= step / 2 + Fraction(1, 10**6), about
+
+    live_names = frozenset({*LiveData._fields, "motor_speed", "output_speed", "battery_power", "operating_state_raw"})
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_in_a_long_random_run_every_frame_is_the_telemetry_of_that_instant(seed: int) -> None:
+    rng = random.Random(seed)
+    escs = [EscSettings("left", 7, Fraction(5, 2), timeout_ns=TIMEOUT), EscSettings("right", timeout_ns=TIMEOUT)]
+    database, layout = prepare(load_database(SHIPPED), "x", escs, DbcSettings())
+    gateway = Gateway(escs, layout, 0, silent_on_loss=seed % 2 == 1)
+    judge = Judge(database, layout, gateway)
+    now = 0
+    gateway.start(now)
+    judge.look(now)
+    until = 40 * SECOND
+    talking = [True, True]
+    while now < until:
+        step = rng.choice((10 * MS, 10 * MS, 10 * MS, 3 * MS, 37 * MS, 100 * MS)) + rng.randrange(MS)
+        target = now + step
+        punctual = rng.random() < 0.9
+        while punctual and (deadline := gateway.next_deadline()) <= target:
+            now = max(now, deadline)
+            gateway.advance(now)
+            judge.look(now)
+        now = target
+        for esc in (0, 1):
+            if rng.random() < 0.01:
+                talking[esc] = not talking[esc]
+            if not talking[esc]:
+                continue
+            wire = (
+                rng.choice((WireLayout.V4, WireLayout.V4, WireLayout.LEGACY)) if rng.random() < 0.02 else WireLayout.V4
+            )
+            if rng.random() < 0.05:
+                gateway.receive_bytes(esc, encode(random_info(rng), wire), now)
+            elif rng.random() < 0.05:
+                gateway.receive_bytes(esc, rng.randbytes(rng.randrange(60)), now)
+            elif rng.random() < 0.005:
+                gateway.port_lost(esc, now)
+                judge.last_live.pop(esc, None)
+                gateway.port_opened(esc, now)
+            else:
+                data = random_live(rng)
+                before = gateway.escs[esc].live_ns
+                judge.last_live[esc], old = (now, data), judge.last_live.get(esc)
+                gateway.receive_bytes(esc, encode(data, wire), now)
+                if gateway.escs[esc].live_ns == before:  # swallowed by rubbish before it: the old one counts
+                    judge.last_live.pop(esc)
+                    if old is not None:
+                        judge.last_live[esc] = old
+            judge.look(now)
+    assert judge.count > 5_000
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 400), st.sampled_from(["live", "lost", "wait"])), max_size=40),
+    st.sampled_from([EVENT, ON_CHANGE, CYCLIC, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE]),
+    st.sampled_from([0, 5, 30]),
+    st.booleans(),
+)
+def test_no_frame_is_ever_older_than_the_time_out(
+    steps: list[tuple[int, str]], kind: int, delay: int, late: bool
+) -> None:
+    bench = lone(kind, 40 if kind in (CYCLIC, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE) else 0, delay)
+    newest: dict[int, int] = {}
+    for number, (step, what) in enumerate(steps, 1):
+        when = bench.now + step * MS
+        if late:
+            bench.jump(when)
+        else:
+            bench.until(when)
+        if what == "live":
+            newest[number] = bench.now
+            bench.live(volts(number))
+        elif what == "lost":
+            bench.gateway.port_lost(0, bench.now)
+            bench.take()
+    bench.until(bench.now + SECOND)
+    for when, frame in bench.sent:
+        value = get(frame.data, 0, 16, True)
+        assert value == 65535 or when - newest[value] <= TIMEOUT
+    values = bench.raws()
+    last_not_available = [value == 65535 for value in values]
+    if values and kind in (EVENT, ON_CHANGE):
+        assert last_not_available[-1]
+        assert not any(a and b for a, b in pairwise(last_not_available))

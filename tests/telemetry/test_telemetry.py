@@ -1,0 +1,649 @@
+"""EscTelemetry with time handed in: link, freshness, derived values, device swaps, deadlines. All frames here are synthetic."""
+
+import random
+from bisect import bisect_right
+from itertools import accumulate, pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode, find_form
+from kontronik_can_gw.protocol.fields import device_and_variant
+from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.sources import Source, sources
+from kontronik_can_gw.telemetry import (
+    INFO_TIMEOUT_NS,
+    MS,
+    MW_NS_PER_WH,
+    NS_PER_BYTE,
+    SECOND,
+    EscSettings,
+    EscTelemetry,
+    Event,
+    LinkState,
+)
+
+TIMEOUT = 250 * MS
+LIVE = LiveData(electrical_speed=21_000, battery_voltage=2400, battery_current=100, operating_state=21)
+BAD = bytearray(encode(LIVE, Layout.V4))
+BAD[10] ^= 1
+BROKEN = bytes(BAD)
+"""A frame whose CRC fails."""
+NOISE = b"\x55" * 20
+
+
+def live(speed: int = 21_000, layout: Layout = Layout.V4) -> bytes:
+    return encode(LIVE._replace(electrical_speed=speed), layout)
+
+
+def info(device: int = Device.KOSMIK, layout: Layout = Layout.V4, cells: int = 6, variant: int = 120) -> bytes:
+    return encode(InfoData(device_and_variant=device_and_variant(device, variant), cell_count=cells), layout)
+
+
+def esc(**known: int) -> EscTelemetry:
+    return EscTelemetry(EscSettings(timeout_ns=known.pop("timeout_ns", TIMEOUT), **known), 0)  # type: ignore[arg-type]
+
+
+def alive(now: int = SECOND) -> EscTelemetry:
+    """An ESC whose first live frame was read at ``now``."""
+    telemetry = esc()
+    telemetry.receive(live(), now)
+    assert link_of(telemetry) is LinkState.OK
+    return telemetry
+
+
+def link_of(telemetry: EscTelemetry) -> LinkState:
+    return telemetry.link
+
+
+def info_of(telemetry: EscTelemetry) -> InfoData | None:
+    return telemetry.info
+
+
+def stream(
+    telemetry: EscTelemetry, begin: int, seconds: float, period: int = 10 * MS, extra: bytes = b"", frame: bytes = b""
+) -> int:
+    """Frames each ``period``, with what the runtime does beside: ``advance`` at each deadline. Returns the last time."""
+    now = begin
+    while now < begin + seconds * SECOND:
+        while telemetry.next_deadline() <= now:
+            telemetry.advance(max(telemetry.next_deadline(), 0))
+        telemetry.receive(extra + (frame or live()), now)
+        now += period
+    return now - period
+
+
+def value(source: Source, telemetry: EscTelemetry, now: int = 0) -> float:
+    """A source's value in its unit, as a packer computes it."""
+    scope = {"esc": telemetry, "live": telemetry.live, "info": telemetry.info, "now": now}
+    return float(eval(source.expression, scope)) / float(source.per_unit)
+
+
+# --- link states
+
+
+def test_before_the_first_byte_nothing_was_ever_seen_and_nothing_is_available() -> None:
+    telemetry = esc()
+    assert (telemetry.link, telemetry.live, telemetry.info) == (LinkState.NEVER_SEEN, None, None)
+    assert (telemetry.layout, telemetry.cells, telemetry.losses, telemetry.age_ms(5 * SECOND)) == (0, 0, 0, None)
+    telemetry.advance(100 * SECOND)
+    assert link_of(telemetry) is LinkState.NEVER_SEEN
+    assert telemetry.frame_rate == 0
+
+
+def test_bytes_without_a_frame_are_a_search() -> None:
+    telemetry = esc()
+    assert telemetry.receive(NOISE, 1) & Event.LINK
+    assert link_of(telemetry) is LinkState.SEARCHING
+    assert not telemetry.receive(NOISE, 2) & Event.LINK
+
+
+@pytest.mark.parametrize("before", [b"", NOISE])
+@pytest.mark.parametrize("layout", list(Layout))
+def test_the_first_live_frame_makes_the_link_ok(before: bytes, layout: Layout) -> None:
+    telemetry = esc()
+    if before:
+        telemetry.receive(before, 1)
+    events = telemetry.receive(live(7, layout), 2 * MS)
+    assert link_of(telemetry) is LinkState.OK
+    assert events & Event.LINK
+    assert events & Event.LIVE
+    assert telemetry.live is not None
+    assert telemetry.live.electrical_speed == 7
+    assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[layout]
+
+
+def test_info_frames_alone_do_not_make_the_link_ok() -> None:
+    telemetry = esc()
+    assert telemetry.receive(info(), MS) & Event.INFO
+    assert link_of(telemetry) is LinkState.SEARCHING
+    assert telemetry.info is not None
+
+
+def test_five_crc_errors_in_a_second_degrade_the_link_and_a_clean_second_mends_it() -> None:
+    telemetry = alive(SECOND)
+    for n in range(5):
+        telemetry.receive(BROKEN + live(), SECOND + (n + 1) * 10 * MS)
+    now = stream(telemetry, SECOND + 60 * MS, 1)
+    assert link_of(telemetry) is LinkState.DEGRADED
+    assert telemetry.live is not None
+    stream(telemetry, now + 10 * MS, 1.2)
+    assert link_of(telemetry) is LinkState.OK
+
+
+def test_four_crc_errors_in_a_second_do_not_degrade_the_link() -> None:
+    telemetry = alive(SECOND)
+    now = SECOND
+    for n in range(4):
+        now = SECOND + (n + 1) * 10 * MS
+        telemetry.receive(BROKEN + live(), now)
+    for _ in range(15):
+        now = stream(telemetry, now + 10 * MS, 0.1)
+        assert link_of(telemetry) is LinkState.OK
+
+
+@pytest.mark.parametrize(("noise", "state"), [(4, LinkState.OK), (5, LinkState.DEGRADED)])
+def test_more_than_a_tenth_of_dropped_bytes_degrades_the_link(noise: int, state: LinkState) -> None:
+    telemetry = alive(SECOND)
+    stream(telemetry, SECOND + 10 * MS, 1.1, extra=b"\x55" * noise)  # 4 of 44 bytes are 9 %, 5 of 45 are 11 %
+    assert link_of(telemetry) is state
+
+
+def test_a_silent_line_is_lost_and_a_frame_brings_it_back() -> None:
+    telemetry = alive(SECOND)
+    events = telemetry.advance(SECOND + TIMEOUT + 1)
+    assert events & Event.LINK
+    assert events & Event.LIVE
+    assert (telemetry.link, telemetry.losses, telemetry.frame_rate) == (LinkState.LOST, 1, 0)
+    telemetry.receive(NOISE, 2 * SECOND)
+    telemetry.receive(info(), 2 * SECOND + 5 * MS)
+    assert link_of(telemetry) is LinkState.LOST
+    assert telemetry.receive(live(), 3 * SECOND) & Event.LINK
+    assert (telemetry.link, telemetry.losses) == (LinkState.OK, 1)
+
+
+def test_a_degraded_link_can_be_lost() -> None:
+    telemetry = alive(SECOND)
+    last = stream(telemetry, SECOND + 10 * MS, 1.1, extra=NOISE)
+    assert link_of(telemetry) is LinkState.DEGRADED
+    telemetry.advance(last + TIMEOUT + 1)
+    assert link_of(telemetry) is LinkState.LOST
+
+
+def test_a_loss_that_is_seen_by_the_next_frame_counts_too() -> None:
+    telemetry = alive(SECOND)
+    events = telemetry.receive(live(5), SECOND + TIMEOUT + 1)
+    assert telemetry.losses == 1
+    assert events & Event.LINK
+    assert link_of(telemetry) is LinkState.OK
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_lost_port_is_an_error_until_it_is_open_again(seen: bool) -> None:
+    telemetry = esc()
+    if seen:
+        telemetry.receive(info() + live(), SECOND)
+    events = telemetry.port_lost()
+    assert events & Event.LINK
+    assert bool(events & Event.LIVE) is seen
+    assert (telemetry.link, telemetry.live, telemetry.info) == (LinkState.PORT_ERROR, None, None)
+    telemetry.advance(3 * SECOND)
+    assert link_of(telemetry) is LinkState.PORT_ERROR
+    assert telemetry.port_lost() == Event.NONE
+    assert telemetry.port_opened() == Event.LINK
+    assert link_of(telemetry) is (LinkState.LOST if seen else LinkState.NEVER_SEEN)
+    telemetry.receive(NOISE, 4 * SECOND)
+    assert link_of(telemetry) is (LinkState.LOST if seen else LinkState.SEARCHING)
+    telemetry.receive(live(), 5 * SECOND)
+    assert link_of(telemetry) is LinkState.OK
+
+
+def test_opening_a_port_that_was_never_lost_changes_nothing() -> None:
+    telemetry = alive()
+    assert telemetry.port_opened() == Event.NONE
+    assert link_of(telemetry) is LinkState.OK
+
+
+def test_a_frame_is_not_put_together_from_before_and_after_a_lost_port() -> None:
+    telemetry = esc()
+    frame = live()
+    telemetry.receive(frame[:30], SECOND)
+    telemetry.port_lost()
+    telemetry.port_opened()
+    telemetry.receive(frame[30:], SECOND + MS)
+    assert telemetry.live is None
+
+
+# --- freshness
+
+
+@pytest.mark.parametrize("timeout", [20 * MS, TIMEOUT, 60 * SECOND])
+def test_live_data_lasts_for_the_time_out_and_not_a_nanosecond_longer(timeout: int) -> None:
+    telemetry = esc(timeout_ns=timeout)
+    telemetry.receive(live(), SECOND)
+    telemetry.advance(SECOND + timeout)
+    assert telemetry.live is not None
+    assert telemetry.up
+    telemetry.advance(SECOND + timeout + 1)
+    assert telemetry.live is None
+    assert not telemetry.up
+
+
+def test_the_age_is_told_in_milliseconds_also_after_the_loss() -> None:
+    telemetry = alive(SECOND)
+    assert [telemetry.age_ms(SECOND + age * MS) for age in (0, 1, 250)] == [0, 1, 250]
+    telemetry.advance(9 * SECOND)
+    assert telemetry.age_ms(9 * SECOND) == 8000
+    assert telemetry.age_ms(SECOND - 1) == 0
+
+
+@pytest.mark.parametrize(("gap", "taken"), [(TIMEOUT, True), (TIMEOUT + 1, False)])
+def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(gap: int, taken: bool) -> None:
+    telemetry = esc()
+    frame = live()
+    telemetry.receive(NOISE + frame[:1], SECOND)
+    telemetry.receive(frame[1:], SECOND + gap)
+    assert (telemetry.live is not None) is taken
+    telemetry.receive(live(3), SECOND + gap + 10 * MS)
+    assert telemetry.live is not None
+    assert telemetry.live.electrical_speed == 3
+
+
+def test_a_stuttering_frame_is_given_up_by_the_age_of_its_first_byte_not_of_its_last_chunk() -> None:
+    telemetry = esc()
+    for n, byte in enumerate(live()):
+        telemetry.receive(bytes((byte,)), SECOND + n * 10 * MS)  # 390 ms for a frame
+    assert telemetry.live is None
+    telemetry = esc()
+    for n, byte in enumerate(live()):
+        telemetry.receive(bytes((byte,)), SECOND + n * 6 * MS)  # 234 ms
+    assert telemetry.live is not None
+    assert telemetry.live_ns == SECOND + 39 * 6 * MS
+
+
+def test_a_whole_frame_behind_an_old_undecided_header_does_not_become_a_new_value() -> None:
+    telemetry = esc(timeout_ns=100 * MS)
+    telemetry.receive(b"KODL" + live(5)[:39], SECOND)
+    telemetry.receive(live(5)[39:], SECOND + 101 * MS)
+    assert telemetry.live is None
+
+
+def test_frames_found_when_old_bytes_are_given_up_are_counted_as_late_and_not_shown() -> None:
+    telemetry = esc(timeout_ns=100 * MS)
+    hidden = b"KODI" + live(5, Layout.LEGACY)  # whole, but the header in front could still be a frame of 44 bytes
+    telemetry.receive(hidden, SECOND)
+    assert telemetry.live is None
+    telemetry.receive(b"", SECOND + 100 * MS + 1)
+    assert (telemetry.live, telemetry.late_frames) == (None, 1)
+
+
+def test_bytes_that_were_bundled_in_one_read_get_the_times_they_had_on_the_wire() -> None:
+    telemetry = esc()
+    telemetry.receive(live(1) + live(2) + live(3) + NOISE, SECOND)
+    assert telemetry.live is not None
+    assert telemetry.live.electrical_speed == 3
+    assert telemetry.live_ns == SECOND - 20 * NS_PER_BYTE
+    assert telemetry.run_time == 2 * 40 * NS_PER_BYTE
+    assert telemetry.energy == 2 * 40 * NS_PER_BYTE * 2400 * 100
+
+
+def test_a_frame_whose_last_byte_is_older_than_the_time_out_when_it_is_read_is_not_shown() -> None:
+    telemetry = esc(timeout_ns=100 * MS)
+    telemetry.receive(live() + b"\x55" * 4000, 10 * SECOND)  # 4000 bytes take 382 ms
+    assert telemetry.live is None
+    assert link_of(telemetry) is not LinkState.OK
+
+
+def test_times_never_run_backwards_when_reads_are_closer_than_the_wire_allows() -> None:
+    telemetry = alive(SECOND)
+    telemetry.receive(live(), SECOND + 10 * MS)
+    before = telemetry.energy, telemetry.run_time
+    telemetry.receive(live() + b"\x55" * 300, SECOND + 11 * MS)
+    assert telemetry.energy >= before[0]
+    assert telemetry.run_time >= before[1]
+    assert telemetry.live_ns is not None
+    assert telemetry.live_ns >= SECOND + 10 * MS
+
+
+# --- derived values
+
+
+def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight() -> None:
+    simulated = SimulatedEsc(EscOptions(info_every=0), seed=3)
+    telemetry = esc()
+    watt_seconds = run_seconds = 0.0
+    sent = simulated.frames_until(60 * SECOND)
+    assert any(s.data.battery_current < 0 for s in sent if isinstance(s.data, LiveData))
+    for before, after in pairwise(sent):
+        assert isinstance(before.data, LiveData)
+        seconds = (after.time_ns - before.time_ns) / 1e9
+        watt_seconds += max(0.0, before.data.battery_voltage / 100 * before.data.battery_current / 10) * seconds
+        run_seconds += seconds if before.data.electrical_speed else 0
+    for each in sent:
+        telemetry.receive(each.wire, SECOND + each.time_ns)
+    known = sources(EscSettings())
+    assert value(known["energy_used"], telemetry) == pytest.approx(watt_seconds / 3600, rel=1e-9)
+    assert value(known["motor_run_time"], telemetry) == pytest.approx(run_seconds, rel=1e-9)
+    assert watt_seconds > 10_000
+    assert 30 < run_seconds < 50
+
+
+def test_energy_is_not_counted_over_a_gap_and_is_kept_over_a_loss() -> None:
+    telemetry = alive(SECOND)
+    telemetry.receive(live(), SECOND + 100 * MS)
+    kept = telemetry.energy
+    assert kept == 100 * MS * 2400 * 100
+    telemetry.receive(live(), 20 * SECOND)
+    assert (telemetry.energy, telemetry.run_time) == (kept, 100 * MS)
+    telemetry.port_lost()
+    telemetry.port_opened()
+    telemetry.receive(live(), 20 * SECOND + 10 * MS)
+    assert (telemetry.energy, telemetry.run_time) == (kept, 100 * MS)
+
+
+def test_one_watt_hour_is_one_watt_for_an_hour() -> None:
+    telemetry = esc(timeout_ns=60 * SECOND)
+    one_watt = encode(LiveData(battery_voltage=1000, battery_current=1), Layout.V4)
+    for minute in range(61):
+        telemetry.receive(one_watt, minute * 60 * SECOND)
+    assert telemetry.energy == MW_NS_PER_WH
+    assert telemetry.run_time == 0
+
+
+def test_power_is_negative_in_regeneration_and_gives_no_energy() -> None:
+    telemetry = esc()
+    braking = encode(LIVE._replace(battery_current=-50), Layout.V4)
+    telemetry.receive(braking, SECOND)
+    assert value(sources(EscSettings())["battery_power"], telemetry) == 24.0 * -5.0
+    telemetry.receive(braking, SECOND + 10 * MS)
+    assert telemetry.energy == 0
+    assert telemetry.run_time == 10 * MS
+
+
+@pytest.mark.parametrize(("override", "told", "cells"), [(0, 6, 6), (12, 6, 12), (12, 0, 12), (0, 0, 0)])
+def test_the_mean_cell_voltage_is_that_of_the_configured_cells_else_of_the_cells_told(
+    override: int, told: int, cells: int
+) -> None:
+    telemetry = esc(cell_count=override)
+    source = sources(telemetry.settings)["mean_cell_voltage"]
+    telemetry.receive(live(), SECOND)
+    assert telemetry.cells == override
+    telemetry.receive(info(cells=told), SECOND + 10 * MS)
+    assert telemetry.cells == cells
+    assert source.supplied == "esc.cells"
+    if cells:
+        assert value(source, telemetry) == pytest.approx(24.0 / cells)
+
+
+@pytest.mark.parametrize("rate", [100, 20])
+def test_the_frame_rate_is_known_after_a_second_in_tenths_of_hertz(rate: int) -> None:
+    telemetry = alive(SECOND)
+    assert telemetry.frame_rate is None
+    period = SECOND // rate
+    last = stream(telemetry, SECOND + period, 0.98 - 1 / rate, period)
+    assert telemetry.frame_rate is None
+    for _ in range(5):
+        last = stream(telemetry, last + period, 1, period)
+        assert telemetry.frame_rate is not None
+        assert abs(telemetry.frame_rate - rate * 10) <= 10
+    telemetry.advance(last + TIMEOUT + 1)
+    assert telemetry.frame_rate == 0
+
+
+def test_the_frame_rate_is_right_when_time_was_let_pass_too_late() -> None:
+    telemetry = alive(SECOND)
+    for n in range(1, 151):
+        telemetry.receive(live(), SECOND + n * 10 * MS)
+    telemetry.advance(SECOND + 1500 * MS)
+    assert telemetry.frame_rate == 1000
+
+
+# --- what the device supplies
+
+
+@pytest.mark.parametrize(
+    ("device", "raw", "supplied"),
+    [
+        (None, 0, False),
+        (None, 1, True),
+        (Device.JIVEPRO, 0, False),
+        (Device.JIVEPRO, 500, False),
+        (Device.KOSMIK, 0, True),
+        (Device.KOLIBRI, 0, True),
+        (Device.KONTROL_X, 0, True),
+        (63, 0, True),
+    ],
+)
+def test_bec_current_is_supplied_by_all_but_a_jivepro_and_at_0_only_by_a_known_device(
+    device: int | None, raw: int, supplied: bool
+) -> None:
+    telemetry = alive()
+    if device is not None:
+        telemetry.receive(info(device), SECOND + 10 * MS)
+    assert telemetry.bec_current_supplied(raw) is supplied
+
+
+@pytest.mark.parametrize(("old", "new"), [(Layout.V4, Layout.LEGACY), (Layout.LEGACY, Layout.V4)])
+@pytest.mark.parametrize("kind", ["live", "info"])
+def test_another_layout_is_another_device_of_which_nothing_is_known(old: Layout, new: Layout, kind: str) -> None:
+    telemetry = esc()
+    telemetry.receive(live(1, old) + info(Device.KOSMIK, old), SECOND)
+    assert telemetry.info is not None
+    events = telemetry.receive(live(2, new) if kind == "live" else info(Device.JIVEPRO, new, 3), SECOND + 10 * MS)
+    assert events & Event.LINK
+    assert events & Event.INFO
+    assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[new]
+    if kind == "live":
+        assert (info_of(telemetry), telemetry.cells) == (None, 0)
+        assert telemetry.live is not None
+        assert telemetry.live.electrical_speed == 2
+    else:
+        assert telemetry.info is not None
+        assert (telemetry.info.device, telemetry.cells) == (Device.JIVEPRO, 3)
+    assert link_of(telemetry) is LinkState.OK
+
+
+def test_another_device_in_the_same_layout_is_told_as_a_change_and_the_same_device_is_not() -> None:
+    telemetry = alive()
+    telemetry.receive(info(Device.KOSMIK), SECOND + 10 * MS)
+    assert telemetry.receive(info(Device.KOSMIK, cells=7), SECOND + 20 * MS) == Event.INFO
+    assert telemetry.receive(info(Device.KOLIBRI, cells=12), SECOND + 30 * MS) == Event.INFO | Event.LINK
+    assert telemetry.receive(info(Device.KOLIBRI, variant=80), SECOND + 40 * MS) == Event.INFO | Event.LINK
+    assert telemetry.info is not None
+    assert (telemetry.info.device, telemetry.info.variant, telemetry.cells) == (Device.KOLIBRI, 80, 6)
+
+
+def test_info_is_forgotten_with_the_loss_of_telemetry() -> None:
+    telemetry = alive()
+    telemetry.receive(info(), SECOND + 10 * MS)
+    events = telemetry.advance(SECOND + TIMEOUT + 1)
+    assert events == Event.LIVE | Event.INFO | Event.LINK
+    assert (telemetry.info, telemetry.cells) == (None, 0)
+
+
+def test_info_without_news_is_forgotten_after_its_time_out_and_not_before() -> None:
+    telemetry = alive()
+    telemetry.receive(info(), SECOND)
+    for n in range(1, 101):
+        telemetry.receive(live(), SECOND + n * INFO_TIMEOUT_NS // 100)
+    assert telemetry.info is not None
+    assert telemetry.advance(SECOND + INFO_TIMEOUT_NS + 1) == Event.INFO
+    assert info_of(telemetry) is None
+    assert telemetry.live is not None
+
+
+def test_the_deadline_says_when_info_is_to_be_forgotten() -> None:
+    telemetry = esc()
+    telemetry.receive(info(), SECOND + 300 * MS)
+    for _ in range(100):
+        if telemetry.next_deadline() > SECOND + 300 * MS + INFO_TIMEOUT_NS + 1:
+            break
+        telemetry.advance(telemetry.next_deadline())
+    assert telemetry.info is None
+
+
+# --- counters and diagnosis
+
+
+def test_the_counters_are_those_of_the_whole_stream() -> None:
+    telemetry = esc()
+    telemetry.receive(NOISE + live() + BROKEN + live(layout=Layout.LEGACY) + info(), SECOND)
+    telemetry.receive(encode(LIVE._replace(operating_state=27), Layout.LEGACY), SECOND + 10 * MS)
+    telemetry.advance(50 * SECOND)
+    counters = telemetry.counters
+    assert (counters.live_v4, counters.live_legacy, counters.info_v4) == (1, 2, 1)
+    assert (counters.crc_errors, counters.dropped_bytes) == (1, 60)
+    assert counters.bytes == 20 + 40 + 40 + 38 + 44 + 38
+    assert telemetry.suspect_frames == 1
+
+
+def test_a_state_that_cannot_be_is_suspect_only_where_the_crc_does_not_cover_it() -> None:
+    telemetry = esc()
+    telemetry.receive(encode(LIVE._replace(operating_state=27), Layout.V4), SECOND)
+    assert telemetry.suspect_frames == 0
+
+
+def test_there_is_no_diagnosis_while_telemetry_comes_and_one_when_not() -> None:
+    telemetry = alive(SECOND)
+    assert telemetry.diagnosis() is None
+    telemetry.advance(SECOND + TIMEOUT + 1)
+    for second in range(2, 6):
+        telemetry.advance(second * SECOND + TIMEOUT)
+    said = telemetry.diagnosis()
+    assert said is not None
+    assert said.startswith("no bytes")
+
+
+def test_the_diagnosis_does_not_depend_on_how_long_ago_the_second_began() -> None:
+    telemetry = esc()
+    for n in range(1, 61):
+        telemetry.receive(bytes((0x55, 0xAA)) * 10, n * 50 * MS - MS)
+        telemetry.advance(n * 50 * MS)
+        said = telemetry.diagnosis()
+        assert said is not None
+        assert said.startswith("bytes but never KOD"), f"after {n * 50} ms"
+
+
+# --- deadlines
+
+
+def chunks_of(seed: int, most: int = 40) -> list[tuple[bytes, int]]:
+    """Bytes with the times of their reads: frames of both layouts, damaged ones, noise, cut anywhere, gaps of all sizes."""
+    source = random.Random(seed)
+    out = bytearray()
+    for number in range(source.randrange(1, 20)):
+        layout = source.choice(list(Layout))
+        frame = bytearray(source.choice([live(number + 1, layout), live(number + 1, layout), info(3, layout)]))
+        kind = source.randrange(10)
+        if kind == 0:
+            frame[source.randrange(len(frame))] ^= 1 << source.randrange(8)
+        elif kind == 1:
+            del frame[source.randrange(len(frame))]
+        elif kind == 2:
+            out += source.randbytes(source.randrange(60))
+        elif kind == 3:
+            out += source.choice([b"K", b"KO", b"KOD", b"KODL", b"KODI", b"KODX", b"KODLKODI"])
+        elif kind == 4:
+            out += b"\x55" * source.randrange(3000)
+        out += frame
+    cuts = sorted(source.choices(range(len(out) + 1), k=source.randrange(most)))
+    pieces = [bytes(out[a:b]) for a, b in pairwise([0, *cuts, len(out)])]
+    now, timed = source.randrange(SECOND), []
+    for piece in pieces:
+        now += source.choice([0, 1, MS, 10 * MS, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, source.randrange(3 * SECOND)])
+        timed.append((piece, now))
+    return timed
+
+
+def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[LiveData]:
+    """By brute force: the live frames of which each byte was read within the time-out before the last one, and that within
+    the time-out before ``now``."""
+    whole = b"".join(piece for piece, _ in timed)
+    ends = list(accumulate(len(piece) for piece, _ in timed))
+    found = []
+    for at in range(len(whole)):
+        form = find_form(whole, at)
+        if form is not None:
+            first = timed[bisect_right(ends, at)][1]
+            last = timed[bisect_right(ends, at + form.length - 1)][1]
+            data = form.decode(whole, at)
+            if isinstance(data, LiveData) and last - first <= TIMEOUT and now - last <= TIMEOUT:
+                found.append(data)
+    return found
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32), st.booleans())
+def test_what_is_shown_was_received_within_the_time_out_whatever_comes(seed: int, advance: bool) -> None:
+    telemetry = esc()
+    timed = chunks_of(seed)
+    for n, (piece, now) in enumerate(timed):
+        if advance:
+            telemetry.advance(now)
+        telemetry.receive(piece, now)
+        if telemetry.live is not None:
+            assert telemetry.live in fresh_frames(timed[: n + 1], now)
+            assert telemetry.live_ns is not None
+            assert 0 <= now - telemetry.live_ns <= TIMEOUT
+        later = now + random.Random(seed + n).randrange(TIMEOUT * 2)
+        if n + 1 == len(timed) or later <= timed[n + 1][1]:
+            telemetry.advance(later)
+            if telemetry.live is not None:
+                assert telemetry.live in fresh_frames(timed[: n + 1], later)
+        assert telemetry.up is (telemetry.link in (LinkState.OK, LinkState.DEGRADED))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.binary(max_size=100), st.integers(0, SECOND)), max_size=30))
+def test_random_bytes_at_random_times_never_raise(chunks: list[tuple[bytes, int]]) -> None:
+    telemetry = esc()
+    now = 0
+    for data, pause in chunks:
+        now += pause
+        telemetry.receive(data, now)
+        telemetry.advance(now)
+        telemetry.diagnosis()
+    assert telemetry.counters.bytes == sum(len(data) for data, _ in chunks)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32))
+def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_deadlines(seed: int) -> None:
+    """An EscTelemetry that is advanced at its deadlines only shows, at any time, what one advanced all the time shows."""
+    seldom, often = esc(), esc()
+    source = random.Random(seed)
+    for piece, now in chunks_of(seed):
+        while (due := seldom.next_deadline()) <= now:
+            seldom.advance(due)
+            assert seldom.next_deadline() > due
+            often.advance(due)
+            assert (seldom.live, seldom.info, seldom.link) == (often.live, often.info, often.link)
+        seldom.receive(piece, now)
+        often.receive(piece, now)
+        often.advance(now)
+        seldom.advance(now)
+        assert seldom.next_deadline() > now
+        between = source.randrange(now, seldom.next_deadline())
+        often.advance(between)
+        assert (seldom.live, seldom.info, seldom.link) == (often.live, often.info, often.link)
+        if between > now:
+            break  # from here on time would run backwards for one of them
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 2**32))
+def test_a_clean_stream_loses_nothing_however_it_is_cut(seed: int) -> None:
+    source = random.Random(seed)
+    layout = source.choice(list(Layout))
+    telemetry = esc()
+    for number in range(1, 30):
+        frame = live(number, layout)
+        cut = source.randrange(len(frame))
+        begin = number * 10 * MS
+        telemetry.receive(frame[:cut], begin + cut * NS_PER_BYTE)
+        telemetry.receive(frame[cut:], begin + len(frame) * NS_PER_BYTE)
+        assert telemetry.live is not None
+        assert telemetry.live.electrical_speed == number
+        assert telemetry.live_ns == begin + len(frame) * NS_PER_BYTE
+    assert telemetry.counters.dropped_bytes == 0
