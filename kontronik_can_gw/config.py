@@ -24,6 +24,7 @@ T = TypeVar("T")
 SHIPPED = "shipped"
 _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _NOT_BLANK = r"\S"
+_TEXT = r"^[^\x00]*[^\x00\s][^\x00]*$"
 
 
 def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
@@ -52,6 +53,10 @@ class CanConfig:
     fd: bool = _key("allow CAN FD messages (longer than 8 bytes)", "boolean", False)
     data_bitrate: int = _key(
         "bit rate of the CAN FD data phase in bit/s", "integer", 2_000_000, low=10_000, high=8_000_000
+    )
+
+    options: Mapping[str, str | float] = _key(
+        "further options of the python-can interface, as host or ttyBaudrate", "options", {}
     )
 
 
@@ -89,7 +94,7 @@ class EscConfig:
 
     port: str = _key("serial port, best by /dev/serial/by-id/...", "string")
     name: str = _key(
-        "short name, prefix of messages and signals with several ESCs; default esc1, esc2 ...",
+        "short name, prefix of messages and signals with several ESCs (the shipped DBC has room for 6 letters); default esc1, esc2 ...",
         "string",
         "",
         pattern="[A-Za-z][A-Za-z0-9_]{0,11}",
@@ -274,7 +279,11 @@ def _value(value: Any, f: Field[Any]) -> Any:
                 raise ValueError(f"{value!r} is not a table")
             flat = _flat(value) if limits["kind"] == "bindings" else value
             return {name: _entry(name, entry, limits) for name, entry in flat.items()}
-    if not isinstance(value, str) or not value.strip():
+        case "options":
+            if not isinstance(value, dict) or not all(isinstance(entry, (str, int, float)) for entry in value.values()):
+                raise ValueError(f"{value!r} is not a table of texts, numbers and booleans")
+            return dict(value)
+    if not isinstance(value, str) or not value.strip() or "\0" in value:
         raise ValueError(f"{value!r} is not a text")
     choices = limits.get("choices")
     if choices and value not in choices:
@@ -389,13 +398,15 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
                 "type": "object",
                 "additionalProperties": {"anyOf": [value, {"type": "object", "additionalProperties": value}]},
             }
+        case "options":
+            entry |= {"type": "object", "additionalProperties": {"type": ["string", "number", "boolean"]}}
         case "ids":
             number = {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
             entry |= {"type": "object", "additionalProperties": number}
         case kind:
             entry["type"] = kind
             if kind == "string":
-                entry["pattern"] = _NOT_BLANK
+                entry["pattern"] = _TEXT
     if "choices" in limits:
         entry["enum"] = list(limits["choices"])
     if "pattern" in limits:

@@ -9,7 +9,7 @@ from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.dbc_output.output import DbcOutput
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus
-from kontronik_can_gw.telemetry import EscSettings, EscTelemetry, Event
+from kontronik_can_gw.telemetry import SECOND, EscSettings, EscTelemetry, Event
 
 
 class Gateway:
@@ -20,6 +20,7 @@ class Gateway:
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
         self._output = DbcOutput(layout, self.escs, self.status, now, silent_on_loss)
         self._link_changes: list[int] = []
+        self._told_ns = now
         self._next_expiry = 0
         """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
@@ -36,7 +37,8 @@ class Gateway:
     def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
         """Bytes of one ESC's UART, read at ``now``."""
         self._expire(now, but=esc)  # a message may hold values of several ESCs
-        self._follow(esc, self.escs[esc].receive(data, now), now)
+        for events in self.escs[esc].receive_each(data, now):
+            self._follow(esc, events, now)
 
     def port_opened(self, esc: int, now: int) -> None:
         """An ESC's port is open (again)."""
@@ -45,6 +47,11 @@ class Gateway:
     def port_lost(self, esc: int, now: int) -> None:
         """An ESC's port cannot be used: its values are not available from now on."""
         self._follow(esc, self.escs[esc].port_lost(), now)
+
+    def can_returned(self, now: int) -> None:
+        """Frames can be sent again after some were lost: say everything that has no cycle once more."""
+        self._expire(now)
+        self._output.start(now)
 
     def set_can_state(self, state: CanState, now: int) -> None:
         """What the runtime knows of the CAN controller."""
@@ -83,6 +90,9 @@ class Gateway:
             if index != but and now >= esc.next_deadline():
                 self._follow(index, esc.advance(now), now)
         self._next_expiry = min(esc.next_deadline() for esc in self.escs)
+        if now - self._told_ns >= SECOND:
+            self._told_ns = now
+            self._output.on_gateway_change(now, each_second=True)
 
     def _follow(self, esc: int, events: int, now: int) -> None:
         if events:

@@ -72,6 +72,8 @@ class Source:
     """A counter that starts again at 0 behind the greatest value the signal can hold."""
     whole: bool = True
     """False where the expression gives a float."""
+    pace: Group | None = None
+    """What the value changes with, where that is not its group."""
 
 
 def _wire_sources(data: DataType, group: Group) -> list[Source]:
@@ -116,8 +118,8 @@ def sources(settings: EscSettings) -> dict[str, Source]:
         Source("output_speed", "1/min", live, speed, settings.pole_pairs * settings.gear, 0, u32),
         Source("battery_power", "W", live, "live[1] * live[2]", Fraction(1000), -0xFFFF * 0x8000, 0xFFFF * 0x7FFF),
         Source("mean_cell_voltage", "V", live, "live[1] / esc.cells", Fraction(100), supplied="esc.cells", whole=False),
-        Source("energy_used", "Wh", link, "esc.energy", Fraction(MW_NS_PER_WH), 0),
-        Source("motor_run_time", "s", link, "esc.run_time", Fraction(SECOND), 0),
+        Source("energy_used", "Wh", link, "esc.energy", Fraction(MW_NS_PER_WH), 0, pace=live),
+        Source("motor_run_time", "s", link, "esc.run_time", Fraction(SECOND), 0, pace=live),
         Source("link_state", "", link, "esc.link", low=0, high=5, names={s: _pascal(s.name) for s in LinkState}),
         Source("layout", "", link, "esc.layout", low=0, high=2, names={0: "Unknown", 1: "V4", 2: "Legacy"}),
         Source("data_age", "ms", link, "esc.age_ms(now)", low=0, supplied="esc.live_ns is not None"),

@@ -5,6 +5,7 @@ or not known of the device now on the line, is None.
 """
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
@@ -43,6 +44,8 @@ class Event:
     LIVE = 1
     INFO = 2
     LINK = 4
+    SECOND = 8
+    """A second is over: counters and rates are as new as they are to be had."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +117,19 @@ class EscTelemetry:
         return None if self.live_ns is None else max(0, now - self.live_ns) // MS
 
     def receive(self, data: bytes, now: int) -> int:
-        """Take bytes that were read at ``now``. An unfinished frame older than the time-out is given up first."""
-        events = self._expire(now)
+        """Take bytes that were read at ``now``, all frames at once."""
+        events = Event.NONE
+        for found in self.receive_each(data, now):
+            events |= found
+        return events
+
+    def receive_each(self, data: bytes, now: int) -> Iterator[int]:
+        """Take bytes that were read at ``now``; the events of each frame in turn, so that none is passed over.
+
+        An unfinished frame older than the time-out is given up first.
+        """
+        if events := self._expire(now):
+            yield events
         deframer = self._deframer
         if self._arrivals and now - self._arrivals[0][1] > self.settings.timeout_ns:
             self.late_frames += len(deframer.flush())
@@ -129,13 +143,12 @@ class EscTelemetry:
                 self._arrivals.popleft()
         else:
             self._arrivals.clear()
-        if frames:
-            for frame in frames:
-                events |= self._accept(frame, now - (end - frame.offset - frame.form.length) * NS_PER_BYTE)
-            events |= self._expire(now)  # a frame with many bytes behind it in one read may be old already
+        for frame in frames:
+            when = now - (end - frame.offset - frame.form.length) * NS_PER_BYTE
+            # a frame with many bytes behind it in one read may be old already
+            yield self._accept(frame, when) | self._expire(now)
         if self.link is LinkState.NEVER_SEEN:
-            events |= self._set_link(LinkState.SEARCHING)
-        return events
+            yield self._set_link(LinkState.SEARCHING)
 
     def port_opened(self) -> int:
         """The port is open (again)."""
@@ -245,5 +258,5 @@ class EscTelemetry:
         self._diagnosis_counters = old
         self._window_counters = new.copy()
         if self.up:
-            return self._set_link(LinkState.DEGRADED if bad else LinkState.OK)
-        return Event.NONE
+            return Event.SECOND | self._set_link(LinkState.DEGRADED if bad else LinkState.OK)
+        return Event.SECOND

@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data
 
 import argparse
 import errno
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
+    _prepare_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
         prog="kontronik-can-gw",
@@ -63,3 +65,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return code
+
+
+def _prepare_streams() -> None:
+    """No surprises from the three standard streams."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:  # closed: a serial port must not get this number, or what is said would be sent to an ESC
+            os.open(os.devnull, os.O_RDWR)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without "µ" gets a "?"

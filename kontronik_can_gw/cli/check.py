@@ -24,7 +24,7 @@ def main(args: argparse.Namespace) -> int:
     names = [esc.name for esc in config.escs]
     for line in table(layout, names):
         print(line)
-    load = layout.bus_load(config.can.bitrate)
+    load = layout.bus_load(config.can.bitrate, config.can.data_bitrate)
     frames = sum(message.rate_hz for message in layout.messages)
     print()
     print(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.config import Config, load
 from kontronik_can_gw.dbc_output.layout import Layout, load_database
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
+from kontronik_can_gw.runtime.can_port import check_interface
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -24,8 +25,9 @@ def say(text: str) -> None:
 def load_all(path: Path) -> tuple[Config, "Database", Layout]:
     """The configuration, the exact database of what is sent, the layout. UserError with every mistake; warnings are said."""
     config = load(path)
+    check_interface(config.can)
     database, layout = layout_of(config)
-    for warning in (*layout.warnings, check_load(layout, config.can.bitrate)):
+    for warning in (*layout.warnings, check_load(layout, config.can.bitrate, config.can.data_bitrate)):
         if warning:
             say(f"warning: {warning}")
     return config, database, layout

@@ -1,6 +1,7 @@
 """``dbc``: write the DBC of several ESCs from a one-ESC DBC, or of exactly what a configuration sends."""
 
 import argparse
+import io
 import re
 import sys
 import tempfile
@@ -44,10 +45,20 @@ def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.dbc_output.expand import dbc_text
 
     text = dbc_text(_database(args))
+    try:
+        data = text.encode("cp1252")  # what tools take a DBC for; ASCII as a rule
+    except UnicodeEncodeError:
+        data = text.encode("utf-8")
+        say(
+            "warning: written in UTF-8, because it has characters that Windows-1252, the usual encoding of a DBC, has not"
+        )
     if args.output == "-":
-        sys.stdout.write(text)
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.buffer.write(data)
+        else:
+            sys.stdout.write(text)
         return 0
-    _write(Path(args.output), text)
+    _write(Path(args.output), data)
     say(f"{args.output} written")
     return 0
 
@@ -85,19 +96,17 @@ def _database(args: argparse.Namespace):  # type: ignore[no-untyped-def]  # cant
     return database
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, data: bytes) -> None:
     """All or nothing: a reader never sees half a file. What is no plain file (a pipe, /dev/stdout) is written to, not replaced."""
     beside: Path | None = None
     try:
         target = path.resolve()
         if target.exists() and not target.is_file():
-            target.write_text(text, encoding="utf-8", newline="")
+            target.write_bytes(data)
             return
-        with tempfile.NamedTemporaryFile(
-            "w", dir=target.parent, prefix=f".{path.name}.", delete=False, encoding="utf-8", newline=""
-        ) as file:
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{path.name}.", delete=False) as file:
             beside = Path(file.name)
-            file.write(text)
+            file.write(data)
         beside.chmod(0o644)
         beside.replace(target)
         beside = None

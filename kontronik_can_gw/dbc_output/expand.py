@@ -72,7 +72,7 @@ def expand(
                         f"{file}: {message.name}: id {message.frame_id:X}h moved to {copy.frame_id:X}h is outside 0..{limit:X}h."
                     )
             if esc is not None:
-                _rename(copy, esc_prefix(esc.name), problems, file)
+                _rename(copy, esc_prefix(esc.name))
             for old, new in zip(message.signals, copy.signals, strict=True):
                 for key in (f"{message.name}.{old.name}", old.name):
                     if key in bind and message in ours:
@@ -85,6 +85,7 @@ def expand(
             messages.append(copy)
             names = {old.name: new.name for old, new in zip(message.signals, copy.signals, strict=True)}
             moved.setdefault(frame_id(message), []).append((frame_id(copy), names))
+    _check_lengths(messages, per_esc, escs, problems, file)
     if problems:
         raise UserError(*problems)
     result = cantools.database.can.Database(
@@ -97,6 +98,24 @@ def expand(
         sort_signals=None,
     )
     return result, out_bind
+
+
+def _check_lengths(
+    messages: Sequence["Message"],
+    per_esc: Sequence["Message"],
+    escs: Sequence[EscSettings],
+    problems: list[str],
+    file: str,
+) -> None:
+    """One line for names that become too long, however many they are."""
+    longest = max((signal.name for message in per_esc for signal in message.signals), key=len, default="")
+    if any(len(name) > _NAME_LIMIT for m in messages for name in (m.name, *(signal.name for signal in m.signals))):
+        room = _NAME_LIMIT - len(longest)
+        long = [esc.name for esc in escs if len(esc_prefix(esc.name)) > room]
+        problems.append(
+            f"{file}: ESC name {' and '.join(long)}: with it in front, names are longer than {_NAME_LIMIT} characters, as that of "
+            f"{longest}. {f'Take ESC names of at most {room} letters' if room > 0 else 'Shorten the names in the DBC'}."
+        )
 
 
 def _relations(
@@ -144,7 +163,7 @@ def _step(
     raise UserError(f"{file}: no step moves the ids for {count} ESCs without a clash. Give the messages other ids.")
 
 
-def _rename(message: "Message", prefix: str, problems: list[str], file: str) -> None:
+def _rename(message: "Message", prefix: str) -> None:
     old_name = message.name
     stem = old_name.removeprefix("Esc")
     message.name = prefix + (stem if stem[:1].isupper() else old_name)
@@ -155,9 +174,4 @@ def _rename(message: "Message", prefix: str, problems: list[str], file: str) -> 
             signal.multiplexer_signal = names[signal.multiplexer_signal]
     for group in message.signal_groups or []:
         group.signal_names = [names.get(name, name) for name in group.signal_names]
-    for name in (message.name, *names.values()):
-        if len(name) > _NAME_LIMIT:
-            problems.append(
-                f"{file}: {old_name}: {name} is longer than {_NAME_LIMIT} characters. Take a shorter ESC name."
-            )
     message.refresh(strict=False)

@@ -6,6 +6,7 @@ limits, value tables and timing come from the file and from nowhere else.
 
 import difflib
 import math
+import re
 import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -111,6 +112,8 @@ class SignalPlan:
     numbers: Mapping[int, int] | None = None
     """Source number to raw value for an enumeration; what is missing is sent as Error."""
     constant: int = 0
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    """Of a float, in raw values; its codes are bit patterns."""
     page: int | None = None
     """The multiplexer value under which the signal is sent; None: always."""
     notes: tuple[str, ...] = ()
@@ -133,28 +136,31 @@ class MessagePlan:
     """Minimum distance between two frames."""
     signals: tuple[SignalPlan, ...]
     escs: frozenset[int]
-    groups: frozenset[Group]
+    paces: frozenset[Group]
+    """What the message's values change with."""
     pages: tuple[int | None, ...] = (None,)
     data_id: int = 0
     """AUTOSAR E2E profile 1 data id, used where the message has a CRC signal."""
 
     @property
-    def bits(self) -> int:
-        """Length on the bus in bits with the most stuffing that is possible (classical CAN) or nominal bits (CAN FD, without BRS)."""
+    def bits(self) -> tuple[int, int]:
+        """Bits on the bus at the nominal rate and at CAN FD's data rate, with the most stuffing that is possible."""
         if self.fd:
-            return (49 if self.extended else 29) + self.length * 8 * 6 // 5 + (21 if self.length > 16 else 17) + 20
+            head = 36 if self.extended else 17
+            data = 5 + 8 * self.length
+            return head + head // 4 + 13, data + data // 4 + (33 if self.length > 16 else 28)
         head = 54 if self.extended else 34
-        return head + 13 + 8 * self.length + (head + 8 * self.length - 1) // 4
+        return head + 13 + 8 * self.length + (head + 8 * self.length - 1) // 4, 0
 
     @property
     def rate_hz(self) -> float:
         """Frames a second to be expected with all UARTs at 100 Hz; messages sent on change are counted by their cycle."""
         events = 0.0
         if SendType.EVENT in self.send_type:
-            if Group.LIVE in self.groups:
+            if Group.LIVE in self.paces:
                 events = EXPECTED_LIVE_HZ * len(self.escs)
-            elif Group.INFO in self.groups:
-                events = EXPECTED_LIVE_HZ / 100 * len(self.escs)
+            else:
+                events = 1.0 * max(1, len(self.escs))
         if self.cycle_ns:
             events += 1e9 / self.cycle_ns
         return min(events, 1e9 / self.delay_ns) if self.delay_ns else events
@@ -182,9 +188,11 @@ class Layout:
     messages: tuple[MessagePlan, ...]
     warnings: tuple[str, ...] = ()
 
-    def bus_load(self, bitrate: int) -> float:
-        """Share of the bus, 0 to 1 and above, that the messages need at ``bitrate`` bit/s."""
-        return sum(message.bits * message.rate_hz for message in self.messages) / bitrate
+    def bus_load(self, bitrate: int, data_bitrate: int = 2_000_000) -> float:
+        """Share of the bus, 0 to 1 and above, that the messages need at these rates in bit/s."""
+        return sum(
+            message.rate_hz * (message.bits[0] / bitrate + message.bits[1] / data_bitrate) for message in self.messages
+        )
 
 
 def normalize(name: str) -> str:
@@ -204,11 +212,15 @@ def load_database(path: Path) -> "Database":
     if b"\0" in raw:
         raise UserError(f"{path}: is a binary file, not a DBC")
     try:
-        text = raw.decode("utf-8")
+        text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = raw.decode("cp1252", errors="replace")
+    if not text.strip():
+        raise UserError(f"{path}: is empty, not a DBC")
     try:
-        database = cantools.database.load_string(text, database_format="dbc", strict=False, sort_signals=None)
+        database = cantools.database.load_string(
+            _spelled_out(text), database_format="dbc", strict=False, sort_signals=None
+        )
     except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"{path}: is not a DBC that can be read: {reason}") from None
@@ -217,6 +229,28 @@ def load_database(path: Path) -> "Database":
     if not database.messages:
         raise UserError(f"{path}: has no message; is it a DBC file?")
     return database
+
+
+def _spelled_out(text: str) -> str:
+    """What other tools write and cantools does not read: a VAL_ that names a VAL_TABLE_, enumeration attributes by text."""
+    tables = dict(re.findall(r"^VAL_TABLE_\s+(\w+)\s+([^;]*?)\s*;", text, re.MULTILINE))
+    text = re.sub(
+        r"^(VAL_\s+\d+\s+\w+\s+)([A-Za-z_]\w*)(\s*;)",
+        lambda found: f"{found[1]}{tables.get(found[2], found[2])}{found[3]}",
+        text,
+        flags=re.MULTILINE,
+    )
+    for name, listed in re.findall(
+        r'^BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?"(\w+)"\s+ENUM\s+([^;]*);', text, re.MULTILINE
+    ):
+        numbers = {value: str(number) for number, value in enumerate(re.findall(r'"([^"]*)"', listed))}
+        text = re.sub(
+            rf'^(BA_\s+"{name}"\s+[^";]*?)"([^"]*)"(\s*;)',
+            lambda found, numbers=numbers: found[1] + numbers.get(found[2], f'"{found[2]}"') + found[3],  # type: ignore[misc]
+            text,
+            flags=re.MULTILINE,
+        )
+    return text
 
 
 def choose_node(database: "Database", wanted: str | None, file: str) -> str:
@@ -300,16 +334,16 @@ class Binder:
 
 
 def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
-    """True if a signal of ours means an ESC's value without saying which ESC."""
+    """True if signals of ours mean an ESC's values, and none says of which ESC."""
+    escs = set()
     for message in database.messages:
         if node in message.senders:
             for signal in message.signals:
                 bound = binder.bound(message.name, signal.name)
-                name = bound if isinstance(bound, str) else signal.name
-                found = binder.by_name(name)
-                if found and found[1] is None and found[0].group is not Group.GATEWAY:
-                    return True
-    return False
+                found = binder.by_name(bound if isinstance(bound, str) else signal.name)
+                if found and found[0].group is not Group.GATEWAY:
+                    escs.add(found[1])
+    return escs == {None}
 
 
 def compile_layout(
@@ -418,9 +452,9 @@ class _Compiler:
             self.problems.append(f"{where}: has several CRC signals: {', '.join(s.name for s in crcs)}. Keep one.")
         if crcs:
             alive = [s for s in signals if s.role is Role.ALIVE]
-            if len(alive) != 1:
+            if len(alive) != 1 or alive[0].high < 14:
                 self.problems.append(
-                    f"{where}: {crcs[0].name}: E2E profile 1 needs exactly one alive counter in the message."
+                    f"{where}: {crcs[0].name}: E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
                 )
         if len(self.problems) > before:
             return None
@@ -435,7 +469,7 @@ class _Compiler:
             delay_ns=delay_ms * MS,
             signals=tuple(signals),
             escs=frozenset(s.esc for s in signals if s.esc is not None),
-            groups=frozenset(s.source.group for s in signals if s.source),
+            paces=frozenset(s.source.pace or s.source.group for s in signals if s.source),
             pages=tuple(sorted(pages)) if pages else (None,),
             data_id=self.settings.data_ids.get(message.name, message.frame_id & 0xFFFF),
         )
@@ -512,7 +546,13 @@ class _Compiler:
         error = next((codes[t] for t in codes if t in _ERROR_TEXTS), None)
         if not_available is None:
             start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
-            usable = start_is_set and isinstance(start, (int, float)) and math.isfinite(start) and start == int(start)
+            # a default start value is nobody's statement that 0 means "not available"; a flag has nothing better
+            usable = (
+                (start_is_set or length == 1)
+                and isinstance(start, (int, float))
+                and math.isfinite(start)
+                and start == int(start)
+            )
             if usable and low <= start <= high:
                 not_available = int(start)
             else:
@@ -545,6 +585,8 @@ class _Compiler:
         while low in special:
             low += 1
         base |= {"low": low, "high": high}
+        if is_float:
+            base |= _float_codes(signal, factor, offset, codes)
         if signal.is_multiplexer:
             return SignalPlan(role=Role.MULTIPLEXER, **base)
         bound = self.binder.bound(message.name, signal.name)
@@ -604,6 +646,8 @@ class _Compiler:
                 missing = [text for number, text in source.names.items() if number not in by_text]
                 if missing:
                     notes.append(f"sent as Error, not in the value table: {', '.join(missing)}")
+            else:
+                notes.append("the value table has no name of it: sent as the ESC's number")
         converted = units.conversion(source.unit, signal.unit or "")
         if converted is None:
             can = ", ".join(units.texts_like(source.unit)[:8]) or "no unit"
@@ -634,6 +678,8 @@ class _Compiler:
                 )
                 return None
             notes.append(f"starts again at 0 after {high}")
+        if not signal.is_float and not _NOT_AVAILABLE_TEXTS & set(codes) and low <= base["not_available"] <= high:
+            notes.append(f"not available is sent as {_number(base['not_available'] * factor + offset)}")
         return SignalPlan(
             role=Role.SOURCE,
             source=source,
@@ -644,6 +690,21 @@ class _Compiler:
             notes=tuple(notes),
             **base,
         )
+
+
+def _float_codes(signal: "Signal", factor: Fraction, offset: Fraction, codes: Mapping[str, int]) -> dict[str, Any]:
+    """Limits and codes of a float signal: those of its value table as floats, else NaN."""
+    code = "<f" if signal.length == 32 else "<d"
+
+    def pattern(texts: frozenset[str]) -> int:
+        number = next((float(codes[text]) for text in codes if text in texts), math.nan)
+        return int.from_bytes(struct.pack(code, number), "little")
+
+    found: dict[str, Any] = {"not_available": pattern(_NOT_AVAILABLE_TEXTS), "error": pattern(_ERROR_TEXTS)}
+    if signal.minimum is not None and signal.maximum is not None and (signal.minimum, signal.maximum) != (0, 0):
+        ends = sorted(float((_exact(end) - offset) / factor) for end in (signal.minimum, signal.maximum))
+        found["limits"] = (ends[0], ends[1])
+    return found
 
 
 def _exact(number: Any) -> Fraction:

@@ -10,11 +10,15 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import GatewayStatus, Group
 from kontronik_can_gw.telemetry import EscTelemetry, Event
 
-_EVENT_OF_GROUP = {Group.LIVE: Event.LIVE, Group.INFO: Event.INFO, Group.LINK: Event.LINK, Group.GATEWAY: Event.NONE}
+_EVENT_OF_PACE = {Group.LIVE: Event.LIVE, Group.INFO: Event.INFO, Group.LINK: Event.LINK, Group.GATEWAY: Event.NONE}
 
 
 class _Message:
-    """One message at work. ``last`` holds the bits of the last frame of each page, without alive counter and CRC."""
+    """One message at work.
+
+    ``last`` holds the bits of the last frame of each page, without alive counter and CRC; ``owed`` the places of the pages that
+    have to follow without waiting for an event.
+    """
 
     __slots__ = (
         "alive",
@@ -23,6 +27,7 @@ class _Message:
         "crc_at",
         "last",
         "on_change",
+        "owed",
         "pack",
         "page",
         "plan",
@@ -34,21 +39,25 @@ class _Message:
         self.plan = plan
         self.pack = compile_pack(plan)
         self.page = 0
+        self.owed: list[int] = []
         self.alive = 0
         crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
         alive = next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)
         self.crc_at = None if crc is None else crc.pieces[0].at // 8
         self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 1
         self.last: dict[int | None, int] = {}
-        self.silent_able = silent and bool(plan.groups & {Group.LIVE, Group.INFO})
+        # what also tells of the link always goes on
+        self.silent_able = silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
-            for group in plan.groups:
-                self.triggers |= _EVENT_OF_GROUP[group]
+            for pace in plan.paces:
+                self.triggers |= _EVENT_OF_PACE[pace]
             if self.triggers & Event.LIVE and self.by_event:
                 self.triggers &= ~Event.LINK  # live frames set the pace; a loss is a live event too
+            elif self.triggers & Event.LINK and not plan.cycle_ns:
+                self.triggers |= Event.SECOND  # counters, rates and ages change all the time
 
 
 class DbcOutput:
@@ -72,66 +81,78 @@ class DbcOutput:
                     self._listeners[esc].append((index, message.triggers))
 
     def start(self, now: int) -> None:
-        """Send every message that has no cycle once, so that nobody goes on with values from before a restart."""
+        """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
         for index, message in enumerate(self._messages):
-            if not message.plan.cycle_ns and self._schedule.request(index, now):
-                self._send(index, now)
+            message.last.clear()
+            if not message.plan.cycle_ns:
+                message.owed = list(range(len(message.plan.pages)))
+                self._request(index, now)
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
         for index, triggers in self._listeners[esc]:
             if triggers & events:
                 message = self._messages[index]
-                if not message.by_event and not self._changed(message, now):
-                    continue
-                if self._schedule.request(index, now):
-                    self._send(index, now)
+                if message.by_event:
+                    if (
+                        len(message.plan.pages) > 1 and not self._escs[esc].up
+                    ):  # no further event will bring the other pages
+                        message.owed = list(range(len(message.plan.pages)))
+                    self._request(index, now)
+                elif self._note_changes(message, now):
+                    self._request(index, now)
 
-    def on_gateway_change(self, now: int, at_once: bool = False) -> None:
+    def on_gateway_change(self, now: int, at_once: bool = False, each_second: bool = False) -> None:
         """The gateway's own state changed: messages with its values that are sent by event or on change follow.
 
-        ``at_once``: without regard to their minimum distance, for the last word.
+        ``at_once``: without regard to their minimum distance, for the last word. ``each_second``: only its counters went on,
+        which is news for messages that have no cycle.
         """
         for index, message in enumerate(self._messages):
-            if Group.GATEWAY not in message.plan.groups:
+            if Group.GATEWAY not in message.plan.paces or (each_second and message.plan.cycle_ns):
                 continue
-            wanted = message.by_event or (message.on_change and self._changed(message, now))
-            if wanted and (at_once or self._schedule.request(index, now)):
-                self._send(index, now)
+            if message.by_event or (message.on_change and self._note_changes(message, now)):
+                if at_once:
+                    self._send(index, now)
+                else:
+                    self._request(index, now)
 
     def advance(self, now: int) -> None:
         """Send what is due."""
         for index, cyclic in self._schedule.due(now):
             message = self._messages[index]
-            if cyclic or message.by_event or self._changed(message, now):
+            if cyclic or message.by_event or message.owed or self._note_changes(message, now):
                 self._send(index, now)
 
     def next_deadline(self) -> int | None:
         """When ``advance`` has something to do."""
         return self._schedule.next_deadline()
 
-    def _changed(self, message: _Message, now: int) -> bool:
-        return self._changed_page(message, now) is not None
+    def _request(self, index: int, now: int) -> None:
+        if self._schedule.request(index, now):
+            self._send(index, now)
 
-    def _changed_page(self, message: _Message, now: int) -> int | None:
-        """Place of the first page that differs from what was sent of it last."""
-        for place, page in enumerate(message.plan.pages):
-            if message.pack(self._escs, self._gateway, now, 0, page or 0) != message.last.get(page):
-                return place
-        return None
+    def _note_changes(self, message: _Message, now: int) -> bool:
+        """True if a page differs from what was sent of it last; with several pages those that do are owed."""
+        plan = message.plan
+        changed = [
+            place
+            for place, page in enumerate(plan.pages)
+            if message.pack(self._escs, self._gateway, now, 0, page or 0) != message.last.get(page)
+        ]
+        if len(plan.pages) > 1:
+            message.owed += [place for place in changed if place not in message.owed]
+        return bool(changed)
 
     def _send(self, index: int, now: int) -> None:
         message = self._messages[index]
         plan = message.plan
         if message.silent_able and not any(self._escs[esc].up for esc in plan.escs):
+            message.owed.clear()
             return
-        if len(plan.pages) > 1:  # one page after the other; a changed one first where changes matter
-            changed = self._changed_page(message, now) if message.on_change else None
-            place = message.page if changed is None else changed
-            message.page = (place + 1) % len(plan.pages)
-            page = plan.pages[place]
-        else:
-            page = plan.pages[0]
+        place = message.owed.pop(0) if message.owed else message.page
+        message.page = (place + 1) % len(plan.pages)
+        page = plan.pages[place]
         pack = message.pack
         bits = pack(self._escs, self._gateway, now, message.alive, page or 0)
         if message.on_change:
@@ -141,4 +162,7 @@ class DbcOutput:
         if message.crc_at is not None:
             at = message.crc_at
             data = data[:at] + bytes((e2e.crc(data, at, plan.data_id),)) + data[at + 1 :]
-        self.frames.append(CanFrame(plan.can_id, data, plan.extended, plan.fd))
+        self.frames.append(CanFrame(plan.can_id, data, plan.extended, plan.fd, place))
+        self._schedule.sent(index, now)
+        if message.owed:
+            self._schedule.wait(index, now)

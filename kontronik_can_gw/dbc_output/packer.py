@@ -14,7 +14,6 @@ from kontronik_can_gw.sources import GatewayStatus, Group
 from kontronik_can_gw.telemetry import EscTelemetry
 
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
-_NAN = {32: b"\0\0\xc0\x7f", 64: b"\0\0\0\0\0\0\xf8\x7f"}
 
 
 def place(pieces: Sequence[Piece], raw: int) -> int:
@@ -27,18 +26,19 @@ def take(pieces: Sequence[Piece], bits: int) -> int:
     return sum((bits >> piece.at & (1 << piece.width) - 1) << piece.shift for piece in pieces)
 
 
-def float_bits(value: float, length: int) -> int:
-    """The IEEE 754 bits of a 32- or 64-bit float; beyond the 32-bit range: infinity is not sent, but NaN."""
+def float_bits(value: float | None, length: int, low: float, high: float, error: int) -> int:
+    """The IEEE 754 bits of a 32- or 64-bit float; ``error`` for what is outside low..high or has no float of this length."""
+    if value is None or not low <= value <= high:
+        return error
     try:
         return int.from_bytes(struct.pack("<f" if length == 32 else "<d", value), "little")
     except OverflowError:
-        return int.from_bytes(_NAN[length], "little")
+        return error
 
 
 def not_available_bits(signal: SignalPlan) -> int:
     """What a signal holds when its value is not available, at its place."""
-    raw = int.from_bytes(_NAN[signal.length], "little") if signal.is_float else signal.not_available
-    return place(signal.pieces, raw)
+    return place(signal.pieces, signal.not_available)
 
 
 def alive_modulus(signal: SignalPlan, has_crc: bool) -> int:
@@ -74,7 +74,7 @@ def source_text(plan: MessagePlan) -> str:
 
 def compile_pack(plan: MessagePlan) -> Pack:
     """The function of ``source_text``, compiled."""
-    names: dict[str, object] = {"float_bits": float_bits, "nan": math.nan}
+    names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf}
     exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
     return names["pack"]  # type: ignore[return-value]
 
@@ -141,13 +141,15 @@ def _value(signal: SignalPlan) -> list[str]:
     source = signal.source
     assert source is not None
     expression = source.expression if source.bit is None else f"{source.expression} >> {source.bit} & 1"
-    if signal.is_float and signal.numbers is not None:
-        table = f"{_table_name(signal)}.get({expression}, nan)"
-        return [f"v = float_bits({table}, {signal.length})", f"bits |= {_placed(signal)}"]
     if signal.is_float:
-        slope, intercept = float(signal.slope), float(signal.intercept)
-        scaled = f"({expression}) * {slope!r} + {intercept!r}"
-        return [f"v = float_bits({scaled}, {signal.length})", f"bits |= {_placed(signal)}"]
+        scaled = f"({expression}) * {float(signal.slope)!r} + {float(signal.intercept)!r}"
+        if signal.numbers is not None:
+            scaled = f"{_table_name(signal)}.get({expression})"
+        low, high = signal.limits
+        return [
+            f"v = float_bits({scaled}, {signal.length}, {low!r}, {high!r}, {signal.error})",
+            f"bits |= {_placed(signal)}",
+        ]
     if signal.numbers is not None:
         return [f"v = {_table_name(signal)}.get({expression}, {signal.error})", f"bits |= {_placed(signal)}"]
     if source.rolls:

@@ -31,9 +31,9 @@ def prepare(
     return database, compile_layout(database, file, escs, settings, taken_ids, fd_allowed)
 
 
-def check_load(layout: Layout, bitrate: int) -> str | None:
+def check_load(layout: Layout, bitrate: int, data_bitrate: int = 2_000_000) -> str | None:
     """A warning above 50 % computed bus load, UserError above 100 %, else None."""
-    load = layout.bus_load(bitrate)
+    load = layout.bus_load(bitrate, data_bitrate)
     text = f"{layout.file}: the messages need {load:.0%} of {bitrate // 1000} kbit/s"
     if load > REFUSE_LOAD:
         raise UserError(f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime) or raise can.bitrate.")

@@ -137,19 +137,28 @@ class CanPort:
         )
         try:
             self._bus.send(message, timeout=0)
-        except (can.CanError, OSError):
+        except can.CanError:
             return Sent.BUSY
+        except Exception:  # what a driver lets out when its adapter has gone: OSError, termios.error ...
+            return Sent.GONE
         return Sent.OK
+
+
+def check_interface(config: CanConfig) -> None:
+    """UserError for an interface that python-can does not know."""
+    with without_asammdf():
+        import can
+    if config.interface not in can.VALID_INTERFACES:
+        near = difflib.get_close_matches(config.interface, can.VALID_INTERFACES, n=1)
+        hint = f" Did you mean {near[0]}?" if near else f" Known: {', '.join(sorted(can.VALID_INTERFACES))}."
+        raise UserError(f"can.interface: {config.interface!r} is no interface of python-can.{hint}")
 
 
 def _open(config: CanConfig) -> "can.BusABC":
     with without_asammdf():
         import can
 
-    if config.interface not in can.VALID_INTERFACES:
-        near = difflib.get_close_matches(config.interface, can.VALID_INTERFACES, n=1)
-        hint = f" Did you mean {near[0]}?" if near else f" Known: {', '.join(sorted(can.VALID_INTERFACES))}."
-        raise UserError(f"can.interface: {config.interface!r} is no interface of python-can.{hint}")
+    check_interface(config)
     options: dict[str, Any] = {}
     mtu = Path("/sys/class/net", config.channel, "mtu")
     if config.interface == "socketcan" and config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
@@ -164,13 +173,16 @@ def _open(config: CanConfig) -> "can.BusABC":
         options["fd"] = True
         if config.interface != "socketcan":
             options["data_bitrate"] = config.data_bitrate
+    options.update(config.options)
     try:
         return can.Bus(interface=config.interface, channel=config.channel, **options)
     except OSError as error:
         if config.interface == "socketcan":
             raise _socketcan_error(config, error) from None
         raise RunError(f"CAN {config.interface} {config.channel}: cannot be opened: {error}") from None
-    except (can.CanError, ValueError, TypeError, ImportError, AttributeError) as error:
+    except (
+        Exception
+    ) as error:  # each of python-can's drivers fails in its own ways, a missing vendor library as NameError
         raise RunError(f"CAN {config.interface} {config.channel}: cannot be opened: {error}") from None
 
 

@@ -16,7 +16,7 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.can_port import CanPort, Sent
-from kontronik_can_gw.runtime.serial_port import PortLost, SerialPort
+from kontronik_can_gw.runtime.serial_port import PortLost, SerialPort, device_of
 from kontronik_can_gw.runtime.slots import Slots
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND, LinkState
@@ -25,8 +25,9 @@ log = logging.getLogger("kontronik_can_gw")
 
 FIRST_RETRY_NS, LONGEST_RETRY_NS = 100 * MS, SECOND
 BUSY_RETRY_NS = 2 * MS
+LASTING_BUSY_NS = SECOND
 SUSPENDED_NS = 250 * MS
-"""A loop that comes back this much too late was suspended: what waits on the ports is old."""
+"""A loop that comes round this much too late was held up or suspended: what waits on the ports is old."""
 DIAGNOSIS_NS = 3 * SECOND
 
 
@@ -82,6 +83,7 @@ class Loop:
         self._can_complaint = ""
         self._slots = Slots()
         self._busy_until: int | None = None
+        self._busy_since: int | None = None
         self._selector = selectors.DefaultSelector()
         self._held: list[str] | None = []  # what was opened is said when all is: an error at start is the only line
         self._stopping = False
@@ -98,9 +100,11 @@ class Loop:
         """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
         now = self._clock()
         try:
-            self._open_can(now)
-            for esc in self._escs:
+            for (
+                esc
+            ) in self._escs:  # first, and locked: so that nothing else, a CAN adapter's driver included, opens them
                 self._open_port(esc, now)
+            self._open_can(now)
         except UserError:
             self.close()
             raise
@@ -116,12 +120,12 @@ class Loop:
         self._transmit(now)
         try:
             while not self._stopping:
-                before = clock()
-                pause = max(0, self._next_deadline() - before)
+                last = now
+                pause = max(0, self._next_deadline() - clock())
                 ready = self._selector.select(pause / SECOND)
                 now = clock()
-                if now - before - pause > SUSPENDED_NS:
-                    self._discard_input(now - before - pause)
+                if now - last - pause > SUSPENDED_NS:
+                    self._discard_input(now - last - pause)
                     ready = []  # what they announced is gone; a hang-up comes again
                 for key, _ in ready:
                     self._serve(key, now)
@@ -231,6 +235,7 @@ class Loop:
 
     def _open_can(self, now: int) -> None:
         try:
+            self._refuse_escs_as_channel()
             port = CanPort(self._can_config)
         except RunError as error:
             if not self._wait and self._can_retry.due is None:
@@ -242,6 +247,15 @@ class Loop:
         if (fd := port.fileno()) is not None:
             self._selector.register(fd, selectors.EVENT_READ, port)
         self._say_open(f"CAN {self._can_config.interface} {self._can_config.channel} is open")
+
+    def _refuse_escs_as_channel(self) -> None:
+        """Whatever its name is now: what leads to an ESC must not be opened as a CAN interface, which would send to it."""
+        device = device_of(self._can_config.channel)
+        for esc in self._escs:
+            if device is not None and device == device_of(esc.path):
+                raise RunError(
+                    f"can.channel {self._can_config.channel} is the port of {esc.name}: nothing may be sent to an ESC."
+                )
 
     def _can_failed(self, reason: str, now: int) -> None:
         self._can_retry.failed(now)
@@ -275,12 +289,19 @@ class Loop:
         count, answer = slots.flush(self._can.send)
         status.sent_frames += count
         if answer is Sent.OK:
-            self._can_works()
+            self._can_works(now)
         else:
             status.send_failures += 1
+            if (
+                answer is Sent.BUSY and self._can.fileno() is None
+            ):  # python-can does not tell a full queue from a dead adapter
+                self._busy_since = self._busy_since or now
+                if now - self._busy_since > LASTING_BUSY_NS:
+                    answer = Sent.GONE
             if answer is Sent.BUSY:
                 self._busy_until = now + BUSY_RETRY_NS
             else:
+                self._busy_since = None
                 name = self._can_config.channel
                 if answer is Sent.GONE:
                     self._close_can()
@@ -288,10 +309,12 @@ class Loop:
                 return
         self.gateway.set_can_state(self._can.state, now)
 
-    def _can_works(self) -> None:
+    def _can_works(self, now: int) -> None:
         self._can_retry.succeeded()
+        self._busy_since = None
         if self._can_complaint:
             self._can_complaint = ""
+            self.gateway.can_returned(now)
             log.info("CAN %s: frames are sent again", self._can_config.channel)
 
     # --- words

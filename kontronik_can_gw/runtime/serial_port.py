@@ -32,6 +32,8 @@ class SerialPort:
         is_pty = os.path.realpath(path).startswith("/dev/pts/")
         quiet = _open_quietly(path)
         try:
+            if not is_pty and (users := _users(path)):  # one that does not lock it, as a getty, could write to it
+                raise _in_use(path, users)
             self._serial = _open(path, serial.PARITY_EVEN, is_pty)
         finally:
             os.close(quiet)
@@ -67,6 +69,23 @@ class SerialPort:
             self._serial.close()
 
 
+def _in_use(path: str, users: str) -> RunError:
+    who = f": {users}" if users else " (another gateway? a getty?)"
+    name = Path(path).name
+    return RunError(
+        f"{path}: is in use by another program{who}. End it; if it is a getty: sudo systemctl disable --now serial-getty@{name}."
+    )
+
+
+def device_of(path: str) -> int | None:
+    """The device number behind a path (slcan's ``path@baud`` too); None where there is none."""
+    try:
+        status = Path(path.partition("@")[0]).stat()
+    except (OSError, ValueError):
+        return None
+    return status.st_rdev or None
+
+
 def _open_quietly(path: str) -> int:
     """Open and switch echo off in one breath: a terminal that was just made echoes what it receives."""
     try:
@@ -75,6 +94,7 @@ def _open_quietly(path: str) -> int:
         raise _explained(path, error.errno, str(error.strerror)) from None
     try:
         mode = termios.tcgetattr(fd)
+        mode[0] &= ~(termios.IXON | termios.IXOFF | termios.IXANY)
         mode[1] &= ~termios.OPOST
         mode[3] &= ~(termios.ECHO | termios.ECHONL | termios.ICANON | termios.ISIG)
         with contextlib.suppress(termios.error):  # pseudo terminals may refuse their own settings
@@ -121,15 +141,15 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
             f"{path}: permission denied. Join its group: sudo usermod -aG {group} $USER, then log in again."
         )
     if number in (errno.EAGAIN, errno.EBUSY):
-        return RunError(f"{path}: is in use by another program (another gateway? a getty?).{_users(path)}")
+        return _in_use(path, _users(path))
     return RunError(f"{path}: cannot be opened: {text}")
 
 
 def _users(path: str) -> str:
-    """Who has the port open, as far as we may see."""
-    target, found = os.path.realpath(path), []
+    """Who else has the port open, as far as we may see."""
+    device, found = device_of(path), set()
     for link in Path("/proc").glob("[0-9]*/fd/*"):
         with contextlib.suppress(OSError):
-            if str(link.readlink()) == target and (pid := link.parts[2]) != str(os.getpid()):
-                found.append(f"{Path('/proc', pid, 'comm').read_text().strip()} (pid {pid})")
-    return f" Open in: {', '.join(sorted(set(found)))}." if found else ""
+            if link.stat().st_rdev == device and (pid := link.parts[2]) != str(os.getpid()):
+                found.add(f"{Path('/proc', pid, 'comm').read_text().strip()} (pid {pid})")
+    return ", ".join(sorted(found))

@@ -1,4 +1,4 @@
-"""Transmit slots: one for each CAN id, the newest value wins, nothing piles up."""
+"""Transmit slots: one for each CAN id (and multiplexer page), the newest value wins, nothing piles up."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ class Slots:
     """Frames that wait to be sent, in the order in which their ids began to wait."""
 
     def __init__(self) -> None:
-        self._frames: dict[tuple[int, bool], CanFrame] = {}
+        self._frames: dict[tuple[int, bool, int], CanFrame] = {}
         self.replaced = 0
         """Frames that were overtaken by a newer one of their id."""
 
@@ -19,7 +19,7 @@ class Slots:
 
     def put(self, frame: CanFrame) -> None:
         """Let a frame wait, in place of an older one of its id."""
-        key = (frame.can_id, frame.extended)
+        key = (frame.can_id, frame.extended, frame.page)
         if key in self._frames:
             self.replaced += 1
         self._frames[key] = frame

@@ -21,13 +21,14 @@ from kontronik_can_gw.telemetry import MS
 
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
 TABLES: dict[str, tuple[str, ...]] = {
-    "can": ("interface", "channel", "bitrate", "fd", "data_bitrate"),
+    "can": ("interface", "channel", "bitrate", "fd", "data_bitrate", "options"),
     "dbc": ("file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids"),
     "run": ("wait_for_devices",),
     "esc": ("port", "name", "pole_pairs", "gear", "cell_count", "telemetry_timeout_ms"),
 }
 DEFAULTS: dict[str, dict[str, object]] = {
-    "can": {"interface": "socketcan", "channel": "can0", "bitrate": 500_000, "fd": False, "data_bitrate": 2_000_000},
+    "can": {"interface": "socketcan", "channel": "can0", "bitrate": 500_000, "fd": False, "data_bitrate": 2_000_000}
+    | {"options": {}},
     "dbc": {"file": "shipped", "node": None, "on_loss": "not_available", "base_id": None, "id_step": None}
     | {"bind": {}, "e2e_data_ids": {}},
     "run": {"wait_for_devices": False},
@@ -423,7 +424,7 @@ def test_what_the_example_shows_as_default_is_the_default() -> None:
     shown = {(table, key): value for table in ("can", "dbc", "run") for key, value in made[table].items()}
     shown |= {("esc", key): value for key, value in made["esc"][0].items()}
     examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
-    examples |= {("esc", "port"), ("esc", "pole_pairs")}
+    examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options")}
     for (table, key), value in shown.items():
         if (table, key) not in examples:
             assert value == DEFAULTS[table][key], f"{table}.{key}"
@@ -518,6 +519,11 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     **dict.fromkeys(STRINGS, st.text(min_size=1, max_size=8).map(lambda text: text.strip() or "x")),
     **dict.fromkeys(BOOLEANS, st.booleans()),
     ("dbc", "on_loss"): st.sampled_from(["not_available", "silent"]),
+    ("can", "options"): st.dictionaries(
+        _TEXT,
+        st.one_of(st.text(), st.integers(), st.booleans(), st.floats(allow_nan=False, allow_infinity=False)),
+        max_size=3,
+    ),
     ("dbc", "bind"): st.dictionaries(
         _TEXT,
         st.one_of(
@@ -591,7 +597,7 @@ def test_the_effective_configuration_as_toml_is_read_back_equal(made: dict[str, 
 
 
 def test_texts_with_quotes_backslashes_and_control_characters_are_read_back_equal() -> None:
-    for port in ('a"b', "C:\\x", "a\nb", "\t\x00\x1f\x7f\x85", "ü€😀", "'''", '"""', "#", "a = [b]"):
+    for port in ('a"b', "C:\\x", "a\nb", "\t\x01\x1f\x7f\x85", "ü€😀", "'''", '"""', "#", "a = [b]"):
         equal(parse({"esc": [{"port": port}], "dbc": {"bind": {port: port}, "file": port}}, "a.toml"))
 
 

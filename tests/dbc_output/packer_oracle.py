@@ -353,6 +353,8 @@ class Sig:
             return listed
         if self.start_value is not None:
             return self.start_value
+        if self.length == 1:
+            return 0  # the default of the file's GenSigStartValue: a flag has nothing better
         return self.range[0] if self.signed else self.range[1]
 
     @property

@@ -297,7 +297,8 @@ def test_error_is_known_by_its_usual_names(text: str) -> None:
         (Sig("MaxThrottle", 0, 8, signed=True), -128),
         (Sig("MaxThrottle", 0, 8, signed=True, start_value=-1), -1),
         (Sig("SelftestErrors", 0, 64), (1 << 64) - 1),
-        (Sig("TestEepromSize", 0, 1), 1),
+        (Sig("TestEepromSize", 0, 1), 0),
+        (Sig("TestEepromSize", 0, 1, start_value=1), 1),
         (Sig("TestEepromSize", 0, 1, start_value=0), 0),
     ],
 )
@@ -396,7 +397,7 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(at: int, data_i
         assert theirs(moved, 0, data_id) == moved
 
 
-@pytest.mark.parametrize(("length", "modulus"), [(2, 4), (4, 15), (8, 15)])
+@pytest.mark.parametrize(("length", "modulus"), [(4, 15), (5, 15), (8, 15)])
 def test_with_a_crc_the_alive_counter_never_shows_15(length: int, modulus: int) -> None:
     layout = layout_of([Msg("M", 1, 8, [Sig("Crc8", 0, 8), Sig("Alive", 8, length), Sig("BatteryVoltage", 16, 16)])])
     gateway = Gateway([EscSettings("esc1")], layout, 0)

@@ -378,6 +378,13 @@ def test_a_signal_that_does_not_say_of_which_esc_is_refused(tmp_path: Path) -> N
     only(lines, "Power.U", "right.battery_voltag", "battery_voltage")
 
 
+def test_one_signal_without_an_esc_among_those_of_named_escs_is_said_to_be_the_mistake(tmp_path: Path) -> None:
+    left, right = Sig("LeftBatteryVoltage", 0, 16, unit="V"), Sig("RightBatteryVoltage", 16, 16, unit="V")
+    text = one(left, right, Sig("BatteryCurrent", 32, 16, signed=True, unit="A"))
+    lines = mistakes(tmp_path, text, names=("left", "right"))
+    only(lines, "Power.BatteryCurrent", "of which ESC", "left.battery_current", "right.battery_current")
+
+
 def test_a_node_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
     text = dbc_text([Msg("Power", 1, 8, [VOLTAGE]), Msg("Brake", 2, 8, [Sig("Foo", 0, 8)], sender="Other")])
     only(mistakes(tmp_path, text, DbcSettings(node="Motor")), "my_car.dbc", "'Motor'", "Gateway, Other", "dbc.node")

@@ -29,7 +29,8 @@ from packer_oracle import (
 )
 
 from kontronik_can_gw.dbc_output.layout import DbcSettings, MessagePlan, Piece, _pieces, compile_layout
-from kontronik_can_gw.dbc_output.packer import compile_pack, float_bits, place, take
+from kontronik_can_gw.dbc_output.packer import compile_pack, place, take
+from kontronik_can_gw.dbc_output.packer import float_bits as bits_of_float
 from kontronik_can_gw.dbc_output.units import conversion
 from kontronik_can_gw.sources import GatewayStatus
 from kontronik_can_gw.sources import sources as all_sources
@@ -227,6 +228,20 @@ def pieces_from_layout(start: int, length: int, little: bool) -> tuple[Piece, ..
     loaded = cantools.database.load_string(dbc_text([Msg("M", 1, 64, [signal])]), "dbc")
     assert isinstance(loaded, Database)
     return _pieces(loaded.messages[0].signals[0])
+
+
+NAN_32 = 0x7FC00000
+
+
+def float_bits(value: float | None, length: int) -> int:
+    return bits_of_float(value, length, -math.inf, math.inf, NAN_32)
+
+
+@pytest.mark.parametrize(
+    ("value", "right"), [(None, 7), (-1.5, 7), (100.5, 7), (math.nan, 7), (100.0, 0x42C80000), (0.0, 0)]
+)
+def test_a_float_outside_its_limits_is_sent_as_error(value: float | None, right: int) -> None:
+    assert bits_of_float(value, 32, 0.0, 100.0, 7) == right
 
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
