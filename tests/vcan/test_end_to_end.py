@@ -145,7 +145,7 @@ def test_silent_on_loss_stops_values_but_not_the_link_status(vcan: str, start_ga
         lost = time.time()
         time.sleep(2)
         late = {frame.can_id for frame in list(dump.frames) if frame.time > lost + 0.4}
-        assert late == {0x6B0, 0x6D8, 0x6D9}
+        assert late == {0x680, 0x6B0, 0x6D8, 0x6D9}, "both messages with link status go on"
         assert gateway.end() == 0
 
 
