@@ -145,8 +145,10 @@ class EscTelemetry:
             self._arrivals.clear()
         for frame in frames:
             when = now - (end - frame.offset - frame.form.length) * NS_PER_BYTE
-            # a frame with many bytes behind it in one read may be old already
-            yield self._accept(frame, when) | self._expire(now)
+            if now - when > self.settings.timeout_ns:  # with so many bytes behind it in one read it is old already
+                self.late_frames += 1
+            else:
+                yield self._accept(frame, when)
         if self.link is LinkState.NEVER_SEEN:
             yield self._set_link(LinkState.SEARCHING)
 

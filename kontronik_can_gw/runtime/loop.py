@@ -108,6 +108,9 @@ class Loop:
         except UserError:
             self.close()
             raise
+        for esc in self._escs:
+            if esc.port is not None:
+                esc.port.discard()  # an interface may take seconds to open
         for line in self._held or ():
             log.info(line)
         self._held = None
@@ -326,7 +329,7 @@ class Loop:
             self._held.append(line)
 
     def _report(self, now: int) -> None:
-        for index in self.gateway.take_link_changes():
+        for index in dict.fromkeys(self.gateway.take_link_changes()):
             esc, port = self.gateway.escs[index], self._escs[index]
             port.diagnosis_due = now + DIAGNOSIS_NS
             if esc.link in (LinkState.OK, LinkState.DEGRADED):

@@ -251,6 +251,18 @@ def test_an_interface_that_python_can_does_not_know_is_found_before_anything_is_
     assert "Did you mean socketcan?" in capsys.readouterr().err
 
 
+def test_a_read_of_many_old_frames_is_no_flood_of_link_changes(tmp_path: Path) -> None:
+    message = 'BO_ 256 M: 8 Gw\n SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
+    gateway = gateway_of(tmp_path, HEAD + message + TAIL)
+    gateway.start(0)
+    gateway.take_frames()
+    gateway.receive_bytes(0, b"".join(frame_of(LiveData(electrical_speed=n)) for n in range(100)), SECOND)
+    assert gateway.take_link_changes() == [0]
+    assert gateway.escs[0].losses == 0
+    assert gateway.escs[0].late_frames > 20
+    assert [frame.data[0] for frame in gateway.take_frames()][-1] == 99
+
+
 class StoppedBus:
     """A CAN port in which the process is suspended for 20 s, once."""
 
