@@ -22,6 +22,7 @@ from kontronik_can_gw.telemetry import MS, EscSettings
 
 T = TypeVar("T")
 SHIPPED = "shipped"
+_OWN_OPTIONS = {"interface", "channel", "bitrate", "fd", "data_bitrate"}
 _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _NOT_BLANK = r"\S"
 _TEXT = r"^[^\x00]*[^\x00\s][^\x00]*$"
@@ -282,6 +283,8 @@ def _value(value: Any, f: Field[Any]) -> Any:
         case "options":
             if not isinstance(value, dict) or not all(isinstance(entry, (str, int, float)) for entry in value.values()):
                 raise ValueError(f"{value!r} is not a table of texts, numbers and booleans")
+            if own := sorted(_OWN_OPTIONS & set(value)):
+                raise ValueError(f"{own[0]} has its own key: can.{own[0]}")
             return dict(value)
     if not isinstance(value, str) or not value.strip() or "\0" in value:
         raise ValueError(f"{value!r} is not a text")
@@ -399,7 +402,9 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
                 "additionalProperties": {"anyOf": [value, {"type": "object", "additionalProperties": value}]},
             }
         case "options":
-            entry |= {"type": "object", "additionalProperties": {"type": ["string", "number", "boolean"]}}
+            scalar = {"type": ["string", "number", "boolean"]}
+            names = {"not": {"enum": sorted(_OWN_OPTIONS)}}
+            entry |= {"type": "object", "propertyNames": names, "additionalProperties": scalar}
         case "ids":
             number = {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
             entry |= {"type": "object", "additionalProperties": number}

@@ -71,6 +71,11 @@ class Gateway:
         output = self._output.next_deadline()
         return expiry if output is None else min(output, expiry)
 
+    @property
+    def frames_wait(self) -> bool:
+        """True while ``take_frames`` has something to hand over."""
+        return bool(self._output.frames)
+
     def take_frames(self) -> list[CanFrame]:
         """The frames to send, oldest first; the list is handed over."""
         frames = self._output.frames

@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.errors import UserError
@@ -74,6 +75,8 @@ def _prepare_streams() -> None:
             os.fstat(number)
         except OSError:  # closed: a serial port must not get this number, or what is said would be sent to an ESC
             os.open(os.devnull, os.O_RDWR)
+    if sys.stderr is None:  # talk must not go to standard output instead
+        sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115  for the whole run
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without "µ" gets a "?"

@@ -36,6 +36,7 @@ _ALIVE_ENDINGS = (
     "rollingcounter",
     "sequencecounter",
 )
+_LARGEST_FLOAT = int(struct.unpack("<f", b"\xff\xff\x7f\x7f")[0])
 _CRC_ENDINGS = ("crc", "crc8", "checksum")
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 EXPECTED_LIVE_HZ = 100
@@ -217,10 +218,9 @@ def load_database(path: Path) -> "Database":
         text = raw.decode("cp1252", errors="replace")
     if not text.strip():
         raise UserError(f"{path}: is empty, not a DBC")
+    text = _spelled_out(text, path)
     try:
-        database = cantools.database.load_string(
-            _spelled_out(text), database_format="dbc", strict=False, sort_signals=None
-        )
+        database = cantools.database.load_string(text, database_format="dbc", strict=False, sort_signals=None)
     except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"{path}: is not a DBC that can be read: {reason}") from None
@@ -231,26 +231,48 @@ def load_database(path: Path) -> "Database":
     return database
 
 
-def _spelled_out(text: str) -> str:
-    """What other tools write and cantools does not read: a VAL_ that names a VAL_TABLE_, enumeration attributes by text."""
-    tables = dict(re.findall(r"^VAL_TABLE_\s+(\w+)\s+([^;]*?)\s*;", text, re.MULTILINE))
+_STRING = re.compile(r'"(?:\\"|[^"])*"')
+_MASKED = re.compile(r'"\0(\d+)\0"')
+
+
+def _spelled_out(text: str, path: Path) -> str:
+    """What other tools write and cantools does not read: a VAL_ that names a VAL_TABLE_, enumeration attributes by text.
+
+    Strings are masked while lines are looked at, so that no comment and no value text is touched.
+    """
+    strings: list[str] = []
+
+    def mask(found: re.Match[str]) -> str:
+        strings.append(found[0])
+        return f'"\0{len(strings) - 1}\0"'
+
+    def shown(masked: str) -> str:
+        return _MASKED.sub(lambda found: strings[int(found[1])], masked)
+
+    text = _STRING.sub(mask, text)
+    tables = dict(re.findall(r"^\s*VAL_TABLE_\s+(\w+)\s+([^;]*?)\s*;", text, re.MULTILINE))
     text = re.sub(
-        r"^(VAL_\s+\d+\s+\w+\s+)([A-Za-z_]\w*)(\s*;)",
+        r"^(\s*VAL_\s+\d+\s+\w+\s+)([A-Za-z_]\w*)(\s*;)",
         lambda found: f"{found[1]}{tables.get(found[2], found[2])}{found[3]}",
         text,
         flags=re.MULTILINE,
     )
-    for name, listed in re.findall(
-        r'^BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?"(\w+)"\s+ENUM\s+([^;]*);', text, re.MULTILINE
-    ):
-        numbers = {value: str(number) for number, value in enumerate(re.findall(r'"([^"]*)"', listed))}
-        text = re.sub(
-            rf'^(BA_\s+"{name}"\s+[^";]*?)"([^"]*)"(\s*;)',
-            lambda found, numbers=numbers: found[1] + numbers.get(found[2], f'"{found[2]}"') + found[3],  # type: ignore[misc]
-            text,
-            flags=re.MULTILINE,
-        )
-    return text
+    listed = re.findall(
+        r"^\s*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?(\"\0\d+\0\")\s+ENUM\s+([^;]*);", text, re.MULTILINE
+    )
+    numbers = {
+        shown(name): {shown(value[0]): str(n) for n, value in enumerate(re.finditer(_MASKED, values))}
+        for name, values in listed
+    }
+
+    def number(found: re.Match[str]) -> str:
+        name, value = shown(found[2]), shown(found[4])
+        if name in numbers and value not in numbers[name]:
+            raise UserError(f"{path}: attribute {name}: {value} is none of its values {', '.join(numbers[name])}")
+        return f"{found[1]}{found[2]}{found[3]}{numbers.get(name, {}).get(value, found[4])}{found[5]}"
+
+    text = re.sub(r"^(\s*BA_\s+)(\"\0\d+\0\")(\s+[^\";]*?)(\"\0\d+\0\")(\s*;)", number, text, flags=re.MULTILINE)
+    return shown(text)
 
 
 def choose_node(database: "Database", wanted: str | None, file: str) -> str:
@@ -540,6 +562,9 @@ class _Compiler:
             self.problems.append(
                 f"{where}: cannot hold {', '.join(wide)} of its value table; its values are {low} to {high}."
             )
+            return None
+        if is_float and length == 32 and any(abs(int(raw)) > _LARGEST_FLOAT for raw in signal.choices or {}):
+            self.problems.append(f"{where}: has a value table with numbers that no 32-bit float holds.")
             return None
         start = attribute(signal, "GenSigStartValue", self.database)
         not_available = next((codes[t] for t in codes if t in _NOT_AVAILABLE_TEXTS), None)

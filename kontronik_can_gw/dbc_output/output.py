@@ -54,9 +54,7 @@ class _Message:
         if self.by_event or self.on_change:
             for pace in plan.paces:
                 self.triggers |= _EVENT_OF_PACE[pace]
-            if self.triggers & Event.LIVE and self.by_event:
-                self.triggers &= ~Event.LINK  # live frames set the pace; a loss is a live event too
-            elif self.triggers & Event.LINK and not plan.cycle_ns:
+            if self.triggers & Event.LINK and not plan.cycle_ns and not (self.by_event and self.triggers & Event.LIVE):
                 self.triggers |= Event.SECOND  # counters, rates and ages change all the time
 
 
@@ -94,9 +92,11 @@ class DbcOutput:
             if triggers & events:
                 message = self._messages[index]
                 if message.by_event:
-                    if (
-                        len(message.plan.pages) > 1 and not self._escs[esc].up
-                    ):  # no further event will bring the other pages
+                    state = self._escs[esc]
+                    if triggers & Event.LIVE and triggers & events == Event.LINK and state.up:
+                        continue  # live frames set the pace
+                    gone = not state.up or (events & Event.INFO and state.info is None)
+                    if gone and len(message.plan.pages) > 1:  # no further event will bring the other pages
                         message.owed = list(range(len(message.plan.pages)))
                     self._request(index, now)
                 elif self._note_changes(message, now):
@@ -114,6 +114,8 @@ class DbcOutput:
             if message.by_event or (message.on_change and self._note_changes(message, now)):
                 if at_once:
                     self._send(index, now)
+                    while message.owed:
+                        self._send(index, now)
                 else:
                     self._request(index, now)
 
@@ -121,6 +123,10 @@ class DbcOutput:
         """Send what is due."""
         for index, cyclic in self._schedule.due(now):
             message = self._messages[index]
+            if cyclic and len(message.plan.pages) > 1:
+                if message.page not in message.owed:
+                    message.owed.append(message.page)
+                message.page = (message.page + 1) % len(message.plan.pages)
             if cyclic or message.by_event or message.owed or self._note_changes(message, now):
                 self._send(index, now)
 
@@ -150,8 +156,11 @@ class DbcOutput:
         if message.silent_able and not any(self._escs[esc].up for esc in plan.escs):
             message.owed.clear()
             return
-        place = message.owed.pop(0) if message.owed else message.page
-        message.page = (place + 1) % len(plan.pages)
+        if message.owed:
+            place = message.owed.pop(0)
+        else:
+            place = message.page
+            message.page = (place + 1) % len(plan.pages)
         page = plan.pages[place]
         pack = message.pack
         bits = pack(self._escs, self._gateway, now, message.alive, page or 0)

@@ -26,14 +26,18 @@ def take(pieces: Sequence[Piece], bits: int) -> int:
     return sum((bits >> piece.at & (1 << piece.width) - 1) << piece.shift for piece in pieces)
 
 
-def float_bits(value: float | None, length: int, low: float, high: float, error: int) -> int:
-    """The IEEE 754 bits of a 32- or 64-bit float; ``error`` for what is outside low..high or has no float of this length."""
+def float_bits(value: float | None, length: int, low: float, high: float, error: int, not_available: int = -1) -> int:
+    """The IEEE 754 bits of a 32- or 64-bit float.
+
+    ``error`` for what is outside low..high, has no float of this length, or would look like ``not_available``.
+    """
     if value is None or not low <= value <= high:
         return error
     try:
-        return int.from_bytes(struct.pack("<f" if length == 32 else "<d", value), "little")
+        bits = int.from_bytes(struct.pack("<f" if length == 32 else "<d", value), "little")
     except OverflowError:
         return error
+    return error if bits == not_available else bits
 
 
 def not_available_bits(signal: SignalPlan) -> int:
@@ -146,10 +150,8 @@ def _value(signal: SignalPlan) -> list[str]:
         if signal.numbers is not None:
             scaled = f"{_table_name(signal)}.get({expression})"
         low, high = signal.limits
-        return [
-            f"v = float_bits({scaled}, {signal.length}, {low!r}, {high!r}, {signal.error})",
-            f"bits |= {_placed(signal)}",
-        ]
+        told = f"{signal.error}, {signal.not_available}"
+        return [f"v = float_bits({scaled}, {signal.length}, {low!r}, {high!r}, {told})", f"bits |= {_placed(signal)}"]
     if signal.numbers is not None:
         return [f"v = {_table_name(signal)}.get({expression}, {signal.error})", f"bits |= {_placed(signal)}"]
     if source.rolls:

@@ -82,6 +82,7 @@ class Loop:
         self._can_retry = _Retry()
         self._can_complaint = ""
         self._slots = Slots()
+        self._suspended_ns = min([SUSPENDED_NS, *(esc.settings.timeout_ns for esc in gateway.escs)])
         self._busy_until: int | None = None
         self._busy_since: int | None = None
         self._selector = selectors.DefaultSelector()
@@ -127,7 +128,7 @@ class Loop:
                 pause = max(0, self._next_deadline() - clock())
                 ready = self._selector.select(pause / SECOND)
                 now = clock()
-                if now - last - pause > SUSPENDED_NS:
+                if now - last - pause > self._suspended_ns:
                     self._discard_input(now - last - pause)
                     ready = []  # what they announced is gone; a hang-up comes again
                 for key, _ in ready:
@@ -157,6 +158,8 @@ class Loop:
         ) = -1  # ``stop`` may still come: it must not write to a descriptor of another's
 
     def _next_deadline(self) -> int:
+        if self.gateway.frames_wait:  # of a change that sending itself brought about
+            return 0
         due = [self.gateway.next_deadline()]
         due += [esc.retry.due for esc in self._escs if esc.retry.due is not None]
         due += [when for when in (self._can_retry.due, self._busy_until) if when is not None]
@@ -184,6 +187,7 @@ class Loop:
         log.warning(
             "the process was suspended for %.1f s: what waited on the serial ports is thrown away", late / SECOND
         )
+        self._slots.clear()
         for esc in self._escs:
             if esc.port is not None:
                 esc.port.discard()
@@ -233,6 +237,8 @@ class Loop:
                 self._open_can(now)
             else:
                 self._can_retry.due = None  # an interface that was down is tried by sending
+            if self._can_retry.due is None:
+                self.gateway.can_returned(now)
 
     # --- CAN
 
@@ -291,8 +297,10 @@ class Loop:
         self._busy_until = None
         count, answer = slots.flush(self._can.send)
         status.sent_frames += count
+        if count:
+            self._busy_since = None
         if answer is Sent.OK:
-            self._can_works(now)
+            self._can_works()
         else:
             status.send_failures += 1
             if (
@@ -312,12 +320,11 @@ class Loop:
                 return
         self.gateway.set_can_state(self._can.state, now)
 
-    def _can_works(self, now: int) -> None:
+    def _can_works(self) -> None:
         self._can_retry.succeeded()
         self._busy_since = None
         if self._can_complaint:
             self._can_complaint = ""
-            self.gateway.can_returned(now)
             log.info("CAN %s: frames are sent again", self._can_config.channel)
 
     # --- words

@@ -30,10 +30,11 @@ class SerialPort:
     def __init__(self, path: str) -> None:
         self.path = path
         is_pty = os.path.realpath(path).startswith("/dev/pts/")
+        # one that does not lock it, as a getty, could write to it; its terminal is not touched
+        if Path("/sys/class/tty", Path(os.path.realpath(path)).name).exists() and (users := _users(path)):
+            raise _in_use(path, users)
         quiet = _open_quietly(path)
         try:
-            if not is_pty and (users := _users(path)):  # one that does not lock it, as a getty, could write to it
-                raise _in_use(path, users)
             self._serial = _open(path, serial.PARITY_EVEN, is_pty)
         finally:
             os.close(quiet)

@@ -709,4 +709,5 @@ def test_no_frame_is_ever_older_than_the_time_out(
     last_not_available = [value == 65535 for value in values]
     if values and kind in (EVENT, ON_CHANGE):
         assert last_not_available[-1]
-        assert not any(a and b for a, b in pairwise(last_not_available))
+        # a caller that skips deadlines between two reads may have a value put off and lost again, and the loss said twice
+        assert late or not any(a and b for a, b in pairwise(last_not_available))

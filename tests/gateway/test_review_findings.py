@@ -18,7 +18,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.protocol import codec
-from kontronik_can_gw.protocol.fields import LiveData
+from kontronik_can_gw.protocol.fields import InfoData, LiveData
 from kontronik_can_gw.runtime.can_port import Sent
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.slots import Slots
@@ -251,6 +251,18 @@ def test_an_interface_that_python_can_does_not_know_is_found_before_anything_is_
     assert "Did you mean socketcan?" in capsys.readouterr().err
 
 
+class StoppedBusBase:
+    """What every stand-in for a CAN port without a descriptor has."""
+
+    state = CanState.ERROR_ACTIVE
+
+    def fileno(self) -> None:
+        return None
+
+    def close(self) -> None:
+        pass
+
+
 def test_a_read_of_many_old_frames_is_no_flood_of_link_changes(tmp_path: Path) -> None:
     message = 'BO_ 256 M: 8 Gw\n SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
     gateway = gateway_of(tmp_path, HEAD + message + TAIL)
@@ -263,21 +275,131 @@ def test_a_read_of_many_old_frames_is_no_flood_of_link_changes(tmp_path: Path) -
     assert [frame.data[0] for frame in gateway.take_frames()][-1] == 99
 
 
-class StoppedBus:
-    """A CAN port in which the process is suspended for 20 s, once."""
+def test_a_page_that_changes_often_does_not_starve_the_cycle_of_the_others(tmp_path: Path) -> None:
+    tail = 'BA_ "GenMsgSendType" BO_ 256 4;\nBA_ "GenMsgCycleTime" BO_ 256 100;\n'
+    gateway = gateway_of(tmp_path, HEAD + PAGES + TAIL + tail)
+    gateway.start(0)
+    pages = {0: 0, 1: 0, 2: 0}
+    for n in range(1000):
+        gateway.receive_bytes(0, frame_of(LiveData(battery_voltage=n)), n * 10 * MS)
+        for _, frame in until(gateway, n * 10 * MS, n * 10 * MS + 9 * MS):
+            pages[frame.data[0]] += 1
+    assert pages[0] >= 990
+    assert pages[1] >= 30
+    assert pages[2] >= 30
 
-    state = CanState.ERROR_ACTIVE
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        'CM_ "first\nVAL_ 256 Timing z ;\nBA_ "',
+        'CM_ SG_ 256 Timing "one; two\nVAL_TABLE_ z 1 fake ;";',
+    ],
+)
+def test_comments_are_not_touched_where_files_of_other_tools_are_read(tmp_path: Path, entry: str) -> None:
+    entry = entry if entry.endswith(";") else entry[:-4] + '";'
+    tables = 'BU_: Gw Car\nVAL_TABLE_ z 254 "Error; bad" 255 "NotAvailable" ;\n'
+    text = HEAD.replace("BU_: Gw Car\n", tables) + 'BO_ 256 M: 8 Gw\n SG_ Timing : 0|8@1+ (1,0) [0|0] "us" Car\n\n'
+    path = tmp_path / "c.dbc"
+    path.write_text(text + entry + "\n" + TAIL + "VAL_ 256 Timing z ;\n")
+    database = load_database(path)
+    signal = database.messages[0].signals[0]
+    said = signal.comment or (database.dbc.comment if database.dbc and hasattr(database.dbc, "comment") else None)
+    assert dict(signal.choices or {}) == {254: "Error; bad", 255: "NotAvailable"}
+    if said:
+        assert said in entry
+
+
+def test_an_enumeration_text_that_is_not_listed_is_told(tmp_path: Path) -> None:
+    text = HEAD + 'BO_ 256 M: 8 Gw\n SG_ Timing : 0|8@1+ (1,0) [0|0] "us" Car\n' + TAIL
+    with pytest.raises(UserError, match='"GenMsgSendType": "Sometimes" is none of'):
+        layout_of(tmp_path, text + 'BA_ "GenMsgSendType" BO_ 256 "Sometimes";\n')
+
+
+def test_a_link_change_without_live_data_is_told_by_event_messages_that_show_it(tmp_path: Path) -> None:
+    message = """BO_ 256 M: 8 Gw
+ SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car
+ SG_ LinkState : 32|8@1+ (1,0) [0|0] "" Car
+"""
+    gateway = gateway_of(tmp_path, HEAD + message + TAIL)
+    gateway.start(0)
+    gateway.receive_bytes(0, frame_of(LiveData()), 10 * MS)
+    until(gateway, 10 * MS, SECOND)
+    gateway.port_lost(0, SECOND)
+    assert [frame.data[4] for frame in gateway.take_frames()] == [5]
+
+
+def test_info_that_runs_out_is_said_on_every_page(tmp_path: Path) -> None:
+    pages = """BO_ 256 Pages: 8 Gw
+ SG_ Page M : 0|4@1+ (1,0) [0|0] "" Car
+ SG_ MinBatteryVoltage m0 : 8|16@1+ (0.01,0) [0|0] "V" Car
+ SG_ MaxBatteryVoltage m1 : 8|16@1+ (0.01,0) [0|0] "V" Car
+"""
+    gateway = gateway_of(tmp_path, HEAD + pages + TAIL)
+    gateway.start(0)
+    last: dict[int, bytes] = {}
+    for n in range(2000):
+        now = n * 10 * MS
+        data = frame_of(LiveData())
+        if n % 100 == 0 and n < 500:
+            data += codec.encode(InfoData(min_battery_voltage=1, max_battery_voltage=2), codec.Layout.V4)
+        gateway.receive_bytes(0, data, now)
+        for _, frame in until(gateway, now, now + 9 * MS):
+            last[frame.data[0]] = frame.data[1:3]
+    assert last == {0: b"\xff\xff", 1: b"\xff\xff"}
+
+
+class ScriptedBus(StoppedBusBase):
+    """Answers with what ``answer`` says at each moment."""
+
+    def __init__(self, clock: list[int]) -> None:
+        self.clock = clock
+        self.sent: list[CanFrame] = []
+        self.closed = False
+        self.taken = 0
+
+    def close(self) -> None:
+        self.closed = True
+
+    def send(self, frame: CanFrame) -> Sent:
+        self.taken += 1
+        if self.taken % 3 == 0:
+            return Sent.BUSY
+        self.sent.append(frame)
+        return Sent.OK
+
+
+def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(tmp_path: Path) -> None:
+    clock = [0]
+    message = 'BO_ 256 M: 8 Gw\n SG_ Uptime : 0|32@1+ (1,0) [0|0] "s" Car\n'
+    layout = layout_of(tmp_path, HEAD + message + TAIL)
+    with PtyEsc() as esc:
+        loop = Loop(
+            Gateway([ONE], layout, 0),
+            [esc.path],
+            CanConfig(interface="virtual", channel="busy"),
+            clock=lambda: clock[0],
+        )
+        loop.open()
+        bus = ScriptedBus(clock)
+        loop._can = bus  # type: ignore[assignment]
+        for n in range(500):
+            clock[0] += 10 * MS
+            for can_id in range(10):
+                loop._slots.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
+            loop._transmit(clock[0])
+        assert not bus.closed
+        assert len(bus.sent) > 500
+        loop.close()
+
+
+class StoppedBus(StoppedBusBase):
+    """A CAN port in which the process is suspended for 20 s, once."""
 
     def __init__(self, loop: Loop, esc: PtyEsc, clock: list[int]) -> None:
         self.loop, self.esc, self.clock = loop, esc, clock
         self.sent: list[CanFrame] = []
         self.stopped = False
-
-    def fileno(self) -> None:
-        return None
-
-    def close(self) -> None:
-        pass
 
     def send(self, frame: CanFrame) -> Sent:
         self.sent.append(frame)
@@ -330,3 +452,39 @@ def test_closed_standard_streams_never_lend_their_number_to_a_port(tmp_path: Pat
     assert int(fd) > 2
     assert code_text == "0"
     assert os.path.exists("/dev/null")
+
+
+class DownBus(StoppedBusBase):
+    """Down from 200 ms to 1 s."""
+
+    def __init__(self, clock: list[int]) -> None:
+        self.clock = clock
+        self.sent: list[CanFrame] = []
+
+    def send(self, frame: CanFrame) -> Sent:
+        if 200 * MS <= self.clock[0] < SECOND:
+            return Sent.DOWN
+        self.sent.append(frame)
+        return Sent.OK
+
+
+def test_a_loss_during_an_outage_is_told_behind_it_though_nothing_else_is_sent(tmp_path: Path) -> None:
+    message = 'BO_ 256 M: 8 Gw\n SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
+    clock = [0]
+    gateway = gateway_of(tmp_path, HEAD + message + TAIL)
+    with PtyEsc() as esc:
+        loop = Loop(gateway, [esc.path], CanConfig(interface="virtual", channel="down"), clock=lambda: clock[0])
+        loop.open()
+        bus = DownBus(clock)
+        loop._can = bus  # type: ignore[assignment]
+        gateway.start(0)
+        while clock[0] < 3 * SECOND:
+            clock[0] += 10 * MS
+            if clock[0] <= 200 * MS:
+                gateway.receive_bytes(0, frame_of(LiveData(electrical_speed=5000)), clock[0])
+            loop._reopen(clock[0])
+            gateway.advance(clock[0])
+            loop._transmit(clock[0])
+        loop.close()
+    assert bus.sent[-1].data[:4] == b"\xff\xff\xff\xff"
+    assert loop._can_complaint == ""
