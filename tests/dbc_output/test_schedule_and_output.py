@@ -194,8 +194,9 @@ def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too
             bench.take()
         bench.live()
         lives += 1
-    assert {2, 3} <= set(bench.raws(8, 16))  # Ok and Degraded
-    assert len(bench.times()) == lives
+    assert bench.raws(8, 16)[0] == 1  # Searching, told while there are no live frames yet
+    assert {2, 3} <= set(bench.raws(8, 16))  # Ok and Degraded, told with live frames
+    assert len(bench.times()) == 1 + lives
 
 
 def test_an_event_message_of_info_values_goes_with_info_frames_only() -> None:
