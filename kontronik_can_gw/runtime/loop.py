@@ -101,9 +101,8 @@ class Loop:
         """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
         now = self._clock()
         try:
-            for (
-                esc
-            ) in self._escs:  # first, and locked: so that nothing else, a CAN adapter's driver included, opens them
+            # ports first, and locked: so that nothing else, a CAN adapter's driver included, opens them
+            for esc in self._escs:
                 self._open_port(esc, now)
             self._open_can(now)
         except UserError:
@@ -153,9 +152,8 @@ class Loop:
         for fd in (self._wake_read, self._wake_write):
             with contextlib.suppress(OSError):
                 os.close(fd)
-        self._wake_read = (
-            self._wake_write
-        ) = -1  # ``stop`` may still come: it must not write to a descriptor of another's
+        # ``stop`` may still come: it must not write to a descriptor of another's
+        self._wake_read = self._wake_write = -1
 
     def _next_deadline(self) -> int:
         if self.gateway.frames_wait:  # of a change that sending itself brought about
@@ -303,9 +301,8 @@ class Loop:
             self._can_works()
         else:
             status.send_failures += 1
-            if (
-                answer is Sent.BUSY and self._can.fileno() is None
-            ):  # python-can does not tell a full queue from a dead adapter
+            # without a socket python-can does not tell a full queue from a dead adapter
+            if answer is Sent.BUSY and self._can.fileno() is None:
                 self._busy_since = self._busy_since or now
                 if now - self._busy_since > LASTING_BUSY_NS:
                     answer = Sent.GONE
@@ -322,7 +319,6 @@ class Loop:
 
     def _can_works(self) -> None:
         self._can_retry.succeeded()
-        self._busy_since = None
         if self._can_complaint:
             self._can_complaint = ""
             log.info("CAN %s: frames are sent again", self._can_config.channel)
