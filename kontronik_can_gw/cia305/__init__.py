@@ -1,0 +1,1 @@
+"""Layer setting services (LSS) by CiA 305: the slave."""
