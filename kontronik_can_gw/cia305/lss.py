@@ -1,0 +1,248 @@
+"""The LSS slave of one node (CiA 305): requests on 7E5h in, answers for 7E4h out.
+
+Feed every data frame of 7E5h to ``receive``; answers leave through ``send``. Nothing raises, whatever comes. No clock is needed: the slave
+has no time-outs.
+
+Where independent stacks (CANopenNode, Lely) disagree, the stricter reading holds:
+
+- Only frames of 8 bytes count (Lely takes shorter ones).
+- Selection and identification are sequences without a gap: any other LSS frame between breaks them (Lely keeps the place over some
+  services, CANopenNode takes selection frames in any order).
+- Unconfigured, to fastscan and to "identify non-configured", is a node whose active **and** pending node-ID are FFh (Lely lets every node
+  take part in a fastscan).
+- A fastscan begins with BitChecked = 80h (both stacks would also begin without), with LSSSub and LSSNext in 0..3.
+- A fastscan that has not come to its end is forgotten when the slave leaves the waiting state.
+- "Inquire node-ID" tells the active node-ID (Lely: the pending one while initialising).
+
+All agree, and so does the table of services by state in CiA 305: in configuration state a slave ignores "switch state selective", also that
+of another slave; only "switch state global" brings it back to waiting.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Protocol
+
+UNCONFIGURED = 0xFF
+"""The node-ID of a node that has none."""
+
+
+class Service(IntEnum):
+    """Command specifiers: byte 0 of a frame."""
+
+    SWITCH_GLOBAL = 0x04
+    CONFIGURE_NODE_ID = 0x11
+    CONFIGURE_BIT_TIMING = 0x13
+    STORE = 0x17
+    SELECT_VENDOR = 0x40
+    SELECT_PRODUCT = 0x41
+    SELECT_REVISION = 0x42
+    SELECT_SERIAL = 0x43
+    SELECTED = 0x44
+    IDENTIFY_VENDOR = 0x46
+    IDENTIFY_PRODUCT = 0x47
+    IDENTIFY_REVISION_LOW = 0x48
+    IDENTIFY_REVISION_HIGH = 0x49
+    IDENTIFY_SERIAL_LOW = 0x4A
+    IDENTIFY_SERIAL_HIGH = 0x4B
+    IDENTIFY_NON_CONFIGURED = 0x4C
+    IDENTIFIED = 0x4F
+    NON_CONFIGURED = 0x50
+    FASTSCAN = 0x51
+    INQUIRE_VENDOR = 0x5A
+    INQUIRE_PRODUCT = 0x5B
+    INQUIRE_REVISION = 0x5C
+    INQUIRE_SERIAL = 0x5D
+    INQUIRE_NODE_ID = 0x5E
+
+
+OK = 0
+NODE_ID_OUT_OF_RANGE = 1
+BIT_TIMING_NOT_SUPPORTED = 1
+STORE_NOT_SUPPORTED = 1
+STORE_FAILED = 2
+SPECIFIC_ERROR = 0xFF
+BUS_WRITES_OFF = 1
+"""The specific error behind FFh: writing over the bus is switched off in the configuration."""
+
+SCAN_RESET = 0x80
+"""BitChecked of the frame that begins a fastscan."""
+
+
+class Host(Protocol):
+    """The node as LSS sees it."""
+
+    @property
+    def identity(self) -> tuple[int, int, int, int]:
+        """1018h:1..4: vendor-ID, product code, revision number, serial number; 32 bit each."""
+
+    @property
+    def active_node_id(self) -> int:
+        """1..127, or 255: unconfigured."""
+
+    @property
+    def pending_node_id(self) -> int:
+        """1..127 or 255; becomes the active one at reset communication."""
+
+    def configure_node_id(self, node_id: int) -> bool:
+        """Set the pending node-ID, 1..127 or 255. False: refused (bus writes switched off)."""
+
+    def store_configuration(self) -> bool:
+        """Begin to save the pending node-ID. False: refused.
+
+        After True exactly one call of ``LssSlave.stored`` follows, in the order of the requests, also when the node was reset between.
+        """
+
+    def lss_left_configuration(self, now: int) -> None:
+        """The slave was switched from configuration to waiting state. An unconfigured node with a valid pending node-ID boots now."""
+
+
+class LssSlave:
+    """Configures one node, selected by its identity (1018h). Several slaves hear the same frames, each answers for itself only."""
+
+    def __init__(self, host: Host, send: Callable[[bytes], None]) -> None:
+        self._host = host
+        self._send = send
+        self._configuring = False
+        self._expected = 0
+        """What continues the selection or identification under way; 0: none is."""
+        self._scanned: int | None = None
+        """LSSPos, the part of the identity (0..3) that a fastscan looks at; None: no fastscan under way."""
+        self._stores: deque[bool] = deque()
+        """Savings under way, oldest first: whether the master still waits for the answer."""
+
+    @property
+    def configuring(self) -> bool:
+        """Whether this is the LSS configuration state (else: waiting)."""
+        return self._configuring
+
+    def reset(self) -> None:
+        """Back to waiting state, at an NMT reset: partial selections and scans are forgotten, a late result of a saving is not told."""
+        self._enter(configuring=False)
+
+    def receive(self, data: bytes, now: int) -> None:
+        """Take a data frame of 7E5h. Other lengths than 8 bytes, unknown services and services of the other state are ignored."""
+        if len(data) != 8:
+            return
+        service, number = data[0], int.from_bytes(data[1:5], "little")
+        expected, self._expected = self._expected, 0
+        if service == Service.SWITCH_GLOBAL:
+            self._switch_global(data[1], now)
+        elif Service.IDENTIFY_VENDOR <= service <= Service.IDENTIFY_SERIAL_HIGH:
+            if self._sequence_ends(service, number, expected):
+                self._answer(Service.IDENTIFIED)
+        elif service == Service.IDENTIFY_NON_CONFIGURED:
+            if self._unconfigured:
+                self._answer(Service.NON_CONFIGURED)
+        elif self._configuring:
+            self._configure(service, data)
+        elif Service.SELECT_VENDOR <= service <= Service.SELECT_SERIAL:
+            if self._sequence_ends(service, number, expected):
+                self._enter(configuring=True)
+                self._answer(Service.SELECTED)
+        elif service == Service.FASTSCAN and self._unconfigured:
+            self._fastscan(number, *data[5:])
+
+    def stored(self, ok: bool) -> None:
+        """Tell the master the result of the oldest saving under way.
+
+        Not answered if the slave has left the configuration state since: another slave may be the selected one by now.
+        """
+        if self._stores and self._stores.popleft():
+            self._answer(Service.STORE, OK if ok else STORE_FAILED)
+
+    @property
+    def _unconfigured(self) -> bool:
+        return self._host.active_node_id == UNCONFIGURED and self._host.pending_node_id == UNCONFIGURED
+
+    def _enter(self, configuring: bool) -> None:
+        self._configuring = configuring
+        self._expected = 0
+        self._scanned = None
+        if not configuring:
+            self._stores = deque(False for _ in self._stores)
+
+    def _switch_global(self, mode: int, now: int) -> None:
+        if mode == 1:
+            self._enter(configuring=True)
+        elif mode == 0:
+            left = self._configuring
+            self._enter(configuring=False)
+            if left:
+                self._host.lss_left_configuration(now)
+
+    def _sequence_ends(self, service: int, number: int, expected: int) -> bool:
+        """Whether this frame completes a selection (40h..43h) or identification (46h..4Bh) that fits in all its parts."""
+        first = service in (Service.SELECT_VENDOR, Service.IDENTIFY_VENDOR)
+        if not (first or service == expected) or not self._fits(service, number):
+            return False
+        if service in (Service.SELECT_SERIAL, Service.IDENTIFY_SERIAL_HIGH):
+            return True
+        self._expected = service + 1
+        return False
+
+    def _fits(self, service: int, number: int) -> bool:
+        vendor, product, revision, serial = self._host.identity
+        match service:
+            case Service.SELECT_VENDOR | Service.IDENTIFY_VENDOR:
+                return number == vendor
+            case Service.SELECT_PRODUCT | Service.IDENTIFY_PRODUCT:
+                return number == product
+            case Service.SELECT_REVISION:
+                return number == revision
+            case Service.SELECT_SERIAL:
+                return number == serial
+            case Service.IDENTIFY_REVISION_LOW:
+                return number <= revision
+            case Service.IDENTIFY_REVISION_HIGH:
+                return revision <= number
+            case Service.IDENTIFY_SERIAL_LOW:
+                return number <= serial
+            case _:
+                return serial <= number
+
+    def _fastscan(self, number: int, bit_checked: int, sub: int, following: int) -> None:
+        """51h | IDNumber u32 | BitChecked 0..31 or 80h | LSSSub 0..3 | LSSNext 0..3."""
+        if sub > 3 or following > 3:
+            return
+        if bit_checked == SCAN_RESET:
+            self._scanned = 0
+            self._answer(Service.IDENTIFIED)
+            return
+        if bit_checked > 31 or sub != self._scanned:
+            return
+        if (number ^ self._host.identity[sub]) >> bit_checked:
+            return
+        self._scanned = following
+        # LSSNext < LSSSub with every bit checked: the master has come to the last part it looks at.
+        if bit_checked == 0 and following < sub:
+            self._enter(configuring=True)
+        self._answer(Service.IDENTIFIED)
+
+    def _configure(self, service: int, data: bytes) -> None:
+        """Serve what only a slave in configuration state does. Activate bit timing (15h) has no answer, and here no effect."""
+        if service == Service.CONFIGURE_NODE_ID:
+            self._configure_node_id(data[1])
+        elif service == Service.CONFIGURE_BIT_TIMING:
+            self._answer(service, BIT_TIMING_NOT_SUPPORTED)  # the bit rate belongs to the system
+        elif service == Service.STORE:
+            # noted before the host is asked, which may know the result at once
+            self._stores.append(True)
+            if not self._host.store_configuration():
+                self._stores.pop()
+                self._answer(service, STORE_NOT_SUPPORTED)
+        elif Service.INQUIRE_VENDOR <= service <= Service.INQUIRE_SERIAL:
+            self._answer(service, *self._host.identity[service - Service.INQUIRE_VENDOR].to_bytes(4, "little"))
+        elif service == Service.INQUIRE_NODE_ID:
+            self._answer(service, self._host.active_node_id)
+
+    def _configure_node_id(self, node_id: int) -> None:
+        if not (1 <= node_id <= 127 or node_id == UNCONFIGURED):
+            self._answer(Service.CONFIGURE_NODE_ID, NODE_ID_OUT_OF_RANGE)
+        elif not self._host.configure_node_id(node_id):
+            self._answer(Service.CONFIGURE_NODE_ID, SPECIFIC_ERROR, BUS_WRITES_OFF)
+        else:
+            self._answer(Service.CONFIGURE_NODE_ID, OK)
+
+    def _answer(self, *content: int) -> None:
+        self._send(bytes(content).ljust(8, b"\0"))
