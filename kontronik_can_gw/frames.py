@@ -1,12 +1,14 @@
-"""The CAN frame as the pure core hands it out."""
+"""The CAN frame as the pure core receives it and hands it out."""
 
 from typing import NamedTuple
 
 
 class CanFrame(NamedTuple):
-    """A data frame: id (11 or 29 bit), data (0 to 8 bytes, CAN FD to 64).
+    """A frame: id (11 or 29 bit), data (0 to 8 bytes, CAN FD to 64).
 
-    ``page`` tells frames of one id apart that do not stand for each other (multiplexer pages).
+    ``page`` tells frames of one id apart that do not stand for each other (multiplexer pages). ``remote``: a remote frame (RTR), its
+    data only says how much is asked for. ``queued``: it is sent in order and never replaced (answers of SDO, LSS and NMT, EMCY);
+    where False the newest frame of an id is the one that is sent.
     """
 
     can_id: int
@@ -14,3 +16,5 @@ class CanFrame(NamedTuple):
     extended: bool = False
     fd: bool = False
     page: int = 0
+    remote: bool = False
+    queued: bool = False

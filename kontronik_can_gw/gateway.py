@@ -1,4 +1,4 @@
-"""The assembly of the pure core, and the only surface the runtime sees: bytes and time in, CAN frames and deadlines out.
+"""The assembly of the pure core, and the only surface the runtime sees: bytes, CAN frames and time in, CAN frames and deadlines out.
 
 ``now`` is integer nanoseconds of one monotonic clock: the loop's when live, the capture's in replay.
 """
@@ -11,14 +11,26 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.telemetry import SECOND, EscSettings, EscTelemetry, Event
 
+_NO_IDS: frozenset[int] = frozenset()
+
 
 class Gateway:
-    """One gateway: several ESCs in, one CAN bus out."""
+    """One gateway: several ESCs in, one CAN bus out. ``canopen`` None: no CANopen nodes; a layout without messages: no DBC output."""
 
-    def __init__(self, escs: Sequence[EscSettings], layout: Layout, now: int, silent_on_loss: bool = False) -> None:
+    def __init__(
+        self,
+        escs: Sequence[EscSettings],
+        layout: Layout,
+        now: int,
+        silent_on_loss: bool = False,
+        canopen: "Canopen | None" = None,
+    ) -> None:
         self.escs = [EscTelemetry(settings, now) for settings in escs]
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
         self._output = DbcOutput(layout, self.escs, self.status, now, silent_on_loss)
+        self.nodes: Nodes | None = None
+        if canopen is not None:
+            self.nodes = canopen.make(self.escs, self.status, self._apply, layout)
         self._link_changes: list[int] = []
         self._told_ns = now
         self._next_expiry = 0
@@ -39,6 +51,14 @@ class Gateway:
         self._expire(now, but=esc)  # a message may hold values of several ESCs
         for events in self.escs[esc].receive_each(data, now):
             self._follow(esc, events, now)
+
+    @property
+    def receive_ids(self) -> frozenset[int]:
+        """The 11-bit ids of the data frames that ``receive_frame`` is to be given; the same object until they change."""
+        return _NO_IDS
+
+    def receive_frame(self, frame: CanFrame, now: int) -> None:
+        """A data frame with one of ``receive_ids``, received at ``now``."""
 
     def port_opened(self, esc: int, now: int) -> None:
         """An ESC's port is open (again)."""

@@ -51,6 +51,10 @@ class GatewayStatus:
     sent_frames: int = 0
     replaced_frames: int = 0
     send_failures: int = 0
+    received_frames: int = 0
+    bus_off_count: int = 0
+    dropped_frames: int = 0
+    """Frames to be sent in order that were lost: too many waited, or the interface was down."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The CAN interface: any of python-can's; SocketCAN without waiting, by its own socket.
 
-``send`` never blocks on SocketCAN and never raises: it says what became of the frame.
+``send`` never blocks on SocketCAN and never raises: it says what became of the frame. ``receive`` never blocks and never raises. Data
+frames come only with ids that were asked for, so that foreign traffic does not wake the process.
 """
 
 import contextlib
@@ -8,7 +9,7 @@ import difflib
 import errno
 import socket
 import struct
-import sys
+from collections.abc import Collection
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,16 +18,28 @@ from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
 from kontronik_can_gw.sources import CanState
 
 if TYPE_CHECKING:
     import can
 
+RECEIVE_LIMIT = 64
+"""Frames, error frames among them, that one call of ``receive`` takes at most."""
+_DISCARD_LIMIT = 4096
+_RECEIVE_BUFFER = 1 << 20
+"""Bytes asked for; the kernel grants what net.core.rmem_max allows, by default twice the usual 278 frames."""
+
 _CLASSIC = struct.Struct("=IB3x8s")
 _FD = struct.Struct("=IBB2x64s")
 _FD_BRS = 0x01
 _EXTENDED = 0x80000000
+_REMOTE = 0x40000000
 _ERROR_FLAG = 0x20000000
+_STANDARD_ID = 0x7FF
+_FILTER = struct.Struct("=II")
+_MOST_FILTERS = 512
+"""CAN_RAW_FILTER_MAX: the kernel takes no more for one socket."""
 _ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
 _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x0C, 0x30, 0x40
 
@@ -46,18 +59,65 @@ class CanPort:
     def __init__(self, config: CanConfig) -> None:
         self.config = config
         self.state = CanState.UNKNOWN
+        self.bus_off_count = 0
+        """How often the controller went to bus-off; who counts them may set it back to 0."""
         self._bus = _open(config)
+        self._ids: frozenset[int] = frozenset()
+        self._reader: BusReader | None = None
+        self._removed = False
         self._socket: socket.socket | None = (
             getattr(self._bus, "socket", None) if config.interface == "socketcan" else None
         )
         if self._socket is not None:
-            # no data frame is of interest: only error frames (python-can asks for them) wake the process
+            # until ids are asked for only error frames (python-can asks for them) wake the process
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 0)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
             self._socket.setblocking(False)
 
     def fileno(self) -> int | None:
-        """Readable when ``receive_errors`` has something to do; None where the interface has no descriptor."""
-        return None if self._socket is None else self._socket.fileno()
+        """Readable when ``receive`` has something to do; None where nothing can come. ``set_receive_ids`` may change it."""
+        if self._socket is not None:
+            return self._socket.fileno()
+        return None if self._reader is None else self._reader.fileno()
+
+    @property
+    def tells_busy_from_gone(self) -> bool:
+        """False where a send that fails for want of room and one on a dead adapter look the same: without a socket of our own."""
+        return self._socket is not None
+
+    @property
+    def gone(self) -> bool:
+        """True when reception found that the interface was removed or its driver failed: close it and open it anew."""
+        return self._removed or (self._reader is not None and self._reader.failed)
+
+    def set_receive_ids(self, ids: Collection[int]) -> None:
+        """From now on receive classic data frames with these 11-bit ids and no others. ValueError for a greater id.
+
+        On SocketCAN by the kernel's filters; elsewhere by python-can's, with a thread that reads as soon as there is an id.
+        """
+        if any(not 0 <= can_id <= _STANDARD_ID for can_id in ids):
+            raise ValueError(f"no 11-bit identifiers: {sorted(ids)}")
+        self._ids = frozenset(ids)
+        if self._socket is not None:
+            packed = b"".join(_FILTER.pack(*each) for each in _kernel_filters(self._ids))
+            try:
+                self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed)
+            except OSError:  # of an interface that was removed a moment ago
+                self._removed = True
+        elif self._reader is not None or self._ids:
+            self._filter_bus()
+            if self._reader is None:
+                self._reader = BusReader(self._bus, self._ids)
+            self._reader.ids = self._ids
+
+    def receive(self) -> list[CanFrame]:
+        """The data frames that have come, oldest first, at most RECEIVE_LIMIT; follow the controller's state from error frames."""
+        return self._receive(RECEIVE_LIMIT)
+
+    def discard(self) -> None:
+        """Throw away the data frames that wait to be received; what error frames say still counts."""
+        self._receive(_DISCARD_LIMIT if self._reader is None else QUEUE_LENGTH)
 
     def send(self, frame: CanFrame) -> Sent:
         """Hand a frame to the interface. An interface that was down and is up again reports its old error once: retried."""
@@ -70,33 +130,55 @@ class CanPort:
             self.state = CanState.DOWN
         return result
 
-    def receive_errors(self) -> None:
-        """Follow the controller's state from error frames; what else has come is dropped."""
-        if self._socket is None:
-            return
-        for _ in range(64):
-            try:
-                data = self._socket.recv(72)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                if error.errno in (errno.ENETDOWN, errno.ENODEV):
-                    self.state = CanState.DOWN
-                return
-            if len(data) < 16:
-                return
-            can_id, detail = int.from_bytes(data[:4], sys.byteorder), data[9]
-            if can_id & _ERROR_FLAG:
-                self._follow(can_id, detail)
-
     def close(self) -> None:
+        if self._reader is not None:
+            self._reader.close()  # before the driver is shut down: few of them bear both at once
         with contextlib.suppress(
             Exception
         ):  # an interface that is gone may fail in its own ways; nothing is left to do
             self._bus.shutdown()
 
+    def _receive(self, limit: int) -> list[CanFrame]:
+        if self._reader is not None:
+            frames = self._reader.take(limit)
+            if self._reader.failed:
+                self.state = CanState.DOWN
+            return frames
+        frames = []
+        if self._socket is None:
+            return frames
+        for _ in range(limit):
+            try:
+                data = self._socket.recv(_FD.size)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                if error.errno in (errno.ENETDOWN, errno.ENODEV):
+                    self.state = CanState.DOWN
+                    self._removed = self._removed or error.errno == errno.ENODEV
+                break
+            # a CAN FD frame is longer: no node of CiA 301 takes one (CANopen FD uses the same ids with other content)
+            if len(data) != _CLASSIC.size:
+                continue
+            can_id, size, content = _CLASSIC.unpack(data)
+            if can_id & _ERROR_FLAG:
+                self._follow(can_id, content[1])
+            elif can_id in self._ids:  # with a flag set, of a 29-bit or remote frame, it is none of ours
+                frames.append(CanFrame(can_id, content[:size]))
+        return frames
+
+    def _filter_bus(self) -> None:
+        """Ask python-can's driver for our ids; one that cannot filter is left to the thread."""
+        filters = [{"can_id": each, "can_mask": _STANDARD_ID, "extended": False} for each in sorted(self._ids)]
+        for wanted in (filters, None):
+            with contextlib.suppress(Exception):  # each driver fails in its own way
+                self._bus.set_filters(wanted)  # type: ignore[arg-type]
+                return
+        self._removed = True
+
     def _follow(self, can_id: int, detail: int) -> None:
         if can_id & _ERR_BUS_OFF:
+            self.bus_off_count += self.state is not CanState.BUS_OFF
             self.state = CanState.BUS_OFF
         elif can_id & _ERR_RESTARTED:
             self.state = CanState.ERROR_ACTIVE
@@ -109,9 +191,11 @@ class CanPort:
                 self.state = CanState.ERROR_ACTIVE
 
     def _send(self, frame: CanFrame) -> Sent:
+        if self.gone:
+            return Sent.GONE
         if self._socket is None:
             return self._send_message(frame)
-        can_id = frame.can_id | _EXTENDED if frame.extended else frame.can_id
+        can_id = frame.can_id | (_EXTENDED if frame.extended else 0) | (_REMOTE if frame.remote else 0)
         size = len(frame.data)
         if frame.fd:
             packet = _FD.pack(can_id, size, _FD_BRS, frame.data)
@@ -132,6 +216,7 @@ class CanPort:
             arbitration_id=frame.can_id,
             data=frame.data,
             is_extended_id=frame.extended,
+            is_remote_frame=frame.remote,
             is_fd=frame.fd,
             bitrate_switch=frame.fd,
         )
@@ -142,6 +227,18 @@ class CanPort:
         except Exception:  # what a driver lets out when its adapter has gone: OSError, termios.error ...
             return Sent.GONE
         return Sent.OK
+
+
+def _kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:
+    """(id, mask) pairs that let these 11-bit data frames through; with too many ids blocks of 2, 4 ... of which one is wanted.
+
+    The flags are part of the mask, so that 29-bit and remote frames with the same number stay out.
+    """
+    step = 1
+    while len({can_id // step for can_id in ids}) > _MOST_FILTERS:
+        step *= 2
+    mask = _EXTENDED | _REMOTE | _STANDARD_ID & ~(step - 1)
+    return [(block * step, mask) for block in sorted({can_id // step for can_id in ids})]
 
 
 def check_interface(config: CanConfig) -> None:

@@ -1,7 +1,7 @@
 """The live gateway: one selector loop over serial ports, CAN interface and time. No thread is started here.
 
 What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` may be called from elsewhere (a signal handler,
-another thread).
+another thread). Where python-can has no descriptor to wait on, the CAN port receives by a thread (bus_reader.py).
 """
 
 import contextlib
@@ -16,8 +16,8 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.can_port import CanPort, Sent
+from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.runtime.serial_port import PortLost, SerialPort, device_of
-from kontronik_can_gw.runtime.slots import Slots
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND, LinkState
 
@@ -81,7 +81,9 @@ class Loop:
         self._can: CanPort | None = None
         self._can_retry = _Retry()
         self._can_complaint = ""
-        self._slots = Slots()
+        self._receive_ids: frozenset[int] | None = None
+        """What the open CAN port was told to receive."""
+        self._mailboxes = Mailboxes()
         self._suspended_ns = min([SUSPENDED_NS, *(esc.settings.timeout_ns for esc in gateway.escs)])
         self._busy_until: int | None = None
         self._busy_since: int | None = None
@@ -111,6 +113,8 @@ class Loop:
         for esc in self._escs:
             if esc.port is not None:
                 esc.port.discard()  # an interface may take seconds to open
+        if self._can is not None:
+            self._can.discard()  # a node that has not booted yet hears nothing
         for line in self._held or ():
             log.info(line)
         self._held = None
@@ -128,13 +132,14 @@ class Loop:
                 ready = self._selector.select(pause / SECOND)
                 now = clock()
                 if now - last - pause > self._suspended_ns:
-                    self._discard_input(now - last - pause)
+                    self._discard_input(now - last - pause, now)
                     ready = []  # what they announced is gone; a hang-up comes again
                 for key, _ in ready:
                     self._serve(key, now)
                 self._reopen(now)
                 gateway.advance(now)
                 self._transmit(now)
+                self._follow_receive_ids()
                 self._report(now)
         finally:
             now = clock()
@@ -176,16 +181,20 @@ class Loop:
             if data:
                 self.gateway.receive_bytes(what.index, data, now)
         elif isinstance(what, CanPort):
-            what.receive_errors()
+            self._receive(what, now)
         else:
             with contextlib.suppress(OSError):
                 os.read(self._wake_read, 64)
 
-    def _discard_input(self, late: int) -> None:
+    def _discard_input(self, late: int, now: int) -> None:
         log.warning(
-            "the process was suspended for %.1f s: what waited on the serial ports is thrown away", late / SECOND
+            "the process was suspended for %.1f s: what waited on the serial ports and for CAN is thrown away",
+            late / SECOND,
         )
-        self._slots.clear()
+        self._clear_mailboxes()
+        if self._can is not None:
+            self._can.discard()
+            self._follow_reception(self._can, now)
         for esc in self._escs:
             if esc.port is not None:
                 esc.port.discard()
@@ -253,7 +262,40 @@ class Loop:
         self._can_retry.due = None
         if (fd := port.fileno()) is not None:
             self._selector.register(fd, selectors.EVENT_READ, port)
+        self._receive_ids = None
+        self._follow_receive_ids()
         self._say_open(f"CAN {self._can_config.interface} {self._can_config.channel} is open")
+
+    def _follow_receive_ids(self) -> None:
+        """Tell the open port what to receive, if that has changed."""
+        ids = self.gateway.receive_ids
+        if self._can is None or ids is self._receive_ids:
+            return
+        had_fd = self._can.fileno() is not None
+        self._receive_ids = ids
+        self._can.set_receive_ids(ids)
+        if not had_fd and (fd := self._can.fileno()) is not None:
+            self._selector.register(fd, selectors.EVENT_READ, self._can)
+
+    def _receive(self, port: CanPort, now: int) -> None:
+        if port is not self._can:
+            return
+        frames = port.receive()
+        self.gateway.status.received_frames += len(frames)
+        for frame in frames:
+            self.gateway.receive_frame(frame, now)
+        if frames and self._can_retry.due is not None:
+            self._can_retry.due = now  # it was down, and works again
+        self._follow_reception(port, now)
+
+    def _follow_reception(self, port: CanPort, now: int) -> None:
+        """What receiving told of the interface itself."""
+        self.gateway.status.bus_off_count += port.bus_off_count
+        port.bus_off_count = 0
+        if port.gone:
+            self._can_lost(Sent.GONE, now)
+        else:
+            self.gateway.set_can_state(port.state, now)
 
     def _refuse_escs_as_channel(self) -> None:
         """Whatever its name is now: what leads to an ESC must not be opened as a CAN interface, which would send to it."""
@@ -267,7 +309,7 @@ class Loop:
     def _can_failed(self, reason: str, now: int) -> None:
         self._can_retry.failed(now)
         if self._can_retry.due is not None:
-            self._slots.clear()
+            self._clear_mailboxes()
         self.gateway.set_can_state(CanState.DOWN, now)
         if reason != self._can_complaint:
             self._can_complaint = reason
@@ -281,19 +323,35 @@ class Loop:
             self._can.close()
             self._can = None
 
+    def _can_lost(self, answer: Sent, now: int) -> None:
+        """The interface is down, or gone and to be opened anew."""
+        self._busy_since = None
+        if answer is Sent.GONE:
+            self._close_can()
+        self._can_failed(f"CAN interface {self._can_config.channel}: {'gone' if answer is Sent.GONE else 'down'}.", now)
+
+    def _clear_mailboxes(self) -> None:
+        self._mailboxes.clear()
+        self._count_losses()
+
+    def _count_losses(self) -> None:
+        status, waiting = self.gateway.status, self._mailboxes
+        status.replaced_frames, status.dropped_frames = waiting.replaced, waiting.dropped
+
     def _transmit(self, now: int) -> None:
-        status, slots = self.gateway.status, self._slots
+        status, waiting = self.gateway.status, self._mailboxes
         for frame in self.gateway.take_frames():
-            slots.put(frame)
-        status.replaced_frames = slots.replaced
-        if not len(slots) or self._can is None or self._can_retry.due is not None:
-            if self._can is None or self._can_retry.due is not None:
-                slots.clear()
+            waiting.put(frame)
+        if self._can is None or self._can_retry.due is not None:
+            self._clear_mailboxes()
+            return
+        self._count_losses()
+        if not len(waiting):
             return
         if self._busy_until is not None and now < self._busy_until:
             return
         self._busy_until = None
-        count, answer = slots.flush(self._can.send)
+        count, answer = waiting.flush(self._can.send)
         status.sent_frames += count
         if count:
             self._busy_since = None
@@ -301,20 +359,14 @@ class Loop:
             self._can_works()
         else:
             status.send_failures += 1
-            # without a socket python-can does not tell a full queue from a dead adapter
-            if answer is Sent.BUSY and self._can.fileno() is None:
+            if answer is Sent.BUSY and not self._can.tells_busy_from_gone:
                 self._busy_since = self._busy_since or now
                 if now - self._busy_since > LASTING_BUSY_NS:
                     answer = Sent.GONE
-            if answer is Sent.BUSY:
-                self._busy_until = now + BUSY_RETRY_NS
-            else:
-                self._busy_since = None
-                name = self._can_config.channel
-                if answer is Sent.GONE:
-                    self._close_can()
-                self._can_failed(f"CAN interface {name}: {'gone' if answer is Sent.GONE else 'down'}.", now)
+            if answer is not Sent.BUSY:
+                self._can_lost(answer, now)
                 return
+            self._busy_until = now + BUSY_RETRY_NS
         self.gateway.set_can_state(self._can.state, now)
 
     def _can_works(self) -> None:

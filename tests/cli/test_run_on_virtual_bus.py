@@ -32,7 +32,7 @@ from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, Operat
 from kontronik_can_gw.runtime import can_port
 from kontronik_can_gw.runtime.can_port import CanPort, Sent
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.slots import Slots
+from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import LinkState
@@ -376,7 +376,7 @@ def test_the_demonstration_on_a_terminal_shows_the_table_in_place() -> None:
     assert "0 bytes sent to the ESC" in plain
 
 
-# --- slots
+# --- mailboxes
 
 
 def frame(can_id: int, value: int, extended: bool = False) -> CanFrame:
@@ -384,40 +384,40 @@ def frame(can_id: int, value: int, extended: bool = False) -> CanFrame:
 
 
 def test_of_each_id_only_the_newest_frame_waits_and_the_order_is_that_of_waiting() -> None:
-    slots, sent = Slots(), []
+    mailboxes, sent = Mailboxes(), []
 
     def take(each: CanFrame) -> Sent:
         sent.append(each)
         return Sent.OK
 
     for each in (frame(1, 1), frame(2, 1), frame(1, 2), frame(1, 9, True), frame(1, 3)):
-        slots.put(each)
-    assert (len(slots), slots.replaced) == (3, 2)
-    assert slots.flush(take) == (3, Sent.OK)
+        mailboxes.put(each)
+    assert (len(mailboxes), mailboxes.replaced) == (3, 2)
+    assert mailboxes.flush(take) == (3, Sent.OK)
     assert sent == [frame(1, 3), frame(2, 1), frame(1, 9, True)]
-    assert (len(slots), slots.flush(take)) == (0, (0, Sent.OK))
+    assert (len(mailboxes), mailboxes.flush(take)) == (0, (0, Sent.OK))
 
 
 @pytest.mark.parametrize("answer", [Sent.BUSY, Sent.DOWN, Sent.GONE])
 def test_what_the_interface_does_not_take_goes_on_waiting(answer: Sent) -> None:
-    slots = Slots()
+    mailboxes = Mailboxes()
     for number in range(4):
-        slots.put(frame(number, 0))
+        mailboxes.put(frame(number, 0))
     answers = iter([Sent.OK, answer])
-    assert slots.flush(lambda _: next(answers)) == (1, answer)
-    assert len(slots) == 3
-    slots.put(frame(1, 5))
+    assert mailboxes.flush(lambda _: next(answers)) == (1, answer)
+    assert len(mailboxes) == 3
+    mailboxes.put(frame(1, 5))
     sent: list[CanFrame] = []
 
     def take(each: CanFrame) -> Sent:
         sent.append(each)
         return Sent.OK
 
-    assert slots.flush(take) == (3, Sent.OK)
+    assert mailboxes.flush(take) == (3, Sent.OK)
     assert sent == [frame(1, 5), frame(2, 0), frame(3, 0)]
-    slots.put(frame(1, 0))
-    slots.clear()
-    assert (len(slots), slots.replaced) == (0, 2)
+    mailboxes.put(frame(1, 0))
+    mailboxes.clear()
+    assert (len(mailboxes), mailboxes.replaced) == (0, 2)
 
 
 # --- the CAN port on a socket that is none
@@ -543,29 +543,29 @@ def test_error_frames_tell_the_controllers_state(
 ) -> None:
     port, fake = socket_port
     fake.inbox = [error_frame(kind, detail)]
-    port.receive_errors()
+    port.receive()
     assert state_of(port) is state
 
 
-def test_data_frames_and_fragments_say_nothing_and_a_removed_interface_is_down(
+def test_data_frames_and_fragments_say_nothing_of_the_state_and_a_removed_interface_is_down(
     socket_port: tuple[CanPort, FakeSocket],
 ) -> None:
     port, fake = socket_port
-    fake.inbox = [struct.pack("=IB3x8s", 0x40, 8, b"\x40" * 8), b"short", error_frame(0x40)]
-    port.receive_errors()
+    fake.inbox = [struct.pack("=IB3x8s", 0x40, 8, b"\x40" * 8), b"short"]
+    assert port.receive() == []
     assert state_of(port) is CanState.UNKNOWN
     fake.inbox = [errno.ENETDOWN]
-    port.receive_errors()
+    port.receive()
     assert state_of(port) is CanState.DOWN
     fake.inbox = [errno.EIO]
-    port.receive_errors()
+    port.receive()
     assert state_of(port) is CanState.DOWN
 
 
 def test_a_flood_of_error_frames_does_not_hold_the_loop(socket_port: tuple[CanPort, FakeSocket]) -> None:
     port, fake = socket_port
     fake.inbox = [error_frame(0x40)] * 1000
-    port.receive_errors()
+    port.receive()
     assert len(fake.inbox) >= 900
     port.close()
 
@@ -580,5 +580,5 @@ def test_another_interfaces_refusal_is_busy(monkeypatch: pytest.MonkeyPatch) -> 
     port = CanPort(CanConfig(interface="pcan"))
     assert port.fileno() is None
     assert port.send(frame(1, 1)) is Sent.BUSY
-    port.receive_errors()
+    port.receive()
     port.close()

@@ -2,7 +2,7 @@
 
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from kontronik_can_gw.protocol import codec
 from kontronik_can_gw.protocol.fields import InfoData, LiveData
 from kontronik_can_gw.runtime.can_port import Sent
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.slots import Slots
+from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 
@@ -154,7 +154,7 @@ def test_a_fault_of_one_frame_is_not_passed_over_when_two_come_in_one_read(tmp_p
 
 
 def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
-    slots, sent, free = Slots(), [], True
+    mailboxes, sent, free = Mailboxes(), [], True
 
     def send(frame: CanFrame) -> Sent:
         if free:
@@ -163,8 +163,8 @@ def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
 
     for n in range(100):
         free = n % 2 == 1
-        slots.put(CanFrame(1, b"", page=n % 2))
-        slots.flush(send)
+        mailboxes.put(CanFrame(1, b"", page=n % 2))
+        mailboxes.flush(send)
     assert set(sent) == {0, 1}
 
 
@@ -255,9 +255,18 @@ class StoppedBusBase:
     """What every stand-in for a CAN port without a descriptor has."""
 
     state = CanState.ERROR_ACTIVE
+    tells_busy_from_gone = False
+    gone = False
+    bus_off_count = 0
 
     def fileno(self) -> None:
         return None
+
+    def set_receive_ids(self, ids: Collection[int]) -> None:
+        assert not ids
+
+    def discard(self) -> None:
+        pass
 
     def close(self) -> None:
         pass
@@ -386,7 +395,7 @@ def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(tmp_path: Path) -> None
         for n in range(500):
             clock[0] += 10 * MS
             for can_id in range(10):
-                loop._slots.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
+                loop._mailboxes.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
             loop._transmit(clock[0])
         assert not bus.closed
         assert len(bus.sent) > 500
