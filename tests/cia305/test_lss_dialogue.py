@@ -415,6 +415,13 @@ def test_a_fastscan_may_skip_parts() -> None:
     assert bus.configuring == [True]
 
 
+def test_a_fastscan_ends_only_with_every_bit_checked() -> None:
+    bus = Bus(Node())
+    dialogue(bus, ("51 00000000 80 00 00", "4f"), ("51 04030201 00 00 03", "4f"))
+    dialogue(bus, (f"51 {u32(ME[3])} 01 03 00", "4f"))
+    assert bus.configuring == [False]
+
+
 class FastscanMaster:
     """Finds one unconfigured slave by asking bit by bit, from the highest down: the lowest identity answers longest."""
 

@@ -131,7 +131,7 @@ def sequences(draw: st.DrawFn) -> list[bytes]:
             for bit in (*draw(st.lists(st.integers(0, 31), max_size=2)), None):
                 following = part if bit is not None else (part + 1) % 4
                 made.append(bytes((0x51, *number.to_bytes(4, "little"), bit or 0, part, following)))
-    spoil = draw(st.sampled_from(("no", "no", "drop", "swap", "number", "insert")))
+    spoil = draw(st.sampled_from(("no", "no", "drop", "swap", "number", "bit", "bit", "insert")))
     at = draw(st.integers(0, len(made) - 2))
     if spoil == "drop":
         del made[at]
@@ -139,6 +139,9 @@ def sequences(draw: st.DrawFn) -> list[bytes]:
         made[at], made[at + 1] = made[at + 1], made[at]
     elif spoil == "number":
         made[at] = bytes((made[at][0], *draw(numbers).to_bytes(4, "little"), *made[at][5:]))
+    elif spoil == "bit":
+        place, mask = draw(st.integers(1, 7)), 1 << draw(st.integers(0, 7))
+        made[at] = bytes(byte ^ (mask if i == place else 0) for i, byte in enumerate(made[at]))
     elif spoil == "insert":
         made.insert(at, draw(single))
     return made
