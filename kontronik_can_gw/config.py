@@ -17,6 +17,7 @@ from typing import Any, TypeVar, cast
 
 from kontronik_can_gw.dbc_output.layout import DbcSettings, normalize
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.sources import sources
 from kontronik_can_gw.telemetry import MS, EscSettings
 
@@ -65,6 +66,7 @@ class CanConfig:
 class DbcConfig:
     """The DBC output."""
 
+    enabled: bool = _key("send the messages of a DBC", "boolean", True)
     file: str = _key(
         "DBC file, relative to this configuration; 'shipped' is the one of this package", "string", SHIPPED
     )
@@ -90,6 +92,50 @@ class DbcConfig:
 
 
 @dataclass(frozen=True)
+class CanopenConfig:
+    """The CANopen nodes, one for each ESC."""
+
+    enabled: bool = _key("be a CANopen node for each ESC", "boolean", False)
+    node_id: int = _key(
+        "node-ID of the first ESC, the others follow; 255: all wait for LSS", "integer", 1, low=1, high=127, also=255
+    )
+    eds: str = _key(
+        "EDS file the nodes are built from, relative to this configuration; 'shipped' is the one of this package",
+        "string",
+        SHIPPED,
+    )
+    vendor_id: int | None = _key(
+        "vendor-ID in 1018h:1; only CiA assigns one (default: as the EDS says)",
+        "integer",
+        None,
+        low=0,
+        high=0xFFFFFFFF,
+    )
+    serial: int | None = _key(
+        "serial number of the first node in 1018h:4, the others follow (default: made from the machine's id)",
+        "integer",
+        None,
+        low=0,
+        high=0xFFFFFFFF,
+    )
+    self_start: bool = _key(
+        "go OPERATIONAL after boot-up without a master (1F80h); otherwise as the EDS says", "boolean", False
+    )
+    read_only: bool = _key("refuse every write over the bus, and LSS", "boolean", False)
+    cia402_mirrors: bool = _key(
+        "show the objects 6000h..67FFh (speed, DC link voltage, error code) that generic drive tools know",
+        "boolean",
+        True,
+    )
+    store: str | None = _key(
+        "folder of what masters store (default: the service's state folder, else /var/lib/kontronik-can-gw or, for a "
+        "user, ~/.local/state/kontronik-can-gw)",
+        "string",
+        None,
+    )
+
+
+@dataclass(frozen=True)
 class EscConfig:
     """One ESC and its serial port."""
 
@@ -107,6 +153,21 @@ class EscConfig:
     cell_count: int = _key("cells of the battery; 0: as the ESC tells", "integer", 0, low=0, high=255)
     telemetry_timeout_ms: int = _key(
         "live values older than this are not available", "integer", 250, low=20, high=60_000
+    )
+
+    node_id: int | None = _key(
+        "CANopen node-ID of this ESC; 255: waits for LSS (default: counted on from canopen.node_id)",
+        "integer",
+        None,
+        low=1,
+        high=127,
+        also=255,
+    )
+    device: str | None = _key(
+        "the device that belongs here; another one is reported (CANopen EMCY 7510h)",
+        "string",
+        None,
+        choices=tuple(device.text for device in Device),
     )
 
     @property
@@ -131,6 +192,7 @@ class Config:
 
     can: CanConfig
     dbc: DbcConfig
+    canopen: CanopenConfig
     run: RunConfig
     esc: tuple[EscConfig, ...]
     file: str = "(built-in)"
@@ -151,8 +213,30 @@ class Config:
             return shipped("dbc/kontronik_esc.dbc")
         return Path(self.file).parent / self.dbc.file
 
+    @property
+    def eds_path(self) -> Path:
+        """The EDS file, the shipped one or relative to the configuration."""
+        if self.canopen.eds == SHIPPED:
+            return shipped("eds/kontronik_esc.eds")
+        return Path(self.file).parent / self.canopen.eds
 
-_TABLES: dict[str, type[Any]] = {"can": CanConfig, "dbc": DbcConfig, "run": RunConfig, "esc": EscConfig}
+    @property
+    def node_ids(self) -> list[int]:
+        """CANopen node-IDs of the ESCs, in their order."""
+        base = self.canopen.node_id
+        counted = [base if base == UNCONFIGURED else base + number for number in range(len(self.esc))]
+        return [own if esc.node_id is None else esc.node_id for esc, own in zip(self.esc, counted, strict=True)]
+
+
+_TABLES: dict[str, type[Any]] = {
+    "can": CanConfig,
+    "dbc": DbcConfig,
+    "canopen": CanopenConfig,
+    "run": RunConfig,
+    "esc": EscConfig,
+}
+UNCONFIGURED = 255
+"""The node-ID of a node that waits for LSS."""
 
 
 def shipped(name: str) -> Path:
@@ -206,7 +290,11 @@ def parse(tables: Mapping[str, Any], file: str) -> Config:
     _check_escs(escs, file, problems)
     if problems:
         raise UserError(*problems)
-    return Config(**cast(Any, made), esc=tuple(escs.values()), file=file)
+    config = Config(**cast(Any, made), esc=tuple(escs.values()), file=file)
+    _check_outputs(config, problems)
+    if problems:
+        raise UserError(*problems)
+    return config
 
 
 def schema() -> dict[str, Any]:
@@ -236,7 +324,7 @@ def schema() -> dict[str, Any]:
 def as_toml(config: Config) -> str:
     """The effective configuration as TOML, defaults included."""
     lines: list[str] = []
-    for name in ("can", "dbc", "run"):
+    for name in ("can", "dbc", "canopen", "run"):
         lines += _toml_table(f"[{name}]", getattr(config, name))
     for esc in config.esc:
         lines += _toml_table("[[esc]]", esc)
@@ -325,8 +413,9 @@ def _entry(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
 def _integer(value: Any, limits: Mapping[str, Any]) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise ValueError(f"{value!r} is not a whole number")
-    if not limits["low"] <= value <= limits["high"]:
-        raise ValueError(f"{value} is outside {limits['low']}..{limits['high']}")
+    if not limits["low"] <= value <= limits["high"] and value != limits.get("also"):
+        also = f" and not {limits['also']}" if "also" in limits else ""
+        raise ValueError(f"{value} is outside {limits['low']}..{limits['high']}{also}")
     return value
 
 
@@ -370,6 +459,25 @@ def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -
             )
 
 
+def _check_outputs(config: Config, problems: list[str]) -> None:
+    file, canopen = config.file, config.canopen
+    if not config.dbc.enabled and not canopen.enabled:
+        problems.append(f"{file}: dbc.enabled, canopen.enabled: both are false, so nothing would be sent. Enable one.")
+    if not canopen.enabled:
+        return
+    seen: dict[int, int] = {}
+    for number, node_id in enumerate(config.node_ids, 1):
+        if node_id == UNCONFIGURED:
+            continue
+        if not 1 <= node_id <= 127:
+            problems.append(
+                f"{file}: esc[{number}]: its node-ID would be {node_id}. Choose a smaller canopen.node_id, or a node_id for it."
+            )
+        elif node_id in seen:
+            problems.append(f"{file}: esc[{number}].node_id: {node_id} is also that of esc[{seen[node_id]}]")
+        seen.setdefault(node_id, number)
+
+
 def name_problem(names: Sequence[str]) -> str | None:
     """Why ESCs with these names cannot be told apart; None where they can."""
     problems: list[str] = []
@@ -387,7 +495,9 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
     entry: dict[str, Any] = {"description": limits["doc"]}
     match limits["kind"]:
         case "integer":
-            entry |= {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
+            entry |= {"type": "integer", "minimum": limits["low"], "maximum": limits.get("also", limits["high"])}
+            if "also" in limits:
+                entry["not"] = {"exclusiveMinimum": limits["high"], "exclusiveMaximum": limits["also"]}
         case "ratio":
             entry |= {
                 "anyOf": [

@@ -5,6 +5,8 @@
 
 from collections.abc import Sequence
 
+from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
+from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.dbc_output.output import DbcOutput
 from kontronik_can_gw.frames import CanFrame
@@ -23,14 +25,15 @@ class Gateway:
         layout: Layout,
         now: int,
         silent_on_loss: bool = False,
-        canopen: "Canopen | None" = None,
+        canopen: CanopenSetup | None = None,
     ) -> None:
         self.escs = [EscTelemetry(settings, now) for settings in escs]
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
         self._output = DbcOutput(layout, self.escs, self.status, now, silent_on_loss)
         self.nodes: Nodes | None = None
         if canopen is not None:
-            self.nodes = canopen.make(self.escs, self.status, self._apply, layout)
+            ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
+            self.nodes = Nodes(canopen, self.escs, self.status, self._apply, ids)
         self._link_changes: list[int] = []
         self._told_ns = now
         self._next_expiry = 0
@@ -40,6 +43,8 @@ class Gateway:
         """The runtime has opened what it could: run."""
         self.status.state = GatewayState.RUNNING
         self._output.start(now)
+        if self.nodes is not None:
+            self.nodes.start(now)
 
     def stop(self, now: int) -> None:
         """The last word: a status that says the gateway is going."""
@@ -55,10 +60,35 @@ class Gateway:
     @property
     def receive_ids(self) -> frozenset[int]:
         """The 11-bit ids of the data frames that ``receive_frame`` is to be given; the same object until they change."""
-        return _NO_IDS
+        return _NO_IDS if self.nodes is None else self.nodes.receive_ids
 
     def receive_frame(self, frame: CanFrame, now: int) -> None:
         """A data frame with one of ``receive_ids``, received at ``now``."""
+        if self.nodes is not None:
+            self._expire(now)
+            self.nodes.receive(frame, now)
+
+    def receive_overrun(self, now: int) -> None:
+        """The CAN controller lost received frames."""
+        if self.nodes is not None:
+            self.nodes.overrun(now)
+
+    def take_saves(self) -> list[tuple[int, Stored]]:
+        """Parameters to store, (ESC, what), oldest first; each is answered by one call of ``saved`` for that ESC, in this order."""
+        if self.nodes is None or not self.nodes.saves:
+            return []
+        saves, self.nodes.saves = self.nodes.saves, []
+        return saves
+
+    def saved(self, esc: int, error: str | None, now: int) -> None:
+        """An ESC's parameters are on disk; or could not be stored, and why."""
+        if self.nodes is not None:
+            self.nodes.saved(esc, error, now)
+
+    def parameters_damaged(self, esc: int, now: int) -> None:
+        """What was stored for an ESC could not be read: its node runs on defaults and says so."""
+        if self.nodes is not None:
+            self.nodes.parameters_damaged(esc, now)
 
     def port_opened(self, esc: int, now: int) -> None:
         """An ESC's port is open (again)."""
@@ -79,27 +109,36 @@ class Gateway:
         if state is not self.status.can_state:
             self.status.can_state = state
             self._output.on_gateway_change(now)
+            if self.nodes is not None:
+                self.nodes.on_can_state(state, now)
 
     def advance(self, now: int) -> None:
         """Let time pass: time-outs, cyclic messages."""
         self._expire(now)
         self._output.advance(now)
+        if self.nodes is not None:
+            self.nodes.advance(now)
 
     def next_deadline(self) -> int:
         """When ``advance`` is to be called at the latest."""
         expiry = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
+        if self.nodes is not None:
+            expiry = min(expiry, self.nodes.due)
         output = self._output.next_deadline()
         return expiry if output is None else min(output, expiry)
 
     @property
     def frames_wait(self) -> bool:
         """True while ``take_frames`` has something to hand over."""
-        return bool(self._output.frames)
+        return bool(self._output.frames) or (self.nodes is not None and bool(self.nodes.frames))
 
     def take_frames(self) -> list[CanFrame]:
         """The frames to send, oldest first; the list is handed over."""
         frames = self._output.frames
         self._output.frames = []
+        if self.nodes is not None and self.nodes.frames:
+            frames = self.nodes.frames + frames
+            self.nodes.frames = []
         return frames
 
     def take_link_changes(self) -> list[int]:
@@ -122,6 +161,8 @@ class Gateway:
     def _follow(self, esc: int, events: int, now: int) -> None:
         if events:
             self._output.on_event(esc, events, now)
+            if self.nodes is not None:
+                self.nodes.on_event(esc, events, now)
         if events & Event.LINK:
             self._next_expiry = 0
             self._link_changes.append(esc)
@@ -129,3 +170,9 @@ class Gateway:
             if escs_ok != self.status.escs_ok:
                 self.status.escs_ok = escs_ok
                 self._output.on_gateway_change(now)
+
+    def _apply(self, esc: int, settings: EscSettings) -> None:
+        """Settings that came over the bus: they hold for everything that is sent, the DBC's messages too."""
+        self.escs[esc].apply(settings)
+        self._output.apply(esc, settings)
+        self._next_expiry = 0

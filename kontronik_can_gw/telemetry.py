@@ -22,7 +22,6 @@ INFO_TIMEOUT_NS = 10 * SECOND
 """Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
 MW_NS_PER_WH = 3_600_000 * SECOND
 """Energy is kept in milliwatt nanoseconds: one step of voltage (10 mV) by one of current (0.1 A) is exactly 1 mW."""
-_DEGRADED_CRC_ERRORS = 5
 _DEGRADED_DROPPED_SHARE = 10  # one dropped byte in so many received
 
 
@@ -53,7 +52,7 @@ class EscSettings:
     """What a person knows of one ESC and its drive train.
 
     ``gear``: motor revolutions per output revolution. ``cell_count`` 0: as the ESC tells. ``timeout_ns`` (20 ms to 60 s):
-    live data older than this is not available.
+    live data older than this is not available. ``crc_error_threshold``: so many CRC errors in a second make a link DEGRADED.
     """
 
     name: str = "esc"
@@ -61,6 +60,7 @@ class EscSettings:
     gear: Fraction = Fraction(1)
     cell_count: int = 0
     timeout_ns: int = 250 * MS
+    crc_error_threshold: int = 5
 
 
 class EscTelemetry:
@@ -69,13 +69,16 @@ class EscTelemetry:
     Attributes read by the packers: ``live``, ``info`` (None where not available), ``link``, ``layout`` (0 unknown, 1 V4,
     2 legacy), ``cells`` (0 unknown), ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``,
     ``energy`` (drawn from the battery, milliwatt nanoseconds), ``run_time`` (ns with the motor turning), ``live_ns`` (time of
-    the newest live frame's last byte, None before the first).
+    the newest live frame's last byte, None before the first). ``last_live`` and ``last_info`` are the newest ever, fresh or not, of the
+    layout now on the line; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
     """
 
     def __init__(self, settings: EscSettings, now: int) -> None:
         self.settings = settings
         self.live: LiveData | None = None
         self.info: InfoData | None = None
+        self.last_live: LiveData | None = None
+        self.last_info: InfoData | None = None
         self.link = LinkState.NEVER_SEEN
         self.layout = 0
         self.cells = settings.cell_count
@@ -85,6 +88,11 @@ class EscTelemetry:
         self.run_time = 0
         self.live_ns: int | None = None
         self.info_ns: int | None = None
+        self.last_info_ns: int | None = None
+        self.line_errors = 0
+        self.base = Counters()
+        self.base_losses = 0
+        self.base_line_errors = 0
         self.suspect_frames = 0
         self.late_frames = 0
         self._deframer = Deframer()
@@ -115,6 +123,16 @@ class EscTelemetry:
     def age_ms(self, now: int) -> int | None:
         """Age of the newest live frame, None before the first."""
         return None if self.live_ns is None else max(0, now - self.live_ns) // MS
+
+    def apply(self, settings: EscSettings) -> None:
+        """Other settings from now on."""
+        self.settings = settings
+        self.cells = settings.cell_count or (self.info.cell_count if self.info else 0)
+
+    def reset_statistics(self) -> None:
+        """Let the counters that are shown relative to ``base`` begin anew; the stream's own go on."""
+        self.base = self.counters.copy()
+        self.base_losses, self.base_line_errors = self.losses, self.line_errors
 
     def receive(self, data: bytes, now: int) -> int:
         """Take bytes that were read at ``now``, all frames at once."""
@@ -190,13 +208,15 @@ class EscTelemetry:
         if layout != self.layout:
             self.layout = layout
             self._forget_device()
+            self.last_info = None  # of another device
+            self.last_info_ns = None
             events = Event.INFO | Event.LINK
         data = frame.data
         if isinstance(data, InfoData):
             if self.info is not None and data.device_and_variant != self.info.device_and_variant:
                 events |= Event.LINK
-            self.info = data
-            self.info_ns = when
+            self.info = self.last_info = data
+            self.info_ns = self.last_info_ns = when
             self.cells = self.settings.cell_count or data.cell_count
             return events | Event.INFO
         if frame.suspect:
@@ -209,7 +229,7 @@ class EscTelemetry:
                 if self.live.electrical_speed:
                     self.run_time += elapsed
         self._last_power = data.battery_voltage * data.battery_current
-        self.live = data
+        self.live = self.last_live = data
         self.live_ns = when
         if self.link is not LinkState.OK and self.link is not LinkState.DEGRADED:
             events |= self._set_link(LinkState.OK)
@@ -255,7 +275,7 @@ class EscTelemetry:
         frames = new.live - old.live
         self.frame_rate = round(frames * 10 * SECOND / (now - self._window_ns)) if self.up else 0
         dropped, received = new.dropped_bytes - old.dropped_bytes, new.bytes - old.bytes
-        bad = new.crc_errors - old.crc_errors >= _DEGRADED_CRC_ERRORS or dropped * _DEGRADED_DROPPED_SHARE > received
+        bad = new.crc_errors - old.crc_errors >= self.settings.crc_error_threshold or dropped * _DEGRADED_DROPPED_SHARE > received
         self._window_ns = now
         self._diagnosis_counters = old
         self._window_counters = new.copy()

@@ -1,14 +1,15 @@
 """Plans, packers and schedule put together: telemetry events and time in, CAN frames out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from kontronik_can_gw.dbc_output import e2e
-from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType
+from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
 from kontronik_can_gw.dbc_output.packer import alive_modulus, compile_pack
 from kontronik_can_gw.dbc_output.schedule import Schedule
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.sources import GatewayStatus, Group
-from kontronik_can_gw.telemetry import EscTelemetry, Event
+from kontronik_can_gw.sources import GatewayStatus, Group, Source, sources
+from kontronik_can_gw.telemetry import EscSettings, EscTelemetry, Event
 
 _EVENT_OF_PACE = {Group.LIVE: Event.LIVE, Group.INFO: Event.INFO, Group.LINK: Event.LINK, Group.GATEWAY: Event.NONE}
 
@@ -85,6 +86,17 @@ class DbcOutput:
             if not message.plan.cycle_ns:
                 message.owed = list(range(len(message.plan.pages)))
                 self._request(index, now)
+
+    def apply(self, esc: int, settings: EscSettings) -> None:
+        """Other pole pairs or gear of an ESC: the plans with values that depend on them are compiled anew."""
+        known = sources(settings)
+        for message in self._messages:
+            signals = tuple(
+                _rescaled(signal, known) if signal.esc == esc else signal for signal in message.plan.signals
+            )
+            if signals != message.plan.signals:
+                message.plan = replace(message.plan, signals=signals)
+                message.pack = compile_pack(message.plan)
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
@@ -175,3 +187,10 @@ class DbcOutput:
         self._schedule.sent(index, now)
         if message.owed:
             self._schedule.wait(index, now)
+
+
+def _rescaled(signal: SignalPlan, known: Mapping[str, Source]) -> SignalPlan:
+    old = signal.source
+    if old is None or (new := known[old.name]).per_unit == old.per_unit:
+        return signal
+    return replace(signal, source=new, slope=signal.slope * old.per_unit / new.per_unit)

@@ -6,7 +6,7 @@ available its NotAvailable code; nothing wraps, nothing is clipped. Bit 0 of the
 
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.dbc_output.layout import MessagePlan, Piece, Role, SignalPlan
@@ -76,9 +76,9 @@ def source_text(plan: MessagePlan) -> str:
     return "\n".join(lines) + "\n"
 
 
-def compile_pack(plan: MessagePlan) -> Pack:
-    """The function of ``source_text``, compiled."""
-    names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf}
+def compile_pack(plan: MessagePlan, further: Mapping[str, object] | None = None) -> Pack:
+    """The function of ``source_text``, compiled. ``further``: what expressions of the plan's sources may name besides."""
+    names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf, **(further or {})}
     exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
     return names["pack"]  # type: ignore[return-value]
 
@@ -156,7 +156,7 @@ def _value(signal: SignalPlan) -> list[str]:
         return [f"v = {_table_name(signal)}.get({expression}, {signal.error})", f"bits |= {_placed(signal)}"]
     if source.rolls:
         return [f"v = ({expression}) % {signal.high + 1}", f"bits |= {_placed(signal)}"]
-    lines = [f"v = {_scaled(expression, signal.slope, signal.intercept, source.whole)}"]
+    lines = [f"v = {scaled_text(expression, signal.slope, signal.intercept, source.whole)}"]
     if not _always_fits(signal):
         lines.append(f"if not {signal.low} <= v <= {signal.high}:")
         lines.append(f"    v = {signal.error}")
@@ -172,7 +172,8 @@ def _table_name(signal: SignalPlan) -> str:
     return f"numbers_at_{signal.pieces[0].at}_of_{signal.page or 0}"
 
 
-def _scaled(expression: str, slope: Fraction, intercept: Fraction, whole: bool) -> str:
+def scaled_text(expression: str, slope: Fraction, intercept: Fraction, whole: bool) -> str:
+    """Python text of a source's value in steps x -> ``x * slope + intercept``, rounded to the nearest, halves up."""
     if not whole:
         return f"round(({expression}) * {float(slope)!r} + {float(intercept)!r})"
     if slope == 1 and intercept == 0:
@@ -181,7 +182,7 @@ def _scaled(expression: str, slope: Fraction, intercept: Fraction, whole: bool) 
         return f"({expression}) * {slope} + {intercept}"
     common = slope.denominator * intercept.denominator
     a, b = int(slope * common), int(intercept * common)
-    return f"(({expression}) * {2 * a} + {2 * b + common}) // {2 * common}"  # rounded to the nearest, halves up
+    return f"(({expression}) * {2 * a} + {2 * b + common}) // {2 * common}"
 
 
 def _always_fits(signal: SignalPlan) -> bool:

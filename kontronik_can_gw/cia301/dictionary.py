@@ -1,0 +1,231 @@
+"""The object dictionary of one node: values by index and sub-index, with every check that CiA 301 wants before one changes.
+
+Built from an EDS. A variable is either plain storage or bound: ``read`` then gives its value at each access.
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from kontronik_can_gw.cia301.abort import Abort, SdoAbort
+from kontronik_can_gw.cia301.eds import Eds, Entry
+
+Value = int | float | bytes
+Read = Callable[[int], Value]
+"""``now`` to value. Raises SdoAbort where there is none."""
+
+_LONGEST_TEXT = 255
+_LONGEST_DOMAIN = 0x10000
+_DOMAIN = 0x0F
+
+
+def codec(data_type: int) -> Any:
+    """The canopen library's codec of a number type (``pack``, ``unpack``, ``size`` like a struct.Struct); None for texts and domains."""
+    from canopen.objectdictionary import ODVariable
+
+    return ODVariable.STRUCT_TYPES.get(data_type)
+
+
+def key(index: int, sub: int) -> int:
+    """Index and sub-index as one number, as PDO mappings have them in their upper 24 bits."""
+    return index << 8 | sub
+
+
+class Variable:
+    """One entry at work. ``check`` may refuse a new value; ``written`` follows one, and returns False if the confirmation comes later."""
+
+    __slots__ = ("check", "codec", "entry", "power_on", "read", "value", "written")
+
+    def __init__(self, entry: Entry) -> None:
+        self.entry = entry
+        self.codec = codec(entry.data_type)
+        self.read: Read | None = None
+        self.check: Callable[[int], None] | None = None
+        self.written: Callable[[int], bool] | None = None
+        self.power_on: Value = self.empty if entry.default is None else entry.default
+        self.value: Value = self.power_on
+
+    @property
+    def empty(self) -> Value:
+        """What a variable without a default holds."""
+        return b"" if self.codec is None else 0
+
+    @property
+    def size(self) -> int | None:
+        """Bytes of the type; None for texts and domains."""
+        if self.codec is None:
+            return None
+        size: int = self.codec.size
+        return size
+
+    @property
+    def readable(self) -> bool:
+        return self.entry.access != "wo"
+
+    @property
+    def writable(self) -> bool:
+        return "w" in self.entry.access
+
+    def encode(self, value: Value) -> bytes:
+        """Little-endian bytes of a value."""
+        if self.codec is None:
+            assert isinstance(value, bytes)
+            return value
+        data: bytes = self.codec.pack(value)
+        return data
+
+    def decode(self, data: bytes) -> Value:
+        """The value of bytes of the right size."""
+        if self.codec is None:
+            return data
+        value: Value = self.codec.unpack(data)[0]
+        return value
+
+    def default(self, node_id: int) -> Value:
+        """The power-on value of a node with this node-ID: ``$NODEID`` worked in."""
+        if self.entry.relative and isinstance(self.power_on, int):
+            return self.power_on + node_id
+        return self.power_on
+
+
+class Dictionary:
+    """All variables of one node. What is asked or told over the bus goes through ``upload`` and ``download``."""
+
+    def __init__(self, eds: Eds) -> None:
+        self.variables = {key(entry.index, entry.sub): Variable(entry) for entry in eds.entries}
+        self._indices = frozenset(entry.index for entry in eds.entries)
+        self.read_only = False
+        """True: nothing may be written over the bus."""
+        self.changed: Callable[[Variable, int], None] = lambda _variable, _now: None
+        """Told of each value that was written over the bus."""
+
+    def get(self, index: int, sub: int = 0) -> Variable | None:
+        """The variable, None where there is none."""
+        return self.variables.get(key(index, sub))
+
+    def number(self, index: int, sub: int = 0, otherwise: int = 0) -> int:
+        """The whole number that a variable holds; ``otherwise`` where the EDS has no such variable."""
+        variable = self.get(index, sub)
+        return otherwise if variable is None or not isinstance(variable.value, int) else variable.value
+
+    def subs(self, index: int) -> Iterator[Variable]:
+        """Variables of an array or record, from sub-index 1 on."""
+        for sub in range(1, 255):
+            if (variable := self.get(index, sub)) is not None:
+                yield variable
+
+    def find(self, index: int, sub: int) -> Variable:
+        """The variable. SdoAbort 06020000h or 06090011h where there is none."""
+        variable = self.variables.get(key(index, sub))
+        if variable is None:
+            raise SdoAbort(Abort.NO_SUB_INDEX if index in self._indices else Abort.NO_OBJECT)
+        return variable
+
+    def value(self, variable: Variable, now: int) -> Value:
+        """What a variable holds now. SdoAbort where its source has nothing."""
+        return variable.value if variable.read is None else variable.read(now)
+
+    # --- what the SDO server asks
+
+    def upload(self, index: int, sub: int, now: int) -> bytes:
+        """The bytes that are read over the bus."""
+        variable = self.find(index, sub)
+        if not variable.readable:
+            raise SdoAbort(Abort.WRITE_ONLY)
+        return variable.encode(self.value(variable, now))
+
+    def check_download(self, index: int, sub: int, size: int | None) -> None:
+        """Whether so many bytes may be written there, before any is moved."""
+        variable = self.find(index, sub)
+        if not variable.writable:
+            raise SdoAbort(Abort.READ_ONLY)
+        if self.read_only:
+            raise SdoAbort(Abort.DEVICE_STATE)
+        if size is not None:
+            _check_size(variable, size)
+
+    def max_size(self, index: int, sub: int) -> int | None:
+        """The most bytes that can be written there."""
+        variable = self.find(index, sub)
+        if variable.size is not None:
+            return variable.size
+        return _LONGEST_DOMAIN if variable.entry.data_type == _DOMAIN else _LONGEST_TEXT
+
+    def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
+        """Write. False where the confirmation comes later."""
+        self.check_download(index, sub, len(data))
+        variable = self.find(index, sub)
+        value = variable.decode(data)
+        entry = variable.entry
+        if not isinstance(value, bytes):
+            if entry.high is not None and not value <= entry.high:
+                raise SdoAbort(Abort.TOO_HIGH)
+            if entry.low is not None and not value >= entry.low:
+                raise SdoAbort(Abort.TOO_LOW)
+        if variable.check is not None:
+            assert isinstance(value, int)
+            variable.check(value)
+        variable.value = value
+        done = True if variable.written is None else variable.written(now)
+        self.changed(variable, now)
+        return done
+
+    # --- power-on and storage
+
+    def reset(self, first: int, last: int, node_id: int, stored: dict[int, bytes]) -> list[int]:
+        """Give the variables of these indices their power-on values: the stored one where there is one, else the default.
+
+        Returns the keys of stored values that do not fit this EDS (any more); they are passed over.
+        """
+        misfits = [number for number in stored if number not in self.variables]
+        for number, variable in self.variables.items():
+            if not first <= number >> 8 <= last:
+                continue
+            variable.value = variable.default(node_id)
+            if (data := stored.get(number)) is None:
+                continue
+            if not variable.writable or (variable.size is not None and len(data) != variable.size):
+                misfits.append(number)
+                continue
+            value = variable.decode(data)
+            entry = variable.entry
+            low, high = entry.low, entry.high
+            if not isinstance(value, bytes) and not (low is None or value >= low) & (high is None or value <= high):
+                misfits.append(number)
+                continue
+            variable.value = value
+        return misfits
+
+    def to_store(self, first: int, last: int, node_id: int) -> dict[int, bytes]:
+        """What differs from the defaults: all that a parameter store needs to keep, so that $NODEID stays alive in the rest."""
+        return {
+            number: variable.encode(variable.value)
+            for number, variable in self.variables.items()
+            if first <= number >> 8 <= last
+            and "rw" in variable.entry.access
+            and variable.read is None
+            and variable.value != variable.default(node_id)
+        }
+
+
+def _check_size(variable: Variable, size: int) -> None:
+    most = _LONGEST_DOMAIN if variable.entry.data_type == _DOMAIN else _LONGEST_TEXT
+    least = 0
+    if variable.size is not None:
+        least = most = variable.size
+    if size > most:
+        raise SdoAbort(Abort.TOO_LONG)
+    if size < least:
+        raise SdoAbort(Abort.TOO_SHORT)
+
+
+def fits(variable: Variable, low: int, high: int) -> bool:
+    """Whether a variable's type holds all whole numbers from low to high."""
+    if variable.codec is None:
+        return False
+    try:
+        variable.codec.pack(low)
+        variable.codec.pack(high)
+    except (struct.error, ValueError, OverflowError):
+        return False
+    return True

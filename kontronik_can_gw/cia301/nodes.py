@@ -1,0 +1,156 @@
+"""All CANopen nodes of a gateway on one bus: routing by COB-ID, one stream of frames out, no node disturbing another."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from kontronik_can_gw.cia301.eds import Eds
+from kontronik_can_gw.cia301.emergency import GatewayError
+from kontronik_can_gw.cia301.heartbeat import NEVER
+from kontronik_can_gw.cia301.node import LSS_REQUEST, UNCONFIGURED, Node, NodeSettings, esc_settings, make_dictionary
+from kontronik_can_gw.cia301.pdo import Tpdo
+from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.sources import CanState, GatewayStatus
+from kontronik_can_gw.telemetry import EscSettings, EscTelemetry
+
+SettingsChanged = Callable[[int, EscSettings], None]
+
+
+@dataclass(frozen=True)
+class CanopenSetup:
+    """What nodes are made from: the EDS in use, and for each ESC what the configuration says and what is stored."""
+
+    eds: Eds
+    settings: tuple[NodeSettings, ...]
+    stored: tuple[Stored, ...]
+
+    def esc_settings(self, escs: Sequence[EscSettings]) -> list[EscSettings]:
+        """The ESCs' settings with the EDS's defaults and what was stored over the bus worked in."""
+        return [
+            esc_settings(make_dictionary(self.eds, esc, node, stored)[0], esc)
+            for esc, node, stored in zip(escs, self.settings, self.stored, strict=True)
+        ]
+
+
+class Nodes:
+    """One node for each ESC.
+
+    Frames are appended to ``frames``, requests to store to ``saves`` as (ESC, parameters); the owner empties both.
+
+    ``foreign_ids``: 11-bit ids that the gateway sends otherwise; no PDO may be given one. ``settings_changed`` is told the ESC's index
+    and its new settings when a master writes 2100h.
+    """
+
+    def __init__(
+        self,
+        setup: CanopenSetup,
+        escs: Sequence[EscTelemetry],
+        gateway: GatewayStatus,
+        settings_changed: SettingsChanged,
+        foreign_ids: Mapping[int, str] | None = None,
+    ) -> None:
+        self.frames: list[CanFrame] = []
+        self.saves: list[tuple[int, Stored]] = []
+        self.receive_ids: frozenset[int] = frozenset()
+        self.due = NEVER
+        self._settings_changed = settings_changed
+        self._foreign_ids = foreign_ids or {}
+        self._routes: dict[int, list[Callable[[bytes, int], None]]] = {}
+        self._rerouted = True
+        self.nodes: list[Node] = []
+        for esc, settings, stored in zip(escs, setup.settings, setup.stored, strict=True):
+            dictionary, _ = make_dictionary(setup.eds, esc.settings, settings, stored)
+            self.nodes.append(Node(setup.eds, dictionary, esc, gateway, settings, stored, self))
+
+    # --- what happens
+
+    def start(self, now: int) -> None:
+        """Power on."""
+        for node in self.nodes:
+            node.power_on(now)
+        self._after()
+
+    def receive(self, frame: CanFrame, now: int) -> None:
+        """A frame from the bus. 29-bit and RTR frames are not CANopen frames of ours."""
+        if frame.extended or frame.remote or frame.fd:
+            return
+        begin = len(self.frames)
+        for taker in self._routes.get(frame.can_id, ()):
+            taker(frame.data, now)
+        if frame.can_id == LSS_REQUEST:
+            # what several slaves say at the same time is one frame on a bus
+            self.frames[begin:] = dict.fromkeys(self.frames[begin:])
+        self._after()
+
+    def on_event(self, esc: int, events: int, now: int) -> None:
+        """Something of an ESC changed."""
+        self.nodes[esc].on_event(events, now)
+        self._after()
+
+    def on_can_state(self, state: CanState, now: int) -> None:
+        """The CAN controller's state changed."""
+        for node in self.nodes:
+            node.on_can_state(state, now)
+        self._after()
+
+    def overrun(self, now: int) -> None:
+        """The CAN controller lost received frames."""
+        for node in self.nodes:
+            node.overrun(now)
+        self._after()
+
+    def parameters_damaged(self, esc: int, now: int) -> None:
+        """A node's parameter file could not be read: it runs on defaults."""
+        self.nodes[esc].set_error(GatewayError.PARAMETER_FILE, True, now)
+        self._after()
+
+    def saved(self, esc: int, error: str | None, now: int) -> None:
+        """The oldest request of an ESC's node to store is on disk, or failed for a reason."""
+        self.nodes[esc].saved(error, now)
+        self._after()
+
+    def advance(self, now: int) -> None:
+        """Let time pass."""
+        if now < self.due:
+            return
+        for node in self.nodes:
+            node.advance(now)
+        self._after()
+
+    def cob_ids(self) -> dict[int, str]:
+        """Every COB-ID the nodes use, and what for."""
+        return {cob_id: what for node in self.nodes for cob_id, what in node.cob_ids()}
+
+    # --- what nodes ask (node.Surroundings)
+
+    def send(self, frame: CanFrame) -> None:
+        self.frames.append(frame)
+
+    def save(self, node: Node, stored: Stored) -> None:
+        self.saves.append((self.nodes.index(node), stored))
+
+    def settings_changed(self, node: Node, settings: EscSettings) -> None:
+        self._settings_changed(self.nodes.index(node), settings)
+
+    def routes_changed(self) -> None:
+        self._rerouted = True
+
+    def cob_id_taken(self, cob_id: int, tpdo: Tpdo) -> bool:
+        if cob_id in self._foreign_ids:
+            return True
+        others = (other for node in self.nodes for other in node.tpdos if other is not tpdo)
+        return any(other.valid and other.cob_id == cob_id for other in others)
+
+    def node_id_taken(self, node_id: int, node: Node) -> bool:
+        others = (other for other in self.nodes if other is not node)
+        return node_id != UNCONFIGURED and any(node_id in (o.node_id, o.pending_node_id) for o in others)
+
+    def _after(self) -> None:
+        if self._rerouted:
+            self._rerouted = False
+            self._routes = {}
+            for node in self.nodes:
+                for cob_id, taker in node.routes():
+                    self._routes.setdefault(cob_id, []).append(taker)
+            self.receive_ids = frozenset(self._routes)
+        self.due = min((node.due for node in self.nodes), default=NEVER)
