@@ -1,7 +1,7 @@
 """Receives from a python-can interface that has no descriptor to wait on: a thread of its own, a bounded queue, a descriptor.
 
-What may touch what: ``_run`` belongs to the thread, everything else to the loop's thread; they share ``ids`` and ``failed`` (each written
-by one side only), the queue, and the descriptor, which the lock guards against a write behind its closing.
+What may touch what: ``_run`` belongs to the thread, everything else to the loop's thread. They share ``ids``, ``failed`` and ``dropped``
+(each written by one side only), the queue, and the descriptor, which the lock guards against a write behind its closing.
 """
 
 import logging
@@ -28,6 +28,8 @@ class BusReader:
     def __init__(self, bus: "can.BusABC", ids: frozenset[int]) -> None:
         self.ids = ids
         self.failed = False
+        self.dropped = 0
+        """Frames that came while the queue was full."""
         self._bus = bus
         self._frames: deque[CanFrame] = deque()
         self._stopping = False
@@ -68,7 +70,11 @@ class BusReader:
         try:
             while not self._stopping:
                 message = self._bus.recv(_POLL_S)
-                if message is not None and self._wanted(message) and len(self._frames) < QUEUE_LENGTH:
+                if message is None or not self._wanted(message):
+                    continue
+                if len(self._frames) >= QUEUE_LENGTH:
+                    self.dropped += 1
+                else:
                     self._frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
                     self._wake()
         except Exception as error:  # what a driver lets out when its adapter has gone: CanError, OSError, TypeError ...

@@ -41,7 +41,9 @@ _FILTER = struct.Struct("=II")
 _MOST_FILTERS = 512
 """CAN_RAW_FILTER_MAX: the kernel takes no more for one socket."""
 _ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
-_CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x0C, 0x30, 0x40
+_CTRL_RX_OVERFLOW, _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x01, 0x0C, 0x30, 0x40
+_SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
+"""The kernel's figures of a socket; the last one counts what it dropped for want of room."""
 
 
 class Sent(Enum):
@@ -61,6 +63,9 @@ class CanPort:
         self.state = CanState.UNKNOWN
         self.bus_off_count = 0
         """How often the controller went to bus-off; who counts them may set it back to 0."""
+        self.overruns = 0
+        """How often received frames were lost, in the controller or because we were late; who counts them may set it back to 0."""
+        self._known_drops = 0
         self._bus = _open(config)
         self._ids: frozenset[int] = frozenset()
         self._reader: BusReader | None = None
@@ -116,8 +121,9 @@ class CanPort:
         return self._receive(RECEIVE_LIMIT)
 
     def discard(self) -> None:
-        """Throw away the data frames that wait to be received; what error frames say still counts."""
+        """Throw away the data frames that wait to be received. What error frames say still counts; data frames lost before do not."""
         self._receive(_DISCARD_LIMIT if self._reader is None else QUEUE_LENGTH)
+        self._known_drops = self._drops()
 
     def send(self, frame: CanFrame) -> Sent:
         """Hand a frame to the interface. An interface that was down and is up again reports its old error once: retried."""
@@ -143,6 +149,7 @@ class CanPort:
             frames = self._reader.take(limit)
             if self._reader.failed:
                 self.state = CanState.DOWN
+            self._note_drops()
             return frames
         frames = []
         if self._socket is None:
@@ -165,7 +172,25 @@ class CanPort:
                 self._follow(can_id, content[1])
             elif can_id in self._ids:  # with a flag set, of a 29-bit or remote frame, it is none of ours
                 frames.append(CanFrame(can_id, content[:size]))
+        else:
+            self._note_drops()  # there was more than we take at once: perhaps more than the kernel holds
         return frames
+
+    def _note_drops(self) -> None:
+        drops = self._drops()
+        self.overruns += drops != self._known_drops
+        self._known_drops = drops
+
+    def _drops(self) -> int:
+        """Received frames that were dropped since opening because too many waited for us."""
+        if self._reader is not None:
+            return self._reader.dropped
+        if self._socket is None:
+            return 0
+        try:
+            return int(_MEMINFO.unpack(self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))[-1])
+        except (OSError, struct.error):  # an old kernel, which has fewer figures
+            return 0
 
     def _filter_bus(self) -> None:
         """Ask python-can's driver for our ids; one that cannot filter is left to the thread."""
@@ -183,6 +208,7 @@ class CanPort:
         elif can_id & _ERR_RESTARTED:
             self.state = CanState.ERROR_ACTIVE
         elif can_id & _ERR_CONTROLLER:
+            self.overruns += bool(detail & _CTRL_RX_OVERFLOW)
             if detail & _CTRL_PASSIVE:
                 self.state = CanState.ERROR_PASSIVE
             elif detail & _CTRL_WARNING:

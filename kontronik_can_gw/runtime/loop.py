@@ -291,7 +291,9 @@ class Loop:
     def _follow_reception(self, port: CanPort, now: int) -> None:
         """What receiving told of the interface itself."""
         self.gateway.status.bus_off_count += port.bus_off_count
-        port.bus_off_count = 0
+        if port.overruns:
+            self.gateway.receive_overrun(now)
+        port.bus_off_count = port.overruns = 0
         if port.gone:
             self._can_lost(Sent.GONE, now)
         else:

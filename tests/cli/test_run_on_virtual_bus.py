@@ -440,6 +440,9 @@ class FakeSocket:
     def setsockopt(self, *option: object) -> None:
         self.options.append(option)
 
+    def getsockopt(self, _level: int, _name: int, size: int) -> bytes:
+        return bytes(size)
+
     def setblocking(self, blocking: bool) -> None:
         self.blocking = blocking
 

@@ -257,7 +257,7 @@ class StoppedBusBase:
     state = CanState.ERROR_ACTIVE
     tells_busy_from_gone = False
     gone = False
-    bus_off_count = 0
+    bus_off_count = overruns = 0
 
     def fileno(self) -> None:
         return None
