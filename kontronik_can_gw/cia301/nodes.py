@@ -1,6 +1,6 @@
 """All CANopen nodes of a gateway on one bus: routing by COB-ID, one stream of frames out, no node disturbing another."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from kontronik_can_gw.cia301.eds import Eds
@@ -13,6 +13,8 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import CanState, GatewayStatus
 from kontronik_can_gw.telemetry import EscSettings, EscTelemetry
 
+_FRAME_BITS = 47
+"""Of a frame without data and stuffing."""
 SettingsChanged = Callable[[int, EscSettings], None]
 
 
@@ -30,6 +32,13 @@ class CanopenSetup:
             esc_settings(make_dictionary(self.eds, esc, node, stored)[0], esc)
             for esc, node, stored in zip(escs, self.settings, self.stored, strict=True)
         ]
+
+    def nodes(self, escs: Sequence[EscSettings]) -> "Nodes":
+        """The nodes as they are after power-on, without a gateway around them: to see their COB-IDs and objects."""
+        telemetry = [EscTelemetry(settings, 0) for settings in escs]
+        nodes = Nodes(self, telemetry, GatewayStatus(), lambda _esc, _settings: None)
+        nodes.start(0)
+        return nodes
 
 
 class Nodes:
@@ -120,6 +129,24 @@ class Nodes:
     def cob_ids(self) -> dict[int, str]:
         """Every COB-ID the nodes use, and what for."""
         return {cob_id: what for node in self.nodes for cob_id, what in node.cob_ids()}
+
+    def frames_per_second(self) -> float:
+        """Frames to be expected from PDOs and heartbeats when all is well."""
+        return sum(rate for _, rate in self._traffic())
+
+    def bits_per_second(self) -> float:
+        """What these need on the bus, with the most stuffing."""
+        return sum((_FRAME_BITS + 8 * size + (33 + 8 * size) // 4) * rate for size, rate in self._traffic())
+
+    def _traffic(self) -> Iterator[tuple[int, float]]:
+        """(data bytes, frames a second)."""
+        for node in self.nodes:
+            if node.node_id == UNCONFIGURED:
+                continue
+            if period := node.dictionary.number(0x1017):
+                yield 1, 1000 / period
+            for tpdo in node.tpdos:
+                yield 8, tpdo.rate_hz
 
     # --- what nodes ask (node.Surroundings)
 

@@ -14,11 +14,11 @@ from kontronik_can_gw.cia301.abort import Abort, SdoAbort
 from kontronik_can_gw.cia301.bindings import LINK, Bound
 from kontronik_can_gw.cia301.dictionary import Dictionary, Variable
 from kontronik_can_gw.cia301.heartbeat import NEVER
-from kontronik_can_gw.dbc_output.layout import MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.dbc_output.layout import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
 from kontronik_can_gw.dbc_output.packer import Pack, compile_pack, place
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import GatewayStatus, Group, Source
-from kontronik_can_gw.telemetry import MS, EscTelemetry, Event
+from kontronik_can_gw.telemetry import MS, SECOND, EscTelemetry, Event
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
 MOST = 512
@@ -182,6 +182,24 @@ class Tpdo:
     @property
     def inhibit_ns(self) -> int:
         return self._inhibit_ns
+
+    @property
+    def on_change(self) -> bool:
+        """True if changes of a status object are what causes it."""
+        return bool(self._status_mask)
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second to be expected with the UART at 100 Hz; those sent on change or at SYNC (10 Hz taken) by their cycle."""
+        if not self._running:
+            return 0.0
+        if self._type not in EVENT_TYPES:
+            return 10.0 / max(1, self._type)
+        cycle = SECOND / self._event_ns if self._event_ns else 0.0
+        if self.on_change:
+            return cycle or 1.0
+        events = EXPECTED_LIVE_HZ if self._triggers & Event.LIVE else 1.0
+        return max(cycle, min(events, SECOND / self._inhibit_ns) if self._inhibit_ns else events)
 
     def configure(self, now: int) -> None:
         """Take over what the dictionary says. A PDO that begins to exist in OPERATIONAL begins like at its start."""

@@ -1,10 +1,13 @@
 """``check``: what a configuration means and will send, without opening anything."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.cli.common import load_all
-from kontronik_can_gw.config import as_toml
+from kontronik_can_gw.cia301.nodes import Nodes
+from kontronik_can_gw.cia301.pdo import EVENT_TYPES, Tpdo
+from kontronik_can_gw.cli.common import Loaded, load_all
+from kontronik_can_gw.config import UNCONFIGURED, as_toml
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
 from kontronik_can_gw.telemetry import MS
 
@@ -17,21 +20,62 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    config, _, layout = load_all(args.config)
+    loaded = load_all(args.config)
+    config, layout = loaded.config, loaded.layout
     print(f"# effective configuration of {args.config}")
     print(as_toml(config))
-    print(f"# messages of {layout.node} by {layout.file}")
-    names = [esc.name for esc in config.escs]
-    for line in table(layout, names):
-        print(line)
     load = layout.bus_load(config.can.bitrate, config.can.data_bitrate)
     frames = sum(message.rate_hz for message in layout.messages)
-    print()
+    if config.dbc.enabled:
+        print(f"# messages of {layout.node} by {layout.file}")
+        names = [esc.name for esc in config.escs]
+        for line in table(layout, names):
+            print(line)
+        print()
+    if loaded.canopen is not None:
+        nodes = loaded.canopen.nodes(loaded.escs)
+        print(f"# CANopen nodes by {loaded.canopen.eds.name}")
+        for line in node_table(nodes, loaded):
+            print(line)
+        print()
+        load += nodes.bits_per_second() / config.can.bitrate
+        frames += nodes.frames_per_second()
     print(
         f"# bus load {load:.1%} of {config.can.bitrate // 1000} kbit/s: {frames:.0f} frames/s with each ESC at 100 Hz, "
-        "worst stuffing; messages sent on change counted by their cycle"
+        "worst stuffing; what is sent on change counted by its cycle, no SDO traffic"
     )
     return 0
+
+
+def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
+    """Each node's COB-IDs and PDOs in columns."""
+    rows: list[tuple[str, ...]] = [("node", "COB-ID", "what", "sent", "objects")]
+    for node, esc in zip(nodes.nodes, loaded.escs, strict=True):
+        first = f"{esc.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else node.node_id}"
+        if node.node_id == UNCONFIGURED:
+            rows.append((first, "7E5h", "LSS", "", f"serial number {node.identity[3]}"))
+            continue
+        for cob_id, what in dict(node.cob_ids()).items():
+            tpdo = next((t for t in node.tpdos if t.valid and t.cob_id == cob_id), None)
+            objects = "" if tpdo is None else ", ".join(entry.variable.entry.name for entry in tpdo.mapped)
+            what = what.removesuffix(f" of CANopen node {node.node_id}").removesuffix(
+                f" to CANopen node {node.node_id}"
+            )
+            rows.append((first, f"{cob_id:03X}h", what, "" if tpdo is None else pdo_timing(tpdo), objects))
+            first = ""
+    return columns(rows)
+
+
+def pdo_timing(tpdo: Tpdo) -> str:
+    """When a PDO is sent, in words."""
+    if tpdo.type not in EVENT_TYPES:
+        return "at a SYNC after news" if tpdo.type == 0 else f"every {tpdo.type} SYNC"
+    words = ["on change" if tpdo.on_change else "with each frame"]
+    if tpdo.inhibit_ns:
+        words.append(f">= {tpdo.inhibit_ns / MS:g} ms")
+    if tpdo.event_ns:
+        words.append(f"every {tpdo.event_ns // MS} ms")
+    return ", ".join(words)
 
 
 def table(layout: Layout, esc_names: list[str]) -> list[str]:
@@ -43,10 +87,13 @@ def table(layout: Layout, esc_names: list[str]) -> list[str]:
         for signal in message.signals:
             rows.append((*first, signal.name, _source(signal, esc_names), "; ".join(signal.notes)))
             first = ("", "", "")
-    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)
-    ]
+    return columns([head, *rows])
+
+
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines with the cells of each column one under the other."""
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def can_id(message: MessagePlan) -> str:

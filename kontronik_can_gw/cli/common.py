@@ -5,16 +5,32 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.config import Config, load
+from kontronik_can_gw import __version__
+from kontronik_can_gw.cia301.eds import Eds, without
+from kontronik_can_gw.cia301.eds import load as eds_of
+from kontronik_can_gw.cia301.node import NodeSettings, check_eds
+from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cia301.storage import Stored, decode
+from kontronik_can_gw.config import UNCONFIGURED, Config, load
 from kontronik_can_gw.dbc_output.layout import Layout, load_database
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.runtime.can_port import check_interface
+from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
+from kontronik_can_gw.runtime.store import ParameterStore
+from kontronik_can_gw.telemetry import EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
+
+
+_FRAME_BITS = 135
+"""Of a CAN frame with 8 data bytes, with the most stuffing; block uploads take every second place on the bus."""
 
 
 def say(text: str) -> None:
@@ -22,21 +38,133 @@ def say(text: str) -> None:
     print(f"kontronik-can-gw: {text}", file=sys.stderr)
 
 
-def load_all(path: Path) -> tuple[Config, "Database", Layout]:
-    """The configuration, the exact database of what is sent, the layout. UserError with every mistake; warnings are said."""
+@dataclass(frozen=True)
+class Loaded:
+    """A checked configuration and what belongs to it. ``database`` None: no DBC output; ``canopen`` None: no nodes."""
+
+    config: Config
+    escs: list[EscSettings]
+    """As they hold: with what masters stored worked in."""
+    database: "Database | None"
+    layout: Layout
+    canopen: CanopenSetup | None
+    damaged: tuple[tuple[int, str], ...]
+    """ESCs whose stored parameters cannot be read, and why."""
+    store: ParameterStore | None
+
+
+def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) -> Loaded:
+    """Everything that a configuration means. UserError with every mistake; warnings are said.
+
+    ``store`` makes the store of what masters stored, for the one who runs; None: it is only looked at.
+    """
     config = load(path)
     check_interface(config.can)
-    database, layout = layout_of(config)
-    for warning in (*layout.warnings, check_load(layout, config.can.bitrate, config.can.data_bitrate)):
+    loaded = assemble(config, store(parameter_folder(config)) if store and config.canopen.enabled else None)
+    nodes = loaded.canopen.nodes(loaded.escs).bits_per_second() if loaded.canopen else 0
+    load_warning = check_load(loaded.layout, config.can.bitrate, config.can.data_bitrate, nodes)
+    for warning in (*loaded.layout.warnings, load_warning):
         if warning:
             say(f"warning: {warning}")
-    return config, database, layout
+    return loaded
 
 
-def layout_of(config: Config) -> tuple["Database", Layout]:
-    """The database and layout that belong to a configuration."""
+def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
+    """What belongs to a configuration. Without a store its files are only looked at."""
+    escs = config.escs
+    canopen: CanopenSetup | None = None
+    damaged: list[tuple[int, str]] = []
+    taken: dict[int, str] = {}
+    if config.canopen.enabled:
+        canopen, damaged = _canopen(config, store)
+        escs = canopen.esc_settings(escs)
+        taken = canopen.nodes(escs).cob_ids()
+    if not config.dbc.enabled:
+        return Loaded(config, escs, None, Layout("", "", ()), canopen, tuple(damaged), store)
     file = config.dbc_path
-    return prepare(load_database(file), str(file), config.escs, config.dbc_settings, config.can.fd)
+    database, layout = prepare(load_database(file), str(file), escs, config.dbc_settings, config.can.fd, taken)
+    return Loaded(config, escs, database, layout, canopen, tuple(damaged), store)
+
+
+def load_eds(config: Config) -> Eds:
+    """The EDS in use, checked."""
+    path = config.eds_path
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file.") from None
+    eds = eds_of(data, str(path))
+    if not config.canopen.cia402_mirrors:
+        eds = eds_of(without(data, range(0x6000, 0x6800)), str(path))
+    check_eds(eds, config.escs[0])
+    return eds
+
+
+def parameter_folder(config: Config) -> Path:
+    """Where masters' parameters are kept."""
+    if config.canopen.store is None:
+        return state_folder()
+    return Path(config.file).parent / config.canopen.store
+
+
+def _canopen(config: Config, store: ParameterStore | None) -> tuple[CanopenSetup, list[tuple[int, str]]]:
+    canopen = config.canopen
+    eds = load_eds(config)
+    identity = machine_identity()
+    settings: list[NodeSettings] = []
+    kept: list[Stored] = []
+    damaged: list[tuple[int, str]] = []
+    for number, (esc, node_id) in enumerate(zip(config.esc, config.node_ids, strict=True)):
+        serial = serial_number(number + 1, identity) if canopen.serial is None else canopen.serial + number & 0xFFFFFFFF
+        settings.append(
+            NodeSettings(
+                node_id,
+                serial,
+                canopen.vendor_id,
+                canopen.self_start,
+                canopen.read_only,
+                config.can.bitrate,
+                segment_ns=2 * _FRAME_BITS * 1_000_000_000 // config.can.bitrate,
+                version=__version__,
+                device=next((device for device in Device if device.text == esc.device), None),
+            )
+        )
+        found, reason = (
+            _look_at(parameter_folder(config) / f"{esc.name}.params") if store is None else store.load(esc.name)
+        )
+        kept.append(found)
+        if reason is not None:
+            damaged.append((number, reason))
+    _forget_clashing_ids(config, settings, kept)
+    return CanopenSetup(eds, tuple(settings), tuple(kept)), damaged
+
+
+def _look_at(path: Path) -> tuple[Stored, str | None]:
+    """What a node stored, and why that cannot be read; nothing is changed."""
+    try:
+        return decode(path.read_bytes()), None
+    except FileNotFoundError:
+        return Stored(), None
+    except (OSError, ValueError) as error:
+        return Stored(), f"{path}: {error}"
+
+
+def _forget_clashing_ids(config: Config, settings: list[NodeSettings], kept: list[Stored]) -> None:
+    """A node-ID that was stored over the bus and has become another's by a changed configuration gives way."""
+    taken: dict[int, str] = {}
+    for number, (esc, own, stored) in enumerate(zip(config.esc, settings, kept, strict=True)):
+        node_id = own.node_id if stored.node_id is None else stored.node_id
+        if node_id in taken and stored.node_id is not None and own.node_id not in taken:
+            say(f"warning: {esc.name}: the stored node-ID {node_id} is that of {taken[node_id]}; taking {own.node_id}")
+            kept[number] = replace(stored, node_id=None)
+            node_id = own.node_id
+        elif node_id in taken:
+            raise UserError(
+                f"{config.file}: {esc.name}: node-ID {node_id} is that of {taken[node_id]}, which a master stored. "
+                f"Choose another node_id, or remove what is stored: {parameter_folder(config)}."
+            )
+        if node_id != UNCONFIGURED:
+            taken[node_id] = esc.name
 
 
 def set_up_log(verbose: bool = False) -> None:

@@ -77,7 +77,12 @@ def _database(args: argparse.Namespace):  # type: ignore[no-untyped-def]  # cant
         given += ["--from"] if args.source is not None else []
         if given:
             raise UserError(f"{' and '.join(given)} cannot be combined with --config, which says all that")
-        return load_all(args.config)[1]
+        database = load_all(args.config).database
+        if database is None:
+            raise UserError(
+                f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. --canopen writes those of the nodes."
+            )
+        return database
     names = args.name or []
     count = args.esc if args.esc is not None else max(1, len(names))
     if names and len(names) != count:

@@ -110,7 +110,7 @@ def main(args: argparse.Namespace) -> int:
     with without_asammdf():
         import can
 
-    from kontronik_can_gw.cli.common import layout_of
+    from kontronik_can_gw.cli.common import assemble
     from kontronik_can_gw.config import parse
     from kontronik_can_gw.gateway import Gateway
     from kontronik_can_gw.offline.pty import PtyEsc
@@ -127,9 +127,10 @@ def main(args: argparse.Namespace) -> int:
             "esc": [{"port": esc.path, "pole_pairs": 7, "gear": 9.8}],
         }
         config = parse(tables, "demo")
-        database, layout = layout_of(config)
-        logger = Logger(database)
-        gateway = Gateway(config.escs, layout, time.monotonic_ns())
+        loaded = assemble(config)
+        assert loaded.database is not None
+        logger = Logger(loaded.database)
+        gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns())
         loop = Loop(gateway, [esc.path], config.can)
         bus = stack.enter_context(can.Bus(interface="virtual", channel=channel))
         loop.open()

@@ -31,10 +31,15 @@ def prepare(
     return database, compile_layout(database, file, escs, settings, taken_ids, fd_allowed)
 
 
-def check_load(layout: Layout, bitrate: int, data_bitrate: int = 2_000_000) -> str | None:
-    """A warning above 50 % computed bus load, UserError above 100 %, else None."""
-    load = layout.bus_load(bitrate, data_bitrate)
-    text = f"{layout.file}: the messages need {load:.0%} of {bitrate // 1000} kbit/s"
+def check_load(layout: Layout, bitrate: int, data_bitrate: int = 2_000_000, further_bits: float = 0) -> str | None:
+    """A warning above 50 % computed bus load, UserError above 100 %, else None. ``further_bits``: of CANopen nodes, in a second."""
+    load = layout.bus_load(bitrate, data_bitrate) + further_bits / bitrate
+    what = "the CANopen nodes" if not layout.messages else f"{layout.file}: the messages"
+    if layout.messages and further_bits:
+        what += " and the CANopen nodes"
+    text = f"{what} need {load:.0%} of {bitrate // 1000} kbit/s"
     if load > REFUSE_LOAD:
-        raise UserError(f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime) or raise can.bitrate.")
+        raise UserError(
+            f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime; inhibit times) or raise can.bitrate."
+        )
     return f"{text}; other nodes get little" if load > WARN_LOAD else None

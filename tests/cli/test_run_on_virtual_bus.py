@@ -22,7 +22,7 @@ import can
 import pytest
 from cantools.database.can import Database
 
-from kontronik_can_gw.cli.common import layout_of
+from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import CanConfig, parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
@@ -53,7 +53,9 @@ class Bench:
         }
         config = parse(tables, "bench.toml")
         self.database: Database
-        self.database, layout = layout_of(config)
+        loaded = assemble(config)
+        assert loaded.database is not None
+        self.database, layout = loaded.database, loaded.layout
         self.bus = can.Bus(interface="virtual", channel=channel)
         self.gateway = Gateway(config.escs, layout, time.monotonic_ns())
         self.loop = Loop(self.gateway, list(ports), config.can, wait)

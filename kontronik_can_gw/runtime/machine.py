@@ -1,0 +1,40 @@
+"""What is the machine's own: serial numbers for its nodes, the folder for its parameters."""
+
+import hashlib
+import os
+from pathlib import Path
+
+_IDENTITIES = ("/etc/machine-id", "/var/lib/dbus/machine-id", "/proc/device-tree/serial-number")
+_NAME = "kontronik-can-gw"
+
+
+def machine_identity(root: Path = Path("/")) -> bytes:
+    """What tells this board from others: the system's id and the board's serial number (copied memory cards share the former).
+
+    Empty where the system has neither.
+    """
+    found = b""
+    for name in _IDENTITIES:
+        try:
+            found += (root / name.lstrip("/")).read_bytes().strip(b"\0\n ") + b"\0"
+        except OSError:
+            continue
+    return found
+
+
+def serial_number(number: int, identity: bytes) -> int:
+    """1018h:4 of the ESC with this number (1 ...): always the same on this board, different on others; 0 without an identity."""
+    if not identity:
+        return 0
+    digest = hashlib.sha256(identity + f"{_NAME} {number}".encode()).digest()
+    return int.from_bytes(digest[:4], "big") or 1
+
+
+def state_folder() -> Path:
+    """Where parameters are kept if the configuration does not say: what systemd gives the service, or the user's."""
+    if given := os.environ.get("STATE_DIRECTORY"):
+        return Path(given.split(":")[0])
+    if os.geteuid() == 0:
+        return Path("/var/lib") / _NAME
+    home = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(home) / _NAME
