@@ -113,11 +113,11 @@ class _Shape:
 
 
 def _var(*types: int) -> _Shape:
-    return _Shape((VAR,), {0: types}, (0,))
+    return _Shape((VAR,), {0: types})
 
 
 def _list(kind: int, data_type: int, last: int, *needed: int) -> _Shape:
-    return _Shape((kind,), {0: (_U8,)} | dict.fromkeys(range(1, last + 1), (data_type,)), (0, *needed))
+    return _Shape((kind,), {0: (_U8,)} | dict.fromkeys(range(1, last + 1), (data_type,)), needed)
 
 
 _COMMUNICATION: Mapping[int, _Shape] = {
@@ -137,16 +137,21 @@ _COMMUNICATION: Mapping[int, _Shape] = {
     0x1017: _var(_U16),
     0x1018: _list(RECORD, _U32, 4, 1),
     0x1019: _var(_U8),
-    0x1021: _Shape((DOMAIN, VAR), {0: (_DOMAIN_TYPE,)}, (0,)),
+    0x1021: _Shape((DOMAIN, VAR), {0: (_DOMAIN_TYPE,)}),
     0x1022: _var(_U8, _U16),  # copies of the table differ in the width
     0x1029: _list(ARRAY, _U8, 0xFE, 1),
     0x1200: _list(RECORD, _U32, 2, 1, 2),
     0x1F80: _var(_U32),
 }
 # Sub-index 4 is reserved.
-_PDO_COMMUNICATION = _Shape((RECORD,), {0: (_U8,), 1: (_U32,), 2: (_U8,), 3: (_U16,), 5: (_U16,), 6: (_U8,)}, (0, 1, 2))
-_PDO_MAPPING = _Shape((RECORD, ARRAY), _list(RECORD, _U32, 0x40).types, (0,))
+_PDO_COMMUNICATION = _Shape((RECORD,), {0: (_U8,), 1: (_U32,), 2: (_U8,), 3: (_U16,), 5: (_U16,), 6: (_U8,)}, (1, 2))
+_PDO_MAPPING = _Shape((RECORD, ARRAY), _list(RECORD, _U32, 0x40).types)
 _PDO_COMMUNICATIONS, _PDO_MAPPINGS = range(0x1800, 0x1A00), range(0x1A00, 0x1C00)
+
+
+def _counts(index: int) -> bool:
+    """Whether sub-index 0 is a count that changes: errors kept, objects mapped."""
+    return index == 0x1003 or index in _PDO_MAPPINGS
 
 
 def _shape(index: int) -> _Shape | None:
@@ -389,26 +394,31 @@ class _Checker:
         if kind in (DOMAIN, VAR):
             for sub in subs.values():
                 self._say(sub.name, f"[{index:04X}] is a {_KINDS[kind]} and has no sub-indices. Remove this section.")
-            variables = {0: self._variable(section, kind, index)}
+            variables = {0: self._variable(section, name, kind, index)}
         elif kind in (ARRAY, RECORD):
-            variables = self._members(index, section, subs)
+            variables = self._members(index, name, section, subs)
         elif kind is not None:
             self._say(section.name, f"ObjectType=0x{kind:X}: not one of {_choices(_KINDS)}.")
-        self.objects[index] = _Object(index, VAR if kind is None else kind, name, variables)
+        self.objects[index] = _Object(index, kind or 0, name, variables)
 
-    def _members(self, index: int, section: _Section, subs: Mapping[int, _Section]) -> dict[int, _Variable]:
+    def _members(self, index: int, name: str, section: _Section, subs: Mapping[int, _Section]) -> dict[int, _Variable]:
         compact = self._number(section, "CompactSubObj", 0)
         count = self._number(section, "SubNumber", 0)
         if compact:
-            if subs or count:
-                self._say(section.name, "CompactSubObj excludes SubNumber and sections of sub-indices. Keep one way.")
-            return self._compact(index, section, compact)
+            if not subs and not count:
+                return self._compact(index, name, section, compact)
+            self._say(section.name, "CompactSubObj excludes SubNumber and sections of sub-indices. Keep one way.")
         if count is not None and count != len(subs):
             self._say(section.name, f"SubNumber={count}, but {len(subs)} sub-indices are there. Write {len(subs)}.")
-        variables = {sub: self._variable(subs[sub], VAR, index) for sub in sorted(subs)}
-        for sub in variables:
+        variables = {}
+        for sub in sorted(subs):
+            member = subs[sub]
+            kind = self._number(member, "ObjectType", VAR)
+            if kind not in (None, DOMAIN, VAR):
+                self._say(member.name, f"ObjectType=0x{kind:X}: a sub-index is a VAR, 0x7.")
             if sub > 0xFE:
-                self._say(subs[sub].name, "sub-indices end at FE. Remove this section.")
+                self._say(member.name, "sub-indices end at FE. Remove this section.")
+            variables[sub] = self._variable(member, self._parameter_name(member), kind or VAR, index)
         self._check_sub0(index, variables)
         return variables
 
@@ -420,25 +430,23 @@ class _Checker:
         highest = max(variables)
         if first.data_type != _U8:
             self._say(first.section, f"DataType=0x{first.data_type:04X}: sub-index 0 is an UNSIGNED8, 0x0005.")
-        elif index == 0x1003 or index in _PDO_MAPPINGS:  # a count that changes
+        elif _counts(index):
             if isinstance(first.default, int) and first.default > highest:
-                self._say(first.section, f"DefaultValue={first.default}: the highest sub-index is {highest}.")
+                self._say(first.section, f"DefaultValue: the highest sub-index is {highest}. Write that or less.")
         elif first.default != highest:
-            self._say(
-                first.section,
-                f"DefaultValue={first.default}: the highest sub-index is {highest}. Write 0x{highest:02X}.",
-            )
+            self._say(first.section, f"DefaultValue: the highest sub-index is {highest}. Write 0x{highest:02X}.")
 
-    def _compact(self, index: int, section: _Section, count: int) -> dict[int, _Variable]:
+    def _compact(self, index: int, name: str, section: _Section, count: int) -> dict[int, _Variable]:
         """CiA 306, CompactSubObj: sub-index 0 and ``count`` alike ones. Their names are the object's and a number, or in [xxxxName]."""
         if not 1 <= count <= 0xFE:
             self._say(section.name, f"CompactSubObj={count}: not 1 to 254.")
             return {}
-        variable = self._variable(section, VAR, index)
-        count_name = f"{variable.name} highest sub-index"
-        variables = {0: _Variable(section.name, count_name, _U8, "const", False, None, None, count, False)}
+        variable = self._variable(section, name, VAR, index)
+        count_name = f"{name} highest sub-index"
+        access, highest = ("rw", 0) if _counts(index) else ("const", count)
+        variables = {0: _Variable(section.name, count_name, _U8, access, False, None, None, highest, False)}
         for sub in range(1, count + 1):
-            variables[sub] = _Variable(**{**vars(variable), "name": f"{variable.name}{sub}"})
+            variables[sub] = _Variable(**{**vars(variable), "name": f"{name}{sub}"})
         names = self._sections.get(f"{index:04x}name")
         if names is None:
             return variables
@@ -461,20 +469,15 @@ class _Checker:
             self._say(section.name, f"ParameterName: longer than {_LONGEST_NAME} characters. Shorten it.")
         return name
 
-    def _variable(self, section: _Section, kind: int, index: int) -> _Variable:
+    def _variable(self, section: _Section, name: str, kind: int, index: int) -> _Variable:
         where = section.name
-        name = self._parameter_name(section)
-        if "sub" in where.lower():
-            kind = self._number(section, "ObjectType", VAR) or VAR
-            if kind not in (DOMAIN, VAR):
-                self._say(where, f"ObjectType=0x{kind:X}: a sub-index is a VAR, 0x7.")
         data_type = self._data_type(section, kind, index)
         access = section.get("AccessType").lower() or ("rw" if kind == DOMAIN else "")
         if access not in _ACCESS:
             self._say(where, f"AccessType={section.get('AccessType')}: not one of {', '.join(_ACCESS)}.")
         mappable = bool(self._number(section, "PDOMapping", 0))
-        if mappable and (data_type == _DOMAIN_TYPE or access == "wo"):
-            what = "a DOMAIN" if data_type == _DOMAIN_TYPE else "a write-only object"
+        if mappable and (access == "wo" or (data_type and data_type not in _BITS)):
+            what = "a write-only object" if access == "wo" else f"a {_TYPE_NAMES[data_type]}"
             self._say(where, f"PDOMapping={section.get('PDOMapping')}: {what} has no place in a TPDO. Write 0.")
         if section.get("ParameterValue"):
             self._say(where, "ParameterValue: values belong in a DCF. Write DefaultValue.")
@@ -547,7 +550,9 @@ class _Checker:
             try:
                 bytes.fromhex(text)
             except ValueError:
-                self._say(section.name, f"DefaultValue={text}: not bytes. Write pairs of hexadecimal digits.")
+                self._say(
+                    section.name, f"DefaultValue={text}: not bytes. Write pairs of hexadecimal digits, or nothing."
+                )
                 return None, False
             return text, False
         if data_type in _FLOATS:
@@ -579,12 +584,14 @@ class _Checker:
         if shape is None:
             self._say(f"{index:04X}", f"{item.name}: this node has no such service. Remove the object.")
             return
+        if item.kind not in _KINDS:
+            return
         if item.kind not in shape.kinds:
             kind = shape.kinds[0]
             self._say(f"{index:04X}", f"ObjectType=0x{item.kind:X}: this object is of type {_KINDS[kind]}, 0x{kind:X}.")
             return
         for sub in shape.needed:
-            if sub and sub not in item.subs:
+            if sub not in item.subs:
                 self._say(f"{index:04X}", f"sub-index {sub:X} is mandatory and is not there. Add it.")
         for sub, variable in item.subs.items():
             types = shape.types.get(sub)
@@ -818,7 +825,12 @@ def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
     if entry.data_type == _OCTET_STRING:
         return value.hex()
     text = value.decode("utf-16-le" if entry.data_type == _UNICODE_STRING else "latin-1")
-    if not text.isascii() or (text and not text.isprintable()) or _bare(f"={text}") != f"={text}":
+    if (
+        not text.isascii()
+        or text != text.strip()
+        or (text and not text.isprintable())
+        or _bare(f"={text}") != f"={text}"
+    ):
         where = _spelling(entry.index, entry.sub)
         raise UserError(f"{name}: [{where}] the text {text!r} of {entry.name} cannot stand in a DCF.")
     return text

@@ -1,0 +1,150 @@
+"""Other people's readers take the shipped EDS, and the DCF made from it, without a finding: dcf-tools, npm canopen, canmatrix."""
+
+import json
+import logging
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kontronik_can_gw.cia301 import eds as reader
+from kontronik_can_gw.cia301.eds import Eds, Entry
+
+SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
+PDO_NAMES = [
+    ["Electrical speed", "Battery voltage", "Battery current"],
+    ["Motor current", "Peak current", "Consumed charge", "Throttle", "Output opening"],
+    ["BEC voltage", "PWM input", "BEC current", "Power stage temperature", "BEC temperature"],
+    ["Operating errors", "Operating state", "Timing", "Link status", "Live counter"],
+]
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Eds:
+    return reader.load(SHIPPED.read_bytes(), SHIPPED.name)
+
+
+def dcf_text(shipped: Eds, node_id: int) -> str:
+    """A DCF with a value for every number and text that may be read."""
+    values: dict[tuple[int, int], int | float | bytes] = {}
+    for entry in shipped.entries:
+        default = entry.default
+        if entry.access == "wo" or entry.data_type == 0x0F:
+            continue
+        if default is None:
+            default = b"text" if entry.data_type == 0x09 else 1
+        if entry.relative:
+            assert isinstance(default, int)
+            default += node_id
+        values[entry.index, entry.sub] = default
+    return reader.dcf(shipped, node_id, 250_000, values, "left")
+
+
+# --- dcf-tools ------------------------------------------------------------------------------------------------------
+
+
+def dcfchk(file: Path, node_id: int) -> subprocess.CompletedProcess[str]:
+    """dcf-tools' checker, PDO mappings printed. Without a node-ID it cannot take $NODEID."""
+    command = [sys.executable, "-c", "from dcf.cli import main; main()", "-p", "-n", str(node_id), str(file)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("node_id", [1, 5, 127])
+def test_dcfchk_has_no_finding(node_id: int) -> None:
+    run = dcfchk(SHIPPED, node_id)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
+def test_dcfchk_has_no_finding_in_the_dcf(shipped: Eds, tmp_path: Path) -> None:
+    file = tmp_path / "left.dcf"
+    file.write_bytes(dcf_text(shipped, 5).encode("ascii"))
+    run = dcfchk(file, 5)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"SubNumber=0x9", b"SubNumber=0x8"),
+        (b"DefaultValue=0x00FDFFFF", b"DefaultValue=0x100FDFFFF"),
+        (b"1=0x1000", b"1=0x1004"),
+    ],
+)
+def test_dcfchk_would_have_said_so(tmp_path: Path, old: bytes, new: bytes) -> None:
+    file = tmp_path / "broken.eds"
+    file.write_bytes(SHIPPED.read_bytes().replace(old, new))
+    run = dcfchk(file, 1)
+    assert run.returncode != 0
+    assert "UserWarning" in run.stderr
+
+
+# --- npm canopen ----------------------------------------------------------------------------------------------------
+
+NPM_CANOPEN = Path(__file__).parents[1] / "foreign" / ".cache" / "node" / "node_modules" / "canopen"
+
+
+@pytest.fixture(scope="module")
+def javascript() -> dict[str, Any]:
+    if shutil.which("node") is None or not NPM_CANOPEN.exists():
+        pytest.skip("canopen for node is not installed: run tests/foreign/install.sh")
+    script = Path(__file__).with_name("read_with_npm_canopen.js")
+    command = ["node", str(script), str(NPM_CANOPEN), str(SHIPPED)]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert run.stderr == ""
+    found: dict[str, Any] = json.loads(run.stdout)
+    return found
+
+
+def test_npm_canopen_reads_the_device(shipped: Eds, javascript: dict[str, Any]) -> None:
+    device = shipped.device
+    assert tuple(javascript["bitRates"]) == device.bit_rates
+    assert javascript["vendor"] == device.vendor_number
+    assert javascript["product"] == device.product_number
+    assert javascript["revision"] == device.revision_number
+    assert javascript["lss"] is True
+    assert {int(index): name for index, name in javascript["names"].items()} == shipped.object_names
+
+
+def test_npm_canopen_reads_every_entry_as_we_do(shipped: Eds, javascript: dict[str, Any]) -> None:
+    theirs = {(each["index"], each["sub"]): each for each in javascript["entries"]}
+    assert set(theirs) == {(entry.index, entry.sub) for entry in shipped.entries}
+    for entry in shipped.entries:
+        found = theirs[entry.index, entry.sub]
+        assert (found["name"], found["type"], found["access"]) == (entry.name, entry.data_type, entry.access)
+        if entry.data_type != 0x0F:
+            assert found["mappable"] == entry.mappable, entry.name
+        assert (found["low"] or 0, found["high"]) == (entry.low or 0, entry.high), entry.name  # it takes 0 for no limit
+        if _has_value(entry):
+            value = found["value"].encode() if isinstance(found["value"], str) else found["value"]
+            assert value == entry.default, entry.name
+
+
+def _has_value(entry: Entry) -> bool:
+    """It cannot add a node-ID, and sets sub-index 0 to the highest one that it meets."""
+    counts = entry.sub == 0 and (entry.index == 0x1003 or 0x1A00 <= entry.index < 0x1C00)
+    return entry.default is not None and not entry.relative and not counts
+
+
+# --- canmatrix ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("node_id", [1, 127])
+def test_canmatrix_makes_the_default_pdos_of_it(shipped: Eds, caplog: pytest.LogCaptureFixture, node_id: int) -> None:
+    import canmatrix.formats  # type: ignore[import-untyped]
+
+    with caplog.at_level(logging.WARNING), SHIPPED.open("rb") as file:
+        matrix = next(iter(canmatrix.formats.load(file, "eds", eds_node_id=node_id).values()))
+    assert caplog.records == []
+    numbers = {entry.name.replace(" ", "_"): entry for entry in shipped.entries}
+    for number, names in enumerate(PDO_NAMES):
+        frame = matrix.frame_by_name(f"TPDO_{number + 1}_communication_parameter")
+        assert frame is not None
+        assert (frame.arbitration_id.id, frame.size) == (0x180 + 0x100 * number + node_id, 8)
+        assert [signal.name for signal in frame.signals] == [name.replace(" ", "_") for name in names]
+        for signal in frame.signals:
+            assert signal.is_signed == (numbers[signal.name].data_type in (0x02, 0x03, 0x04))
+    sdo = matrix.frame_by_name("SDO_transmit")
+    assert {"Throttle", "Pole_pairs", "Reset_of_statistics"} < {signal.name for signal in sdo.signals}

@@ -1,0 +1,406 @@
+"""The shipped EDS against its sources: the rows of the sheet, the configuration's ranges, and rules of fussy readers."""
+
+import io
+import re
+from collections import Counter
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import canopen
+import pytest
+
+from kontronik_can_gw.cia301 import eds as reader
+from kontronik_can_gw.cia301.eds import ARRAY, DOMAIN, RECORD, VAR, Eds, Entry
+from kontronik_can_gw.config import EscConfig
+from kontronik_can_gw.protocol.fields import DataType, InfoData, LiveData, Row, rows
+
+SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
+DATA = SHIPPED.read_bytes()
+TEXT = DATA.decode("ascii")
+LINES = TEXT.split("\r\n")
+U8, U16, U32, I32, TEXT_TYPE = 0x05, 0x06, 0x07, 0x04, 0x09
+TYPE_OF_WIRE = {"I": U32, "H": U16, "B": U8, "h": 0x03, "b": 0x02}
+# CiA 303-2: prefix as a power of ten, numerator, denominator
+UNIT_CODES = {"V": 0x260000, "A": 0x040000, "°C": 0x2D0000, "1/min": 0xB44700, "": 0, "µs": 0x030000, "%": 0}
+PREFIX = {"µs": -6, "%": -2}
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Eds:
+    return reader.load(DATA, SHIPPED.name)
+
+
+@pytest.fixture(scope="module")
+def entries(shipped: Eds) -> dict[tuple[int, int], Entry]:
+    return {(entry.index, entry.sub): entry for entry in shipped.entries}
+
+
+def title(field: str) -> str:
+    """A field's name as the EDS writes it."""
+    words = field.replace("_", " ").replace("bec", "BEC").replace("pwm", "PWM")
+    return words[0].upper() + words[1:]
+
+
+def extremes() -> dict[str, Row]:
+    found = rows(InfoData)
+    return {name: found[name] for name in InfoData._fields[InfoData._fields.index("max_electrical_speed") :]}
+
+
+# --- the text -------------------------------------------------------------------------------------------------------
+
+
+def test_it_is_ascii_with_cr_lf_at_every_end_and_no_blanks_before_it() -> None:
+    assert DATA.isascii()
+    assert DATA.endswith(b"\r\n")
+    assert DATA.count(b"\r\n") == DATA.count(b"\n") == DATA.count(b"\r")
+    assert [line for line in LINES if line != line.strip()] == []
+
+
+def test_no_key_is_without_a_value() -> None:
+    assert [line for line in LINES if line.endswith("=")] == []
+
+
+def test_numbers_of_objects_are_hexadecimal_and_the_node_id_stands_in_front() -> None:
+    keys = ("DataType", "ObjectType", "SubNumber", "LowLimit", "HighLimit", "DefaultValue")
+    texts = {"KONTRONIK ESC gateway", "generic"}
+    found = [line.split("=", 1)[1] for line in LINES if line.split("=", 1)[0] in keys]
+    assert len(found) > 500
+    assert {value for value in found if not re.fullmatch(r"(\$NODEID\+)?0x[0-9A-F]+", value)} == texts
+
+
+def test_names_are_unique_over_the_file_and_of_two_characters_or_more(shipped: Eds) -> None:
+    names = [line.split("=", 1)[1] for line in LINES if line.startswith("ParameterName=")]
+    assert [name for name, count in Counter(names).items() if count > 1] == []
+    assert min(map(len, names)) >= 2
+    assert {entry.name for entry in shipped.entries} | set(shipped.object_names.values()) == set(names)
+
+
+def test_comments_are_numbered_and_counted() -> None:
+    start = LINES.index("[Comments]")
+    comments = LINES[start + 2 : LINES.index("", start)]
+    assert LINES[start + 1] == f"Lines={len(comments)}"
+    assert [line.split("=")[0] for line in comments] == [f"Line{n}" for n in range(1, len(comments) + 1)]
+
+
+@pytest.mark.parametrize("unit", ["10 mV", "0.1 A", "mAh", "1/min", "0.1 W", "0.1 Wh", "0.1 Hz", "bit/s", "in us", "%"])
+def test_units_are_told_in_the_comments(unit: str) -> None:
+    assert any(unit in line for line in LINES if line.startswith("Line"))
+
+
+def test_a_domain_has_no_pdo_mapping_key() -> None:
+    section = TEXT.split("[1021]")[1].split("[")[0]
+    assert "ObjectType=0x2" in section
+    assert "PDOMapping" not in section
+
+
+# --- the objects ----------------------------------------------------------------------------------------------------
+
+
+def test_it_is_accepted_and_keeps_its_bytes(shipped: Eds) -> None:
+    assert shipped.data == DATA
+    assert shipped.name == "kontronik_esc.eds"
+    assert [entry.index << 8 | entry.sub for entry in shipped.entries] == sorted(
+        entry.index << 8 | entry.sub for entry in shipped.entries
+    )
+
+
+def test_device_info(shipped: Eds, entries: dict[tuple[int, int], Entry]) -> None:
+    device = shipped.device
+    assert device.bit_rates == (10_000, 20_000, 50_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+    assert (device.tx_pdos, device.rx_pdos, device.lss) == (6, 0, True)
+    assert device.vendor_number == entries[0x1018, 1].default == 0
+    assert device.product_number == entries[0x1018, 2].default
+    assert device.revision_number == entries[0x1018, 3].default
+    assert entries[0x1018, 4].default is None
+
+
+def test_all_objects_of_the_design_are_there_and_no_other(shipped: Eds) -> None:
+    single = "1000 1001 1002 1003 1005 1008 1009 100A 1010 1011 1014 1015 1016 1017 1018 1019 1021 1022 1029 1200 1F80"
+    own = "2000 2001 2002 2010 2011 2020 2021 2100 2101 2102 603F 606C 6079"
+    pdos = [base + n for base in (0x1800, 0x1A00) for n in range(6)]
+    assert sorted(shipped.object_names) == sorted([int(text, 16) for text in f"{single} {own}".split()] + pdos)
+
+
+@pytest.mark.parametrize(
+    ("index", "data"), [(0x2000, LiveData), (0x2011, InfoData)], ids=["live frame", "logged extremes"]
+)
+def test_fields_stand_in_wire_order_with_their_types(
+    entries: dict[tuple[int, int], Entry], index: int, data: DataType
+) -> None:
+    fields_of_frame = rows(LiveData) if data is LiveData else extremes()
+    assert max(sub for at, sub in entries if at == index) == len(fields_of_frame)
+    for sub, (name, row) in enumerate(fields_of_frame.items(), 1):
+        entry = entries[index, sub]
+        expected = title(name).replace("Max ", "Maximum ").replace("Min ", "Minimum ")
+        assert entry.name == expected
+        assert entry.data_type == TYPE_OF_WIRE[row.wire], name
+        assert (entry.access, entry.mappable) == ("ro", True)
+        assert (entry.low, entry.high, entry.default) == (None, None, None)
+
+
+def test_there_are_as_many_logged_extremes_as_the_design_says() -> None:
+    assert len(extremes()) == 0x0E
+
+
+def test_unit_codes_agree_with_the_field_table(entries: dict[tuple[int, int], Entry]) -> None:
+    for sub, (name, row) in enumerate(rows(LiveData).items(), 1):
+        entry = entries[0x2002, sub]
+        assert (entry.access, entry.data_type) == ("const", U32)
+        assert entry.name.lower() == f"unit of {title(name).lower()}"
+        if row.unit == "mAh":  # no code: 3.6 C
+            assert entry.default == 0
+            continue
+        power = PREFIX.get(row.unit, 0) - (len(str(row.per_unit)) - 1)
+        assert entry.default == (power & 0xFF) << 24 | UNIT_CODES[row.unit], name
+
+
+def test_unit_codes_of_the_design(entries: dict[tuple[int, int], Entry]) -> None:
+    codes = [entries[0x2002, sub].default for sub in (1, 2, 3, 7, 8, 9, 12)]
+    assert codes == [0x00B44700, 0xFE260000, 0xFF040000, 0xFD040000, 0xFD260000, 0xFA030000, 0x002D0000]
+
+
+@pytest.mark.parametrize(
+    ("index", "types"),
+    [
+        (0x2001, (I32, I32, I32, U32, U16, U32)),
+        (0x2010, (U8, U16, U16, U32, U8, TEXT_TYPE, TEXT_TYPE)),
+        (0x2020, (U8, U8, U16, U16, U32, U32, U32, U32, U32, U32, U16)),
+        (0x2021, (U32, U8, U32, U32, U32, U32, U32, U8, U8)),
+        (0x2100, (U8, U32, U32, U16, U8, U32, U8, U16)),
+        (0x2101, (U8, U8, U32, U32)),
+        (0x2102, (U32,)),
+    ],
+    ids=lambda value: f"{value:04X}h" if isinstance(value, int) else "",
+)
+def test_types_of_the_other_records(entries: dict[tuple[int, int], Entry], index: int, types: tuple[int, ...]) -> None:
+    found = [entries[at].data_type for at in sorted(entries) if at[0] == index]
+    assert found == [U8, *types]
+
+
+def test_what_may_be_mapped_is_what_telemetry_and_gateway_tell(entries: dict[tuple[int, int], Entry]) -> None:
+    mappable = {index for (index, sub), entry in entries.items() if entry.mappable}
+    assert mappable == {0x2000, 0x2001, 0x2011, 0x2020, 0x2021, 0x603F, 0x606C, 0x6079}
+    for (index, sub), entry in entries.items():
+        if index in mappable:
+            assert entry.mappable == (sub > 0 or entry.object_type == VAR)
+            assert entry.access == ("const" if sub == 0 and entry.object_type == RECORD else "ro")
+
+
+def test_what_may_be_written(entries: dict[tuple[int, int], Entry]) -> None:
+    writable = {at for at, entry in entries.items() if "w" in entry.access}
+    expected = {(index, 0) for index in (0x1003, 0x1005, 0x1014, 0x1015, 0x1017, 0x1019, 0x1F80)}
+    expected |= {(index, sub) for index in (0x1010, 0x1011) for sub in (1, 2, 3)}
+    expected |= {(index, sub) for index in (0x1016, 0x1029) for sub in (1, 2)}
+    expected |= {(0x1800 + n, sub) for n in range(6) for sub in (1, 2, 3, 5, 6)}
+    expected |= {(0x1A00 + n, sub) for n in range(6) for sub in range(9)}
+    expected |= {(0x2100, sub) for sub in range(1, 9)} | {(0x2101, 2), (0x2102, 1)}
+    assert writable == expected
+    assert [at for at, entry in entries.items() if entry.access == "wo"] == [(0x2102, 1)]
+
+
+def limits(entry: Entry) -> tuple[int, int]:
+    """Low and high limit; those of an unsigned type where the EDS gives none."""
+    most = {U8: 0xFF, U16: 0xFFFF, U32: 0xFFFFFFFF}[entry.data_type]
+    return (0 if entry.low is None else entry.low, most if entry.high is None else entry.high)
+
+
+@pytest.mark.parametrize(("sub", "key"), [(1, "pole_pairs"), (4, "telemetry_timeout_ms"), (7, "cell_count")])
+def test_settings_have_the_ranges_and_defaults_of_the_configuration(
+    entries: dict[tuple[int, int], Entry], sub: int, key: str
+) -> None:
+    definition: Any = next(each for each in fields(EscConfig) if each.name == key)
+    entry = entries[0x2100, sub]
+    assert limits(entry) == (definition.metadata["low"], definition.metadata["high"])
+    assert entry.default == definition.default
+
+
+@pytest.mark.parametrize(
+    ("at", "expected"),
+    [
+        ((0x1016, 1), (0, 0xFFFFFF, 0)),
+        ((0x1017, 0), (0, 0xFFFF, 1000)),
+        ((0x1019, 0), (0, 240, 0)),
+        ((0x1029, 1), (0, 2, 0)),
+        ((0x1029, 2), (0, 2, 1)),
+        ((0x1800, 6), (0, 240, 0)),
+        ((0x1A05, 0), (0, 8, 0)),
+        ((0x2100, 2), (1, 0xFFFFFFFF, 1)),
+        ((0x2100, 3), (1, 0xFFFFFFFF, 1)),
+        ((0x2100, 5), (0, 2, 0)),
+        ((0x2100, 6), (0, 0xFFFFFFFF, 0x00FDFFFF)),
+        ((0x2100, 8), (1, 0xFFFF, 5)),
+        ((0x2101, 2), (1, 127, None)),
+        ((0x1005, 0), (0, 0xFFFFFFFF, 0x80)),
+        ((0x1F80, 0), (0, 0xFFFFFFFF, 4)),
+    ],
+)
+def test_limits_and_defaults(
+    entries: dict[tuple[int, int], Entry], at: tuple[int, int], expected: tuple[int, int, int | None]
+) -> None:
+    assert (*limits(entries[at]), entries[at].default) == expected
+
+
+def test_object_codes(entries: dict[tuple[int, int], Entry]) -> None:
+    arrays = {index for (index, _), entry in entries.items() if entry.object_type == ARRAY}
+    assert arrays == {0x1003, 0x1010, 0x1011, 0x1016, 0x1029, 0x2002}
+    assert [index for (index, _), entry in entries.items() if entry.object_type == DOMAIN] == [0x1021]
+
+
+def test_cob_ids_follow_the_node_id(entries: dict[tuple[int, int], Entry]) -> None:
+    relative = {at: entry.default for at, entry in entries.items() if entry.relative}
+    assert relative == {
+        (0x1014, 0): 0x80,
+        (0x1200, 1): 0x600,
+        (0x1200, 2): 0x580,
+        (0x1800, 1): 0x40000180,
+        (0x1801, 1): 0x40000280,
+        (0x1802, 1): 0x40000380,
+        (0x1803, 1): 0x40000480,
+    }
+    assert {entries[index, 1].default for index in (0x1804, 0x1805)} == {0xC0000000}
+
+
+PDOS: dict[int, tuple[str, ...]] = {
+    0: ("Electrical speed", "Battery voltage", "Battery current"),
+    1: ("Motor current", "Peak current", "Consumed charge", "Throttle", "Output opening"),
+    2: ("BEC voltage", "PWM input", "BEC current", "Power stage temperature", "BEC temperature"),
+    3: ("Operating errors", "Operating state", "Timing", "Link status", "Live counter"),
+    4: (),
+    5: (),
+}
+
+
+def test_default_pdos_fill_eight_bytes_in_the_order_of_the_design(entries: dict[tuple[int, int], Entry]) -> None:
+    bits_of_type = {0x02: 8, 0x03: 16, U8: 8, U16: 16, U32: 32}
+    for number, names in PDOS.items():
+        assert entries[0x1A00 + number, 0].default == len(names)
+        mapped = []
+        bits = 0
+        for sub in range(1, 9):
+            value = entries[0x1A00 + number, sub].default
+            assert isinstance(value, int)
+            if sub > len(names):
+                assert value == 0
+                continue
+            entry = entries[value >> 16, value >> 8 & 0xFF]
+            assert value & 0xFF == bits_of_type[entry.data_type]
+            bits += value & 0xFF
+            mapped.append(entry.name)
+        assert tuple(mapped) == names
+        assert bits == (64 if names else 0)
+
+
+def test_times_of_the_default_pdos(entries: dict[tuple[int, int], Entry]) -> None:
+    times = [tuple(entries[0x1800 + n, sub].default for sub in (2, 3, 5, 6)) for n in range(6)]
+    assert times == [
+        (254, 200, 0, 0),
+        (254, 500, 0, 0),
+        (254, 1000, 0, 0),
+        (254, 0, 500, 0),
+        (254, 0, 0, 0),
+        (254, 0, 0, 0),
+    ]
+
+
+# --- beside the canopen library -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("node_id", [1, 5, 127])
+def test_the_canopen_library_reads_every_entry_as_we_do(shipped: Eds, node_id: int) -> None:
+    dictionary = canopen.import_od(str(SHIPPED), node_id=node_id)
+    theirs = {}
+    for item in dictionary.values():
+        members = [item] if isinstance(item, canopen.objectdictionary.ODVariable) else list(item.values())
+        for each in members:
+            default = each.default.encode() if isinstance(each.default, str) else each.default
+            theirs[each.index, each.subindex] = (
+                each.name,
+                each.data_type,
+                each.access_type,
+                each.pdo_mappable,
+                each.min,
+                each.max,
+                default,
+            )
+    ours = {}
+    for entry in shipped.entries:
+        default = entry.default
+        if entry.relative:
+            assert isinstance(default, int)
+            default += node_id
+        ours[entry.index, entry.sub] = (
+            entry.name,
+            entry.data_type,
+            entry.access,
+            entry.mappable,
+            entry.low,
+            entry.high,
+            default,
+        )
+    assert ours == theirs
+    assert {index: dictionary[index].name for index in dictionary} == shipped.object_names
+
+
+def test_the_mirrors_can_be_dropped(shipped: Eds) -> None:
+    mirrors = (0x603F, 0x606C, 0x6079)
+    shorter = reader.without(DATA, mirrors)
+    rest = reader.load(shorter, "short.eds")
+    assert rest.entries == tuple(entry for entry in shipped.entries if entry.index not in mirrors)
+    assert rest.device == shipped.device
+    assert shorter.isascii()
+    assert shorter.count(b"\r\n") == shorter.count(b"\n")
+
+
+def test_dropping_nothing_changes_nothing() -> None:
+    assert reader.without(DATA, ()) == DATA
+
+
+def test_dropping_a_pdo_counts_pdos_and_list_entries_anew(shipped: Eds) -> None:
+    rest = reader.load(reader.without(DATA, {0x1801, 0x1A01}), "short.eds")
+    assert rest.device.tx_pdos == 5
+    assert set(shipped.object_names) - set(rest.object_names) == {0x1801, 0x1A01}
+
+
+def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
+    values: dict[tuple[int, int], int | float | bytes] = {
+        (0x1008, 0): b"left motor",
+        (0x100A, 0): b"1.2.3",
+        (0x1017, 0): 500,
+        (0x1018, 4): 0xDEADBEEF,
+        (0x1800, 1): 0x40000185,
+        (0x2001, 1): -4711,
+        (0x2100, 1): 7,
+        (0x6079, 0): 24420,
+    }
+    text = reader.dcf(shipped, 5, 250_000, values, "left")
+    assert text.count("\r\n") == text.count("\n")
+    source = io.StringIO(text)
+    source.name = "left.dcf"
+    dictionary = canopen.import_od(source)
+    assert (dictionary.node_id, dictionary.bitrate) == (5, 250_000)
+    read_back = {}
+    for item in dictionary.values():
+        members = [item] if isinstance(item, canopen.objectdictionary.ODVariable) else list(item.values())
+        for each in members:
+            if each.value is not None:
+                value = each.value.encode() if isinstance(each.value, str) else each.value
+                read_back[each.index, each.subindex] = value
+    assert read_back == values
+    assert "NodeName=left\r\n" in text
+    assert "LSS_SerialNumber=0xDEADBEEF\r\n" in text
+    cob_id = dictionary.get_variable(0x1802, 1)
+    assert cob_id is not None
+    assert cob_id.default == 0x40000385
+
+
+def test_the_dcf_keeps_every_line_of_the_eds_in_its_place(shipped: Eds) -> None:
+    text = reader.dcf(shipped, 5, 250_000, {(0x1017, 0): 500, (0x2100, 8): 9}, "left")
+    lines = text.split("\r\n")
+    start = lines.index("[DeviceComissioning]")
+    del lines[start : lines.index("", start) + 1]
+    assert [line for line in lines if not line.startswith("ParameterValue=")] == LINES
+    assert [line for line in lines if line.startswith("ParameterValue=")] == [
+        "ParameterValue=0x01F4",
+        "ParameterValue=0x0009",
+    ]
