@@ -1,0 +1,122 @@
+"""What one node keeps over a restart, and the text of the file that it is kept in (objects 1010h, 1011h and the LSS node-ID).
+
+Two lines of JSON, each ended by a line feed, in one form only::
+
+    {"format":"kontronik-can-gw parameters","version":1,"crc32":"5D8B2C1F"}
+    {"node_id":7,"communication":{"1017:00":"F401"},"application":{"2100:01":"07"}}
+
+``crc32`` is the CRC-32 (zlib) of the second line with its line feed. Keys are index:sub-index in hexadecimal, in ascending
+order; values are the raw little-endian bytes in hexadecimal; ``node_id`` is null if none was set over the bus.
+"""
+
+import json
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+VERSION = 1
+COMMUNICATION = range(0x1000, 0x2000)
+APPLICATION = range(0x2000, 0xA000)
+
+_HEADER_START = re.compile(rb'\{"format":"kontronik-can-gw parameters","version":([0-9]{1,9})[,}]')
+_CRC = re.compile(rb'"crc32":"([0-9A-F]{8})"\}')
+_KEY = re.compile(r"([0-9A-F]{4}):([0-9A-F]{2})")
+_VALUE = re.compile(r"(?:[0-9A-F]{2})*")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What one node keeps over a restart. Keys of both mappings: index << 8 | sub-index; values: raw little-endian bytes."""
+
+    node_id: int | None = None
+    """1..127, or 255 (unconfigured), as set over the bus; None: as configured."""
+    communication: Mapping[int, bytes] = field(default_factory=dict)
+    """Objects 1000h..1FFFh."""
+    application: Mapping[int, bytes] = field(default_factory=dict)
+    """Objects 2000h..9FFFh."""
+
+
+def encode(stored: Stored) -> bytes:
+    """Write the file's text: ASCII, the same for equal content. ValueError for what ``decode`` would refuse."""
+    _check_node_id(stored.node_id)
+    content = {
+        "node_id": stored.node_id,
+        "communication": _texts(stored.communication, COMMUNICATION),
+        "application": _texts(stored.application, APPLICATION),
+    }
+    body = _line(content)
+    header = {"format": "kontronik-can-gw parameters", "version": VERSION, "crc32": f"{zlib.crc32(body):08X}"}
+    return _line(header) + body
+
+
+def decode(data: bytes) -> Stored:
+    """Read the file's text. ValueError with the reason for everything that ``encode`` of this version does not write."""
+    if not data:
+        raise ValueError("the file is empty")
+    start = _HEADER_START.match(data)
+    if start is None:
+        raise ValueError("the first line is not that of a parameter file")
+    if int(start[1]) != VERSION:
+        raise ValueError(f"format version {int(start[1])} is unknown, this program knows version {VERSION}")
+    header, _, body = data.partition(b"\n")
+    crc = _CRC.fullmatch(header, start.end())
+    if crc is None:
+        raise ValueError("the first line is damaged")
+    if int(crc[1], 16) != zlib.crc32(body):
+        raise ValueError("the content does not fit its CRC-32: damaged or truncated")
+    try:
+        content = json.loads(body)
+    except (ValueError, RecursionError):
+        raise ValueError("the content is not JSON") from None
+    if not isinstance(content, dict) or set(content) != {"node_id", "communication", "application"}:
+        raise ValueError("the content does not consist of node_id, communication and application")
+    _check_node_id(content["node_id"])
+    stored = Stored(
+        content["node_id"],
+        _values(content["communication"], "communication", COMMUNICATION),
+        _values(content["application"], "application", APPLICATION),
+    )
+    if encode(stored) != data:  # a key twice, other order, blanks: nothing of ours wrote that
+        raise ValueError("the content is not in the form in which this program writes it")
+    return stored
+
+
+def _line(content: Mapping[str, Any]) -> bytes:
+    return json.dumps(content, separators=(",", ":")).encode("ascii") + b"\n"
+
+
+def _check_node_id(node_id: object) -> None:
+    if node_id is None or (type(node_id) is int and (1 <= node_id <= 127 or node_id == 255)):
+        return
+    raise ValueError(f"node_id {node_id!r} is not 1..127, 255 or null")
+
+
+def _check_key(key: int, indices: range) -> None:
+    if key >> 8 not in indices:
+        raise ValueError(f"object {key >> 8:04X}h is not one of {indices[0]:04X}h to {indices[-1]:04X}h")
+
+
+def _texts(values: Mapping[int, bytes], indices: range) -> dict[str, str]:
+    texts = {}
+    for key in sorted(values):
+        _check_key(key, indices)
+        texts[f"{key >> 8:04X}:{key & 0xFF:02X}"] = values[key].hex().upper()
+    return texts
+
+
+def _values(texts: object, name: str, indices: range) -> dict[int, bytes]:
+    if not isinstance(texts, dict):
+        raise ValueError(f"{name} is not an object of keys and values")
+    values = {}
+    for text, value in texts.items():
+        match = _KEY.fullmatch(text)
+        if match is None:
+            raise ValueError(f"{name}: {text!r} is not index:sub-index")
+        if not isinstance(value, str) or _VALUE.fullmatch(value) is None:
+            raise ValueError(f"{name}: the value of {text} is not a row of hexadecimal bytes")
+        key = int(match[1], 16) << 8 | int(match[2], 16)
+        _check_key(key, indices)
+        values[key] = bytes.fromhex(value)
+    return values

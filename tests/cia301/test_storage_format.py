@@ -1,0 +1,207 @@
+"""The text of a parameter file: there and back, and nothing damaged passes."""
+
+import json
+import zlib
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kontronik_can_gw.cia301.storage import Stored, decode, encode
+
+SAMPLE = Stored(
+    7,
+    {0x101700: b"\xf4\x01", 0x140001: bytes.fromhex("81010040"), 0x1A0000: b"\0"},
+    {0x210001: b"\x07", 0x9FFFFF: b"", 0x200000: bytes(range(16))},
+)
+TEXT = b"""{"format":"kontronik-can-gw parameters","version":1,"crc32":"%08X"}
+{"node_id":7,"communication":{"1017:00":"F401","1400:01":"81010040","1A00:00":"00"},\
+"application":{"2000:00":"000102030405060708090A0B0C0D0E0F","2100:01":"07","9FFF:FF":""}}
+"""
+
+
+def with_crc(body: str | bytes, version: object = 1) -> bytes:
+    """A file around any content, with the right CRC-32."""
+    raw = body.encode() if isinstance(body, str) else body
+    return b'{"format":"kontronik-can-gw parameters","version":%s,"crc32":"%08X"}\n%s' % (
+        str(version).encode(),
+        zlib.crc32(raw),
+        raw,
+    )
+
+
+def content(**changed: Any) -> str:
+    whole = {"node_id": None, "communication": {}, "application": {}} | changed
+    return json.dumps(whole, separators=(",", ":")) + "\n"
+
+
+def test_the_text_is_what_the_documentation_says() -> None:
+    body = TEXT.split(b"\n", 1)[1]
+    assert encode(SAMPLE) == TEXT % zlib.crc32(body)
+    assert decode(TEXT % zlib.crc32(body)) == SAMPLE
+
+
+def test_nothing_stored_is_a_file_too() -> None:
+    assert decode(encode(Stored())) == Stored()
+    assert encode(Stored()) == with_crc(content())
+
+
+values = st.binary(max_size=12)
+stores = st.builds(
+    Stored,
+    st.one_of(st.none(), st.integers(1, 127), st.just(255)),
+    st.dictionaries(st.integers(0x100000, 0x1FFFFF), values),
+    st.dictionaries(st.integers(0x200000, 0x9FFFFF), values),
+)
+
+
+@given(stores)
+def test_there_and_back(stored: Stored) -> None:
+    assert decode(encode(stored)) == stored
+
+
+@given(stores, st.randoms())
+def test_equal_content_gives_the_same_bytes_whatever_the_order(stored: Stored, rng: Any) -> None:
+    def shuffled(mapping: Any) -> dict[int, bytes]:
+        items = list(mapping.items())
+        rng.shuffle(items)
+        return dict(items)
+
+    again = Stored(stored.node_id, shuffled(stored.communication), shuffled(stored.application))
+    assert encode(again) == encode(stored)
+
+
+def refused(data: bytes) -> str:
+    with pytest.raises(ValueError) as caught:
+        decode(data)
+    assert type(caught.value) is ValueError  # a reason of ours, not what a library happened to raise
+    return str(caught.value)
+
+
+def test_every_flipped_bit_is_found() -> None:
+    data = encode(SAMPLE)
+    for place in range(len(data)):
+        for bit in range(8):
+            refused(data[:place] + bytes((data[place] ^ 1 << bit,)) + data[place + 1 :])
+
+
+def test_every_byte_in_place_of_every_byte_is_found() -> None:
+    data = encode(Stored(7, {0x101700: b"\xf4\x01"}))
+    for place in range(len(data)):
+        for value in range(256):
+            if value != data[place]:
+                refused(data[:place] + bytes((value,)) + data[place + 1 :])
+
+
+def test_every_truncation_and_every_missing_beginning_is_found() -> None:
+    data = encode(SAMPLE)
+    for length in range(len(data)):
+        refused(data[:length])
+        refused(data[len(data) - length :])
+
+
+@pytest.mark.parametrize("block", [1, 16, 64])
+def test_blocks_of_zeros_are_found(block: int) -> None:
+    """What a file system may leave behind after a power loss."""
+    data = encode(SAMPLE)
+    for start in range(0, len(data), block):
+        refused((data[:start] + bytes(block) + data[start + block :])[: len(data)])
+    refused(bytes(len(data)))
+
+
+@given(st.binary(max_size=200))
+def test_rubbish_is_refused(data: bytes) -> None:
+    refused(data)
+
+
+@given(stores, st.binary(min_size=1, max_size=20))
+@settings(max_examples=50)
+def test_anything_appended_is_refused(stored: Stored, more: bytes) -> None:
+    refused(encode(stored) + more)
+
+
+json_values = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=6)),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=6), inner, max_size=3)),
+    max_leaves=8,
+)
+
+
+@given(json_values)
+def test_other_json_with_a_right_crc_is_refused(value: Any) -> None:
+    refused(with_crc(json.dumps(value) + "\n"))
+    if value is not None:
+        refused(with_crc(content(node_id=[value])))
+    if value != {}:
+        refused(with_crc(content(communication=value)))
+        refused(with_crc(content(application=value)))
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "empty"),
+        (b"\n", "first line"),
+        (b"node_id = 5\n", "first line"),
+        (encode(SAMPLE).split(b"\n")[1] + b"\n", "first line"),
+        (encode(SAMPLE).split(b"\n")[0] + b"\n", "CRC-32"),
+        (encode(SAMPLE).split(b"\n")[0], "CRC-32"),
+        (with_crc(content(), version=2), "version 2 is unknown"),
+        (with_crc(content(), version=0), "version 0 is unknown"),
+        (b'{"format":"kontronik-can-gw parameters","version":12}\nsomething of the future', "version 12 is unknown"),
+        (with_crc(content(), version='"1"'), "first line"),
+        (with_crc(content(), version="01"), "form"),
+        (with_crc(b"\xff\xfe\n"), "not JSON"),
+        (with_crc("[" * 100_000), "not JSON"),
+        (with_crc("{\n"), "not JSON"),
+        (with_crc("[]\n"), "consist"),
+        (with_crc('{"node_id":null}\n'), "consist"),
+        (with_crc(content(more=1)), "consist"),
+        (with_crc(content(node_id=0)), "node_id 0"),
+        (with_crc(content(node_id=128)), "node_id 128"),
+        (with_crc(content(node_id=254)), "node_id 254"),
+        (with_crc(content(node_id=-1)), "node_id -1"),
+        (with_crc(content(node_id=True)), "node_id True"),
+        (with_crc(content(node_id=5.0)), "node_id 5.0"),
+        (with_crc(content(node_id="5")), "node_id '5'"),
+        (with_crc(content(communication=[])), "communication"),
+        (with_crc(content(application=None)), "application"),
+        (with_crc(content(communication={"1017": "00"})), "index:sub-index"),
+        (with_crc(content(communication={"1017:00\n": "00"})), "index:sub-index"),
+        (with_crc(content(communication={"1a00:00": "00"})), "index:sub-index"),
+        (with_crc(content(communication={"1017:00": 5})), "hexadecimal"),
+        (with_crc(content(communication={"1017:00": "0"})), "hexadecimal"),
+        (with_crc(content(communication={"1017:00": "f4"})), "hexadecimal"),
+        (with_crc(content(communication={"1017:00": "F4 01"})), "hexadecimal"),
+        (with_crc(content(communication={"2000:00": "00"})), "2000h"),
+        (with_crc(content(communication={"0FFF:00": "00"})), "0FFFh"),
+        (with_crc(content(application={"1FFF:FF": "00"})), "1FFFh"),
+        (with_crc(content(application={"A000:00": "00"})), "A000h"),
+        (with_crc(content(communication={"1018:00": "00", "1017:00": "00"})), "form"),
+        (with_crc(content().replace("{}", '{"1017:00":"00","1017:00":"01"}', 1)), "form"),
+        (with_crc(content().replace(",", ", ")), "form"),
+        (with_crc(content().rstrip("\n")), "form"),
+        (with_crc(content()).replace(b"\n", b"\r\n"), "first line is damaged"),
+    ],
+)
+def test_the_reason_is_said(data: bytes, reason: str) -> None:
+    assert reason in refused(data)
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        Stored(0),
+        Stored(128),
+        Stored(True),
+        Stored(None, {0x0FFFFF: b""}),
+        Stored(None, {0x200000: b""}),
+        Stored(None, {-1: b""}),
+        Stored(None, {}, {0x1FFFFF: b""}),
+        Stored(None, {}, {0xA00000: b""}),
+    ],
+)
+def test_what_could_not_be_read_back_is_not_written(stored: Stored) -> None:
+    with pytest.raises(ValueError):
+        encode(stored)
