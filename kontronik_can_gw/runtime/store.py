@@ -1,0 +1,199 @@
+"""The parameter files of all nodes in one folder: read at start, written by a thread of its own.
+
+What may touch what: everything is called by the loop's thread; only ``_work`` and what it calls run in the worker. They share the queue,
+the results and the event under one lock that is never held during I/O, so no disk, be it full, read-only or slow, holds the loop up; and
+the names of unusable files, to which the loop's thread adds only before the first saving of that name.
+
+A file is replaced, never changed: temporary file in the same folder, write, fsync, rename, fsync of the folder. After a loss of power at
+any instant the old content is there or the new one; once a saving is reported as on disk, it is the new one. After a failed saving it is
+the old one (the new one, if only the last step failed).
+"""
+
+import contextlib
+import os
+import re
+import signal
+import threading
+from collections import deque
+from pathlib import Path
+
+from kontronik_can_gw.cia301.storage import Stored, decode
+
+CAPACITY = 32
+"""Savings that may wait for the disk."""
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,11}")
+
+
+class ParameterStore:
+    """One file ``NAME.params`` for each node in one folder (mode 0700, made at the first saving), readable by the owner only (0600)."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._lock = threading.Condition()
+        self._waiting: deque[tuple[str, bytes]] = deque()
+        self._results: list[tuple[str, str | None]] = []
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        # Names whose file could not be used and is still in its place: it is moved aside before a new one takes that.
+        self._unusable: set[str] = set()
+
+    def load(self, name: str) -> tuple[Stored, str | None]:
+        """Read what a node kept; to be called before its first saving.
+
+        A missing file is an empty ``Stored``, a damaged or unreadable one too, and then the reason is there. A damaged file is kept as
+        ``NAME.params.damaged``, in place of an older one of that name. What a killed writer left half is removed. ValueError for a name
+        that is none.
+        """
+        path = self._path(name)
+        with contextlib.suppress(OSError):
+            _temporary(path).unlink()
+        try:
+            return decode(path.read_bytes()), None
+        except FileNotFoundError:
+            return Stored(), None
+        except OSError as error:
+            self._unusable.add(name)  # perhaps only for now: it is not touched before something is to be saved
+            return Stored(), f"{path}: {_reason(error)}"
+        except ValueError as error:
+            try:
+                _keep_damaged(path)
+                _sync_folder(path.parent)
+            except OSError:
+                self._unusable.add(name)
+            return Stored(), f"{path}: {error}"
+
+    def save(self, name: str, data: bytes) -> bool:
+        """Let ``data`` become the file's content; never blocks. True: exactly one result follows; results come in the order of the savings.
+
+        False: not accepted, because too many savings wait or the store is closed; no result follows. ValueError for a name that is none.
+        """
+        self._path(name)
+        with self._lock:
+            if self._closed or len(self._waiting) >= CAPACITY or not self._started():
+                return False
+            self._waiting.append((name, data))
+            self._lock.notify()
+        return True
+
+    def fileno(self) -> int:
+        """Give a descriptor that is readable while results wait; -1 after ``close``."""
+        return self._event
+
+    def results(self) -> list[tuple[str, str | None]]:
+        """Take the results since the last call: the name, and None if the content is on disk, else the reason."""
+        with self._lock:
+            if self._event >= 0:
+                with contextlib.suppress(BlockingIOError):
+                    os.eventfd_read(self._event)
+            taken, self._results = self._results, []
+        return taken
+
+    def close(self, timeout: float) -> bool:
+        """Take no more, and wait for what is queued, at most ``timeout`` seconds. False: that was not enough.
+
+        ``results`` may be called once more after it.
+        """
+        with self._lock:
+            self._closed = True
+            self._lock.notify()
+            thread = self._thread
+        if thread is not None:
+            thread.join(timeout)
+        with self._lock:
+            if self._event >= 0:
+                os.close(self._event)
+                self._event = -1
+        return thread is None or not thread.is_alive()
+
+    def _path(self, name: str) -> Path:
+        if _NAME.fullmatch(name) is None:
+            raise ValueError(f"{name!r} is not a node's name: a letter, then up to 11 letters, digits or underscores")
+        return self._folder / f"{name}.params"
+
+    def _started(self) -> bool:
+        """Start the worker if it does not run yet. False: the system gives no thread."""
+        if self._thread is not None:
+            return True
+        thread = threading.Thread(target=self._work, name="parameter-store", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:
+            return False
+        self._thread = thread
+        return True
+
+    def _work(self) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are to wake the loop
+        while True:
+            with self._lock:
+                self._lock.wait_for(lambda: self._waiting or self._closed)
+                if not self._waiting:
+                    return
+                name, data = self._waiting.popleft()
+            problem = self._write(name, data)
+            with self._lock:
+                self._results.append((name, problem))
+                if self._event >= 0:
+                    os.eventfd_write(self._event, 1)
+
+    def _write(self, name: str, data: bytes) -> str | None:
+        path = self._path(name)
+        temporary = _temporary(path)
+        try:
+            _make_folder(self._folder)
+            _write_synced(temporary, data)
+            if name in self._unusable:
+                _keep_damaged(path)
+                self._unusable.remove(name)
+            temporary.replace(path)
+            _sync_folder(self._folder)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            return f"{path}: {_reason(error)}"
+        return None
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(path.name + ".tmp")
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error)
+
+
+def _keep_damaged(path: Path) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        path.replace(path.with_name(path.name + ".damaged"))
+
+
+def _make_folder(folder: Path) -> None:
+    """Make the folder with those above it, and put each one's entry on disk."""
+    if folder.is_dir():
+        return
+    _make_folder(folder.parent)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    _sync_folder(folder.parent)
+
+
+def _write_synced(path: Path, data: bytes) -> None:
+    """Write a new file, in place of a left-over one, and put its content on disk."""
+    path.unlink(missing_ok=True)
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    try:
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.write(fd, rest) :]
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def _sync_folder(folder: Path) -> None:
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

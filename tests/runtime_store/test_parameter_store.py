@@ -1,0 +1,780 @@
+"""The parameter files: order, results, damage, kill -9, full and read-only disks, and loss of power at every instant."""
+
+import errno
+import itertools
+import os
+import random
+import select
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kontronik_can_gw.cia301.storage import Stored, decode, encode
+from kontronik_can_gw.runtime.store import CAPACITY, ParameterStore
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE = 30.0
+"""Seconds that a result may take on a busy machine before a test fails."""
+
+
+def numbered(number: int, size: int = 16) -> bytes:
+    """A file that carries a number, and ``size`` bytes more."""
+    return encode(Stored(None, {}, {0x210001: number.to_bytes(4, "little"), 0x210002: bytes(size)}))
+
+
+def number_of(stored: Stored) -> int:
+    return int.from_bytes(stored.application.get(0x210001, b""), "little")
+
+
+OLD, NEW = numbered(1), numbered(2)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[ParameterStore]:
+    made = ParameterStore(tmp_path / "params")
+    yield made
+    made.close(PATIENCE)
+
+
+def wait_for(store: ParameterStore, count: int) -> list[tuple[str, str | None]]:
+    """Take ``count`` results as the loop does: only when the descriptor is readable."""
+    taken: list[tuple[str, str | None]] = []
+    while len(taken) < count:
+        assert select.select([store.fileno()], [], [], PATIENCE)[0], "no result came"
+        taken += store.results()
+    assert select.select([store.fileno()], [], [], 0)[0] == []
+    return taken
+
+
+def put(store: ParameterStore, name: str, data: bytes) -> str | None:
+    """Save one content and return its result."""
+    assert store.save(name, data)
+    ((about, problem),) = wait_for(store, 1)
+    assert about == name
+    return problem
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+# --- there and back
+
+
+def test_nothing_is_stored_at_first_and_nothing_is_made_by_reading(tmp_path: Path, store: ParameterStore) -> None:
+    assert store.load("esc1") == (Stored(), None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_was_saved_is_loaded_by_the_next_process(tmp_path: Path, store: ParameterStore) -> None:
+    assert put(store, "esc1", OLD) is None
+    assert put(store, "esc1", NEW) is None
+    assert put(store, "esc2", OLD) is None
+    again = ParameterStore(tmp_path / "params")
+    assert again.load("esc1") == (decode(NEW), None)
+    assert again.load("esc2") == (decode(OLD), None)
+    assert again.close(0)
+
+
+def test_folder_and_files_are_the_owners_alone(tmp_path: Path) -> None:
+    store = ParameterStore(tmp_path / "a" / "b")
+    before = os.umask(0)
+    try:
+        assert put(store, "esc1", OLD) is None
+    finally:
+        os.umask(before)
+        store.close(PATIENCE)
+    assert mode(tmp_path / "a" / "b") == 0o700
+    assert mode(tmp_path / "a" / "b" / "esc1.params") == 0o600
+    assert [path.name for path in (tmp_path / "a" / "b").iterdir()] == ["esc1.params"]
+
+
+def test_a_folder_that_is_there_keeps_its_mode(tmp_path: Path) -> None:
+    tmp_path.chmod(0o750)
+    store = ParameterStore(tmp_path)
+    assert put(store, "esc1", OLD) is None
+    store.close(PATIENCE)
+    assert mode(tmp_path) == 0o750
+
+
+@given(
+    st.builds(
+        Stored,
+        st.one_of(st.none(), st.integers(1, 127)),
+        st.dictionaries(st.integers(0x100000, 0x1FFFFF), st.binary(max_size=8), max_size=5),
+        st.dictionaries(st.integers(0x200000, 0x9FFFFF), st.binary(max_size=8), max_size=5),
+    )
+)
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_content_comes_back(store: ParameterStore, stored: Stored) -> None:
+    assert put(store, "esc1", encode(stored)) is None
+    assert store.load("esc1") == (stored, None)
+
+
+@pytest.mark.parametrize("name", ["", "1esc", "_esc", "esc-1", "esc.1", "../esc", "a/b", "esc\n", "ä", "a" * 13])
+def test_a_name_that_is_none_is_refused(store: ParameterStore, name: str) -> None:
+    with pytest.raises(ValueError, match="name"):
+        store.save(name, OLD)
+    with pytest.raises(ValueError, match="name"):
+        store.load(name)
+
+
+@pytest.mark.parametrize("name", ["a", "Z9_", "a" * 12])
+def test_names_up_to_twelve_characters_are_files(tmp_path: Path, store: ParameterStore, name: str) -> None:
+    assert put(store, name, OLD) is None
+    assert (tmp_path / "params" / f"{name}.params").read_bytes() == OLD
+
+
+# --- queue and results
+
+
+def test_no_thread_runs_before_the_first_saving_and_one_after(store: ParameterStore) -> None:
+    def workers() -> list[threading.Thread]:
+        return [thread for thread in threading.enumerate() if thread.name == "parameter-store"]
+
+    before = len(workers())
+    store.load("esc1")
+    assert len(workers()) == before
+    for number in range(5):
+        assert put(store, f"esc{number}", OLD) is None
+    assert len(workers()) == before + 1
+    assert all(thread.daemon for thread in workers())
+    assert store.close(PATIENCE)
+    assert len(workers()) == before
+
+
+class SlowDisk:
+    """Holds every fsync of a file or folder until it is let go."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.reached, self.go = threading.Event(), threading.Event()
+        real = os.fsync
+
+        def fsync(fd: int) -> None:
+            self.reached.set()
+            assert self.go.wait(PATIENCE)
+            real(fd)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+
+
+def test_a_slow_disk_holds_up_nobody_and_the_queue_is_bounded(
+    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = SlowDisk(monkeypatch)
+    begun = time.monotonic()
+    assert store.save("esc0", OLD)
+    assert disk.reached.wait(PATIENCE)  # the worker hangs in the first saving
+    accepted = [store.save(f"esc{number % 3}", numbered(number)) for number in range(1, CAPACITY + 10)]
+    assert accepted == [True] * CAPACITY + [False] * 9
+    assert store.results() == []
+    assert select.select([store.fileno()], [], [], 0)[0] == []
+    assert time.monotonic() - begun < PATIENCE / 2
+    disk.go.set()
+    results = wait_for(store, CAPACITY + 1)
+    assert results == [("esc0", None)] + [(f"esc{number % 3}", None) for number in range(1, CAPACITY + 1)]
+    for name in range(3):
+        newest = max(number for number in range(1, CAPACITY + 1) if number % 3 == name)
+        assert number_of(store.load(f"esc{name}")[0]) == newest
+    assert store.save("esc0", NEW)  # there is room again
+
+
+def test_the_order_of_savings_is_kept_on_disk(
+    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[int] = []
+    real = Path.replace
+
+    def replace(path: Path, target: Path) -> Path:
+        seen.append(number_of(decode(path.read_bytes())))
+        return real(path, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    for number in range(20):
+        assert store.save(f"esc{number % 2}", numbered(number))
+    wait_for(store, 20)
+    assert seen == list(range(20))
+
+
+def test_close_waits_for_what_is_queued(tmp_path: Path, store: ParameterStore) -> None:
+    for number in range(10):
+        assert store.save("esc1", numbered(number))
+    assert store.close(PATIENCE)
+    assert store.results() == [("esc1", None)] * 10
+    assert number_of(store.load("esc1")[0]) == 9
+    assert store.fileno() == -1
+    assert not store.save("esc1", OLD)
+    assert store.close(PATIENCE)
+    assert number_of(store.load("esc1")[0]) == 9
+
+
+def test_close_gives_up_after_its_time_and_the_late_result_touches_no_closed_descriptor(
+    store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = SlowDisk(monkeypatch)
+    assert store.save("esc1", NEW)
+    assert disk.reached.wait(PATIENCE)
+    event = store.fileno()
+    read, write = os.pipe()
+    os.set_blocking(read, False)
+    assert not store.close(0.01)
+    os.dup2(write, event)  # another one has the number of the closed descriptor now
+    try:
+        disk.go.set()
+        assert store.close(PATIENCE)
+        assert store.results() == [("esc1", None)]
+        with pytest.raises(BlockingIOError):
+            os.read(read, 8)
+    finally:
+        for fd in (read, write, event):
+            os.close(fd)
+
+
+def test_a_system_without_a_thread_to_give_refuses_the_saving(
+    store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", start)
+        assert not store.save("esc1", OLD)
+    assert put(store, "esc1", OLD) is None
+
+
+# --- damage
+
+
+def place(tmp_path: Path, data: bytes) -> Path:
+    folder = tmp_path / "params"
+    folder.mkdir(exist_ok=True)
+    (folder / "esc1.params").write_bytes(data)
+    return folder
+
+
+def test_a_damaged_file_gives_the_reason_and_is_kept(tmp_path: Path, store: ParameterStore) -> None:
+    folder = place(tmp_path, OLD[:-5])
+    stored, reason = store.load("esc1")
+    assert stored == Stored()
+    assert reason is not None
+    assert str(folder / "esc1.params") in reason
+    assert "CRC-32" in reason
+    assert [path.name for path in folder.iterdir()] == ["esc1.params.damaged"]
+    assert (folder / "esc1.params.damaged").read_bytes() == OLD[:-5]
+    assert store.load("esc1") == (Stored(), None)
+    assert put(store, "esc1", NEW) is None
+    assert store.load("esc1") == (decode(NEW), None)
+    assert (folder / "esc1.params.damaged").read_bytes() == OLD[:-5]
+
+
+def test_the_newest_damaged_file_is_kept_and_a_good_one_is_never_taken_for_it(
+    tmp_path: Path, store: ParameterStore
+) -> None:
+    folder = place(tmp_path, b"older rubbish")
+    store.load("esc1")
+    place(tmp_path, b"newer rubbish")
+    store.load("esc1")
+    assert (folder / "esc1.params.damaged").read_bytes() == b"newer rubbish"
+    place(tmp_path, OLD)
+    assert store.load("esc1") == (decode(OLD), None)
+    assert (folder / "esc1.params.damaged").read_bytes() == b"newer rubbish"
+    assert (folder / "esc1.params").read_bytes() == OLD
+
+
+@pytest.mark.parametrize("data", [b"", b"\0" * 200, OLD + b"\n", OLD.replace(b'"version":1', b'"version":9')])
+def test_empty_zeroed_and_unknown_files_are_damaged(tmp_path: Path, store: ParameterStore, data: bytes) -> None:
+    folder = place(tmp_path, data)
+    stored, reason = store.load("esc1")
+    assert (stored, bool(reason)) == (Stored(), True)
+    assert (folder / "esc1.params.damaged").read_bytes() == data
+
+
+def test_a_damaged_file_that_cannot_be_moved_is_not_written_over(
+    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = place(tmp_path, b"rubbish")
+
+    def replace(path: Path, target: Path) -> Path:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", replace)
+        stored, reason = store.load("esc1")
+        assert (stored, bool(reason)) == (Stored(), True)
+        assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: Read-only file system"
+    assert (folder / "esc1.params").read_bytes() == b"rubbish"
+    assert put(store, "esc1", NEW) is None
+    assert (folder / "esc1.params").read_bytes() == NEW
+    assert (folder / "esc1.params.damaged").read_bytes() == b"rubbish"
+
+
+def test_a_file_that_cannot_be_read_is_left_alone_until_something_is_saved(
+    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may be readable the next time: an error of the disk that passes must not cost the settings."""
+    folder = place(tmp_path, OLD)
+
+    def read_bytes(path: Path) -> bytes:
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "read_bytes", read_bytes)
+        assert store.load("esc1") == (Stored(), f"{folder / 'esc1.params'}: Input/output error")
+    assert (folder / "esc1.params").read_bytes() == OLD
+    assert put(store, "esc1", NEW) is None
+    assert (folder / "esc1.params.damaged").read_bytes() == OLD
+    assert store.load("esc1") == (decode(NEW), None)
+
+
+def test_a_left_over_temporary_file_is_removed_and_never_read(tmp_path: Path, store: ParameterStore) -> None:
+    folder = place(tmp_path, OLD)
+    (folder / "esc1.params.tmp").write_bytes(NEW)
+    assert store.load("esc1") == (decode(OLD), None)
+    assert [path.name for path in folder.iterdir()] == ["esc1.params"]
+
+
+def test_a_left_over_temporary_file_does_not_hinder_a_saving(tmp_path: Path, store: ParameterStore) -> None:
+    folder = place(tmp_path, OLD)
+    (folder / "esc1.params.tmp").write_bytes(bytes(10_000))
+    (folder / "esc1.params.tmp").chmod(0o644)
+    assert put(store, "esc1", NEW) is None
+    assert (folder / "esc1.params").read_bytes() == NEW
+    assert mode(folder / "esc1.params") == 0o600
+
+
+# --- disks that fail
+
+
+@pytest.mark.parametrize("step", ["open", "write", "fsync", "close", "rename", "fsync of the folder"])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_a_failure_at_any_step_is_told_and_leaves_a_whole_file(
+    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, step: str, code: int
+) -> None:
+    folder = place(tmp_path, OLD)
+    failure = OSError(code, os.strerror(code))
+    real = {name: getattr(os, name) for name in ("open", "write", "fsync", "close")}
+    rename = Path.replace
+
+    def is_folder(fd: int) -> bool:
+        return stat.S_ISDIR(os.fstat(fd).st_mode)
+
+    def is_temporary(fd: int) -> bool:
+        return os.readlink(f"/proc/self/fd/{fd}").endswith(".tmp")
+
+    def opened(path: Any, *more: Any, **options: Any) -> int:
+        if step == "open" and str(path).endswith(".tmp"):
+            raise failure
+        fd: int = real["open"](path, *more, **options)
+        return fd
+
+    def written(fd: int, data: bytes) -> int:
+        if step == "write" and is_temporary(fd):
+            if len(data) < 40:
+                raise failure
+            return int(real["write"](fd, data[: len(data) // 2]))  # some of it goes first
+        return int(real["write"](fd, data))
+
+    def synced(fd: int) -> None:
+        if (step == "fsync of the folder" and is_folder(fd)) or (step == "fsync" and is_temporary(fd)):
+            raise failure
+        real["fsync"](fd)
+
+    def closed(fd: int) -> None:
+        fails = step == "close" and is_temporary(fd)
+        real["close"](fd)
+        if fails:
+            raise failure
+
+    def renamed(path: Path, target: Path) -> Path:
+        if step == "rename":
+            raise failure
+        return rename(path, target)
+
+    with monkeypatch.context() as patched:
+        for name, function in (("open", opened), ("write", written), ("fsync", synced), ("close", closed)):
+            patched.setattr(os, name, function)
+        patched.setattr(Path, "replace", renamed)
+        assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: {os.strerror(code)}"
+    assert [path.name for path in folder.iterdir()] == ["esc1.params"]
+    assert (folder / "esc1.params").read_bytes() == (NEW if step == "fsync of the folder" else OLD)
+    assert put(store, "esc1", NEW) is None
+    assert store.load("esc1") == (decode(NEW), None)
+
+
+def test_a_file_in_place_of_the_folder_is_told(tmp_path: Path, store: ParameterStore) -> None:
+    (tmp_path / "params").write_bytes(b"")
+    problem = put(store, "esc1", NEW)
+    assert problem is not None
+    assert "params" in problem
+    assert (tmp_path / "params").read_bytes() == b""
+
+
+def python(code: str, *arguments: str, prefix: tuple[str, ...] = ()) -> subprocess.CompletedProcess[str]:
+    command = [*prefix, sys.executable, "-c", HELPERS + code, str(ROOT), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+HELPERS = """
+import os, resource, select, subprocess, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from kontronik_can_gw.cia301.storage import Stored, decode, encode
+from kontronik_can_gw.runtime.store import ParameterStore
+
+def numbered(number, size=16):
+    return encode(Stored(None, {}, {0x210001: number.to_bytes(4, "little"), 0x210002: bytes(size)}))
+
+def put(store, data):
+    assert store.save("esc1", data)
+    assert select.select([store.fileno()], [], [], 30)[0]
+    ((name, problem),) = store.results()
+    return problem
+"""
+
+
+def test_a_file_size_limit_of_the_system_leaves_the_old_file_whole(tmp_path: Path) -> None:
+    code = """
+folder = Path(sys.argv[2])
+store = ParameterStore(folder)
+assert put(store, numbered(1)) is None
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+print(put(store, numbered(2, 5000)))
+assert store.load("esc1") == (decode(numbered(1)), None)
+assert os.listdir(folder) == ["esc1.params"]
+assert put(store, numbered(3)) is None
+assert store.load("esc1") == (decode(numbered(3)), None)
+"""
+    done = python(code, str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"{tmp_path}/esc1.params: File too large\n"
+
+
+def test_a_full_and_a_read_only_file_system_leave_the_old_file_whole(tmp_path: Path) -> None:
+    """A real file system of 64 KiB, in a mount namespace of the test's own."""
+    unshare = ("unshare", "--user", "--map-root-user", "--mount")
+    made = subprocess.run([*unshare, "mount", "-t", "tmpfs", "none", tmp_path], capture_output=True, check=False)
+    if made.returncode:
+        pytest.skip("no file system can be mounted here; the failures of each step are tested without one")
+    code = """
+disk = Path(sys.argv[2])
+subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "none", disk], check=True)
+store = ParameterStore(disk / "params")
+assert put(store, numbered(1)) is None
+filler = os.open(disk / "filler", os.O_WRONLY | os.O_CREAT)
+try:
+    while True:
+        os.write(filler, bytes(4096))
+except OSError:
+    pass
+for size in (16, 5000, 50000):
+    print(put(store, numbered(2, size)))
+    assert store.load("esc1") == (decode(numbered(1)), None)
+    assert os.listdir(disk / "params") == ["esc1.params"]
+os.close(filler)
+os.unlink(disk / "filler")
+assert put(store, numbered(3)) is None
+subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+print(put(store, numbered(4)))
+assert store.load("esc1") == (decode(numbered(3)), None)
+print(ParameterStore(disk / "params").load("esc1")[1])
+print(ParameterStore(disk / "other").load("esc1")[1])
+"""
+    done = python(code, str(tmp_path), prefix=unshare)
+    assert (done.returncode, done.stderr) == (0, "")
+    path = f"{tmp_path}/params/esc1.params"
+    full, read_only = f"{path}: No space left on device", f"{path}: Read-only file system"
+    assert done.stdout.splitlines() == [full, full, full, read_only, "None", "None"]
+
+
+# --- kill -9
+
+
+SAVE_FOR_EVER = """
+store = ParameterStore(Path(sys.argv[2]))
+stored, problem = store.load("esc1")
+assert problem is None, problem
+number = int.from_bytes(stored.application.get(0x210001, b""), "little")
+while True:
+    number += 1
+    os.write(1, b"asked %d\\n" % number)
+    assert put(store, numbered(number, number % 7 * 1000)) is None
+    os.write(1, b"done %d\\n" % number)
+"""
+
+
+def test_after_kill_9_at_any_instant_the_file_is_one_that_was_asked_for_and_none_older_than_confirmed(
+    tmp_path: Path,
+) -> None:
+    rng = random.Random(3)
+    folder, confirmed, left_over = tmp_path / "params", 0, 0
+    command = [sys.executable, "-S", "-c", HELPERS + SAVE_FOR_EVER, str(ROOT), str(folder)]
+    for _ in range(40):
+        child = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0)
+        assert child.stdout is not None
+        said = child.stdout.read(1)  # it has begun
+        time.sleep(rng.uniform(0, 0.02))
+        child.kill()
+        said += child.stdout.read()
+        assert child.wait() == -9
+        child.stdout.close()
+        asked, done = confirmed, confirmed
+        for line in said.decode().splitlines():
+            word, number = line.split()
+            if word == "asked":
+                asked = int(number)
+            else:
+                done = int(number)
+        left_over += (folder / "esc1.params.tmp").exists()
+        store = ParameterStore(folder)
+        stored, problem = store.load("esc1")
+        assert store.close(0)
+        assert problem is None
+        confirmed = number_of(stored)
+        assert done <= confirmed <= asked
+        if confirmed:
+            assert encode(stored) == numbered(confirmed, confirmed % 7 * 1000)
+        assert {path.name for path in folder.glob("*")} <= {"esc1.params"}
+    assert confirmed >= 1
+    print(f"{confirmed} savings, {left_over} of 40 kills within a writing")
+
+
+# --- loss of power
+
+
+Step = tuple[str, ...]
+
+
+class Recorder:
+    """Writes down, in their order, the calls that change or secure what is on disk."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        self.steps: list[Step] = []
+        self._folder = folder
+        self._names: dict[int, str] = {}
+        self._real: dict[str, Callable[..., Any]] = {}
+        for name in (
+            "open",
+            "write",
+            "fsync",
+            "close",
+            "unlink",
+            "replace",
+            "rename",
+            "mkdir",
+            "truncate",
+            "ftruncate",
+        ):
+            self._real[name] = getattr(os, name)
+            monkeypatch.setattr(os, name, getattr(self, f"_{name}", self._unexpected))
+
+    def _name(self, path: Any) -> str:
+        return str(Path(path).relative_to(self._folder.parent))
+
+    def _unexpected(self, *arguments: Any) -> None:
+        raise AssertionError(f"not a call that may change a parameter file: {arguments}")
+
+    def _open(self, path: Any, flags: int, *more: Any, **options: Any) -> int:
+        fd: int = self._real["open"](path, flags, *more, **options)
+        if Path(path).is_relative_to(self._folder.parent):
+            self._names[fd] = self._name(path)
+            if flags & os.O_CREAT:
+                assert flags & os.O_EXCL
+                self.steps.append(("create", self._names[fd]))
+        return fd
+
+    def _write(self, fd: int, data: bytes) -> int:
+        count: int = self._real["write"](fd, data[:50])  # a system may take only a part
+        self.steps.append(("write", self._names[fd], bytes(data[:count]).decode("latin-1")))
+        return count
+
+    def _fsync(self, fd: int) -> None:
+        self._real["fsync"](fd)
+        self.steps.append(("fsync", self._names[fd]))
+
+    def _close(self, fd: int) -> None:
+        self._names.pop(fd, None)
+        self._real["close"](fd)
+
+    def _unlink(self, path: Any, *more: Any, **options: Any) -> None:
+        self._real["unlink"](path, *more, **options)
+        self.steps.append(("unlink", self._name(path)))
+
+    def _replace(self, source: Any, target: Any) -> None:
+        self._real["replace"](source, target)
+        self.steps.append(("rename", self._name(source), self._name(target)))
+
+    def _mkdir(self, path: Any, *more: Any) -> None:
+        self._real["mkdir"](path, *more)
+        self.steps.append(("mkdir", self._name(path)))
+
+
+def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str, str]]:
+    """Every state in which the disk may be found: what no fsync has secured may be there, or not, or in part.
+
+    ``files`` is what was on disk before. Changes of a folder not yet synced may each be lost or not, whatever their order (a renaming as a
+    whole); of a file not yet synced any beginning may be there, or zeros. A disk that keeps more order finds one of these states too.
+    """
+    contents: dict[int, str] = dict(enumerate(files.values()))
+    secured: dict[int, str] = dict(contents)
+    entries = {name: inode for inode, name in enumerate(files)}
+    durable = dict(entries)
+    pending: list[dict[str, int | None]] = []
+    for step in steps:
+        if step[0] == "create":
+            inode = len(contents)
+            contents[inode] = secured[inode] = ""
+            entries[step[1]] = inode
+            pending.append({step[1]: inode})
+        elif step[0] == "write":
+            contents[entries[step[1]]] += step[2]
+        elif step[0] == "fsync" and step[1] in entries:
+            secured[entries[step[1]]] = contents[entries[step[1]]]
+        elif step[0] == "fsync":  # a folder: entries are named with theirs
+            durable, pending = dict(entries), []
+        elif step[0] == "unlink":
+            del entries[step[1]]
+            pending.append({step[1]: None})
+        elif step[0] == "rename":
+            entries[step[2]] = entries.pop(step[1])
+            pending.append({step[2]: entries[step[2]], step[1]: None})
+    found = []
+    for kept in itertools.product((False, True), repeat=len(pending)):
+        names: dict[str, int] = dict(durable)
+        for change in itertools.compress(pending, kept):
+            for name, entry in change.items():
+                if entry is None:
+                    names.pop(name, None)
+                else:
+                    names[name] = entry
+        torn = {i for i in names.values() if contents[i] != secured[i]}
+        for damage in range(4 if torn else 1):
+            state = {}
+            for name, inode in names.items():
+                whole, safe = contents[inode], secured[inode]
+                if inode in torn:
+                    whole = (safe, whole[: (len(safe) + len(whole)) // 2], "\0" * len(whole), whole)[damage]
+                state[name] = whole
+            found.append(state)
+    return found
+
+
+def recorded(monkeypatch: pytest.MonkeyPatch, folder: Path, *contents: bytes, load: bool = False) -> list[Step]:
+    """What the store does on disk for one load, or for savings one after the other; each confirmation is a step too."""
+    store = ParameterStore(folder)
+    with monkeypatch.context() as patched:
+        recorder = Recorder(patched, folder)
+        if load:
+            store.load("esc1")
+        for data in contents:
+            problem = put(store, "esc1", data)
+            recorder.steps.append(("confirmed" if problem is None else problem, data.decode()))
+    assert store.close(PATIENCE)
+    return recorder.steps
+
+
+FILE, TEMPORARY, DAMAGED = "params/esc1.params", "params/esc1.params.tmp", "params/esc1.params.damaged"
+
+
+def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
+    """What may be found after a loss of power that is neither the content confirmed last nor a later one asked for."""
+    asked = [files.get(FILE, "")] + [step[1] for step in steps if step[0] == "confirmed"]
+    wrong = []
+    for length in range(len(steps) + 1):
+        done = steps[:length]
+        confirmed = sum(step[0] == "confirmed" for step in done)
+        allowed = asked[confirmed : confirmed + 2]
+        wrong += [state.get(FILE, "") for state in after_power_loss(files, done) if state.get(FILE, "") not in allowed]
+    return wrong
+
+
+def test_the_order_on_disk_is_write_fsync_rename_fsync_of_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place(tmp_path, OLD)
+    steps = recorded(monkeypatch, tmp_path / "params", NEW)
+    writes = [step for step in steps if step[0] == "write"]
+    assert "".join(step[2] for step in writes) == NEW.decode()
+    assert {step[1] for step in writes} == {TEMPORARY}
+    assert [step for step in steps if step[0] != "write"] == [
+        ("create", TEMPORARY),
+        ("fsync", TEMPORARY),
+        ("rename", TEMPORARY, FILE),
+        ("fsync", "params"),
+        ("confirmed", NEW.decode()),
+    ]
+    assert steps.index(writes[-1]) < steps.index(("fsync", TEMPORARY))
+
+
+def test_a_new_folder_is_secured_before_anything_is_confirmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = recorded(monkeypatch, tmp_path / "params", NEW)
+    assert steps[:2] == [("mkdir", "params"), ("fsync", ".")]
+
+
+@pytest.mark.parametrize("left_over", [False, True])
+@pytest.mark.parametrize("first", [False, True])
+def test_at_every_instant_a_loss_of_power_finds_the_old_or_the_new_content(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_over: bool, first: bool
+) -> None:
+    folder = tmp_path / "params"
+    folder.mkdir()
+    files = {} if first else {FILE: OLD.decode()}
+    if left_over:
+        files[TEMPORARY] = "half of so"
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    steps = recorded(monkeypatch, folder, NEW, numbered(3), numbered(4))
+    assert sum(step[0] == "confirmed" for step in steps) == 3
+    assert faults(files, steps) == []
+
+
+def test_at_every_instant_of_moving_a_damaged_file_it_is_somewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = place(tmp_path, b"rubbish")
+    (folder / "esc1.params.damaged").write_bytes(b"older")
+    files = {FILE: "rubbish", DAMAGED: "older"}
+    steps = recorded(monkeypatch, folder, NEW, load=True)
+    assert ("rename", FILE, DAMAGED) in steps
+    moved = steps.index(("fsync", "params"))
+    assert moved < steps.index(("create", TEMPORARY))
+    for length in range(len(steps) + 1):
+        for state in after_power_loss(files, steps[:length]):
+            if length > moved:
+                assert state[DAMAGED] == "rubbish"
+                assert state.get(FILE, "") in ("", NEW.decode())
+            else:
+                assert state in ({DAMAGED: "rubbish"}, {FILE: "rubbish", DAMAGED: "older"})
+
+
+@pytest.mark.parametrize("missing", ["fsync", "fsync of the folder", "rename", "order"])
+def test_the_simulated_loss_of_power_finds_what_a_careless_writer_does(missing: str) -> None:
+    """So that its silence about ours means something."""
+    new = NEW.decode()
+    steps: list[Step] = [
+        ("create", TEMPORARY),
+        ("write", TEMPORARY, new),
+        ("fsync", TEMPORARY),
+        ("rename", TEMPORARY, FILE),
+        ("fsync", "params"),
+        ("confirmed", new),
+    ]
+    files = {FILE: OLD.decode()}
+    assert faults(files, steps) == []
+    if missing == "fsync":
+        del steps[2]
+    elif missing == "fsync of the folder":
+        del steps[4]
+    elif missing == "order":
+        steps[2], steps[3] = ("rename", TEMPORARY, FILE), ("fsync", FILE)
+    else:
+        steps = [("unlink", FILE), ("create", FILE), ("write", FILE, new), ("fsync", FILE), *steps[4:]]
+    assert faults(files, steps) != []
