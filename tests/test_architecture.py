@@ -18,8 +18,11 @@ ORDER = (
     ("telemetry",),
     ("sources",),
     ("dbc_output",),
+    ("cia305",),
+    ("cia301",),
     ("gateway",),
     ("config",),
+    ("canopen_dbc",),
     ("simulator",),
     ("runtime", "offline"),
     ("cli",),
@@ -37,7 +40,7 @@ ONLY_IN = {
     "serial": ("runtime",),
     "can": ("runtime", "cli/demo.py", "offline"),
     "rich": ("cli",),
-    "canopen": (),
+    "canopen": ("cia301/eds.py", "cia301/dictionary.py"),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

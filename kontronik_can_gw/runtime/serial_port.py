@@ -9,6 +9,7 @@ import errno
 import fcntl
 import grp
 import os
+import struct
 import termios
 from pathlib import Path
 
@@ -18,6 +19,11 @@ from kontronik_can_gw.errors import RunError
 
 BAUD_RATE = 115_200
 READ_SIZE = 4096
+
+_TIOCGICOUNT = 0x545D
+_COUNTS = struct.Struct("=20i")
+_FRAME_ERRORS, _PARITY_ERRORS, _BUFFER_OVERRUNS = 6, 8, 10
+"""In struct serial_icounter_struct; 7 are overruns."""
 
 
 class PortLost(Exception):
@@ -59,6 +65,14 @@ class SerialPort:
         if not data:
             raise PortLost("hung up")
         return data
+
+    def line_errors(self) -> int:
+        """Parity, framing and overrun errors that the driver has counted; 0 where it counts none (pseudo terminals, some adapters)."""
+        try:
+            counts = _COUNTS.unpack(fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_COUNTS.size)))
+        except OSError:
+            return 0
+        return int(sum(counts[_FRAME_ERRORS : _PARITY_ERRORS + 1]) + counts[_BUFFER_OVERRUNS])
 
     def discard(self) -> None:
         """Throw away what waits to be read."""

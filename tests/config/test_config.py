@@ -17,34 +17,54 @@ from hypothesis import strategies as st
 import kontronik_can_gw
 from kontronik_can_gw.config import Config, as_toml, load, parse, schema, shipped
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.telemetry import MS
 
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
 TABLES: dict[str, tuple[str, ...]] = {
     "can": ("interface", "channel", "bitrate", "fd", "data_bitrate", "options"),
-    "dbc": ("file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids"),
+    "dbc": ("enabled", "file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids"),
+    "canopen": (
+        *("enabled", "node_id", "eds", "vendor_id", "serial", "self_start", "read_only", "cia402_mirrors", "store"),
+    ),
     "run": ("wait_for_devices",),
-    "esc": ("port", "name", "pole_pairs", "gear", "cell_count", "telemetry_timeout_ms"),
+    "esc": ("port", "name", "pole_pairs", "gear", "cell_count", "telemetry_timeout_ms", "node_id", "device"),
 }
 DEFAULTS: dict[str, dict[str, object]] = {
     "can": {"interface": "socketcan", "channel": "can0", "bitrate": 500_000, "fd": False, "data_bitrate": 2_000_000}
     | {"options": {}},
-    "dbc": {"file": "shipped", "node": None, "on_loss": "not_available", "base_id": None, "id_step": None}
+    "dbc": {
+        "enabled": True,
+        "file": "shipped",
+        "node": None,
+        "on_loss": "not_available",
+        "base_id": None,
+        "id_step": None,
+    }
     | {"bind": {}, "e2e_data_ids": {}},
+    "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
+    | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
     "run": {"wait_for_devices": False},
-    "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250},
+    "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250}
+    | {"node_id": None, "device": None},
 }
 RANGES = {
     ("can", "bitrate"): (10_000, 1_000_000),
     ("can", "data_bitrate"): (10_000, 8_000_000),
     ("dbc", "base_id"): (0, 0x1FFFFFFF),
     ("dbc", "id_step"): (1, 0x1FFFFFFF),
+    ("canopen", "vendor_id"): (0, 0xFFFFFFFF),
+    ("canopen", "serial"): (0, 0xFFFFFFFF),
+    ("canopen", "node_id"): (1, 127),
+    ("esc", "node_id"): (1, 127),
     ("esc", "pole_pairs"): (1, 100),
     ("esc", "cell_count"): (0, 255),
     ("esc", "telemetry_timeout_ms"): (20, 60_000),
 }
 STRINGS = [("can", "interface"), ("can", "channel"), ("dbc", "file"), ("dbc", "node"), ("esc", "port")]
-BOOLEANS = [("can", "fd"), ("run", "wait_for_devices")]
+STRINGS += [("canopen", "eds"), ("canopen", "store")]
+BOOLEANS = [("can", "fd"), ("run", "wait_for_devices"), ("dbc", "enabled")]
+BOOLEANS += [("canopen", key) for key in ("enabled", "self_start", "read_only", "cia402_mirrors")]
 
 
 def tables(table: str = "", key: str = "", value: object = None) -> dict[str, Any]:
@@ -54,6 +74,8 @@ def tables(table: str = "", key: str = "", value: object = None) -> dict[str, An
         made["esc"][0][key] = value
     elif table:
         made[table] = {key: value}
+    if (table, key) == ("dbc", "enabled"):  # something must be sent
+        made["canopen"] = {"enabled": True}
     return made
 
 
@@ -128,6 +150,38 @@ def test_a_switch_is_true_or_false(table: str, key: str) -> None:
     others: list[object] = [0, 1, "true", [], {}]
     for value in others:
         assert "is not true or false" in refused(table, key, value)
+
+
+@pytest.mark.parametrize(("table", "key"), [("canopen", "node_id"), ("esc", "node_id")])
+def test_a_node_id_may_be_255_for_a_node_that_waits_for_lss(table: str, key: str) -> None:
+    assert taken(table, key, 255) == 255
+    assert "128 is outside 1..127 and not 255" in refused(table, key, 128)
+
+
+def test_node_ids_count_on_from_the_base_unless_an_esc_has_its_own() -> None:
+    made = {"canopen": {"enabled": True, "node_id": 10}, "esc": [{"port": f"p{n}"} for n in range(4)]}
+    assert parse(made, "a.toml").node_ids == [10, 11, 12, 13]
+    made["esc"][2]["node_id"] = 99  # type: ignore[index]
+    assert parse(made, "a.toml").node_ids == [10, 11, 99, 13]
+    made["canopen"]["node_id"] = 255  # type: ignore[call-overload]
+    assert parse(made, "a.toml").node_ids == [255, 255, 99, 255]
+
+
+def test_two_escs_with_one_node_id_and_ids_above_127_are_refused() -> None:
+    made = {"canopen": {"enabled": True}, "esc": [{"port": "a"}, {"port": "b", "node_id": 1}]}
+    assert problems(made) == ["a.toml: esc[2].node_id: 1 is also that of esc[1]"]
+    made = {"canopen": {"enabled": True, "node_id": 127}, "esc": [{"port": "a"}, {"port": "b"}]}
+    (said,) = problems(made)
+    assert "its node-ID would be 128" in said
+
+
+def test_a_gateway_that_would_send_nothing_is_refused() -> None:
+    (said,) = problems({"dbc": {"enabled": False}, "esc": [{"port": "a"}]})
+    assert "nothing would be sent" in said
+
+
+def test_an_unknown_device_is_refused_with_those_there_are() -> None:
+    assert "KOSMIK" in refused("esc", "device", "KOSMIC")
 
 
 def test_on_loss_is_one_of_two_and_a_near_miss_is_corrected() -> None:
@@ -233,7 +287,7 @@ def test_a_data_id_is_a_whole_number_of_16_bits_beside_a_message_name() -> None:
     ("given_tables", "said"),
     [
         ({"cann": {}}, "a.toml: cann: unknown table. Did you mean can?"),
-        ({"xyzzy": {}}, "a.toml: xyzzy: unknown table. Known: can, dbc, run, esc."),
+        ({"xyzzy": {}}, "a.toml: xyzzy: unknown table. Known: can, dbc, canopen, run, esc."),
         ({"can": {"bitrte": 1}}, "a.toml: can.bitrte: unknown key. Did you mean bitrate?"),
         ({"run": {"x": 1}}, "a.toml: run.x: unknown key. Known: wait_for_devices."),
         ({"can": 3}, "a.toml: can: is a table, written [can]"),
@@ -392,7 +446,7 @@ def test_the_shipped_example_is_valid_and_says_the_defaults() -> None:
     config = load(EXAMPLE)
     assert len(config.esc) == 1
     assert config.esc[0].pole_pairs == 7
-    for table in ("can", "dbc", "run"):
+    for table in ("can", "dbc", "canopen", "run"):
         for key, default in DEFAULTS[table].items():
             assert getattr(getattr(config, table), key) == default
 
@@ -421,10 +475,11 @@ def test_the_shipped_example_has_every_key_of_every_table() -> None:
 
 def test_what_the_example_shows_as_default_is_the_default() -> None:
     made = tomllib.loads(uncommented())
-    shown = {(table, key): value for table in ("can", "dbc", "run") for key, value in made[table].items()}
+    shown = {(table, key): value for table in ("can", "dbc", "canopen", "run") for key, value in made[table].items()}
     shown |= {("esc", key): value for key, value in made["esc"][0].items()}
     examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
-    examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options")}
+    examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options"), ("esc", "node_id"), ("esc", "device")}
+    examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store")}
     for (table, key), value in shown.items():
         if (table, key) not in examples:
             assert value == DEFAULTS[table][key], f"{table}.{key}"
@@ -519,6 +574,7 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     **dict.fromkeys(STRINGS, st.text(min_size=1, max_size=8).map(lambda text: text.strip() or "x")),
     **dict.fromkeys(BOOLEANS, st.booleans()),
     ("dbc", "on_loss"): st.sampled_from(["not_available", "silent"]),
+    ("esc", "device"): st.sampled_from([device.text for device in Device]),
     ("can", "options"): st.dictionaries(
         _TEXT,
         st.one_of(st.text(), st.integers(), st.booleans(), st.floats(allow_nan=False, allow_infinity=False)),
@@ -558,7 +614,7 @@ def configurations(draw: st.DrawFn, wrong: bool) -> dict[str, Any]:
             made[draw(_TEXT)] = 1
         return made
 
-    made: dict[str, Any] = {name: table(name) for name in ("can", "dbc", "run") if draw(st.booleans())}
+    made: dict[str, Any] = {name: table(name) for name in ("can", "dbc", "canopen", "run") if draw(st.booleans())}
     return made | {"esc": [table("esc") for _ in range(draw(st.integers(1, 3)))]}
 
 
@@ -567,7 +623,14 @@ def only_the_parser_can_tell(made: dict[str, Any]) -> bool:
     try:
         parse(made, "a.toml")
     except UserError as error:
-        signs = ("is also that of", "makes signal names ambiguous", "is outside 0.001..1000", "1 to 12 letters")
+        signs = (
+            "is also that of",
+            "nothing would be sent",
+            "its node-ID would be",
+            "makes signal names ambiguous",
+            "is outside 0.001..1000",
+            "1 to 12 letters",
+        )
         return all(any(sign in problem for sign in signs) for problem in error.problems)
     return False
 
