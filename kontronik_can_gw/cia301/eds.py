@@ -54,7 +54,7 @@ _HEADING = re.compile(r"\s*\[([^\]]*)\]")
 _COMMENT = re.compile(r"(?:^|\s);.*")
 _OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
 _OF_OBJECT = re.compile(r"([0-9a-f]{4})(sub[0-9a-f]+|name|value|denotation|objectlinks)?$", re.IGNORECASE)
-_NUMBER = re.compile(r"-?(?:0x[0-9a-f]+|0+|[1-9][0-9]*)$", re.IGNORECASE)
+_NUMBER = re.compile(r"-?(?:0x[0-9a-f]{1,20}|0|[1-9][0-9]{0,20})$", re.IGNORECASE)
 _NODE_ID = re.compile(r"\$NODEID(?:\+(?P<after>[^+]+))?$|(?P<before>[^+]+)\+\$NODEID$", re.IGNORECASE)
 
 
@@ -360,7 +360,7 @@ class _Checker:
             if right != name and (right == _LISTS[2] or name != _LISTS[1]):
                 self._say(name, f"{key}=0x{index:04X}: belongs into [{right}].")
         digits = sorted(int(key) for key in numbers if key.isdigit())
-        if count is not None and digits != list(range(1, count + 1)):
+        if count is not None and (count != len(digits) or digits != list(range(1, len(digits) + 1))):
             self._say(
                 name,
                 f"SupportedObjects={count}, but {len(digits)} are listed, or their numbers have gaps. "

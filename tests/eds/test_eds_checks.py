@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.cia301 import eds as reader
@@ -155,6 +155,26 @@ def test_rubbish_is_refused_without_anything_else_being_raised() -> None:
         b"[Comments]\nLines=x",
     ):
         assert len(problems(data)) >= 3
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.data())
+def test_a_damaged_file_is_read_or_refused_and_nothing_else(data: st.DataObject) -> None:
+    lines = SHIPPED.split("\r\n")
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(lines) - 1))
+        key = lines[at].split("=")[0]
+        value = data.draw(
+            st.one_of(st.sampled_from(["", "-1", "0", "255", "0x1FFFFFFFF", "9" * 30, "[", "$NODEID", "x"]), st.text())
+        )
+        lines[at : at + 1] = data.draw(
+            st.sampled_from(
+                [[], [lines[at]] * 2, [f"{key}={value}"], [value], [f"[{value}]"], [lines[at], "CompactSubObj=2"]]
+            )
+        )
+    text = "\r\n".join(lines).encode("utf-8", "replace")
+    found = problems(text)
+    assert all(problem.startswith("mine.eds: ") and problem.endswith((".", ";'.")) for problem in found)
 
 
 # --- lists ----------------------------------------------------------------------------------------------------------
