@@ -1,0 +1,361 @@
+"""CAN reception and queued sending on a real socket: kernel filters, full queues, interfaces that go and come back."""
+
+import os
+import select
+import socket
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Self
+
+import pytest
+from vcan_tools import ip, wait_for
+
+from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.protocol import Layout as UartLayout
+from kontronik_can_gw.protocol import LiveData, encode
+from kontronik_can_gw.runtime.can_port import CanPort, Sent
+from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import EscSettings, LinkState
+
+EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
+CLASSIC = struct.Struct("=IB3x8s")
+
+
+class Peer:
+    """Another participant: a raw socket of its own, with room for bursts."""
+
+    def __init__(self, interface: str) -> None:
+        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self._socket.setsockopt(socket.SOL_SOCKET, 33, 4_000_000)  # SO_RCVBUFFORCE
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        self._socket.bind((interface,))
+
+    def send(self, can_id: int, data: bytes = b"") -> None:
+        self._socket.send(CLASSIC.pack(can_id, len(data), data))
+
+    def send_fd(self, can_id: int, data: bytes) -> None:
+        self._socket.send(struct.pack("=IBB2x64s", can_id, len(data), 1, data))
+
+    def receive(self, seconds: float = 3) -> tuple[int, bytes] | None:
+        """The next frame's id and data; None when none comes."""
+        if not select.select([self._socket], [], [], seconds)[0]:
+            return None
+        can_id, size, data = CLASSIC.unpack(self._socket.recv(72)[: CLASSIC.size])
+        return can_id, data[:size]
+
+    def ask(self, can_id: int, data: bytes, seconds: float = 3) -> tuple[int, bytes] | None:
+        """Send a request; the next frame that comes."""
+        self.send(can_id, data)
+        return self.receive(seconds)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+
+@contextmanager
+def port_on(interface: str, ids: Sequence[int], fd: bool = False, own: bool = False) -> Iterator[CanPort]:
+    port = CanPort(CanConfig("socketcan", interface, fd=fd, options={"receive_own_messages": own}))
+    try:
+        port.set_receive_ids(frozenset(ids))
+        yield port
+    finally:
+        port.close()
+
+
+def readable(port: CanPort, seconds: float = 0.0) -> bool:
+    fd = port.fileno()
+    assert fd is not None
+    return bool(select.select([fd], [], [], seconds)[0])
+
+
+def all_of(port: CanPort) -> list[CanFrame]:
+    """What waits, to the end."""
+    frames: list[CanFrame] = []
+    while readable(port, 0.05):
+        frames += port.receive()
+    return frames
+
+
+# --- the port
+
+
+def test_exactly_the_wanted_frames_come_and_nothing_else_makes_the_socket_readable(vcan: str) -> None:
+    wanted = (0x000, 0x080, 0x601, 0x7E5)
+    with port_on(vcan, wanted) as port, Peer(vcan) as peer:
+        for can_id in range(0x800):
+            if can_id not in wanted:
+                peer.send(can_id, b"foreign")
+        for can_id in wanted:
+            peer.send(can_id | EXTENDED, b"29 bit")
+            peer.send(can_id | REMOTE)
+            peer.send_fd(can_id, b"fd")
+        assert not readable(port, 0.2)
+        for n, can_id in enumerate(wanted):
+            peer.send(can_id, bytes((n,)))
+        assert all_of(port) == [CanFrame(can_id, bytes((n,))) for n, can_id in enumerate(wanted)]
+        port.set_receive_ids(frozenset())
+        for can_id in wanted:
+            peer.send(can_id)
+        assert not readable(port, 0.2)
+
+
+def test_600_ids_are_merged_and_still_exactly_they_come(vcan: str) -> None:
+    wanted = set(range(0x081, 0x081 + 3 * 600, 3))
+    with port_on(vcan, sorted(wanted)) as port, Peer(vcan) as peer:
+        came: list[int] = []
+        for can_id in range(0x800):
+            peer.send(can_id)
+            peer.send(can_id | EXTENDED)
+            peer.send(can_id | REMOTE)
+            if can_id % 64 == 63:
+                came += [frame.can_id for frame in all_of(port)]
+        assert came == sorted(wanted)
+        assert port.overruns == 0
+
+
+def test_on_a_bus_with_can_fd_only_classic_frames_come(vcan: str) -> None:
+    with port_on(vcan, [0x601], fd=True) as port, Peer(vcan) as peer:
+        peer.send_fd(0x601, b"12345678")
+        peer.send_fd(0x601, bytes(64))
+        peer.send(0x601, b"classic")
+        assert all_of(port) == [CanFrame(0x601, b"classic")]
+        assert port.send(CanFrame(0x581, bytes(64), fd=True)) is Sent.OK
+
+
+def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vcan: str) -> None:
+    with port_on(vcan, [0x581], own=True) as port, port_on(vcan, [0x581]) as second, Peer(vcan) as peer:
+        assert port.send(CanFrame(0x581, b"own")) is Sent.OK
+        peer.send(0x581, b"other")
+        assert all_of(port) == [CanFrame(0x581, b"other")]
+        assert all_of(second) == [CanFrame(0x581, b"own"), CanFrame(0x581, b"other")]
+        assert port.send(CanFrame(0x702, b"", remote=True)) is Sent.OK
+        assert [peer.receive() for _ in range(2)] == [(0x581, b"own"), (0x702 | REMOTE, b"")]
+
+
+def test_a_block_of_several_clients_fits_into_the_socket_and_an_overrun_is_noticed(vcan: str) -> None:
+    with port_on(vcan, [0x601]) as port, Peer(vcan) as peer:
+        for n in range(508):  # four blocks of 127 segments, more than a socket's usual 278 frames
+            peer.send(0x601, n.to_bytes(2, "little"))
+        assert [int.from_bytes(frame.data, "little") for frame in all_of(port)] == list(range(508))
+        assert port.overruns == 0
+        for _ in range(3000):
+            peer.send(0x601)
+        assert len(all_of(port)) < 3000
+        assert port.overruns == 1
+        for _ in range(3000):
+            peer.send(0x601)
+        port.discard()
+        assert not readable(port)
+        peer.send(0x601, b"new")
+        assert all_of(port) == [CanFrame(0x601, b"new")]
+        assert port.overruns == 1
+
+
+def test_error_frames_are_followed_beside_data_frames(vcan: str) -> None:
+    with port_on(vcan, [0x601]) as port:
+        for line in ("601#01", "20000040#0000000000000000", "602#02", "20000100#0000000000000000", "601#03"):
+            subprocess.run(["cansend", vcan, line], check=True)
+        subprocess.run(["cansend", vcan, "20000040#0000000000000000"], check=True)
+        assert all_of(port) == [CanFrame(0x601, b"\1"), CanFrame(0x601, b"\3")]
+        assert (port.state, port.bus_off_count) == (CanState.BUS_OFF, 2)
+
+
+# --- the loop
+
+
+class Node(Gateway):
+    """A gateway that answers a frame with an even id by one frame, one with an odd id by a block of 127 and 40 fast PDOs."""
+
+    def __init__(self, *ids: int) -> None:
+        super().__init__([EscSettings("esc1")], Layout("x", "Gw", ()), time.monotonic_ns())
+        self.ids = frozenset(ids)
+        self.overruns = 0
+        self.waiting: list[CanFrame] = []
+
+    @property
+    def receive_ids(self) -> frozenset[int]:
+        return self.ids
+
+    def receive_frame(self, frame: CanFrame, now: int) -> None:
+        if frame.can_id % 2 == 0:
+            self.waiting.append(CanFrame(frame.can_id - 0x80, frame.data, queued=True))
+            return
+        self.waiting += [CanFrame(0x581, bytes((n,)), queued=True) for n in range(127)]
+        self.waiting += [CanFrame(0x181 + n, b"old") for n in range(40)]
+        self.waiting += [CanFrame(0x181 + n, b"new") for n in range(40)]
+
+    def receive_overrun(self, now: int) -> None:
+        self.overruns += 1
+
+    @property
+    def frames_wait(self) -> bool:
+        return bool(self.waiting) or super().frames_wait
+
+    def take_frames(self) -> list[CanFrame]:
+        frames, self.waiting = self.waiting + super().take_frames(), []
+        return frames
+
+
+class Running:
+    """A loop in a thread."""
+
+    def __init__(self, node: Node, interface: str, esc: PtyEsc) -> None:
+        self.esc = esc
+        self.loop = Loop(node, [esc.path], CanConfig("socketcan", interface))
+        self.loop.open()
+        self.thread = threading.Thread(target=self.loop.run, daemon=True)
+        self.thread.start()
+
+    def wake(self) -> None:
+        """Let the loop see what was changed behind its back."""
+        os.write(self.loop._wake_write, b"\0")
+
+    def wakeups(self) -> int:
+        """How often the loop's thread gave up the processor by itself: each wait is one."""
+        status = Path(f"/proc/self/task/{self.thread.native_id}/status").read_text()
+        return sum(int(line.split()[1]) for line in status.splitlines() if line.startswith("voluntary_ctxt"))
+
+
+@pytest.fixture
+def run_node(vcan: str) -> Iterator[Callable[[Node], Running]]:
+    made: list[Running] = []
+    with PtyEsc() as esc:
+
+        def run(node: Node) -> Running:
+            made.append(Running(node, vcan, esc))
+            return made[-1]
+
+        yield run
+        for each in made:
+            each.loop.stop()
+            each.thread.join(5)
+            assert not each.thread.is_alive()
+        assert esc.received == 0
+
+
+def test_4000_foreign_frames_do_not_wake_a_process_that_receives(
+    vcan: str, run_node: Callable[[Node], Running]
+) -> None:
+    node = Node(0x000, 0x080, 0x602)
+    running = run_node(node)
+    with Peer(vcan) as peer:
+        assert peer.ask(0x602, b"x") == (0x582, b"x")
+
+        def cost(can_id: int, *options: str) -> int:
+            """The loop's waits while 4000 frames are sent; that it was these frames the peer sees."""
+            time.sleep(0.1)
+            before = running.wakeups()
+            identifier = ("-I", f"{can_id & 0x7FF:X}")
+            subprocess.run(["cangen", vcan, "-g", "0", "-n", "4000", "-i", *identifier, *options], check=True)
+            waits = running.wakeups() - before
+            seen = [frame[0] for _ in range(4000) if (frame := peer.receive(1))]
+            assert seen.count(can_id) == len(seen) == 4000
+            return waits
+
+        begin = time.monotonic()
+        foreign = cost(0x123), cost(0x602 | EXTENDED, "-e"), cost(0x602 | REMOTE, "-R")
+        seconds = time.monotonic() - begin
+        print(f"3 times 4000 foreign frames: {foreign} waits of the loop in {seconds:.1f} s")
+        assert sum(foreign) < 20 + 50 * seconds, "the loop's own deadlines, no more"
+        assert node.status.received_frames == 1
+        before = running.wakeups()
+        for n in range(100):
+            assert peer.ask(0x602, bytes((n,))) == (0x582, bytes((n,)))
+        assert running.wakeups() - before > 30, "wanted ones do"
+
+
+def test_a_block_of_127_and_pdos_share_a_bus_that_is_full(vcan: str, run_node: Callable[[Node], Running]) -> None:
+    """Some 1000 frames/s, with room for ten: the kernel says ENOBUFS again and again."""
+    shaper = ["tc", "qdisc", "add", "dev", vcan, "root", "tbf", "rate", "125kbit", "burst", "160", "limit", "160"]
+    subprocess.run(shaper, check=True)
+    node = Node(0x601)
+    run_node(node)
+    with Peer(vcan) as peer:
+        peer.send(0x601)
+        came: list[tuple[int, bytes]] = []
+        while len(came) < 167 and (frame := peer.receive()) is not None:
+            came.append(frame)
+        assert peer.receive(0.2) is None
+    block = [data[0] for can_id, data in came if can_id == 0x581]
+    assert block == list(range(127)), "all of the block, in order"
+    pdos = [frame for frame in came if frame[0] != 0x581]
+    assert pdos == [(0x181 + n, b"new") for n in range(40)], "of each PDO the newest"
+    assert [can_id == 0x581 for can_id, _ in came[:80]] == [True, False] * 40, "in turns"
+    status = node.status
+    assert (status.sent_frames, status.dropped_frames, status.replaced_frames) == (167, 0, 40)
+    assert status.send_failures > 5, "the queue was full again and again"
+
+
+def test_a_node_hears_again_when_its_interface_was_down(vcan: str, run_node: Callable[[Node], Running]) -> None:
+    node = Node(0x602)
+    running = run_node(node)
+    with Peer(vcan) as peer:
+        for n in range(3):
+            assert peer.ask(0x602, bytes((n,))) == (0x582, bytes((n,)))
+            port = running.loop._can
+            ip("link", "set", vcan, "down")
+            wait_for(lambda: node.status.can_state is CanState.DOWN, 2, "down, though nothing was sent")
+            node.waiting.append(CanFrame(0x582, b"lost", queued=True))
+            running.wake()
+            wait_for(lambda n=n: node.status.dropped_frames == n + 1, 2, "a lost answer")  # type: ignore[misc]
+            ip("link", "set", vcan, "up")
+            with pytest.raises(OSError, match="down"):
+                peer.receive(0)
+            assert peer.ask(0x602, b"again", 0.5) == (0x582, b"again")
+            assert node.status.can_state is CanState.ERROR_ACTIVE
+            assert running.loop._can is port
+
+
+def test_a_node_hears_again_when_its_interface_was_removed(vcan: str, run_node: Callable[[Node], Running]) -> None:
+    node = Node(0x602)
+    running = run_node(node)
+    for n in range(2):
+        with Peer(vcan) as peer:
+            assert peer.ask(0x602, bytes((n,))) == (0x582, bytes((n,)))
+        port = running.loop._can
+        ip("link", "del", vcan)
+        wait_for(lambda port=port: running.loop._can is not port, 2, "gone, though nothing was sent")  # type: ignore[misc]
+        assert node.status.can_state is CanState.DOWN
+        ip("link", "add", vcan, "type", "vcan")
+        ip("link", "set", vcan, "up")
+        wait_for(lambda: running.loop._can is not None, 3, "open again")
+        with Peer(vcan) as peer:
+            peer.send(0x603)
+            assert peer.ask(0x602, b"again") == (0x582, b"again")
+    assert node.status.received_frames == 4
+
+
+def test_a_flood_of_wanted_frames_does_not_starve_the_uart(vcan: str, run_node: Callable[[Node], Running]) -> None:
+    node = Node(0x602)
+    running = run_node(node)
+    flood = subprocess.Popen(["cangen", vcan, "-g", "0", "-I", "602", "-L", "8", "-i"])
+    try:
+        begin = time.monotonic()
+        wait_for(lambda: node.status.received_frames > 100, 5, "the flood")
+        written = 0
+        while time.monotonic() - begin < 2:
+            running.esc.write(encode(LiveData(electrical_speed=written), UartLayout.V4))
+            written += 1
+            time.sleep(0.01)
+        seconds = time.monotonic() - begin
+    finally:
+        flood.terminate()
+        flood.wait()
+    telemetry = node.escs[0]
+    wait_for(lambda: telemetry.counters.live == written, 2, "all live frames")
+    print(f"{written} live frames beside {node.status.received_frames} CAN frames in {seconds:.1f} s")
+    assert telemetry.losses == 0
+    assert telemetry.link is LinkState.OK
