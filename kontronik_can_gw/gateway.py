@@ -5,6 +5,7 @@
 
 from collections.abc import Sequence
 
+from kontronik_can_gw.cia301.nmt import NmtState
 from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.dbc_output.layout import Layout
@@ -145,6 +146,17 @@ class Gateway:
         """ESCs whose link state, layout or device changed since the last call."""
         changes, self._link_changes = self._link_changes, []
         return changes
+
+    @property
+    def node_changes(self) -> int:
+        """Grows with each change of a node's NMT state or node-ID."""
+        return 0 if self.nodes is None else self.nodes.state_changes
+
+    def node_states(self) -> list[tuple[int, NmtState, int]]:
+        """Of each ESC's CANopen node: node-ID, NMT state, PDOs sent so far. Empty without nodes."""
+        if self.nodes is None:
+            return []
+        return [(node.node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos)) for node in self.nodes.nodes]
 
     def _expire(self, now: int, but: int | None = None) -> None:
         """What is too old by now goes before anything is sent."""

@@ -36,6 +36,7 @@ SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x600, 0x580, 0x7E5, 0x7E4
 _COMMUNICATION, _APPLICATION = (0x1000, 0x1FFF), (0x2000, 0x9FFF)
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 _SELF_START_OFF = 4
+_MOST_SAVES = 4
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
 
 
@@ -72,6 +73,9 @@ class Surroundings(Protocol):
 
     def routes_changed(self) -> None:
         """The node listens to other COB-IDs now."""
+
+    def state_changed(self) -> None:
+        """The node's NMT state or node-ID is another one."""
 
     def cob_id_taken(self, cob_id: int, tpdo: Tpdo) -> bool:
         """Whether something else of the gateway sends with this id."""
@@ -210,6 +214,7 @@ class Node:
             if not self.dictionary.number(0x1F80, otherwise=_SELF_START_OFF) & _SELF_START_OFF:
                 self._enter(NmtState.OPERATIONAL, now)
         self._around.routes_changed()
+        self._around.state_changed()
         self._set_due()
 
     def routes(self) -> Iterator[tuple[int, Callable[[bytes, int], None]]]:
@@ -326,7 +331,10 @@ class Node:
     def store_configuration(self) -> bool:
         if self.settings.read_only:
             return False
-        self._save("lss", replace(self._wanted, node_id=self._bus_node_id))
+        try:
+            self._save("lss", replace(self._wanted, node_id=self._bus_node_id))
+        except SdoAbort:
+            return False
         return True
 
     def lss_left_configuration(self, now: int) -> None:
@@ -396,6 +404,7 @@ class Node:
             return
         self._leave_state()
         self.state = state
+        self._around.state_changed()
         if state is NmtState.STOPPED:
             self.sdo.reset()
             return
@@ -482,6 +491,8 @@ class Node:
         self._bus_node_id = node_id
 
     def _save(self, purpose: str, stored: Stored) -> None:
+        if len(self._waiting_saves) >= _MOST_SAVES:  # a disk that does not come round
+            raise SdoAbort(Abort.LOCAL_CONTROL)
         self._wanted = stored
         self._waiting_saves.append((purpose, stored))
         self._around.save(self, stored)

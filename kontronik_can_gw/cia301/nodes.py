@@ -62,6 +62,8 @@ class Nodes:
         self.saves: list[tuple[int, Stored]] = []
         self.receive_ids: frozenset[int] = frozenset()
         self.due = NEVER
+        self.state_changes = 0
+        """Grows with each change of a node's NMT state or node-ID."""
         self._settings_changed = settings_changed
         self._foreign_ids = foreign_ids or {}
         self._routes: dict[int, list[Callable[[bytes, int], None]]] = {}
@@ -161,6 +163,9 @@ class Nodes:
 
     def routes_changed(self) -> None:
         self._rerouted = True
+
+    def state_changed(self) -> None:
+        self.state_changes += 1
 
     def cob_id_taken(self, cob_id: int, tpdo: Tpdo) -> bool:
         if cob_id in self._foreign_ids:

@@ -140,6 +140,8 @@ class Tpdo:
         self.cob_id = 0
         self.valid = False
         self.due = NEVER
+        self.sent = 0
+        """Frames so far."""
         self._dictionary = dictionary
         self._esc = esc
         self._gateway = gateway
@@ -385,6 +387,7 @@ class Tpdo:
             self._event_due = self._next_event(now)
         bits = self._pack((self._esc,), self._gateway, now, 0, 0)
         self._last_status = bits & self._status_mask
+        self.sent += 1
         self._send_frame(CanFrame(self.cob_id, bits.to_bytes(self._length, "little")))
 
     def _next_event(self, now: int) -> int:

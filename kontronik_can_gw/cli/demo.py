@@ -1,7 +1,7 @@
 """``demo``: the whole gateway without hardware, vcan or privileges.
 
-A simulated ESC on a pseudo terminal, the real serial path, the real packer, python-can's in-process bus, and on the screen what a
-logger with the DBC decodes from that bus. Nothing on the screen comes from anywhere but the bus.
+A simulated ESC on a pseudo terminal, the real serial path, the real packer and CANopen node, python-can's in-process bus, and on the
+screen what a logger with the DBC and a small CANopen master see on that bus. Nothing on the screen comes from anywhere but the bus.
 """
 
 import argparse
@@ -9,15 +9,19 @@ import contextlib
 import logging
 import os
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.cia301 import heartbeat, nmt, node
+from kontronik_can_gw.cia301.nmt import NmtState
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.protocol.states import OperatingError
 
 if TYPE_CHECKING:
     import can
@@ -59,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulated faults (default 1)")
     parser.epilog = (
         "A simulated ESC on a pseudo terminal, the real gateway, python-can's in-process bus, "
-        "and on the screen what a logger with the DBC decodes."
+        "and on the screen what a logger with the DBC and a CANopen master see."
     )
 
 
@@ -106,6 +110,51 @@ class Logger:
         return [name for name in self.flags if self.values.get(name) == 1 and name != "ProgrammingAllowed"]
 
 
+@dataclass
+class Master:
+    """A CANopen master as small as can be: starts the node, reads one object a second, counts what the node sends."""
+
+    bus: "can.BusABC"
+    node_id: int = 1
+    state: str = "-"
+    cell_voltage: str = "-"
+    emergency: str = "none yet"
+    counts: dict[int, int] = field(default_factory=dict)
+    _next_poll: float = 0.0
+
+    def take(self, message: "can.Message", seconds: float) -> None:
+        """Follow a frame, and do what a master does."""
+        data, node_id = bytes(message.data), self.node_id
+        match message.arbitration_id - node_id:
+            case heartbeat.COB_ID:
+                self.state = NmtState(data[0]).name.replace("_", "-")
+                if data[0] in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL):
+                    self._send(nmt.COB_ID, bytes((nmt.Command.START, node_id)))
+            case 0x080:
+                code, bit = int.from_bytes(data[:2], "little"), data[3]
+                what = next((error.text for error in OperatingError if error == bit), "gateway")
+                self.emergency = f"{code:04X}h {what}" if code else "0000h no error any more"
+            case node.SDO_ANSWER:
+                known = data[0] == 0x4B
+                self.cell_voltage = f"{int.from_bytes(data[4:6], 'little') / 1000:.3f} V" if known else "not available"
+            case base if base & 0x7F == 0 and 0x180 <= base <= 0x500:
+                number = (base >> 8) & 7
+                self.counts[number] = self.counts.get(number, 0) + 1
+        if seconds >= self._next_poll:
+            self._next_poll = seconds + 1
+            self._send(node.SDO_REQUEST + node_id, bytes.fromhex("40 01 20 05 00 00 00 00"))
+
+    def line(self) -> str:
+        """What the master knows."""
+        pdos = " ".join(f"TPDO{number} {count}" for number, count in sorted(self.counts.items())) or "no PDO yet"
+        return f"node {self.node_id} {self.state}  {pdos}  SDO 2001h:5 {self.cell_voltage}  EMCY {self.emergency}"
+
+    def _send(self, cob_id: int, data: bytes) -> None:
+        import can
+
+        self.bus.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+
+
 def main(args: argparse.Namespace) -> int:
     with without_asammdf():
         import can
@@ -122,17 +171,20 @@ def main(args: argparse.Namespace) -> int:
     failures: list[BaseException] = []
     with contextlib.ExitStack() as stack:
         esc = stack.enter_context(PtyEsc())
+        store = stack.enter_context(tempfile.TemporaryDirectory())
         tables = {
             "can": {"interface": "virtual", "channel": channel},
+            "canopen": {"enabled": True, "store": store},
             "esc": [{"port": esc.path, "pole_pairs": 7, "gear": 9.8}],
         }
         config = parse(tables, "demo")
         loaded = assemble(config)
         assert loaded.database is not None
         logger = Logger(loaded.database)
-        gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns())
+        gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns(), canopen=loaded.canopen)
         loop = Loop(gateway, [esc.path], config.can)
         bus = stack.enter_context(can.Bus(interface="virtual", channel=channel))
+        master = Master(bus)
         loop.open()
 
         def running(work: object) -> threading.Thread:
@@ -149,7 +201,7 @@ def main(args: argparse.Namespace) -> int:
 
         threads = [running(loop.run), running(lambda: _feed(esc, args.seed, stop))]
         with stopping_on_signals(stop.set):
-            _show(logger, bus, args.seconds, stop)
+            _show(logger, master, bus, args.seconds, stop)
         stop.set()
         loop.stop()
         for thread in threads:
@@ -164,7 +216,6 @@ def main(args: argparse.Namespace) -> int:
 
 def _feed(esc: object, seed: int, stop: threading.Event) -> None:
     from kontronik_can_gw.offline import pty
-    from kontronik_can_gw.protocol.states import OperatingError
     from kontronik_can_gw.simulator import FLIGHT, SECOND_NS, Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc
 
     thrown_in = (
@@ -180,7 +231,7 @@ def _feed(esc: object, seed: int, stop: threading.Event) -> None:
     pty.run([(simulated, esc)], stop=stop.is_set)  # type: ignore[list-item]
 
 
-def _show(logger: Logger, bus: "can.BusABC", seconds: float | None, stop: threading.Event) -> None:
+def _show(logger: Logger, master: Master, bus: "can.BusABC", seconds: float | None, stop: threading.Event) -> None:
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -198,6 +249,7 @@ def _show(logger: Logger, bus: "can.BusABC", seconds: float | None, stop: thread
             message = bus.recv(max(0.0, min(until - now, 0.1)))
             if message is not None:
                 logger.take(message)
+                master.take(message, now)
             if time.monotonic() >= next_time:
                 next_time += pause
                 yield
@@ -207,13 +259,13 @@ def _show(logger: Logger, bus: "can.BusABC", seconds: float | None, stop: thread
 
         with Live(console=console, auto_refresh=False, transient=False) as live:
             for _ in listen(_REFRESH_S):
-                live.update(_screen(logger, time.monotonic() - begin), refresh=True)
+                live.update(_screen(logger, master, time.monotonic() - begin), refresh=True)
     else:
         for _ in listen(_PLAIN_LINE_S):
-            print(_plain_line(logger, time.monotonic() - begin), flush=True)
+            print(_plain_line(logger, master, time.monotonic() - begin), flush=True)
 
 
-def _plain_line(logger: Logger, seconds: float) -> str:
+def _plain_line(logger: Logger, master: Master, seconds: float) -> str:
     words = [f"{seconds:6.1f} s  link {logger.text('LinkState'):9}"]
     for name, digits in (
         ("ElectricalSpeed", "0"),
@@ -224,10 +276,11 @@ def _plain_line(logger: Logger, seconds: float) -> str:
         words.append(f"{name} {logger.text(name, digits)} {logger.units.get(name, '')}".rstrip())
     words.append(f"state {logger.text('OperatingState')}")
     active = logger.active()
+    words.append(f"CANopen {master.line()}")
     return "  ".join(words) + (f"  FAULTS {', '.join(active)}" if active else "")
 
 
-def _screen(logger: Logger, seconds: float) -> "Group":
+def _screen(logger: Logger, master: Master, seconds: float) -> "Group":
     from rich.console import Group
     from rich.panel import Panel
     from rich.table import Table
@@ -254,8 +307,9 @@ def _screen(logger: Logger, seconds: float) -> "Group":
     active = logger.active()
     faults = Text("faults: " + (", ".join(active) if active else "none"), "bold red" if active else "green")
     foot = Text(
-        f"{seconds:.0f} s, {logger.frames} CAN frames decoded by kontronik_esc.dbc, uptime {logger.text('Uptime')} s. Ctrl-C ends.",
+        f"{seconds:.0f} s, {logger.frames} CAN frames on the bus, uptime {logger.text('Uptime')} s. Ctrl-C ends.",
         "dim",
     )
-    title = "demo: simulated ESC -> UART -> gateway -> CAN -> logger with the DBC"
-    return Group(Panel(Group(head, "", body, "", faults), title=title, title_align="left"), foot)
+    title = "demo: simulated ESC -> UART -> gateway -> CAN -> logger with the DBC, CANopen master"
+    canopen = Text(f"CANopen: {master.line()}", "cyan")
+    return Group(Panel(Group(head, "", body, "", faults, "", canopen), title=title, title_align="left"), foot)

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from kontronik_can_gw.cli.common import Loaded, load_all, set_up_log, stopping_on_signals
+from kontronik_can_gw.telemetry import SECOND
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -17,7 +18,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="wait for ports and interfaces that are missing at start (run.wait_for_devices)",
     )
+    parser.add_argument(
+        "--status",
+        type=_seconds,
+        metavar="SECONDS",
+        help="log a line about telemetry, CAN, NMT states and PDO traffic every so many seconds (default: changes only)",
+    )
     parser.epilog = "Ends by SIGTERM or SIGINT within half a second. The serial ports are only read; nothing is ever transmitted to an ESC."
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0
+    if not 0.1 <= value <= 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, 0.1 or more")
+    return value
 
 
 def main(args: argparse.Namespace) -> int:
@@ -31,7 +48,8 @@ def main(args: argparse.Namespace) -> int:
     silent = config.dbc.on_loss == "silent"
     gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns(), silent, loaded.canopen)
     wait = args.wait or config.run.wait_for_devices
-    loop = Loop(gateway, [esc.port for esc in config.esc], config.can, wait, store=loaded.store)
+    status_ns = int((args.status or 0) * SECOND)
+    loop = Loop(gateway, [esc.port for esc in config.esc], config.can, wait, loaded.store, status_ns)
     with stopping_on_signals(loop.stop):
         loop.open()
         _say_parameters(loaded)

@@ -9,15 +9,19 @@ import logging
 import os
 import selectors
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 
-from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.cia301.nmt import NmtState
+from kontronik_can_gw.cia301.storage import Stored, encode
+from kontronik_can_gw.config import UNCONFIGURED, CanConfig
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.can_port import CanPort, Sent
 from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.runtime.serial_port import PortLost, SerialPort, device_of
+from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND, LinkState
 
@@ -28,6 +32,7 @@ BUSY_RETRY_NS = 2 * MS
 LASTING_BUSY_NS = SECOND
 SUSPENDED_NS = 250 * MS
 """A loop that comes round this much too late was held up or suspended: what waits on the ports is old."""
+_LAST_SAVE_S = 0.2
 DIAGNOSIS_NS = 3 * SECOND
 
 
@@ -58,6 +63,8 @@ class _Esc:
         self.retry = _Retry()
         self.complaint = ""
         self.diagnosis_due = 0
+        self.line_errors = 0
+        self.line_errors_due = 0
 
 
 class Loop:
@@ -69,12 +76,22 @@ class Loop:
         ports: Sequence[str],
         can_config: CanConfig,
         wait_for_devices: bool = False,
+        store: ParameterStore | None = None,
+        status_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.gateway = gateway
         self._clock = clock
         self._can_config = can_config
         self._wait = wait_for_devices
+        self._store = store
+        self._to_keep: deque[tuple[int, Stored]] = deque()
+        self._keeping = 0
+        self._node_changes = 0
+        self._node_states: list[tuple[int, NmtState]] = []
+        self._status_ns = status_ns
+        self._status_due = 0 if status_ns else None
+        self._status_before: tuple[int, list[int]] = (0, [])
         self._escs = [
             _Esc(i, esc.settings.name, path) for i, (esc, path) in enumerate(zip(gateway.escs, ports, strict=True))
         ]
@@ -92,6 +109,8 @@ class Loop:
         self._stopping = False
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._selector.register(self._wake_read, selectors.EVENT_READ, None)
+        if store is not None:
+            self._selector.register(store.fileno(), selectors.EVENT_READ, store)
 
     def stop(self) -> None:
         """End ``run`` soon; safe in a signal handler and from another thread."""
@@ -138,6 +157,7 @@ class Loop:
                     self._serve(key, now)
                 self._reopen(now)
                 gateway.advance(now)
+                self._keep(now)
                 self._transmit(now)
                 self._follow_receive_ids()
                 self._report(now)
@@ -154,6 +174,8 @@ class Loop:
         if self._can is not None:
             self._close_can()
         self._selector.close()
+        if self._store is not None:
+            self._store.close(_LAST_SAVE_S)
         for fd in (self._wake_read, self._wake_write):
             with contextlib.suppress(OSError):
                 os.close(fd)
@@ -165,7 +187,7 @@ class Loop:
             return 0
         due = [self.gateway.next_deadline()]
         due += [esc.retry.due for esc in self._escs if esc.retry.due is not None]
-        due += [when for when in (self._can_retry.due, self._busy_until) if when is not None]
+        due += [w for w in (self._can_retry.due, self._busy_until, self._status_due) if w is not None]
         return min(due)
 
     def _serve(self, key: selectors.SelectorKey, now: int) -> None:
@@ -182,6 +204,8 @@ class Loop:
                 self.gateway.receive_bytes(what.index, data, now)
         elif isinstance(what, CanPort):
             self._receive(what, now)
+        elif isinstance(what, ParameterStore):
+            self._take_kept(what, now)
         else:
             with contextlib.suppress(OSError):
                 os.read(self._wake_read, 64)
@@ -213,6 +237,7 @@ class Loop:
         esc.port = port
         esc.retry.succeeded()
         esc.diagnosis_due = now + DIAGNOSIS_NS
+        esc.line_errors = port.line_errors()
         self._selector.register(port.fileno(), selectors.EVENT_READ, esc)
         self.gateway.port_opened(esc.index, now)
         self._say_open(f"{esc.name}: {esc.path} is open")
@@ -246,6 +271,32 @@ class Loop:
                 self._can_retry.due = None  # an interface that was down is tried by sending
             if self._can_retry.due is None:
                 self.gateway.can_returned(now)
+
+    # --- parameters
+
+    def _keep(self, now: int) -> None:
+        """Hand what is to be stored to the store's thread; while the disk has not taken what came before, it waits."""
+        self._to_keep += self.gateway.take_saves()
+        while self._to_keep:
+            index, stored = self._to_keep[0]
+            if self._store is not None and self._store.save(self._escs[index].name, encode(stored)):
+                self._keeping += 1
+            elif self._keeping:
+                return
+            else:
+                log.error("%s: parameters cannot be stored: there is no store for them", self._escs[index].name)
+                self.gateway.saved(index, "no store", now)
+            self._to_keep.popleft()
+
+    def _take_kept(self, store: ParameterStore, now: int) -> None:
+        for name, error in store.results():
+            self._keeping -= 1
+            index = next(esc.index for esc in self._escs if esc.name == name)
+            if error is None:
+                log.info("%s: parameters stored", name)
+            else:
+                log.error("%s: parameters cannot be stored: %s", name, error)
+            self.gateway.saved(index, error, now)
 
     # --- CAN
 
@@ -385,7 +436,42 @@ class Loop:
         else:
             self._held.append(line)
 
+    def _report_nodes(self) -> None:
+        if self.gateway.node_changes == self._node_changes:
+            return
+        self._node_changes = self.gateway.node_changes
+        states = [(node_id, state) for node_id, state, _ in self.gateway.node_states()]
+        before, self._node_states = self._node_states, states
+        for index, (node_id, state) in enumerate(states):
+            if before and before[index] == (node_id, state):
+                continue
+            words = "waits for LSS" if node_id == UNCONFIGURED else f"{node_id} {_words(state.name)}"
+            log.info("%s: CANopen node %s", self._escs[index].name, words)
+
+    def _tell_status(self, now: int) -> None:
+        """One line about everything, for who wants it every so often."""
+        status, states = self.gateway.status, self.gateway.node_states()
+        counts = [status.sent_frames, *(pdos for _, _, pdos in states)]
+        then, before = self._status_before
+        self._status_before = (now, counts)
+        self._status_due = now + self._status_ns
+        if not before:
+            return
+        seconds = (now - then) / SECOND
+        rates = [(new - old) / seconds for new, old in zip(counts, before, strict=True)]
+        words = [f"CAN {_words(status.can_state.name)} {rates[0]:.0f} frames/s"]
+        for number, esc in enumerate(self.gateway.escs):
+            rate = "" if esc.frame_rate is None else f" {esc.frame_rate / 10:.0f} Hz"
+            words.append(f"{esc.settings.name}: telemetry {_words(esc.link.name)}{rate}")
+            if states and states[number][0] != UNCONFIGURED:
+                node_id, state, _ = states[number]
+                words.append(f"node {node_id} {_words(state.name)} {rates[1 + number]:.0f} PDOs/s")
+        log.info("%s", "; ".join(words))
+
     def _report(self, now: int) -> None:
+        self._report_nodes()
+        if self._status_due is not None and now >= self._status_due:
+            self._tell_status(now)
         for index in dict.fromkeys(self.gateway.take_link_changes()):
             esc, port = self.gateway.escs[index], self._escs[index]
             port.diagnosis_due = now + DIAGNOSIS_NS
@@ -398,9 +484,19 @@ class Loop:
             elif esc.link is LinkState.LOST:
                 log.warning("%s: telemetry lost; its values are marked as not available", port.name)
         for port in self._escs:
+            if port.port is not None and now >= port.line_errors_due:
+                port.line_errors_due = now + SECOND
+                count = port.port.line_errors()
+                self.gateway.escs[port.index].line_errors += max(0, count - port.line_errors)
+                port.line_errors = count
             if port.port is not None and port.diagnosis_due and now >= port.diagnosis_due:
                 port.diagnosis_due = now + DIAGNOSIS_NS
                 diagnosis = self.gateway.escs[port.index].diagnosis()
                 if diagnosis and diagnosis != port.complaint:
                     port.complaint = diagnosis
                     log.warning("%s: no telemetry: %s", port.name, diagnosis)
+
+
+def _words(name: str) -> str:
+    """A constant's name as people read it."""
+    return name.lower().replace("_", "-")
