@@ -128,8 +128,8 @@ class CanopenConfig:
         True,
     )
     store: str | None = _key(
-        "folder of what masters store (default: the service's state folder, else /var/lib/kontronik-can-gw or, for a "
-        "user, ~/.local/state/kontronik-can-gw)",
+        "folder of what masters store (default: the service's state folder; else for root /var/lib/kontronik-can-gw, "
+        "for others ~/.local/state/kontronik-can-gw)",
         "string",
         None,
     )

@@ -103,7 +103,7 @@ def test_a_configuration_is_required(command: str) -> None:
 
 OPTIONS = {
     "demo": ["--seconds", "--seed"],
-    "run": ["-c", "--config", "--wait"],
+    "run": ["-c", "--config", "--wait", "--status"],
     "check": ["-c", "--config"],
     "init": ["FILE", "--force"],
     "dbc": ["-c", "--config", "--from", "--esc", "--name", "--base-id", "--id-step", "--node", "-o", "--output"],

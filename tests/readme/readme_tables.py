@@ -7,11 +7,28 @@ from pathlib import Path
 
 import cantools.database
 
-from kontronik_can_gw.config import CanConfig, DbcConfig, EscConfig, RunConfig, shipped
+from kontronik_can_gw.cia301.eds import ARRAY, RECORD, Eds, load
+from kontronik_can_gw.cia301.emergency import GatewayError, code_of_bit
+from kontronik_can_gw.config import CanConfig, CanopenConfig, DbcConfig, EscConfig, RunConfig, shipped
+from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.sources import Group, sources
 from kontronik_can_gw.telemetry import EscSettings
 
 README = Path(__file__).resolve().parents[2] / "README.md"
+_FOLDED = {*range(0x1800, 0x1C00), 0x2002}
+_TYPES = {2: "i8", 3: "i16", 4: "i32", 5: "u8", 6: "u16", 7: "u32", 9: "text", 15: "domain"}
+_FOUND_BY_GATEWAY = {
+    GatewayError.TELEMETRY_LOST: "telemetry lost",
+    GatewayError.CRC_RATE: "telemetry degraded: many CRC errors or dropped bytes",
+    GatewayError.PORT_GONE: "serial port gone",
+    GatewayError.OTHER_DEVICE: "another device than `[esc].device` says",
+    GatewayError.RECEIVE_OVERRUN: "received CAN frames were lost",
+    GatewayError.CAN_PASSIVE: "CAN controller error passive",
+    GatewayError.HEARTBEAT_LOST: "a watched heartbeat stayed away; byte 4: the node-ID",
+    GatewayError.BUS_OFF_LEFT: "back from bus-off",
+    GatewayError.SYNC_LENGTH: "SYNC of a wrong length",
+    GatewayError.PARAMETER_FILE: "the parameter file could not be read: defaults",
+}
 _WHEN = {
     Group.LIVE: "with fresh live data",
     Group.INFO: "with info of the present device",
@@ -22,10 +39,18 @@ _WHEN = {
 
 def configuration() -> str:
     lines = ["| key | range | default | meaning |", "|---|---|---|---|"]
-    for head, table in (("can", CanConfig), ("dbc", DbcConfig), ("run", RunConfig), ("[esc]", EscConfig)):
+    for head, table in (
+        ("can", CanConfig),
+        ("dbc", DbcConfig),
+        ("canopen", CanopenConfig),
+        ("run", RunConfig),
+        ("[esc]", EscConfig),
+    ):
         for f in fields(table):
             limits = f.metadata
             span = f"{limits['low']} … {limits['high']}" if "low" in limits else limits["kind"]
+            if "also" in limits:
+                span += f", {limits['also']}"
             if "choices" in limits:
                 span = ", ".join(f'"{choice}"' for choice in limits["choices"])
             default = "**required**" if f.default is MISSING and f.default_factory is MISSING else ""
@@ -79,7 +104,70 @@ def source_table() -> str:
     return "\n".join(lines)
 
 
-TABLES = {"configuration": configuration, "messages": messages, "sources": source_table}
+def emergencies() -> str:
+    lines = ["| code | byte 3 | meaning |", "|---|---|---|"]
+    for bit in OperatingError:
+        if bit is not OperatingError.PROGRAMMING_ALLOWED:
+            lines.append(f"| {code_of_bit(bit):04X}h | {int(bit)} | {bit.meaning} |")
+    for error in GatewayError:
+        code, which = error.value
+        lines.append(f"| {code:04X}h | FFh{f', byte 4 = {which}' if which else ''} | {_FOUND_BY_GATEWAY[error]} |")
+    lines.append("| 0000h | FFh | no error any more |")
+    return "\n".join(lines)
+
+
+def objects() -> str:
+    eds = load(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
+    lines = ["| object | name | type | access | default | limits | PDO |", "|---|---|---|---|---|---|---|"]
+    for entry in eds.entries:
+        index, sub = entry.index, entry.sub
+        several = entry.object_type in (ARRAY, RECORD)
+        if several and sub == 0:
+            name = f"{eds.object_names[index]}{_pdo(eds, index)}"
+            lines.append(f"| **{index:04X}h** | **{name}** | | | | | |")
+        if index in _FOLDED or (several and sub == 0):
+            continue
+        where = f"{index:04X}h:{sub:02X}" if several else f"**{index:04X}h**"
+        name = entry.name if several else f"**{entry.name}**"
+        limits = "" if entry.low is entry.high is None else f"{_number(entry.low)} … {_number(entry.high)}"
+        default = f"$NODEID + {_number(entry.default)}" if entry.relative else _number(entry.default)
+        mappable = "yes" if entry.mappable else ""
+        lines.append(
+            f"| {where} | {name} | {_TYPES[entry.data_type]} | {entry.access} | {default} | {limits} | {mappable} |"
+        )
+    return "\n".join(lines)
+
+
+def _pdo(eds: Eds, index: int) -> str:
+    """What a PDO is by default, behind the name of its parameters."""
+    entries = {(e.index, e.sub): e for e in eds.entries}
+    value = {at: entry.default for at, entry in entries.items() if isinstance(entry.default, int)}
+    if index in range(0x1800, 0x1A00):
+        cob_id, kind, inhibit, timer = (value[index, sub] for sub in (1, 2, 3, 5))
+        if cob_id >> 31:
+            return ": spare"
+        return f": $NODEID + {cob_id & 0x7FF:X}h, type {kind}, inhibit time {inhibit / 10:g} ms, event timer {timer} ms"
+    if index in range(0x1A00, 0x1C00):
+        mapped = (value[index, sub] for sub in range(1, value[index, 0] + 1))
+        return ": " + (", ".join(entries[m >> 16, m >> 8 & 0xFF].name for m in mapped) or "nothing")
+    return ""
+
+
+def _number(value: float | bytes | None) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bytes):
+        return value.decode("ascii")
+    return f"{value:X}h" if isinstance(value, int) and value > 0xFFFF else str(value)
+
+
+TABLES = {
+    "configuration": configuration,
+    "messages": messages,
+    "sources": source_table,
+    "emergencies": emergencies,
+    "objects": objects,
+}
 
 
 def with_tables(text: str) -> str:
