@@ -103,6 +103,8 @@ class Gateway:
         """Frames can be sent again after some were lost: say everything that has no cycle once more."""
         self._expire(now)
         self._output.start(now)
+        if self.nodes is not None:
+            self.nodes.can_returned(now)
 
     def set_can_state(self, state: CanState, now: int) -> None:
         """What the runtime knows of the CAN controller."""

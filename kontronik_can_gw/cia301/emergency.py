@@ -180,6 +180,13 @@ class Emergencies:
         self._told = False
         self._untold = list(self._active)
 
+    def tell_again(self, now: int) -> None:
+        """After an outage in which emergencies were lost: tell all that is wrong once more, or that nothing is."""
+        self.close()
+        self._untold = list(self._active)
+        self._told = True
+        self.open(now)
+
     def advance(self, now: int) -> None:
         """Send what waits, no closer than the inhibit time."""
         while self._pending and now >= self._free_at:

@@ -28,7 +28,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.protocol.states import Device, device_text
 from kontronik_can_gw.sources import CanState, GatewayStatus, Group
-from kontronik_can_gw.telemetry import MS, EscSettings, EscTelemetry, Event, LinkState
+from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry, Event, LinkState
 
 UNCONFIGURED = 255
 SAVE, LOAD, RESET = (int.from_bytes(word, "little") for word in (b"save", b"load", b"rset"))
@@ -160,6 +160,7 @@ class Node:
         self._bus_node_id = stored.node_id
         self._waiting_saves: deque[tuple[str, Stored]] = deque()
         self._started = False
+        self._next_overrun = 0
         self._can_state = CanState.UNKNOWN
         self._live = True  # for the edge of 1029h:2
         history = sum(1 for _ in dictionary.subs(0x1003))
@@ -187,7 +188,7 @@ class Node:
 
     def reset_node(self, now: int) -> None:
         """NMT reset node: manufacturer's and profile objects too."""
-        self.misfits = self.dictionary.reset(*_APPLICATION, self.node_id, dict(self._stored.application))
+        self.misfits = self.dictionary.reset(_APPLICATION[0], 0xFFFF, self.node_id, dict(self._stored.application))
         self._apply_settings(now)
         self.reset_communication(now, keep_misfits=True)
 
@@ -224,7 +225,8 @@ class Node:
             return
         yield nmt.COB_ID, self._on_nmt
         yield SDO_REQUEST + self.node_id, self._on_sdo
-        yield self.dictionary.number(0x1005, otherwise=0x80) & 0x7FF, self._on_sync
+        if self.dictionary.get(0x1005) is not None:
+            yield self.dictionary.number(0x1005) & 0x7FF, self._on_sync
         for node_id in self.consumer.node_ids:
             yield heartbeat.COB_ID + node_id, partial(self._on_heartbeat, node_id)
 
@@ -233,9 +235,10 @@ class Node:
         yield nmt.COB_ID, "NMT"
         yield LSS_REQUEST, "LSS"
         yield LSS_ANSWER, "LSS"
-        yield self.dictionary.number(0x1005, otherwise=0x80) & 0x7FF, "SYNC"
         if self.node_id == UNCONFIGURED:
             return
+        if self.dictionary.get(0x1005) is not None:
+            yield self.dictionary.number(0x1005) & 0x7FF, "SYNC"
         who = f"CANopen node {self.node_id}"
         yield heartbeat.COB_ID + self.node_id, f"the heartbeat of {who}"
         yield SDO_REQUEST + self.node_id, f"SDO requests to {who}"
@@ -276,8 +279,21 @@ class Node:
         self.emergencies.set(error, present, now)
         self._set_due()
 
+    def can_returned(self, now: int) -> None:
+        """Frames can be sent again after some were lost: say once more what is wrong, and what is sent on change only."""
+        if self.state not in _VALID:
+            return
+        self.emergencies.tell_again(now)
+        if self.state is NmtState.OPERATIONAL:
+            for tpdo in self.tpdos:
+                tpdo.tell_again(now)
+        self._set_due()
+
     def overrun(self, now: int) -> None:
-        """Received frames were lost in the controller."""
+        """Received frames were lost in the controller: said once a second at most."""
+        if now < self._next_overrun:
+            return
+        self._next_overrun = now + SECOND
         self.emergencies.pulse(GatewayError.RECEIVE_OVERRUN, now)
         self._set_due()
 

@@ -20,11 +20,15 @@ SettingsChanged = Callable[[int, EscSettings], None]
 
 @dataclass(frozen=True)
 class CanopenSetup:
-    """What nodes are made from: the EDS in use, and for each ESC what the configuration says and what is stored."""
+    """What nodes are made from: the EDS in use, and for each ESC what the configuration says and what is stored.
+
+    ``escs``: the ESCs as the configuration says, which is what 2100h is restored to; empty: as the gateway is given them.
+    """
 
     eds: Eds
     settings: tuple[NodeSettings, ...]
     stored: tuple[Stored, ...]
+    escs: tuple[EscSettings, ...] = ()
 
     def esc_settings(self, escs: Sequence[EscSettings]) -> list[EscSettings]:
         """The ESCs' settings with the EDS's defaults and what was stored over the bus worked in."""
@@ -69,8 +73,9 @@ class Nodes:
         self._routes: dict[int, list[Callable[[bytes, int], None]]] = {}
         self._rerouted = True
         self.nodes: list[Node] = []
-        for esc, settings, stored in zip(escs, setup.settings, setup.stored, strict=True):
-            dictionary, _ = make_dictionary(setup.eds, esc.settings, settings, stored)
+        bases = setup.escs or tuple(esc.settings for esc in escs)
+        for esc, base, settings, stored in zip(escs, bases, setup.settings, setup.stored, strict=True):
+            dictionary, _ = make_dictionary(setup.eds, base, settings, stored)
             self.nodes.append(Node(setup.eds, dictionary, esc, gateway, settings, stored, self))
 
     # --- what happens
@@ -102,6 +107,12 @@ class Nodes:
         """The CAN controller's state changed."""
         for node in self.nodes:
             node.on_can_state(state, now)
+        self._after()
+
+    def can_returned(self, now: int) -> None:
+        """Frames can be sent again after some were lost."""
+        for node in self.nodes:
+            node.can_returned(now)
         self._after()
 
     def overrun(self, now: int) -> None:

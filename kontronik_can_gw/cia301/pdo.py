@@ -336,6 +336,11 @@ class Tpdo:
         if self._started and self._running and any(entry.variable is variable for entry in self._mapped):
             self._news(now)
 
+    def tell_again(self, now: int) -> None:
+        """Say once more what is sent on change only."""
+        if self._started and self._running and self._status_mask:
+            self._news(now)
+
     def on_sync(self, counter: int, now: int) -> None:
         """A SYNC message; ``counter`` 0 where it has none."""
         if not self._started or not self._running or self._type > 240:

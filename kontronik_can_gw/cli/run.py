@@ -64,6 +64,10 @@ def _say_parameters(loaded: Loaded) -> None:
         log.error("%s: stored parameters: %s. Running on defaults.", loaded.escs[esc].name, reason)
     if loaded.canopen is None:
         return
+    for node, esc_settings in zip(loaded.canopen.nodes(loaded.escs).nodes, loaded.escs, strict=True):
+        for key in node.misfits:
+            where = f"{key >> 8:04X}h:{key & 0xFF:02X}"
+            log.warning("%s: the stored %s does not fit this EDS and is passed over", esc_settings.name, where)
     for configured, holds in zip(loaded.config.escs, loaded.escs, strict=True):
         for name in ("pole_pairs", "gear", "cell_count", "timeout_ns"):
             if getattr(configured, name) != getattr(holds, name):
