@@ -5,7 +5,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.frames import CanFrame
@@ -106,6 +106,7 @@ PUTS = st.tuples(st.booleans(), st.integers(0x181, 0x184))
 STEPS = st.lists(st.one_of(PUTS, st.integers(0, 6)), max_size=80)
 
 
+@settings(deadline=None)  # a busy machine is no fault
 @given(STEPS)
 def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent(
     steps: list[tuple[bool, int] | int],
