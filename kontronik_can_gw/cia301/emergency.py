@@ -59,6 +59,9 @@ class GatewayError(Enum):
     PARAMETER_FILE = 0x6300, 0
 
 
+_OF_COMMUNICATION = frozenset(error.value[0] for error in (GatewayError.HEARTBEAT_LOST, GatewayError.SYNC_LENGTH))
+
+
 class Condition(NamedTuple):
     """Something that is wrong."""
 
@@ -174,8 +177,9 @@ class Emergencies:
         self._pending.clear()
 
     def reset(self) -> None:
-        """Reset communication: an empty history, and everything that is wrong counts as untold."""
+        """Reset communication: an empty history, and everything that is wrong counts as untold; heartbeats and SYNC are watched anew."""
         self.close()
+        self._active = {condition: None for condition in self._active if condition.code not in _OF_COMMUNICATION}
         self.history.clear()
         self._told = False
         self._untold = list(self._active)

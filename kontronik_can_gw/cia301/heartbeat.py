@@ -47,12 +47,17 @@ class Consumer:
         self._watched: dict[int, _Watched] = {}
 
     def configure(self, values: Iterable[int]) -> None:
-        """From the entries of 1016h: bits 23..16 node-ID, bits 15..0 time in ms; 0 in either leaves it unused."""
-        self._watched = {}
+        """From the entries of 1016h: bits 23..16 node-ID, bits 15..0 time in ms; 0 in either leaves it unused.
+
+        A watch that stays as it was goes on.
+        """
+        before, self._watched = self._watched, {}
         for value in values:
-            node_id, time_ms = value >> 16 & 0xFF, value & 0xFFFF
-            if 1 <= node_id <= 127 and time_ms:
-                self._watched[node_id] = _Watched(node_id, time_ms * MS)
+            node_id, timeout = value >> 16 & 0xFF, (value & 0xFFFF) * MS
+            if 1 <= node_id <= 127 and timeout:
+                old = before.get(node_id)
+                kept = old if old is not None and old.timeout == timeout else None
+                self._watched[node_id] = kept or _Watched(node_id, timeout)
 
     @property
     def node_ids(self) -> tuple[int, ...]:

@@ -489,6 +489,7 @@ class Node:
 
     def _configure_heartbeat(self, now: int) -> None:
         self.producer.configure(self.dictionary.number(0x1017), now)
+        self.consumer = heartbeat.Consumer()
         self.consumer.configure(v.value for v in self.dictionary.subs(0x1016) if isinstance(v.value, int))
 
     def _apply_settings(self, now: int) -> None:
@@ -685,9 +686,10 @@ class Node:
         heartbeat.check_consumer(value, others)
 
     def _watches_changed(self, now: int) -> bool:
-        for node_id in self.consumer.lost:
-            self.emergencies.set(GatewayError.HEARTBEAT_LOST, False, now, node_id)
+        lost = self.consumer.lost
         self.consumer.configure(v.value for v in self.dictionary.subs(0x1016) if isinstance(v.value, int))
+        for node_id in set(lost).difference(self.consumer.lost):
+            self.emergencies.set(GatewayError.HEARTBEAT_LOST, False, now, node_id)
         self._around.routes_changed()
         return True
 
