@@ -20,7 +20,7 @@ from kontronik_can_gw.cia301.eds import Eds
 from kontronik_can_gw.cia301.emergency import Emergencies, GatewayError
 from kontronik_can_gw.cia301.heartbeat import NEVER
 from kontronik_can_gw.cia301.nmt import Command, NmtState
-from kontronik_can_gw.cia301.pdo import COMMUNICATION, MAPPING, MOST, Tpdo, restricted
+from kontronik_can_gw.cia301.pdo import COB_ID, COMMUNICATION, INVALID_BIT, MAPPING, MOST, Tpdo, restricted
 from kontronik_can_gw.cia301.sdo import SdoServer
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.cia305.lss import LssSlave
@@ -36,6 +36,7 @@ SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x600, 0x580, 0x7E5, 0x7E4
 _COMMUNICATION, _APPLICATION = (0x1000, 0x1FFF), (0x2000, 0x9FFF)
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 _SELF_START_OFF = 4
+_NOT_VALID = 1 << 31  # of 1014h
 _MOST_SAVES = 4
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
 
@@ -77,11 +78,11 @@ class Surroundings(Protocol):
     def state_changed(self) -> None:
         """The node's NMT state or node-ID is another one."""
 
-    def cob_id_taken(self, cob_id: int, tpdo: Tpdo) -> bool:
-        """Whether something else of the gateway sends with this id."""
+    def cob_id_taken(self, cob_id: int, user: object) -> bool:
+        """Whether something else of the gateway uses this id; ``user`` as in ``Node.chosen_ids``."""
 
     def node_id_taken(self, node_id: int, node: "Node") -> bool:
-        """Whether another node of the gateway has this node-ID, now or from its next reset on."""
+        """Whether another node of the gateway has this node-ID, now or from its next reset on, or another message a COB-ID of it."""
 
 
 def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
@@ -203,6 +204,8 @@ class Node:
         self.node_id = self.pending_node_id
         self.misfits += self.dictionary.reset(*_COMMUNICATION, self.node_id, dict(self._stored.communication))
         for tpdo in self.tpdos:
+            tpdo.valid = False  # what one had is free for another
+        for tpdo in self.tpdos:
             self._configure_or_default(tpdo, now)
         self._configure_heartbeat(now)
         self.emergencies.inhibit_ns = self.dictionary.number(0x1015) * MS // 10
@@ -243,10 +246,23 @@ class Node:
         yield heartbeat.COB_ID + self.node_id, f"the heartbeat of {who}"
         yield SDO_REQUEST + self.node_id, f"SDO requests to {who}"
         yield SDO_ANSWER + self.node_id, f"SDO answers of {who}"
-        yield self.dictionary.number(0x1014) & 0x7FF, f"emergencies of {who}"
+        if not self._emergency_id & _NOT_VALID:
+            yield self._emergency_id & 0x7FF, f"emergencies of {who}"
         for tpdo in self.tpdos:
             if tpdo.valid:
                 yield tpdo.cob_id, f"TPDO {tpdo.number + 1} of {who}"
+
+    def chosen_ids(self) -> Iterator[tuple[object, int]]:
+        """COB-IDs that a master can choose: (who uses it, id). All nodes may have the same SYNC, so it is one user."""
+        if self.node_id == UNCONFIGURED:
+            return
+        if self.dictionary.get(0x1005) is not None:
+            yield sync, self.dictionary.number(0x1005) & 0x7FF
+        if not self._emergency_id & _NOT_VALID:
+            yield self, self._emergency_id & 0x7FF
+        for tpdo in self.tpdos:
+            if tpdo.valid:
+                yield tpdo, tpdo.cob_id
 
     # --- what happens
 
@@ -409,9 +425,12 @@ class Node:
         self._send(LSS_ANSWER, data)
 
     def _send_emergency(self, data: bytes) -> None:
-        cob_id = self.dictionary.number(0x1014, otherwise=1 << 31)
-        if not cob_id >> 31:
-            self._send(cob_id & 0x7FF, data)
+        if not self._emergency_id & _NOT_VALID:
+            self._send(self._emergency_id & 0x7FF, data)
+
+    @property
+    def _emergency_id(self) -> int:
+        return self.dictionary.number(0x1014, otherwise=_NOT_VALID)
 
     # --- states
 
@@ -475,7 +494,7 @@ class Node:
             tpdo.on_download(variable, now)
 
     def _configure_or_default(self, tpdo: Tpdo, now: int) -> None:
-        """Stored PDO parameters that no longer make sense with this EDS give way to the defaults."""
+        """Stored PDO parameters that no longer make sense with this EDS give way to the defaults; without a free COB-ID there is no PDO."""
         try:
             tpdo.configure(now)
             tpdo.check(lambda cob_id: self._around.cob_id_taken(cob_id, tpdo))
@@ -486,6 +505,10 @@ class Node:
                         self.misfits.append(number)
                     variable.value = default
             tpdo.configure(now)
+            cob_id = self.dictionary.get(COMMUNICATION + tpdo.number, COB_ID)
+            if cob_id is not None and self._around.cob_id_taken(tpdo.cob_id, tpdo):
+                cob_id.value = int(cob_id.value) | INVALID_BIT
+                tpdo.configure(now)
 
     def _configure_heartbeat(self, now: int) -> None:
         self.producer.configure(self.dictionary.number(0x1017), now)
@@ -557,7 +580,7 @@ class Node:
         hook(0x1003, 0, _only_zero, lambda _now: self._clear_history())
         for variable in self.dictionary.subs(0x1003):
             variable.read = partial(self._history, variable.entry.sub)
-        hook(0x1005, 0, lambda v: sync.check_cob_id(v, restricted(v & 0x7FF) and v & 0x7FF != 0x80), self._rerouted)
+        hook(0x1005, 0, self._check_sync_cob_id, self._rerouted)
         version = self.settings.version.encode("ascii", "replace")
         read(0x100A, 0, lambda _now: version)
         for part in (1, 2, 3):
@@ -670,12 +693,19 @@ class Node:
         return True
 
     def _check_emergency_cob_id(self, value: int) -> None:
-        """1014h: bits 0..30 cannot change while it is valid; no 29-bit or restricted id."""
-        old = self.dictionary.number(0x1014, otherwise=1 << 31)
-        if value & 0x7FFFF800 or (not value >> 31 and restricted(value & 0x7FF)):
+        """1014h: bits 0..30 cannot change while it is valid; no 29-bit or restricted id, none that is taken."""
+        old, valid = self._emergency_id, not value & _NOT_VALID
+        if value & 0x7FFFF800 or (valid and restricted(value & 0x7FF)):
             raise SdoAbort(Abort.VALUE)
-        if not old >> 31 and not value >> 31 and old != value:
+        if valid and not old & _NOT_VALID and old != value:
             raise SdoAbort(Abort.VALUE)
+        if valid and self._around.cob_id_taken(value & 0x7FF, self):
+            raise SdoAbort(Abort.INCOMPATIBLE)
+
+    def _check_sync_cob_id(self, value: int) -> None:
+        sync.check_cob_id(value, restricted(value & 0x7FF))
+        if self._around.cob_id_taken(value & 0x7FF, sync):
+            raise SdoAbort(Abort.INCOMPATIBLE)
 
     def _set_emergency_inhibit(self) -> bool:
         self.emergencies.inhibit_ns = self.dictionary.number(0x1015) * MS // 10

@@ -3,11 +3,20 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from kontronik_can_gw.cia301 import heartbeat
 from kontronik_can_gw.cia301.eds import Eds
 from kontronik_can_gw.cia301.emergency import GatewayError
 from kontronik_can_gw.cia301.heartbeat import NEVER
-from kontronik_can_gw.cia301.node import LSS_REQUEST, UNCONFIGURED, Node, NodeSettings, esc_settings, make_dictionary
-from kontronik_can_gw.cia301.pdo import Tpdo
+from kontronik_can_gw.cia301.node import (
+    LSS_REQUEST,
+    SDO_ANSWER,
+    SDO_REQUEST,
+    UNCONFIGURED,
+    Node,
+    NodeSettings,
+    esc_settings,
+    make_dictionary,
+)
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import CanState, GatewayStatus
@@ -15,6 +24,8 @@ from kontronik_can_gw.telemetry import EscSettings, EscTelemetry
 
 _FRAME_BITS = 47
 """Of a frame without data and stuffing."""
+_FIRST_IDS = (0x80, SDO_ANSWER, SDO_REQUEST, heartbeat.COB_ID)
+"""COB-IDs of EMCY, SDO and heartbeat, less the node-ID."""
 SettingsChanged = Callable[[int, EscSettings], None]
 
 
@@ -178,15 +189,18 @@ class Nodes:
     def state_changed(self) -> None:
         self.state_changes += 1
 
-    def cob_id_taken(self, cob_id: int, tpdo: Tpdo) -> bool:
+    def cob_id_taken(self, cob_id: int, user: object) -> bool:
         if cob_id in self._foreign_ids:
             return True
-        others = (other for node in self.nodes for other in node.tpdos if other is not tpdo)
-        return any(other.valid and other.cob_id == cob_id for other in others)
+        used = (chosen for node in self.nodes for chosen in node.chosen_ids())
+        return any(other is not user and other_id == cob_id for other, other_id in used)
 
     def node_id_taken(self, node_id: int, node: Node) -> bool:
-        others = (other for other in self.nodes if other is not node)
-        return node_id != UNCONFIGURED and any(node_id in (o.node_id, o.pending_node_id) for o in others)
+        if node_id == UNCONFIGURED:
+            return False
+        if any(first + node_id in self._foreign_ids for first in _FIRST_IDS):
+            return True
+        return any(node_id in (other.node_id, other.pending_node_id) for other in self.nodes if other is not node)
 
     def _after(self) -> None:
         if self._rerouted:
