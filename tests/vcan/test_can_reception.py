@@ -25,7 +25,7 @@ from kontronik_can_gw.protocol import LiveData, encode
 from kontronik_can_gw.runtime.can_port import CanPort, Sent
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import EscSettings, LinkState
+from kontronik_can_gw.telemetry import EscSettings
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 CLASSIC = struct.Struct("=IB3x8s")
@@ -316,7 +316,7 @@ def test_a_node_hears_again_when_its_interface_was_down(vcan: str, run_node: Cal
             with pytest.raises(OSError, match="down"):
                 peer.receive(0)
             assert peer.ask(0x602, b"again", 0.5) == (0x582, b"again")
-            assert node.status.can_state is CanState.ERROR_ACTIVE
+            wait_for(lambda: node.status.can_state is CanState.ERROR_ACTIVE, 2, "error active")
             assert running.loop._can is port
 
 
@@ -339,24 +339,33 @@ def test_a_node_hears_again_when_its_interface_was_removed(vcan: str, run_node: 
     assert node.status.received_frames == 4
 
 
-def test_a_flood_of_wanted_frames_does_not_starve_the_uart(vcan: str, run_node: Callable[[Node], Running]) -> None:
+def test_a_flood_of_wanted_frames_does_not_starve_the_uart(
+    vcan: str, run_node: Callable[[Node], Running], caplog: pytest.LogCaptureFixture
+) -> None:
     node = Node(0x602)
     running = run_node(node)
+    counters = node.escs[0].counters
+    took: list[float] = []
     flood = subprocess.Popen(["cangen", vcan, "-g", "0", "-I", "602", "-L", "8", "-i"])
     try:
-        begin = time.monotonic()
         wait_for(lambda: node.status.received_frames > 100, 5, "the flood")
-        written = 0
-        while time.monotonic() - begin < 2:
-            running.esc.write(encode(LiveData(electrical_speed=written), UartLayout.V4))
-            written += 1
+        for n in range(150):
+            before, begin = counters.live, time.monotonic()
+            running.esc.write(encode(LiveData(electrical_speed=n), UartLayout.V4))
+            while counters.live == before and time.monotonic() - begin < 1:
+                time.sleep(0.001)
+            took.append(time.monotonic() - begin)
             time.sleep(0.01)
-        seconds = time.monotonic() - begin
+        received = node.status.received_frames
+        assert flood.poll() is None, "to the end"
     finally:
         flood.terminate()
         flood.wait()
-    telemetry = node.escs[0]
-    wait_for(lambda: telemetry.counters.live == written, 2, "all live frames")
-    print(f"{written} live frames beside {node.status.received_frames} CAN frames in {seconds:.1f} s")
-    assert telemetry.losses == 0
-    assert telemetry.link is LinkState.OK
+    # on a busy machine the whole process may be held up so long that the loop rightly takes what waits for old
+    held_up = sum("suspended" in record.message for record in caplog.records)
+    print(
+        f"150 live frames beside {received} CAN frames, the slowest {max(took) * 1000:.0f} ms, {held_up} times held up"
+    )
+    assert 150 - counters.live <= held_up <= 5
+    assert sorted(took)[75] < 0.1
+    assert received > 1000
