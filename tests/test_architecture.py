@@ -35,6 +35,7 @@ ONLY_IN = {
         "dbc_output/expand.py",
         "dbc_output/prepare.py",
         "dbc_output/writer.py",
+        "canopen_dbc.py",
         "cli",
     ),
     "serial": ("runtime",),

@@ -1,9 +1,10 @@
 """What several commands share: from a configuration to a checked layout, and talk on standard error."""
 
+import io
 import logging
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,10 +16,10 @@ from kontronik_can_gw.cia301.eds import load as eds_of
 from kontronik_can_gw.cia301.node import NodeSettings, check_eds
 from kontronik_can_gw.cia301.nodes import CanopenSetup
 from kontronik_can_gw.cia301.storage import Stored, decode
-from kontronik_can_gw.config import UNCONFIGURED, Config, load
+from kontronik_can_gw.config import UNCONFIGURED, Config, load, shipped
 from kontronik_can_gw.dbc_output.layout import Layout, load_database
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.runtime.can_port import check_interface
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
@@ -206,3 +207,52 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
     finally:
         for number, old in zip(numbers, before, strict=True):
             signal.signal(number, old)
+
+
+def canopen_of(loaded: Loaded) -> CanopenSetup:
+    """The nodes of a configuration. UserError where it has none."""
+    if loaded.canopen is None:
+        raise UserError(f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. Set it to true.")
+    return loaded.canopen
+
+
+def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:
+    """Nodes by the shipped EDS, as they are without a configuration."""
+    file = shipped("eds/kontronik_esc.eds")
+    settings = tuple(NodeSettings(node_id, version=__version__) for node_id in node_ids)
+    return CanopenSetup(eds_of(file.read_bytes(), str(file)), settings, (Stored(),) * len(settings))
+
+
+def write_output(where: str, text: str, encoding: str) -> None:
+    """Text to a file, which is then told, or for ``-`` to standard output; line ends as they are. RunError where it cannot be written."""
+    data = text.encode(encoding)
+    if where != "-":
+        write_file(Path(where), data)
+        say(f"{where} written")
+    elif isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.buffer.write(data)
+    else:
+        sys.stdout.write(text)
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """All or nothing: a reader never sees half a file. What is no plain file (a pipe, /dev/stdout) is written to, not replaced."""
+    import tempfile
+
+    beside: Path | None = None
+    try:
+        target = path.resolve()
+        if target.exists() and not target.is_file():
+            target.write_bytes(data)
+            return
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{path.name}.", delete=False) as file:
+            beside = Path(file.name)
+            file.write(data)
+        beside.chmod(0o644)
+        beside.replace(target)
+        beside = None
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror}. Give another -o.") from None
+    finally:
+        if beside is not None:
+            beside.unlink(missing_ok=True)

@@ -1,21 +1,31 @@
-"""``dbc``: write the DBC of several ESCs from a one-ESC DBC, or of exactly what a configuration sends."""
+"""``dbc``: write the DBC of several ESCs from a one-ESC DBC, or of exactly what a configuration or its CANopen nodes send."""
 
 import argparse
-import io
 import re
-import sys
-import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cli.common import load_all, say
+from kontronik_can_gw.canopen_dbc import database as canopen_database
+from kontronik_can_gw.canopen_dbc import waiting_for_lss
+from kontronik_can_gw.cli.common import canopen_of, load_all, say, shipped_canopen, write_output
 from kontronik_can_gw.config import name_problem, shipped
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.telemetry import EscSettings
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+_MOST_NODES = 127
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-c", "--config", type=Path, metavar="FILE", help="write the DBC of what this configuration sends"
+    )
+    parser.add_argument(
+        "--canopen",
+        action="store_true",
+        help="describe what the CANopen nodes send: PDOs as they are mapped now, heartbeats, emergencies",
     )
     parser.add_argument(
         "--from", type=Path, dest="source", metavar="DBC", help="one-ESC DBC to start from (default: the shipped one)"
@@ -44,53 +54,52 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.dbc_output.expand import dbc_text
 
-    text = dbc_text(_database(args))
+    text = dbc_text(_canopen(args) if args.canopen else _database(args))
     try:
-        data = text.encode("cp1252")  # what tools take a DBC for; ASCII as a rule
+        text.encode("cp1252")  # what tools take a DBC for; ASCII as a rule
+        encoding = "cp1252"
     except UnicodeEncodeError:
-        data = text.encode("utf-8")
+        encoding = "utf-8"
         say(
             "warning: written in UTF-8, because it has characters that Windows-1252, the usual encoding of a DBC, has not"
         )
-    if args.output == "-":
-        if isinstance(sys.stdout, io.TextIOWrapper):
-            sys.stdout.buffer.write(data)
-        else:
-            sys.stdout.write(text)
-        return 0
-    _write(Path(args.output), data)
-    say(f"{args.output} written")
+    write_output(args.output, text, encoding)
     return 0
 
 
-def _database(args: argparse.Namespace):  # type: ignore[no-untyped-def]  # cantools' type, imported only when needed
+def _canopen(args: argparse.Namespace) -> "Database":
+    """The DBC of the configured nodes, or of as many by the shipped EDS, node-IDs from 1 on."""
+    _refuse(args, ("from", "base_id", "id_step", "node"), "--canopen, which describes the nodes as they are")
+    if args.config is not None:
+        _refuse(args, ("esc", "name"), "--config, which says all that")
+        loaded = load_all(args.config)
+        setup, escs = canopen_of(loaded), loaded.escs
+    else:
+        escs = _escs(args)
+        if len(escs) > _MOST_NODES:
+            raise UserError(f"--esc: {len(escs)} are more than the {_MOST_NODES} nodes that a CANopen bus has")
+        setup = shipped_canopen(range(1, len(escs) + 1))
+        escs = setup.esc_settings(escs)
+    nodes = setup.nodes(escs)
+    if waiting := waiting_for_lss(nodes, escs):
+        say(f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to describe")
+    return canopen_database(nodes, escs)
+
+
+def _database(args: argparse.Namespace) -> "Database":
     from kontronik_can_gw.dbc_output.expand import expand
     from kontronik_can_gw.dbc_output.layout import DbcSettings, choose_node, load_database
     from kontronik_can_gw.dbc_output.prepare import prepare
 
     if args.config is not None:
-        given = [
-            f"--{n.replace('_', '-')}"
-            for n in ("esc", "name", "base_id", "id_step", "node")
-            if getattr(args, n) is not None
-        ]
-        given += ["--from"] if args.source is not None else []
-        if given:
-            raise UserError(f"{' and '.join(given)} cannot be combined with --config, which says all that")
+        _refuse(args, ("esc", "name", "base_id", "id_step", "node", "from"), "--config, which says all that")
         database = load_all(args.config).database
         if database is None:
             raise UserError(
                 f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. --canopen writes those of the nodes."
             )
         return database
-    names = args.name or []
-    count = args.esc if args.esc is not None else max(1, len(names))
-    if names and len(names) != count:
-        raise UserError(f"--name is given {len(names)} times for {count} ESCs")
-    names = names or [f"esc{number}" for number in range(1, count + 1)]
-    if problem := name_problem(names):
-        raise UserError(f"--name: {problem}")
-    escs = [EscSettings(name) for name in names]
+    escs = _escs(args)
     file = args.source or shipped("dbc/kontronik_esc.dbc")
     database = load_database(file)
     node = choose_node(database, args.node, str(file))
@@ -101,25 +110,27 @@ def _database(args: argparse.Namespace):  # type: ignore[no-untyped-def]  # cant
     return database
 
 
-def _write(path: Path, data: bytes) -> None:
-    """All or nothing: a reader never sees half a file. What is no plain file (a pipe, /dev/stdout) is written to, not replaced."""
-    beside: Path | None = None
-    try:
-        target = path.resolve()
-        if target.exists() and not target.is_file():
-            target.write_bytes(data)
-            return
-        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{path.name}.", delete=False) as file:
-            beside = Path(file.name)
-            file.write(data)
-        beside.chmod(0o644)
-        beside.replace(target)
-        beside = None
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror}. Give another -o.") from None
-    finally:
-        if beside is not None:
-            beside.unlink(missing_ok=True)
+def _refuse(args: argparse.Namespace, options: tuple[str, ...], beside: str) -> None:
+    """UserError for options that make no sense beside another one."""
+    given = [
+        f"--{name.replace('_', '-')}"
+        for name in options
+        if getattr(args, "source" if name == "from" else name) is not None
+    ]
+    if given:
+        raise UserError(f"{' and '.join(given)} cannot be combined with {beside}")
+
+
+def _escs(args: argparse.Namespace) -> list[EscSettings]:
+    """As many ESCs as ``--esc`` and ``--name`` say."""
+    names = args.name or []
+    count = args.esc if args.esc is not None else max(1, len(names))
+    if names and len(names) != count:
+        raise UserError(f"--name is given {len(names)} times for {count} ESCs")
+    names = names or [f"esc{number}" for number in range(1, count + 1)]
+    if problem := name_problem(names):
+        raise UserError(f"--name: {problem}")
+    return [EscSettings(name) for name in names]
 
 
 def _count(text: str) -> int:

@@ -106,7 +106,11 @@ OPTIONS = {
     "run": ["-c", "--config", "--wait", "--status"],
     "check": ["-c", "--config"],
     "init": ["FILE", "--force"],
-    "dbc": ["-c", "--config", "--from", "--esc", "--name", "--base-id", "--id-step", "--node", "-o", "--output"],
+    "dbc": [
+        *("-c", "--config", "--canopen", "--from", "--esc", "--name", "--base-id", "--id-step", "--node"),
+        *("-o", "--output"),
+    ],
+    "eds": ["-c", "--config", "--node-id", "-o", "--output"],
     "decode": ["FILE", "--csv", "--stats"],
     "simulate": [
         *("--esc", "--device", "--layout", "--variant", "--firmware", "--cells", "--rate", "--info-every"),

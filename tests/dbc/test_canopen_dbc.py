@@ -1,0 +1,785 @@
+"""The DBC of the CANopen side: what it decodes from the nodes' own frames is what the telemetry says, in every tool."""
+
+import io
+import logging
+import random
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cantools.database
+import pytest
+from cantools.database.can import Database
+from cantools.database.namedsignalvalue import NamedSignalValue
+from dbc_rules import ENUMS, RULES, parse
+from test_dbc_in_other_tools import frame, raw_value
+
+from kontronik_can_gw import canopen_dbc
+from kontronik_can_gw.cia301 import eds as reader
+from kontronik_can_gw.cia301.eds import Eds
+from kontronik_can_gw.cia301.emergency import GatewayError
+from kontronik_can_gw.cia301.node import NodeSettings
+from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cia301.storage import Stored, encode
+from kontronik_can_gw.cli import main
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.dbc_output.expand import esc_prefix
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.dbc_output.writer import dbc_text
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
+from kontronik_can_gw.protocol.states import Device, OperatingError
+from kontronik_can_gw.simulator import BYTE_NS, Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry
+
+SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_canopen.dbc"
+EDS_TEXT = shipped("eds/kontronik_esc.eds").read_bytes().decode("ascii")
+EDS = reader.load(EDS_TEXT.encode(), "kontronik_esc.eds")
+ONE = (EscSettings("esc1"),)
+PAIR = (EscSettings("left"), EscSettings("right_r", pole_pairs=7, gear=Fraction(5, 2)))
+NA = "NotAvailable"
+
+
+def setup(
+    escs: Sequence[EscSettings], node_ids: Sequence[int] = (), stored: Sequence[Stored] = (), eds: Eds = EDS
+) -> CanopenSetup:
+    ids = node_ids or range(1, len(escs) + 1)
+    return CanopenSetup(eds, tuple(NodeSettings(i, serial=i) for i in ids), tuple(stored) or (Stored(),) * len(escs))
+
+
+def read(text: str) -> Database:
+    """At cantools' strictest, and without a warning of two messages with one name or id."""
+    database = cantools.database.load_string(text, "dbc", strict=True)
+    assert isinstance(database, Database)
+    return database
+
+
+def written(of: CanopenSetup, escs: Sequence[EscSettings]) -> str:
+    settings = of.esc_settings(escs)
+    text = dbc_text(canopen_dbc.database(of.nodes(settings), settings))
+    assert text.isascii()
+    return text
+
+
+def pascal(name: str) -> str:
+    return "".join(word.capitalize() for word in name.split("_"))
+
+
+class Bench:
+    """A gateway with simulated ESCs on its lines; each frame is decoded at once and held against the telemetry of that moment."""
+
+    def __init__(self, of: CanopenSetup, escs: Sequence[EscSettings], simulated: Sequence[EscOptions] = ()) -> None:
+        self.setup = of
+        self.escs = of.esc_settings(escs)
+        self.gateway = Gateway(self.escs, Layout("", "", ()), 0, canopen=of)
+        assert self.gateway.nodes is not None
+        self.nodes = self.gateway.nodes
+        options = simulated or (EscOptions(),) * len(escs)
+        self.simulators = [SimulatedEsc(option, seed=n, start_ns=MS) for n, option in enumerate(options)]
+        self.prefixes = [esc_prefix(esc.name) if len(escs) > 1 else "" for esc in escs]
+        self.database = read(written(of, escs))
+        self.seen: dict[str, list[dict[str, Any]]] = {}
+        """Message name to what was decoded, in order."""
+        self.gateway.start(0)
+
+    def describe_anew(self) -> None:
+        """The DBC of the nodes as they are at this moment."""
+        self.database = read(dbc_text(canopen_dbc.database(self.nodes, self.escs)))
+
+    def operational(self, now: int) -> None:
+        self.gateway.receive_frame(CanFrame(0, b"\x01\x00"), now)
+        self.take()
+
+    def run(self, until: int) -> None:
+        events = sorted(
+            (sent.time_ns + len(sent.wire) * BYTE_NS, n, sent.wire)
+            for n, simulator in enumerate(self.simulators)
+            for sent in simulator.frames_until(until)
+        )
+        for when, esc, wire in events:
+            self.until(when)
+            self.gateway.receive_bytes(esc, wire, when)
+            self.take()
+        self.until(until)
+
+    def until(self, when: int) -> None:
+        while (due := self.gateway.next_deadline()) <= when:
+            self.gateway.advance(due)
+            self.take()
+
+    def take(self) -> None:
+        for sent in self.gateway.take_frames():
+            if 0x580 <= sent.can_id < 0x600 or sent.can_id == 0x7E4:
+                continue
+            message = self.database.get_message_by_frame_id(sent.can_id)
+            assert len(sent.data) == message.length, message.name
+            decoded: Any = message.decode(sent.data)
+            values = {k: str(v) if isinstance(v, NamedSignalValue) else v for k, v in decoded.items()}
+            self.seen.setdefault(message.name, []).append(values)
+            esc = self.of_message(sent.can_id)
+            if "Tpdo" in message.name:
+                self.check(self.gateway.escs[esc], self.prefixes[esc], values)
+
+    def of_message(self, can_id: int) -> int:
+        nodes = enumerate(self.nodes.nodes)
+        return next(n for n, node in nodes if can_id in dict(node.cob_ids()))
+
+    def check(self, esc: EscTelemetry, prefix: str, values: Mapping[str, Any]) -> None:
+        known = expected(esc)
+        for name, value in values.items():
+            assert name.startswith(prefix)
+            wanted = known[name.removeprefix(prefix)]
+            if isinstance(wanted, float):
+                assert value == pytest.approx(wanted, abs=1e-9), name
+            else:
+                assert value == wanted, name
+
+    def sdo(self, request: str, now: int, node_id: int = 1) -> str:
+        self.gateway.receive_frame(CanFrame(0x600 + node_id, bytes.fromhex(request)), now)
+        for esc, stored in self.gateway.take_saves():
+            self.stored = stored
+            self.gateway.saved(esc, None, now)
+        answers = [f for f in self.gateway.take_frames() if f.can_id == 0x580 + node_id]
+        assert len(answers) == 1
+        return answers[0].data.hex()
+
+    def write(self, index: int, sub: int, value: int, size: int, now: int = 2 * MS, node_id: int = 1) -> None:
+        command = {1: "2f", 2: "2b", 4: "23"}[size]
+        place = f"{index.to_bytes(2, 'little').hex()}{sub:02x}"
+        assert self.sdo(f"{command}{place}{value.to_bytes(4, 'little').hex()}", now, node_id) == f"60{place}00000000"
+
+    def remap(self, pdo: int, cob_id: int, objects: Sequence[int], node_id: int = 1, kind: int = 254) -> None:
+        """The procedure of CiA 301 for another mapping; ``objects`` as mapping entries."""
+        self.write(0x1800 + pdo, 1, 0xC0000000 | cob_id, 4, node_id=node_id)
+        self.write(0x1A00 + pdo, 0, 0, 1, node_id=node_id)
+        for sub, entry in enumerate(objects, 1):
+            self.write(0x1A00 + pdo, sub, entry, 4, node_id=node_id)
+        self.write(0x1A00 + pdo, 0, len(objects), 1, node_id=node_id)
+        self.write(0x1800 + pdo, 2, kind, 1, node_id=node_id)
+        self.write(0x1800 + pdo, 1, 0x40000000 | cob_id, 4, node_id=node_id)
+
+
+def expected(esc: EscTelemetry) -> dict[str, Any]:
+    """What each signal without prefix must show now, from the rows of the sheet and the telemetry."""
+    live, info, settings = esc.live, esc.last_info, esc.settings
+    found: dict[str, Any] = {}
+    for data, kind in ((live, LiveData), (info, InfoData)):
+        for name, row in rows(kind).items():
+            signal = pascal(name) + ("Percent" if row.unit == "%" else "")
+            found[signal] = NA if data is None else row.physical(getattr(data, name))
+    found["OperatingState"] = NA
+    if live is not None:
+        found["OperatingState"] = ENUMS["OperatingState"].get(live.operating_state, f"State{live.operating_state}")
+    word = 0xFFFFFFFF if live is None else live.operating_errors
+    found |= {pascal(bit.name): word >> bit & 1 for bit in OperatingError}
+    if not (esc.bec_current_supplied(live.bec_current) if live else False):
+        found["BecCurrent"] = NA
+    if info is None or info.device == Device.JIVEPRO:
+        found["MaxBecCurrent"] = NA
+    found["LinkState"] = ENUMS["LinkState"][esc.link]
+    found["Replay"] = 0
+    found["InfoValid"] = int(esc.info is not None)
+    found["LiveCounter"] = esc.counters.live % 256
+    found["CrcErrors"] = esc.counters.crc_errors
+    speed = None if live is None else Fraction(live.electrical_speed, settings.pole_pairs)
+    found["MotorSpeed"] = NA if speed is None else int(speed + Fraction(1, 2))
+    found["OutputSpeed"] = NA if speed is None else int(speed / settings.gear + Fraction(1, 2))
+    found["VelocityActualValue"] = found["MotorSpeed"]
+    found["DcLinkCircuitVoltage"] = found["BatteryVoltage"]
+    power = None if live is None else live.battery_voltage * live.battery_current
+    found["BatteryPower"] = NA if power is None else (power + 50) // 100 / 10
+    return found
+
+
+# --- the shipped file -------------------------------------------------------------------------------------------------
+
+
+def test_the_shipped_file_is_what_the_command_writes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["dbc", "--canopen"]) == 0
+    assert capsys.readouterr().out == SHIPPED.read_text()
+
+
+def test_the_shipped_file_describes_the_defaults_of_node_1() -> None:
+    db = parse(SHIPPED.read_bytes())
+    timing = {
+        message.name: (
+            message.id,
+            message.dlc,
+            db.send_type(message),
+            db.number("GenMsgCycleTime", message),
+            db.number("GenMsgDelayTime", message),
+        )
+        for message in db.messages
+    }
+    assert timing == {
+        "EscTpdo1": (0x181, 8, "Event", 0, 20),
+        "EscTpdo2": (0x281, 8, "Event", 0, 50),
+        "EscTpdo3": (0x381, 8, "Event", 0, 100),
+        "EscTpdo4": (0x481, 8, "CyclicAndOnChange", 500, 0),
+        "EscHeartbeat": (0x701, 1, "Cyclic", 1000, 0),
+        "EscEmergency": (0x081, 8, "Event", 0, 0),
+    }
+
+
+OF_THE_OTHER_FILE = {
+    "ids_are_in_the_free_range",
+    "eight_escs_fit",
+    "messages_have_eight_bytes",
+    "alive_counters_are_where_they_belong",
+    "not_available_and_error_are_named",
+    "limits_leave_out_the_codes",
+    "enums_are_closed",
+    "messages_have_a_schedule",
+    "start_values_are_raw_not_available",
+    "one_esc_loads_the_bus_below_ten_percent",
+}
+"""Rules that only messages of our own layout can keep; what PDOs keep instead is in the tests that follow."""
+
+
+def test_the_rules_that_are_passed_over_are_there() -> None:
+    assert set(RULES) > OF_THE_OTHER_FILE
+
+
+@pytest.mark.parametrize("rule", sorted(set(RULES) - OF_THE_OTHER_FILE))
+def test_the_shipped_file_keeps_the_rule(rule: str) -> None:
+    assert list(RULES[rule](parse(SHIPPED.read_bytes()))) == []
+
+
+NEVER_MISSING = {"LinkState", "LiveCounter", "NodeState", "EmergencyCode", "EmergencySource", "EmergencyWord"}
+
+
+def test_not_available_is_named_outside_the_limits_and_the_start_value() -> None:
+    db = parse(SHIPPED.read_bytes())
+    for signal in db.signals:
+        table = db.tables.get(signal.key, {})
+        start = int(db.attribute("GenSigStartValue", "SG_", *signal.key) or -1)
+        if signal.is_flag or signal.name in NEVER_MISSING:
+            assert NA not in table.values(), signal.name
+            continue
+        assert table[signal.not_available] == NA
+        assert start == signal.not_available
+        raw = (signal.error, (1 << signal.length - 1) - 1) if signal.signed else (0, signal.error)
+        assert (signal.minimum, signal.maximum) == tuple(number * signal.factor for number in raw), signal.name
+
+
+def test_enumerations_name_every_value_that_can_be_sent() -> None:
+    """One sample without a name costs all names in asammdf."""
+    db = parse(SHIPPED.read_bytes())
+    tables = {name: table for (_, name), table in db.tables.items()}
+    states = tables["OperatingState"]
+    assert sorted(states) == list(range(256))
+    assert {number: states[number] for number in ENUMS["OperatingState"]} == ENUMS["OperatingState"]
+    assert [states[number] for number in (0, 4, 8, 27, 254, 255)] == [
+        "State0",
+        "State4",
+        "State8",
+        "State27",
+        "State254",
+        NA,
+    ]
+    assert tables["LinkState"] == ENUMS["LinkState"]
+    assert tables["NodeState"] == {0: "BootUp", 4: "Stopped", 5: "Operational", 127: "PreOperational"}
+    assert sorted(tables["EmergencySource"]) == [*range(32), 255]
+    codes = tables["EmergencyCode"]
+    assert {codes[error.value[0]] for error in GatewayError} == {
+        *(
+            "TelemetryFault",
+            "ReceiveOverrun",
+            "CanPassive",
+            "HeartbeatLost",
+            "BusOffLeft",
+            "SyncLength",
+            "ParameterFile",
+        )
+    }
+    design = [0x3220, 0x3210, 0x2350, 0x2351, 0xFF04, 0x4210, 0x5114, 0x5115, 0x2220, 0x4410, 0xFF0A, 0xFF0B]
+    design += [0x1000, 0xFF0D, 0x5000, 0x5530, 0x6010, *range(0xFF11, 0xFF18)]
+    assert [codes[code] for code in design] == [pascal(bit.name) for bit in OperatingError]
+    assert set(codes) == {0, *design, *range(0xFF18, 0xFF20)} | {error.value[0] for error in GatewayError}
+
+
+def test_names_are_those_of_the_shipped_dbc_where_both_show_a_value() -> None:
+    """A logger that is set up for one finds the same names in the other."""
+    ours = {signal.name: signal for signal in parse(SHIPPED.read_bytes()).signals}
+    others = {signal.name: signal for signal in parse(shipped("dbc/kontronik_esc.dbc").read_bytes()).signals}
+    common = set(ours) & set(others)
+    own = {"Replay", "InfoValid", "LiveCounter", "NodeState"}
+    assert {name for name in set(ours) - common if not name.startswith(("Emergency", "ErrorRegister"))} == own
+    assert all(ours[name].unit == others[name].unit for name in common)
+
+
+def test_comments_tell_that_flags_are_set_while_the_telemetry_is_lost() -> None:
+    db = parse(SHIPPED.read_bytes())
+    comments = dict(db.comments)
+    for bit in OperatingError:
+        comment = comments[("SG_", 0x481, pascal(bit.name))]
+        assert bit.meaning in comment
+        assert "all its bits are set and OperatingState is NotAvailable" in comment
+    assert "Not sent while the telemetry is lost" in comments[("BO_", 0x181)]
+    assert "Goes on while the telemetry is lost" in comments[("BO_", 0x481)]
+    assert "node 1 (esc1)" in comments[("",)]
+
+
+# --- decoding what nodes send --------------------------------------------------------------------------------------------
+
+
+def test_every_frame_of_a_running_node_decodes_to_the_telemetry() -> None:
+    errors = (
+        ErrorWindow(OperatingError.UNDERVOLTAGE, SECOND, SECOND),
+        ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_WARNING, 3 * SECOND, SECOND),
+    )
+    bench = Bench(setup(ONE), ONE, [EscOptions(faults=Faults(errors=errors))])
+    bench.operational(0)
+    bench.run(8 * SECOND)
+    count = {name: len(values) for name, values in bench.seen.items()}
+    assert set(count) == {message.name for message in bench.database.messages}
+    assert count["EscTpdo1"] > 300
+    assert count["EscTpdo2"] > 100
+    assert count["EscTpdo3"] > 60
+    assert [values["NodeState"] for values in bench.seen["EscHeartbeat"]] == ["BootUp", *["Operational"] * 8]
+    told = [(v["EmergencyCode"], v["EmergencySource"], v["EmergencyWord"]) for v in bench.seen["EscEmergency"]]
+    assert [code for code, _, _ in told] == ["Undervoltage", "NoError", "PowerStageOvertempWarning", "NoError"]
+    assert [source for _, source, _ in told] == ["Undervoltage", "Gateway", "PowerStageOvertempWarning", "Gateway"]
+    assert [word & 0x1F for _, _, word in told] == [1, 0, 16, 0]
+    first = bench.seen["EscEmergency"][0]
+    assert {name for name in first if name.startswith("ErrorRegister") and first[name]} == {
+        "ErrorRegisterGeneric",
+        "ErrorRegisterVoltage",
+    }
+    assert max(values["BatteryCurrent"] for values in bench.seen["EscTpdo1"]) > 5
+    assert {values["OperatingState"] for values in bench.seen["EscTpdo4"]} >= {"MotorOff", "SpoolUpFromStill"}
+
+
+def test_lost_telemetry_is_not_available_and_told_as_an_emergency() -> None:
+    lost = EscOptions(faults=Faults(dropout=Dropout(2 * SECOND, 4 * SECOND)))
+    bench = Bench(setup(ONE), ONE, [lost])
+    bench.operational(0)
+    bench.run(5 * SECOND)
+    states = bench.seen["EscTpdo4"]
+    assert [s["LinkState"] for s in states[:1]] == ["NeverSeen"]
+    assert "Lost" in {s["LinkState"] for s in states}
+    for values in states:
+        fresh = values["LinkState"] in ("Ok", "Degraded")
+        assert (values["OperatingState"] == NA) == (not fresh)
+        assert (values["Timing"] == NA) == (not fresh)
+    assert any(values["InfoValid"] for values in states)
+    told = [(v["EmergencyCode"], v["EmergencySource"], v["EmergencyWord"]) for v in bench.seen["EscEmergency"]]
+    assert told == [("TelemetryFault", "Gateway", 1), ("NoError", "Gateway", 0)]
+
+
+def test_a_jivepro_supplies_no_bec_current() -> None:
+    bench = Bench(setup(ONE), ONE, [EscOptions(device=Device.JIVEPRO)])
+    bench.operational(0)
+    bench.run(3 * SECOND)
+    assert bench.seen["EscTpdo3"][-1]["BecCurrent"] == NA
+    assert bench.seen["EscTpdo3"][-1]["BecVoltage"] > 4
+
+
+def test_several_escs_have_their_names_in_front() -> None:
+    bench = Bench(setup(PAIR, (5, 9)), PAIR)
+    bench.operational(0)
+    bench.run(3 * SECOND)
+    assert set(bench.seen) == {
+        f"{prefix}{stem}" for prefix in ("Left", "RightR") for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat")
+    }
+    ids = {message.name: message.frame_id for message in bench.database.messages}
+    assert (ids["LeftTpdo1"], ids["RightRTpdo1"], ids["RightRHeartbeat"]) == (0x185, 0x189, 0x709)
+    assert ids["LeftEmergency"] == 0x85
+    assert "node 5 (left), node 9 (right_r)" in str(bench.database.buses[0].comment)
+
+
+# --- other mappings ------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_master_mapped_and_stored_is_described_from_the_configuration() -> None:
+    first = Bench(setup(PAIR), PAIR)
+    # 2001h:1 motor speed, 2001h:3 battery power; 2011h:2, 2011h:7, 2011h:9, 2011h:B, 2011h:3
+    first.remap(4, 0x1A2, [0x20010120, 0x20010320], node_id=2)
+    first.remap(1, 0x282, [0x20110210, 0x20110710, 0x20110908, 0x20110B08, 0x20110310], node_id=2)
+    first.remap(0, 0x182, [0x606C0020, 0x60790020], node_id=2)
+    first.write(0x1801, 5, 400, 2, node_id=2)
+    first.write(0x1017, 0, 250, 2, node_id=2)
+    assert first.sdo("2310100173617665", 3 * MS, 2) == "6010100100000000"
+    stored = first.stored
+    assert stored.communication
+    assert encode(stored)
+
+    bench = Bench(setup(PAIR, stored=[Stored(), stored]), PAIR)
+    signals = {m.name: {s.name for s in m.signals} for m in bench.database.messages}
+    assert signals["RightRTpdo5"] == {"RightRMotorSpeed", "RightRBatteryPower"}
+    assert signals["RightRTpdo1"] == {"RightRVelocityActualValue", "RightRDcLinkCircuitVoltage"}
+    assert signals["LeftTpdo1"] == {"LeftElectricalSpeed", "LeftBatteryVoltage", "LeftBatteryCurrent"}
+    assert "LeftTpdo5" not in signals
+    extremes = bench.database.get_message_by_name("RightRTpdo2")
+    assert (extremes.cycle_time, extremes.send_type) == (400, "CyclicAndEvent")
+    assert bench.database.get_message_by_name("RightRHeartbeat").cycle_time == 250
+    bench.operational(0)
+    bench.run(7 * SECOND)
+    assert len(bench.seen["RightRTpdo5"]) > 300
+    assert max(values["RightRMotorSpeed"] for values in bench.seen["RightRTpdo5"][1:]) > 100
+    assert bench.seen["RightRTpdo2"][0]["RightRMaxThrottlePercent"] == NA
+    assert bench.seen["RightRTpdo2"][-1]["RightRMaxBatteryVoltage"] > 10
+
+
+def test_a_value_in_two_pdos_has_two_names() -> None:
+    bench = Bench(setup(ONE), ONE)
+    bench.remap(4, 0x501, [0x20000210, 0x20000A08, 0x20000210])
+    bench.remap(5, 0x502, [0x20000E20, 0x20200720])
+    bench.describe_anew()
+    names = {m.name: [s.name for s in m.signals] for m in bench.database.messages}
+    assert names["EscTpdo5"] == ["BatteryVoltage2", "Throttle2Percent", "BatteryVoltage3"]
+    assert names["EscTpdo4"][0] == "Undervoltage"
+    assert (names["EscTpdo6"][0], names["EscTpdo6"][-1]) == ("Undervoltage2", "CrcErrors")
+    comment = bench.database.get_message_by_name("EscTpdo6").get_signal_by_name("Undervoltage2").comment
+    assert comment is not None
+    assert comment.endswith("While the word is not available all its bits are set.")
+
+
+def test_a_word_that_ends_in_bits_without_a_name_keeps_its_length() -> None:
+    bench = Bench(setup(ONE), ONE)
+    bench.write(0x1803, 1, 0xC0000481, 4)
+    bench.remap(4, 0x501, [0x20000F08, 0x20000E20])
+    bench.describe_anew()
+    assert bench.database.get_message_by_name("EscTpdo5").length == 5
+    assert not any(message.name == "EscTpdo4" for message in bench.database.messages)
+    bench.operational(3 * MS)
+    bench.run(SECOND)
+    assert bench.seen["EscTpdo5"][-1]["ProgrammingAllowed"] in (0, 1)
+
+
+def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
+    bench = Bench(setup(ONE), ONE)
+    bench.remap(0, 0x181, [0x20000120], kind=3)
+    bench.remap(1, 0x281, [0x20000410], kind=0)
+    bench.write(0x1802, 1, 0xC0000381, 4)
+    bench.write(0x1803, 5, 0, 2)
+    bench.write(0x1017, 0, 0, 2)
+    bench.write(0x1014, 0, 0x80000081, 4)
+    bench.describe_anew()
+    db = parse(dbc_text(bench.database).encode())
+    sent = {m.name: (db.send_type(m), db.number("GenMsgCycleTime", m)) for m in db.messages}
+    assert sent == {
+        "EscTpdo1": ("None", 0),
+        "EscTpdo2": ("None", 0),
+        "EscTpdo4": ("OnChange", 0),
+        "EscHeartbeat": ("Event", 0),
+    }
+    comments = dict(db.comments)
+    assert "every SYNC number 3" in comments[("BO_", 0x181)]
+    assert "at a SYNC when there is news" in comments[("BO_", 0x281)]
+    assert "only the boot-up message" in comments[("BO_", 0x701)]
+
+
+def with_objects(*sections: tuple[int, str, int, str]) -> Eds:
+    """The shipped EDS with mappable plain variables: index, name, data type, default."""
+    text = EDS_TEXT.replace("\r\n", "\n")
+    listed = re.search(r"\[ManufacturerObjects\]\nSupportedObjects=(\d+)\n((?:\d+=.*\n)+)", text)
+    assert listed
+    count = int(listed[1])
+    more = "".join(f"{count + n}={index:#x}\n" for n, (index, *_) in enumerate(sections, 1))
+    text = text.replace(
+        listed[0], f"[ManufacturerObjects]\nSupportedObjects={count + len(sections)}\n{listed[2]}{more}"
+    )
+    for index, name, data_type, default in sections:
+        text += (
+            f"\n[{index:04X}]\nParameterName={name}\nObjectType=0x7\nDataType=0x{data_type:04X}\nAccessType=rw\n"
+            f"DefaultValue={default}\nPDOMapping=1\n"
+        )
+    return reader.load(text.replace("\n", "\r\n").encode(), "mine.eds")
+
+
+def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() -> None:
+    eds = with_objects(
+        (0x2200, "Nick-Winkel des linken Auslegers (grob)", 0x03, "-5"),
+        (0x2201, "%%", 0x05, "7"),
+        (0x2202, "oil pressure", 0x08, "1.5"),
+        (0x2203, "BIG", 0x1B, "0xFFFFFFFFFFFFFFFF"),
+        (0x2204, 'a "switch"; here\\', 0x01, "1"),
+        (0x2205, "Battery voltage 2", 0x10 - 0x0C, "-70000"),
+    )
+    bench = Bench(setup(ONE, eds=eds), ONE)
+    bench.remap(0, 0x181, [0x22040001, 0x22000010, 0x22010008, 0x22020020])
+    bench.remap(1, 0x281, [0x22030040])
+    bench.remap(2, 0x381, [0x22050020])
+    bench.write(0x1803, 1, 0xC0000481, 4)
+    bench.describe_anew()
+    bench.gateway.receive_frame(CanFrame(0, b"\x01\x00"), 3 * MS)
+    decoded: dict[str, Any] = {}
+    for sent in bench.gateway.take_frames():
+        values: Any = bench.database.decode_message(sent.can_id, sent.data)
+        decoded |= values
+    assert decoded == {
+        "ASwitchHere": 1,
+        "NickWinkelDesLinkenAuslegersGrob": -5,
+        "Object2201Sub00": 7,
+        "OilPressure": 1.5,
+        "Big": 0xFFFFFFFFFFFFFFFF,
+        "BatteryVoltage2": -70000,
+    }
+    text = dbc_text(bench.database)
+    assert "SIG_VALTYPE_ 385 OilPressure : 1;" in text
+    assert "a 'switch', here/" in text
+    assert "VAL_ 641" not in text
+
+
+def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
+    escs = [EscSettings("port_outer_1"), EscSettings("port_outer_2")]
+    text = written(setup(escs), escs)
+    db = parse(text.encode())
+    for rule in (
+        "names_are_unique",
+        "everything_has_one_comment",
+        "signals_do_not_overlap",
+        "every_line_is_understood",
+    ):
+        assert list(RULES[rule](db)) == []
+    names = [message.name for message in db.messages] + [signal.name for signal in db.signals]
+    assert max(map(len, names)) == 32
+    assert all(re.fullmatch("PortOuter[12][A-Z][A-Za-z0-9]*", name) for name in names)
+    assert "PortOuter1LimitBatteryVoltageMin" in names
+
+
+def test_a_node_that_waits_for_lss_has_no_frames_and_is_named() -> None:
+    text = written(setup(PAIR, (3, 255)), PAIR)
+    assert {message.name for message in parse(text.encode()).messages} == {
+        f"Left{stem}" for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat", "Emergency")
+    }
+    assert "Waiting for a node-ID by LSS, so without frames: right_r." in dict(parse(text.encode()).comments)[("",)]
+    nobody = read(written(setup(ONE, (255,)), ONE))
+    assert nobody.messages == []
+
+
+def test_one_cob_id_for_two_messages_is_refused_by_name() -> None:
+    eds = reader.load(EDS_TEXT.replace("$NODEID+0x80\r", "0xA0\r").encode(), "mine.eds")
+    said = r"RightREmergency and LeftEmergency have the same COB-ID 0A0h\. Give one of them another"
+    with pytest.raises(UserError, match=said):
+        written(setup(PAIR, eds=eds), PAIR)
+
+
+def test_the_file_of_many_nodes_keeps_the_rules_and_can_be_written_again() -> None:
+    escs = [EscSettings(f"esc{number}") for number in range(1, 9)]
+    text = written(setup(escs), escs)
+    db = parse(text.encode())
+    for rule in set(RULES) - OF_THE_OTHER_FILE:
+        assert [f for f in RULES[rule](db) if not f.endswith("is longer than 28")] == [], rule
+    assert len({message.id for message in db.messages}) == 6 * 8
+    assert dbc_text(read(text)) == text
+
+
+def test_a_name_in_any_spelling_becomes_pascal_case() -> None:
+    names = (
+        "bec_voltage",
+        "BEC voltage",
+        "BecVoltage",
+        "RPMControl",
+        "JIVEPro",
+        "KONTROL-X",
+        "Sync_StandBy",
+        "UHV",
+        "x1",
+    )
+    assert [canopen_dbc.pascal_case(name) for name in names] == [
+        *["BecVoltage"] * 3,
+        *("RpmControl", "JivePro", "KontrolX", "SyncStandBy", "Uhv", "X1"),
+    ]
+
+
+# --- other readers -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("error")
+def test_cantools_loads_the_shipped_file_strictly_and_silently(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        database = cantools.database.load_file(SHIPPED, database_format="dbc", encoding="ascii", strict=True)
+    assert caplog.records == []
+    assert isinstance(database, Database)
+    assert dbc_text(database) == SHIPPED.read_text()
+
+
+def random_data(length: int, seed: int) -> Iterator[bytes]:
+    choice = random.Random(seed)
+    yield bytes(length)
+    yield b"\xff" * length
+    yield from (choice.randbytes(length) for _ in range(50))
+
+
+def test_all_readers_find_the_same_raw_values_in_any_bytes(caplog: pytest.LogCaptureFixture) -> None:
+    import canmatrix.formats  # type: ignore[import-untyped]
+    from opendbc.can.dbc import DBC  # type: ignore[import-untyped]
+    from opendbc.can.parser import get_raw_value  # type: ignore[import-untyped]
+
+    with caplog.at_level(logging.WARNING):
+        matrix = canmatrix.formats.loadp_flat(str(SHIPPED))
+    assert [record.getMessage() for record in caplog.records] == []
+    assert matrix.load_errors == []
+    opendbc = DBC(str(SHIPPED))
+    seen = cantools.database.load_file(SHIPPED)
+    assert isinstance(seen, Database)
+    db = parse(SHIPPED.read_bytes())
+    assert {address: message.name for address, message in opendbc.msgs.items()} == {m.id: m.name for m in db.messages}
+    assert len(matrix.frames) == len(db.messages)
+    for message in db.messages:
+        of_matrix, of_opendbc = matrix.frame_by_name(message.name), opendbc.msgs[message.id].sigs
+        assert list(of_opendbc) == [signal.name for signal in message.signals]
+        assert (of_matrix.size, of_matrix.cycle_time) == (message.dlc, db.number("GenMsgCycleTime", message))
+        for signal in message.signals:
+            its = of_matrix.signal_by_name(signal.name)
+            assert (its.unit, its.min, its.max) == (signal.unit, signal.minimum, signal.maximum)
+            assert its.values == db.tables.get(signal.key, {})
+            assert of_opendbc[signal.name].factor == float(signal.factor)
+        for data in random_data(message.dlc, message.id):
+            expected = {signal.name: raw_value(signal, data) for signal in message.signals}
+            assert seen.decode_message(message.id, data, decode_choices=False, scaling=False) == expected
+            assert {name: value.raw_value for name, value in of_matrix.decode(data).items()} == expected
+            for name, its in of_opendbc.items():
+                raw = get_raw_value(data, its)
+                raw -= (raw >> (its.size - 1) << its.size) if its.is_signed else 0
+                assert raw == expected[name], name
+
+
+def test_opendbc_reads_every_value_text() -> None:
+    from opendbc.can import CANDefine  # type: ignore[import-untyped]
+
+    db = parse(SHIPPED.read_bytes())
+    names = {message.id: message.name for message in db.messages}
+    defined = CANDefine(str(SHIPPED)).dv
+    for (message_id, name), table in db.tables.items():
+        assert defined[names[message_id]][name] == {number: text.upper() for number, text in table.items()}
+
+
+def test_asammdf_gives_numbers_gaps_and_names(tmp_path: Path) -> None:
+    import can
+    from asammdf import MDF
+
+    db = parse(SHIPPED.read_bytes())
+    choice = random.Random(4)
+    moments: list[dict[str, dict[str, int]]] = []
+    for moment in range(20):
+        raw: dict[str, dict[str, int]] = {}
+        for message in db.messages:
+            raw[message.name] = {}
+            for signal in message.signals:
+                table = db.tables.get(signal.key, {})
+                missing = [number for number, text in table.items() if text == NA]
+                named = [number for number in table if number not in missing]
+                low, high = int(signal.minimum / signal.factor), int(signal.maximum / signal.factor)
+                value = choice.choice(named) if named else choice.randint(low, high)
+                raw[message.name][signal.name] = missing[0] if missing and moment % 5 == 0 else value
+        moments.append(raw)
+    with can.MF4Writer(tmp_path / "raw.mf4") as writer:
+        for number, raw in enumerate(moments):
+            for message in db.messages:
+                writer.on_message_received(
+                    can.Message(
+                        timestamp=1_700_000_000 + number / 10,
+                        arbitration_id=message.id,
+                        is_extended_id=False,
+                        data=frame(message, raw[message.name]),
+                    )
+                )
+    with MDF(tmp_path / "raw.mf4") as measurement:
+        decoded = measurement.extract_bus_logging({"CAN": [(str(SHIPPED), 0)]})
+    for message in db.messages:
+        for signal in message.signals:
+            sent = [raw[message.name][signal.name] for raw in moments]
+            table = db.tables.get(signal.key, {})
+            samples = list(decoded.get(signal.name).samples)
+            assert decoded.get(signal.name).unit == signal.unit
+            if len(table) > 1:
+                assert [text.decode() for text in samples] == [table[number] for number in sent], signal.name
+                continue
+            for number, sample in zip(sent, samples, strict=True):
+                if number in table:
+                    assert sample != sample, signal.name  # NaN
+                else:
+                    assert float(sample) == pytest.approx(float(number * signal.factor)), signal.name
+    decoded.close()
+
+
+# --- the command ---------------------------------------------------------------------------------------------------------
+
+
+def command(*words: object) -> tuple[int, str, str]:
+    out, talk = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(talk):
+        code = main(["dbc", *map(str, words)])
+    return code, out.getvalue(), talk.getvalue()
+
+
+def configuration(folder: Path, more: str = "", canopen: str = "enabled = true") -> Path:
+    file = folder / "gateway.toml"
+    file.write_text(
+        '[can]\ninterface = "virtual"\n[dbc]\nenabled = false\n'
+        f'[canopen]\nstore = "kept"\n{canopen}\n'
+        f'[[esc]]\nname = "left"\nport = "/dev/ttyUSB0"\n{more}'
+    )
+    return file
+
+
+def test_the_command_describes_as_many_nodes_as_asked_for(tmp_path: Path) -> None:
+    code, text, _ = command("--canopen", "--name", "left", "--name", "right_r")
+    assert code == 0
+    assert {m.name for m in read(text).messages} >= {"LeftTpdo1", "RightRTpdo4"}
+    assert command("--canopen", "--esc", 3, "-o", tmp_path / "three.dbc")[0] == 0
+    assert (tmp_path / "three.dbc").read_text() == command("--canopen", "--esc", 3)[1]
+    assert {m.frame_id for m in read(command("--canopen", "--esc", 12)[1]).messages} >= {0x18C, 0x70C}
+
+
+def test_the_command_describes_the_nodes_of_a_configuration_with_what_masters_stored(tmp_path: Path) -> None:
+    bench = Bench(setup(ONE, (9,)), ONE)
+    bench.remap(0, 0x189, [0x20000210], node_id=9)
+    bench.write(0x2101, 2, 21, 1, node_id=9)
+    assert bench.sdo("2310100173617665", 3 * MS, 9) == "6010100100000000"
+    file = configuration(tmp_path, canopen="enabled = true\nnode_id = 9")
+    before = command("--canopen", "-c", file)[1]
+    assert "BO_ 393 EscTpdo1: 8 " in before
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "left.params").write_bytes(encode(replace(bench.stored, node_id=21)))
+    code, text, said = command("--canopen", "-c", file)
+    assert (code, said) == (0, "")
+    assert {m.frame_id: [s.name for s in m.signals] for m in read(text).messages}[0x195] == ["BatteryVoltage"]
+    assert "node 21 (left)" in text
+    assert "BO_ 1813 EscHeartbeat: 1 " in text
+
+
+def test_the_command_warns_of_nodes_that_wait_for_lss(tmp_path: Path) -> None:
+    file = configuration(tmp_path, '[[esc]]\nname = "right"\nport = "/dev/ttyUSB1"\nnode_id = 255\n')
+    code, text, said = command("--canopen", "-c", file)
+    assert code == 0
+    assert said == "kontronik-can-gw: warning: right: no node-ID yet (LSS gives one), so no frames to describe\n"
+    assert "RightTpdo1" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--from", "x.dbc"], "--from cannot be combined with --canopen"),
+        (["--base-id", "1", "--id-step", "2"], "--base-id and --id-step cannot be combined with --canopen"),
+        (["--node", "x"], "--node cannot be combined with --canopen"),
+        (["--esc", "128"], "128 are more than the 127 nodes"),
+        (["--esc", "2", "--name", "a"], "--name is given 1 times for 2 ESCs"),
+        (["-c", "FILE", "--esc", "2"], "--esc cannot be combined with --config"),
+        (["-c", "none.toml"], "none.toml: cannot be read"),
+    ],
+)
+def test_bad_wishes_are_one_line(words: list[str], expected: str, tmp_path: Path) -> None:
+    given = [str(configuration(tmp_path)) if word == "FILE" else word for word in words]
+    code, text, said = command("--canopen", *given)
+    assert (code, text, said.count("\n")) == (2, "", 1)
+    assert expected in said
+
+
+def test_a_configuration_without_canopen_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "gateway.toml"
+    file.write_text('[can]\ninterface = "virtual"\n[[esc]]\nport = "/dev/ttyUSB0"\n')
+    code, text, said = command("--canopen", "-c", file)
+    assert (code, text) == (2, "")
+    assert (
+        said == f"kontronik-can-gw dbc: {file}: canopen.enabled is false: there are no CANopen nodes. Set it to true.\n"
+    )
