@@ -21,6 +21,7 @@ COMMANDS = {
     "check": "check a configuration and print what it will send",
     "init": "write a commented example configuration",
     "dbc": "write the DBC for several ESCs or for a configuration",
+    "eds": "write the EDS, or the DCF of a CANopen node",
     "decode": "decode recorded UART bytes to JSON lines or CSV",
     "simulate": "simulate ESCs on pseudo terminals",
     "schema": "print the JSON Schema of the configuration",
