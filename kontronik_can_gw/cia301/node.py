@@ -163,7 +163,7 @@ class Node:
         self._started = False
         self._next_overrun = 0
         self._can_state = CanState.UNKNOWN
-        self._live = True  # for the edge of 1029h:2
+        self._live = False  # for the edge of 1029h:2
         history = sum(1 for _ in dictionary.subs(0x1003))
         self.emergencies = Emergencies(self._send_emergency, max(1, history))
         self.producer = heartbeat.Producer()

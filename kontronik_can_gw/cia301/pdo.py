@@ -221,6 +221,7 @@ class Tpdo:
         self._compile()
         if self._started and self._running:
             if was_running:
+                self._pending = self._pending and self._type in EVENT_TYPES
                 self._event_due = self._next_event(now)
                 self._set_due()
             else:
