@@ -40,11 +40,11 @@ class Gateway:
         self._next_expiry = 0
         """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
-    def start(self, now: int) -> None:
-        """The runtime has opened what it could: run."""
+    def start(self, now: int, can_open: bool = True) -> None:
+        """The runtime has opened what it could: run. Nodes boot when there is a bus that can hear it."""
         self.status.state = GatewayState.RUNNING
         self._output.start(now)
-        if self.nodes is not None:
+        if self.nodes is not None and can_open:
             self.nodes.start(now)
 
     def stop(self, now: int) -> None:

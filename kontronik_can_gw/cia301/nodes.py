@@ -83,6 +83,7 @@ class Nodes:
         self._foreign_ids = foreign_ids or {}
         self._routes: dict[int, list[Callable[[bytes, int], None]]] = {}
         self._rerouted = True
+        self._started = False
         self.nodes: list[Node] = []
         bases = setup.escs or tuple(esc.settings for esc in escs)
         for esc, base, settings, stored in zip(escs, bases, setup.settings, setup.stored, strict=True):
@@ -93,6 +94,7 @@ class Nodes:
 
     def start(self, now: int) -> None:
         """Power on."""
+        self._started = True
         for node in self.nodes:
             node.power_on(now)
         self._after()
@@ -121,7 +123,10 @@ class Nodes:
         self._after()
 
     def can_returned(self, now: int) -> None:
-        """Frames can be sent again after some were lost."""
+        """Frames can be sent again after some were lost, or for the first time."""
+        if not self._started:
+            self.start(now)
+            return
         for node in self.nodes:
             node.can_returned(now)
         self._after()

@@ -142,7 +142,8 @@ class Loop:
         """Until ``stop``. Then a last status is sent and everything is closed."""
         gateway, clock = self.gateway, self._clock
         now = clock()
-        gateway.start(now)
+        gateway.start(now, self._can is not None)
+        self._follow_receive_ids()  # before the boot-up message: a master may ask as soon as it sees it
         self._transmit(now)
         try:
             while not self._stopping:
@@ -158,8 +159,8 @@ class Loop:
                 self._reopen(now)
                 gateway.advance(now)
                 self._keep(now)
-                self._transmit(now)
                 self._follow_receive_ids()
+                self._transmit(now)
                 self._report(now)
         finally:
             now = clock()
