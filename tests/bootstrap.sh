@@ -2,7 +2,8 @@
 # Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test
 #   demo  the project
 #   lint  and its test tools
-#   test  and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing
+#   test  and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and the CANopen
+#         masters of others that the node is tried with (tests/foreign)
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
 
@@ -101,6 +102,6 @@ install_vcan() {
 case $what in
     demo) install_project demo . ;;
     lint) install_project test '.[test]' ;;
-    test) install_project test '.[test]'; install_vcan ;;
+    test) install_project test '.[test]'; install_vcan; tests/foreign/install.sh || say "tests with the masters named above are left out" ;;
     *) die "$what: demo, lint or test" ;;
 esac
