@@ -216,10 +216,13 @@ class Loop:
             "the process was suspended for %.1f s: what waited on the serial ports and for CAN is thrown away",
             late / SECOND,
         )
+        lost = self._mailboxes.dropped
         self._clear_mailboxes()
         if self._can is not None:
             self._can.discard()
             self._follow_reception(self._can, now)
+        if self._mailboxes.dropped != lost:  # an answer is too late by now, but what is wrong has to be known
+            self.gateway.can_returned(now)
         for esc in self._escs:
             if esc.port is not None:
                 esc.port.discard()
