@@ -72,7 +72,8 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePla
         length = bits_of(variable)
         signed = variable.entry.data_type in _SIGNED
         if bound is None:
-            storage = f"storage[{variable.entry.index << 8 | variable.entry.sub:#x}].value"
+            value = "value" if variable.read is None else "read(now)"
+            storage = f"storage[{variable.entry.index << 8 | variable.entry.sub:#x}].{value}"
             source = Source(variable.entry.name, "", Group.GATEWAY, storage)
         else:
             source = bound.source
@@ -419,6 +420,8 @@ class Tpdo:
         carries_link = False
         for entry, signal in zip(self._mapped, plan.signals, strict=True):
             if entry.bound is None:
+                if entry.variable.read is not None:  # of a service: the error register, the error code
+                    self._status_mask |= place(signal.pieces, -1)
                 continue
             carries_link |= entry.variable.entry.index == LINK and entry.bound.status
             if entry.bound.status:

@@ -14,7 +14,7 @@ from kontronik_can_gw import __version__
 from kontronik_can_gw.cia301.eds import Eds, without
 from kontronik_can_gw.cia301.eds import load as eds_of
 from kontronik_can_gw.cia301.node import NodeSettings, check_eds
-from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.cia301.storage import Stored, decode
 from kontronik_can_gw.config import UNCONFIGURED, Config, load, shipped
 from kontronik_can_gw.dbc_output.layout import Layout, load_database
@@ -64,7 +64,10 @@ def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) 
     loaded = assemble(config, store(parameter_folder(config)) if store and config.canopen.enabled else None)
     nodes = loaded.canopen.nodes(loaded.escs).bits_per_second() if loaded.canopen else 0
     load_warning = check_load(loaded.layout, config.can.bitrate, config.can.data_bitrate, nodes)
-    for warning in (*loaded.layout.warnings, load_warning):
+    unread = (
+        [] if store else [f"{loaded.escs[esc].name}: stored parameters: {reason}" for esc, reason in loaded.damaged]
+    )
+    for warning in (*loaded.layout.warnings, load_warning, *unread):
         if warning:
             say(f"warning: {warning}")
     return loaded
@@ -79,12 +82,28 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     if config.canopen.enabled:
         canopen, damaged = _canopen(config, store)
         escs = canopen.esc_settings(escs)
-        taken = canopen.nodes(escs).cob_ids()
+        nodes = canopen.nodes(escs)
+        _check_cob_ids(nodes, canopen.eds.name)
+        taken = nodes.cob_ids()
     if not config.dbc.enabled:
         return Loaded(config, escs, None, Layout("", "", ()), canopen, tuple(damaged), store)
     file = config.dbc_path
     database, layout = prepare(load_database(file), str(file), escs, config.dbc_settings, config.can.fd, taken)
     return Loaded(config, escs, database, layout, canopen, tuple(damaged), store)
+
+
+def _check_cob_ids(nodes: Nodes, eds: str) -> None:
+    """Two nodes, or two services, with one COB-ID: as where an EDS gives EMCY or a PDO an id without $NODEID."""
+    problems: list[str] = []
+    users: dict[int, str] = {}
+    for node in nodes.nodes:
+        for cob_id, what in node.cob_ids():
+            if users.setdefault(cob_id, what) != what:
+                problems.append(
+                    f"{eds}: COB-ID {cob_id:03X}h is that of {users[cob_id]} and of {what}. Change one default (or add $NODEID)."
+                )
+    if problems:
+        raise UserError(*problems)
 
 
 def load_eds(config: Config) -> Eds:
@@ -137,7 +156,7 @@ def _canopen(config: Config, store: ParameterStore | None) -> tuple[CanopenSetup
         if reason is not None:
             damaged.append((number, reason))
     _forget_clashing_ids(config, settings, kept)
-    return CanopenSetup(eds, tuple(settings), tuple(kept)), damaged
+    return CanopenSetup(eds, tuple(settings), tuple(kept), tuple(config.escs)), damaged
 
 
 def _look_at(path: Path) -> tuple[Stored, str | None]:

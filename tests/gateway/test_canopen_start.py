@@ -1,7 +1,13 @@
-"""When the nodes boot: with the bus, and not before there is one."""
+"""When the nodes boot: with the bus, and not before there is one; and what is refused before."""
+
+from pathlib import Path
+
+import pytest
 
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse
+from kontronik_can_gw.config import parse, shipped
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.telemetry import SECOND
 
@@ -28,3 +34,61 @@ def test_an_outage_later_on_does_not_boot_the_nodes_again() -> None:
     assert [f.can_id for f in made.take_frames()] == [0x701]
     made.can_returned(SECOND // 2)
     assert 0x701 not in [f.can_id for f in made.take_frames()]
+
+
+def refused(tmp_path: Path, eds: bytes = b"", dbc: str = "") -> str:
+    tables: dict[str, object] = {"esc": [{"port": "a"}, {"port": "b"}]}
+    canopen: dict[str, object] = {"enabled": True, "store": str(tmp_path)}
+    if eds:
+        (tmp_path / "my.eds").write_bytes(eds)
+        canopen["eds"] = str(tmp_path / "my.eds")
+    if dbc:
+        (tmp_path / "my.dbc").write_text(dbc)
+        tables["dbc"] = {"file": str(tmp_path / "my.dbc")}
+    with pytest.raises(UserError) as caught:
+        assemble(parse({**tables, "canopen": canopen}, "test"))
+    (problem,) = caught.value.problems
+    return problem
+
+
+def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused_by_name(tmp_path: Path) -> None:
+    message = 'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Logger\nBO_ {} Volts: 8 Gw\n SG_ esc2BatteryVoltage : 0|16@1+ (0.01,0) [0|0] "V" Logger\n'
+    said = refused(tmp_path, dbc=message.format(0x182))
+    assert "Volts: id 182h is used by TPDO 1 of CANopen node 2" in said
+    assert "SYNC" in refused(tmp_path, dbc=message.format(0x80))
+    assert "SDO answers of CANopen node 1" in refused(tmp_path, dbc=message.format(0x581))
+
+
+def test_an_eds_that_gives_two_nodes_one_cob_id_is_refused(tmp_path: Path) -> None:
+    eds = shipped("eds/kontronik_esc.eds").read_bytes()
+    said = refused(tmp_path, eds.replace(b"DefaultValue=$NODEID+0x80\r", b"DefaultValue=0xA0\r"))
+    assert "COB-ID 0A0h is that of emergencies of CANopen node 1 and of emergencies of CANopen node 2" in said
+
+
+def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(tmp_path: Path) -> None:
+    eds = shipped("eds/kontronik_esc.eds").read_bytes()
+    head, register, tail = eds.partition(b"[1001]")
+    eds = head + register + tail.replace(b"PDOMapping=0", b"PDOMapping=1", 1)
+    (tmp_path / "my.eds").write_bytes(eds)
+    canopen = {"enabled": True, "store": str(tmp_path), "eds": str(tmp_path / "my.eds"), "self_start": True}
+    loaded = assemble(parse({"canopen": canopen, "dbc": {"enabled": False}, "esc": [{"port": "a"}]}, "test"))
+    made = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
+    made.start(0)
+    for index, sub, size, value in (
+        (0x1A04, 1, 4, 0x603F0010),
+        (0x1A04, 2, 4, 0x10010008),
+        (0x1A04, 0, 1, 2),
+        (0x1804, 1, 4, 0x400001A1),
+    ):
+        made.take_frames()
+        command = {1: 0x2F, 4: 0x23}[size]
+        data = bytes((command, index & 0xFF, index >> 8, sub)) + value.to_bytes(4, "little")
+        made.receive_frame(CanFrame(0x601, data), 0)
+        assert [f.data[0] for f in made.take_frames() if f.can_id == 0x581] == [0x60]
+    live = bytes.fromhex("4B4F444C000000008A09000000000000000000000000581FE90300001D20000002000C0039234C14")
+    made.receive_bytes(0, live, SECOND)
+    made.take_frames()
+    made.advance(2 * SECOND)
+    sent = [frame.data for frame in made.take_frames() if frame.can_id == 0x1A1]
+    assert sent == [bytes.fromhex("107501")]
+    assert loaded.canopen is not None
