@@ -104,7 +104,7 @@ class Emergencies:
         self._word_register = 0
         self._active: dict[Condition, None] = {}
         self._untold: list[Condition] = []
-        self._told = False  # something was told that no 0000h has taken back
+        self._told = False  # what was sent last is an error, not 0000h
         self._pending: deque[tuple[Condition | None, bytes]] = deque(maxlen=_MAX_PENDING)
         self._open = False
         self._free_at = -NEVER
@@ -139,10 +139,12 @@ class Emergencies:
                 self._word_register |= register_of(code_of_bit(bit))
         wanted = {Condition(code_of_bit(bit), bit, 0): None for bit in range(32) if bits >> bit & 1}
         gone = [c for c in self._active if c.source != _FROM_GATEWAY and c not in wanted]
+        for condition in gone:
+            del self._active[condition]
         for condition in wanted:
             if condition not in self._active:
                 self._rise(condition, now)
-        self._fall(gone, now)
+        self._end(now)
 
     def set(self, error: GatewayError, present: bool, now: int, detail: int | None = None) -> None:
         """One of the gateway's own findings begins or ends."""
@@ -151,7 +153,8 @@ class Emergencies:
         if present and condition not in self._active:
             self._rise(condition, now)
         elif not present and condition in self._active:
-            self._fall([condition], now)
+            del self._active[condition]
+            self._end(now)
 
     def pulse(self, error: GatewayError, now: int) -> None:
         """A finding that is over as soon as it is told."""
@@ -161,26 +164,26 @@ class Emergencies:
     def open(self, now: int) -> None:
         """Emergencies may be sent (PRE-OPERATIONAL, OPERATIONAL): what rose and is still there is told."""
         self._open = True
-        for condition in self._untold:
+        for condition in dict.fromkeys(self._untold):
             if condition in self._active:
                 self._tell(condition)
         self._untold = []
-        if not self._active and self._told:
-            self._tell(None)
+        self._end(now)
         self.advance(now)
 
     def close(self) -> None:
         """No emergencies (STOPPED): what waits is told later, if it is still true then."""
         self._open = False
         self._untold += [condition for condition, _ in self._pending if condition is not None]
-        self._told = self._told or any(condition is None for condition, _ in self._pending)
         self._pending.clear()
 
     def reset(self) -> None:
-        """Reset communication: an empty history, and everything that is wrong counts as untold; heartbeats and SYNC are watched anew."""
+        """Reset communication: what is wrong counts as untold and is all that the history holds; heartbeats and SYNC are watched anew."""
         self.close()
         self._active = {condition: None for condition in self._active if condition.code not in _OF_COMMUNICATION}
         self.history.clear()
+        for condition in self._active:
+            self._note(condition)
         self._told = False
         self._untold = list(self._active)
 
@@ -194,31 +197,34 @@ class Emergencies:
     def advance(self, now: int) -> None:
         """Send what waits, no closer than the inhibit time."""
         while self._pending and now >= self._free_at:
-            self._send(self._pending.popleft()[1])
+            condition, data = self._pending.popleft()
+            self._told = condition is not None
+            self._send(data)
             self._free_at = now + self.inhibit_ns
 
     def _rise(self, condition: Condition, now: int) -> None:
         self._active[condition] = None
-        self.history.appendleft(condition.detail << 24 | condition.source << 16 | condition.code)
+        self._note(condition)
         if self._open:
             self._tell(condition)
             self.advance(now)
         else:
             self._untold.append(condition)
 
-    def _fall(self, gone: list[Condition], now: int) -> None:
-        for condition in gone:
-            del self._active[condition]
-        if gone and not self._active and self._told and self._open:
+    def _note(self, condition: Condition) -> None:
+        self.history.appendleft(condition.detail << 24 | condition.source << 16 | condition.code)
+
+    def _end(self, now: int) -> None:
+        """Take back what was told, or still waits to be, when nothing is wrong any more."""
+        owed = self._pending[-1][0] is not None if self._pending else self._told
+        if owed and self._open and not self._active:
             self._tell(None)
             self.advance(now)
 
     def _tell(self, condition: Condition | None) -> None:
         if condition is None:
-            self._told = False
             head, tail = bytes((0, 0, self.register, _FROM_GATEWAY)), bytes(4)
         else:
-            self._told = True
             head = condition.code.to_bytes(2, "little") + bytes((self.register, condition.source))
             from_gateway = condition.source == _FROM_GATEWAY
             tail = (condition.detail if from_gateway else self._word).to_bytes(4, "little")

@@ -160,9 +160,8 @@ class Node:
         self._wanted = stored
         self._bus_node_id = stored.node_id
         self._waiting_saves: deque[tuple[str, Stored]] = deque()
-        self._started = False
         self._next_overrun = 0
-        self._can_state = CanState.UNKNOWN
+        self._off_bus = False
         self._live = False  # for the edge of 1029h:2
         history = sum(1 for _ in dictionary.subs(0x1003))
         self.emergencies = Emergencies(self._send_emergency, max(1, history))
@@ -184,12 +183,14 @@ class Node:
 
     def power_on(self, now: int) -> None:
         """The gateway starts. A node without a node-ID stays silent until LSS gives it one."""
-        self._started = True
         self.reset_node(now)
 
     def reset_node(self, now: int) -> None:
         """NMT reset node: manufacturer's and profile objects too."""
-        self.misfits = self.dictionary.reset(_APPLICATION[0], 0xFFFF, self.node_id, dict(self._stored.application))
+        self._stop_pdos()
+        self.emergencies.close()  # nothing is said before the boot-up message
+        node_id = self.pending_node_id
+        self.misfits = self.dictionary.reset(_APPLICATION[0], 0xFFFF, node_id, dict(self._stored.application))
         self._apply_settings(now)
         self.reset_communication(now, keep_misfits=True)
 
@@ -197,7 +198,7 @@ class Node:
         """NMT reset communication: the pending node-ID, power-on values of 1000h..1FFFh, boot-up."""
         if not keep_misfits:
             self.misfits = []
-        self._leave_state()
+        self._stop_pdos()
         self.sdo.reset()
         self.lss.reset()
         self.emergencies.reset()
@@ -280,13 +281,12 @@ class Node:
 
     def on_can_state(self, state: CanState, now: int) -> None:
         """The CAN controller's state changed."""
-        before, self._can_state = self._can_state, state
-        if not self._started or self.node_id == UNCONFIGURED:
-            return
         self.emergencies.set(GatewayError.CAN_PASSIVE, state is CanState.ERROR_PASSIVE, now)
         if state is CanState.BUS_OFF:
+            self._off_bus = True
             self._communication_error(now)
-        elif before is CanState.BUS_OFF:
+        elif self._off_bus and state not in (CanState.DOWN, CanState.UNKNOWN):
+            self._off_bus = False
             self.emergencies.pulse(GatewayError.BUS_OFF_LEFT, now)
         self._set_due()
 
@@ -437,10 +437,11 @@ class Node:
     def _enter(self, state: NmtState, now: int) -> None:
         if state is self.state:
             return
-        self._leave_state()
+        self._stop_pdos()
         self.state = state
         self._around.state_changed()
         if state is NmtState.STOPPED:
+            self.emergencies.close()
             self.sdo.reset()
             return
         self.emergencies.open(now)
@@ -448,11 +449,10 @@ class Node:
             for tpdo in self.tpdos:
                 tpdo.start(now)
 
-    def _leave_state(self) -> None:
+    def _stop_pdos(self) -> None:
         if self.state is NmtState.OPERATIONAL:
             for tpdo in self.tpdos:
                 tpdo.stop()
-        self.emergencies.close()
 
     def _communication_error(self, now: int) -> None:
         self._behave(self.dictionary.number(0x1029, 1), now)

@@ -348,7 +348,7 @@ def test_ids_of_other_pdos_of_all_nodes_and_of_the_dbc_are_taken() -> None:
 
 
 def test_a_pdo_whose_default_id_was_given_to_another_node_stays_off_after_a_reset() -> None:
-    bench = Bench(2, changes=QUIET | {(0x1800, 1): {"default": 0x40000180, "relative": True}})
+    bench = Bench(2, changes={**QUIET, **default(0x1800, 1, 0x40000180, relative=True)})
     assert bench.write(0x1800, 1, 0xC0000182, node=2) is None
     assert bench.write(0x1804, 1, 0x40000182, node=1) is None
     bench.put(0, "82 02")
