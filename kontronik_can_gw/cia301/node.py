@@ -159,7 +159,7 @@ class Node:
         self._stored = stored
         self._wanted = stored
         self._bus_node_id = stored.node_id
-        self._waiting_saves: deque[tuple[str, Stored]] = deque()
+        self._waiting_saves: deque[tuple[int | None, Stored]] = deque()  # the SDO server's ticket, None for LSS
         self._next_overrun = 0
         self._off_bus = False
         self._live = False  # for the edge of 1029h:2
@@ -330,16 +330,16 @@ class Node:
 
     def saved(self, error: str | None, now: int) -> None:
         """The oldest request to store is done: on disk, or failed for a reason."""
-        purpose, stored = self._waiting_saves.popleft()
+        ticket, stored = self._waiting_saves.popleft()
         if error is None:
             self._stored = stored
             self.set_error(GatewayError.PARAMETER_FILE, False, now)
         elif not self._waiting_saves:
             self._wanted = self._stored
-        if purpose == "lss":
+        if ticket is None:
             self.lss.stored(error is None)
         else:
-            self.sdo.confirm(None if error is None else Abort.HARDWARE, now)
+            self.sdo.confirm(None if error is None else Abort.HARDWARE, now, ticket)
         self._set_due()
 
     # --- LSS: the node as its slave sees it (cia305.lss.Host)
@@ -364,7 +364,7 @@ class Node:
         if self.settings.read_only:
             return False
         try:
-            self._save("lss", replace(self._wanted, node_id=self._bus_node_id))
+            self._save(None, replace(self._wanted, node_id=self._bus_node_id))
         except SdoAbort:
             return False
         return True
@@ -530,11 +530,11 @@ class Node:
         self.pending_node_id = node_id
         self._bus_node_id = node_id
 
-    def _save(self, purpose: str, stored: Stored) -> None:
+    def _save(self, ticket: int | None, stored: Stored) -> None:
         if len(self._waiting_saves) >= _MOST_SAVES:  # a disk that does not come round
             raise SdoAbort(Abort.LOCAL_CONTROL)
         self._wanted = stored
-        self._waiting_saves.append((purpose, stored))
+        self._waiting_saves.append((ticket, stored))
         self._around.save(self, stored)
 
     def _store(self, part: int) -> None:
@@ -545,7 +545,7 @@ class Node:
         if part in (1, 3):
             application = self.dictionary.to_store(*_APPLICATION, self.node_id)
             stored = replace(stored, application=application, node_id=self._bus_node_id)
-        self._save("sdo", stored)
+        self._save(self.sdo.waiting, stored)
 
     def _restore(self, part: int) -> None:
         """1011h: defaults from the next reset on. A node-ID that LSS stored stays: it is taken back by LSS."""
@@ -554,7 +554,7 @@ class Node:
             stored = replace(stored, communication={})
         if part in (1, 3):
             stored = replace(stored, application={})
-        self._save("sdo", stored)
+        self._save(self.sdo.waiting, stored)
 
     # --- binding
 

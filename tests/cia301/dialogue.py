@@ -174,10 +174,7 @@ class Bench:
         """One request and its one answer."""
         self.gateway.receive_frame(CanFrame(0x600 + node, request), self.now)
         self._collect()
-        answers = [f for _, f in self.heard if f.can_id == 0x580 + node]
-        self.heard = [(t, f) for t, f in self.heard if f.can_id != 0x580 + node]
-        assert len(answers) == 1, f"{len(answers)} answers to {request.hex(' ')}"
-        return answers[0].data
+        return self._answer(node)
 
     def read(self, index: int, sub: int = 0, node: int = 1) -> bytes | int:
         """The data of an upload, or its abort code."""
@@ -209,7 +206,9 @@ class Bench:
         if 1 <= len(data) <= 4:
             request = bytes((0x23 | 4 - len(data) << 2,)) + multiplexer + data.ljust(4, b"\0")
             if data in (_SAVE, _LOAD) and index in (0x1010, 0x1011):
-                return self._write_and_store(node, request)
+                self.put(0x600 + node, request)
+                self.answer_saves()
+                return self._confirmed(self._answer(node), b"\x60" + multiplexer + bytes(4))
             return self._confirmed(self.ask(node, request), b"\x60" + multiplexer + bytes(4))
         answer = self.ask(node, b"\x21" + multiplexer + len(data).to_bytes(4, "little"))
         if answer[0] == 0x80:
@@ -231,13 +230,20 @@ class Bench:
         assert isinstance(data, bytes), f"{index:04X}h:{sub:02X}: {data:08X}h"
         return int.from_bytes(data, "little")
 
-    def _write_and_store(self, node: int, request: bytes) -> int | None:
-        self.put(0x600 + node, request)
-        self.answer_saves()
+    def store(self, part: int = 1, node: int = 1) -> Stored:
+        """What a download to 1010h asks to be stored; it is, and the download is confirmed."""
+        self.put(0x600 + node, b"\x23\x10\x10" + bytes((part,)) + _SAVE)
+        ((esc, stored),) = self.answer_saves()
+        assert esc == next(n for n, other in enumerate(self.nodes) if other.node_id == node)
+        assert self._answer(node) == b"\x60\x10\x10" + bytes((part,)) + bytes(4)
+        return stored
+
+    def _answer(self, node: int) -> bytes:
+        """The one SDO answer that a node has given."""
         answers = [f for _, f in self.heard if f.can_id == 0x580 + node]
         self.heard = [(t, f) for t, f in self.heard if f.can_id != 0x580 + node]
-        (answer,) = answers
-        return self._confirmed(answer.data, b"\x60" + request[1:4] + bytes(4))
+        assert len(answers) == 1, f"{len(answers)} answers of node {node}"
+        return answers[0].data
 
     @staticmethod
     def _confirmed(answer: bytes, expected: bytes) -> int | None:
