@@ -15,6 +15,8 @@ Choices where the standard leaves room:
 * More data than the indicated size or than the object holds ends in 06070012h as soon as it is certain, less than the indicated
   size in 06070013h after the last segment. 06070010h ("does not match") is left to the dictionary: here it is always known in
   which way the length is wrong.
+* Both answers to a block initiate say that the server supports a CRC, whatever the client does; there is one only if the client
+  supports it too. Without, the field is 0 in a block upload and not looked at in a block download.
 * An unused bit ("x") of a command is ignored, so any command with specifier 4 is an abort; an abort is never answered.
 """
 
@@ -239,7 +241,6 @@ class SdoServer:
                 _refuse(self._too_long)
             self._limit, self._too_long = size, Abort.TOO_LONG
         self._size = size
-        self._received = bytearray()
 
     def _take_segment(self, data: bytes, now: int) -> None:
         """000t nnnc, data (7). Answer: 001t 0000, 0 (7)."""

@@ -367,6 +367,43 @@ DIALOGUES: dict[str, list[Line]] = {
         (13, ">", "0641424344454647"),
         (13, "<", "8000000001000405"),
     ],
+    "segments under way may take long altogether": [
+        (0, ">", "c404200000000000"),
+        (0, "<", "a40420007f000000"),
+        (100, ">", "0141424344454647"),
+        (200, ">", "0241424344454647"),
+        (200, "<", "8004200012000706"),
+        (250, ">", "0341424344454647"),
+        (300, ">", "0441424344454647"),
+        (351, ">", "0541424344454647"),
+        (351, "<", "8000000001000405"),
+        (351, ">", "0141424344454647"),
+        (351, "<", "8000000001000405"),
+    ],
+    "after the last segment under way the next is a request": [
+        (0, ">", "c404200000000000"),
+        (0, "<", "a40420007f000000"),
+        (1, ">", "0141424344454647"),
+        (1, ">", "0241424344454647"),
+        (1, "<", "8004200012000706"),
+        (2, ">", "8341424344454647"),
+        (2, ">", "0141424344454647"),
+        (2, "<", "8000000001000405"),
+    ],
+    "a block download after one that was cut short starts afresh": [
+        (0, ">", "c404200000000000"),
+        (0, "<", "a40420007f000000"),
+        (1, ">", "0141424344454647"),
+        (1, ">", "0241424344454647"),
+        (1, "<", "8004200012000706"),
+        (2, ">", "c60420000a000000"),
+        (2, "<", "a40420007f000000"),
+        (3, ">", "0141424344454647"),
+        (3, ">", "8248494a00000000"),
+        (3, "<", "a2027f0000000000"),
+        (4, ">", "d1" + crc(b"ABCDEFGHIJ") + "0000000000"),
+        (4, "<", "a100000000000000"),
+    ],
     "a request right after a sub-block was cut short is served": [
         (0, ">", "c404200000000000"),
         (0, "<", "a40420007f000000"),
@@ -448,6 +485,13 @@ DIALOGUES: dict[str, list[Line]] = {
         (1, ">", "0248000000000000"),
         (1, "<", "8000000001000405"),
     ],
+    "the client aborts a block download and goes on with a segment": [
+        (0, ">", "c604200008000000"),
+        (0, "<", "a40420007f000000"),
+        (1, ">", "8004200000000008"),
+        (1, ">", "0141424344454647"),
+        (1, "<", "8000000001000405"),
+    ],
     "block download to a read-only object is refused before data moves": [
         (0, ">", "c60810000a000000"),
         (0, "<", "8008100002000106"),
@@ -463,6 +507,15 @@ DIALOGUES: dict[str, list[Line]] = {
         (1, "<", "a2017f0000000000"),
         (2, ">", "d9" + crc(b"\x65") + "0000000000"),
         (2, "<", "8006200031000906"),
+    ],
+    "block download that says only in an empty segment that it is over": [
+        (0, ">", "c604200007000000"),
+        (0, "<", "a40420007f000000"),
+        (1, ">", "0141424344454647"),
+        (1, ">", "8200000000000000"),
+        (1, "<", "a2027f0000000000"),
+        (2, ">", "dd" + crc(b"ABCDEFG") + "ffffffffff"),
+        (2, "<", "a100000000000000"),
     ],
     "block download whose last segment is empty": [
         (0, ">", "c606200001000000"),
@@ -656,6 +709,8 @@ def test_dialogue(lines: list[Line]) -> None:
         ("block download with size and CRC", (0x2004, 0, b"ABCDEFGHIJ")),
         ("block download without size and CRC", (0x2004, 0, b"ABC")),
         ("block download of no bytes", (0x2004, 0, b"")),
+        ("block download that says only in an empty segment that it is over", (0x2004, 0, b"ABCDEFG")),
+        ("a block download after one that was cut short starts afresh", (0x2004, 0, b"ABCDEFGHIJ")),
         ("block download that loses a segment in the middle", (0x2003, 0, DATA30)),
         ("block download that loses all but the last segment", (0x2003, 0, DATA30)),
         ("block download in which a segment comes twice", (0x2004, 0, b"ABCDEFGH")),
@@ -751,6 +806,30 @@ def test_a_sub_block_cut_short_by_a_reset_writes_nowhere() -> None:
     for line in lines[0x20:]:
         assert bench.request(bytes.fromhex(line)) == []
     assert bench.objects.written == []
+    assert not bench.server.busy
+
+
+def test_segments_on_their_way_when_a_reset_comes_are_no_requests_either() -> None:
+    bench = Bench()
+    bench.play([(200, ">", "c403200000000000"), (200, "<", "a40320007f000000")])
+    bench.server.reset()
+    bench.now += 50 * MS
+    assert bench.request(bytes.fromhex("0141424344454647")) == []
+    assert bench.request(bytes.fromhex("0241424344454647")) == []
+    assert bench.request(bytes.fromhex("4001100000000000")) == [bytes.fromhex("4f01100005000000")]
+
+
+def test_a_segmented_upload_has_no_segment_too_many() -> None:
+    bench = Bench()
+    bench.objects.entries[0x2003, 0].value = b"ABCDEFG"
+    bench.play(
+        [
+            (0, ">", "4003200000000000"),
+            (0, "<", "4103200007000000"),
+            (0, ">", "6000000000000000"),
+            (0, "<", "0141424344454647"),
+        ]
+    )
     assert not bench.server.busy
 
 
@@ -991,6 +1070,23 @@ def test_an_early_acknowledgement_of_a_paced_sub_block_begins_a_new_one() -> Non
             *said("<", segments(data, [2, 3, 4]), 4),
             (5, ">", "a204030000000000"),
             (5, "<", "8003200003000405"),
+        ]
+    )
+
+
+def test_the_time_out_runs_from_the_last_burst() -> None:
+    data = bytes(range(49))
+    bench = Bench(segment_ns=100 * MS)
+    bench.objects.entries[0x2003, 0].value = data
+    lines = segments(data, range(7))
+    bench.play(
+        [
+            (0, ">", "a40320007f000000"),
+            (0, "<", "c603200031000000"),
+            (0, ">", "a300000000000000"),
+            *said("<", lines[:4]),
+            *said("<", lines[4:], 400),
+            (2400, "<", "8003200000000405"),
         ]
     )
 

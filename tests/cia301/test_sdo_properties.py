@@ -235,7 +235,7 @@ class Model:
         if self.phase == "idle" and self.stray:
             return bytes((self.stray | (pick & 0x80),)) + raw[1:8]
         if self.phase == "down segment":
-            return bytes((self.toggle << 4 | pick & 0x0F,)) + raw[1:8]
+            return bytes(((self.toggle ^ (low % 16 == 15)) << 4 | pick & 0x0F,)) + raw[1:8]
         if self.phase == "up segment":
             return bytes((0x60 | self.toggle << 4,)) + bytes(7)
         if self.phase == "block down":
