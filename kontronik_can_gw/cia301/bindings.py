@@ -17,6 +17,8 @@ LIVE, DERIVED, INFO, EXTREMES, LINK, GATEWAY = 0x2000, 0x2001, 0x2010, 0x2011, 0
 UNITS = 0x2002
 SETTINGS, NODE_ID, RESET_STATISTICS = 0x2100, 0x2101, 0x2102
 ERROR_CODE, VELOCITY, DC_LINK_VOLTAGE = 0x603F, 0x606C, 0x6079
+_CELLS = "(esc.cells or (esc.last_info.cell_count if esc.live is None and esc.last_info is not None else 0))"
+"""Number of cells; while telemetry is lost that of the last value."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,10 @@ def bindings(settings: EscSettings) -> dict[tuple[int, int], Bound]:
         ("motor_run_time", 1),
     )
     for sub, (name, steps) in enumerate(derived, 1):
-        bind(DERIVED, sub, replace(known[name], rolls=name in ("energy_used", "motor_run_time")), steps)
+        source = replace(known[name], rolls=name in ("energy_used", "motor_run_time"))
+        if name == "mean_cell_voltage":
+            source = replace(source, expression=source.expression.replace("esc.cells", _CELLS), supplied=_CELLS)
+        bind(DERIVED, sub, source, steps)
     firmware = Source("firmware", "", Group.INFO, "info[1]", low=0, high=U16)
     for sub, source in enumerate(
         (known["device_raw"], known["variant"], firmware, known["selftest_errors"], known["cell_count"]), 1

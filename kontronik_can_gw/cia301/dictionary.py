@@ -137,10 +137,10 @@ class Dictionary:
     def check_download(self, index: int, sub: int, size: int | None) -> None:
         """Whether so many bytes may be written there, before any is moved."""
         variable = self.find(index, sub)
-        if not variable.writable:
-            raise SdoAbort(Abort.READ_ONLY)
         if self.read_only:
             raise SdoAbort(Abort.DEVICE_STATE)
+        if not variable.writable:
+            raise SdoAbort(Abort.READ_ONLY)
         if size is not None:
             _check_size(variable, size)
 

@@ -27,7 +27,7 @@ from kontronik_can_gw.cia305.lss import LssSlave
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.protocol.states import Device, device_text
-from kontronik_can_gw.sources import CanState, GatewayStatus, Group
+from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus, Group
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry, Event, LinkState
 
 UNCONFIGURED = 255
@@ -36,6 +36,17 @@ SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x600, 0x580, 0x7E5, 0x7E4
 _COMMUNICATION, _APPLICATION = (0x1000, 0x1FFF), (0x2000, 0x9FFF)
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 _SELF_START_OFF = 4
+_WHOLE = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x15, 0x1B})  # data types
+_UNSIGNED = {
+    **dict.fromkeys(((at.SETTINGS, sub) for sub in range(1, 9)), 1),
+    (at.NODE_ID, 1): 1,
+    (at.NODE_ID, 2): 1,
+    (at.NODE_ID, 3): 4,
+    (at.NODE_ID, 4): 4,
+    (at.RESET_STATISTICS, 1): 4,
+    (at.ERROR_CODE, 0): 2,
+}
+"""Objects that services read or write: the bytes they need at least."""
 _NOT_VALID = 1 << 31  # of 1014h
 _MOST_SAVES = 4
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
@@ -668,6 +679,7 @@ class Node:
         esc = self.esc
         return (
             int(esc.link)
+            | (self._gateway.state is GatewayState.REPLAY) << 6
             | (esc.info is not None) << 7
             | int(self._gateway.can_state) << 8
             | (esc.live is not None) << 16
@@ -800,10 +812,25 @@ def check_eds(eds: Eds, settings: EscSettings) -> None:
         if variable is None:
             continue
         where = f"{eds.name}: {index:04X}h:{sub:02X} {variable.entry.name}"
-        if _range(variable)[1] < 0 or isinstance(variable.decode(bytes(variable.size or 0)), float):
+        if variable.entry.data_type not in _WHOLE:
             problems.append(f"{where}: shows {binding.source.name}, so it must be of a whole-number type.")
         elif variable.writable:
             problems.append(f"{where}: shows {binding.source.name}, so it must be read only (AccessType=ro).")
+    for (index, sub), size in _UNSIGNED.items():
+        variable = dictionary.get(index, sub)
+        if variable is None:
+            continue
+        whole = variable.entry.data_type in _WHOLE
+        if not whole or _range(variable)[0] < 0 or (variable.size or 0) < size:
+            problems.append(
+                f"{eds.name}: {index:04X}h:{sub:02X} {variable.entry.name}: must be of an unsigned type of {8 * size} bits or more."
+            )
+    for sub in (6, 7):
+        variable = dictionary.get(at.INFO, sub)
+        if variable is not None and variable.size is not None:
+            problems.append(
+                f"{eds.name}: {at.INFO:04X}h:{sub:02X} {variable.entry.name}: is a text, so it must be a VISIBLE_STRING."
+            )
     esc = EscTelemetry(settings, 0)
     dictionary.reset(*_COMMUNICATION, 1, {})
     for number in range(MOST):

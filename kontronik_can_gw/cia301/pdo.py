@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from kontronik_can_gw.cia301.abort import Abort, SdoAbort
 from kontronik_can_gw.cia301.bindings import LINK, Bound
-from kontronik_can_gw.cia301.dictionary import Dictionary, Variable
+from kontronik_can_gw.cia301.dictionary import Dictionary, Value, Variable
 from kontronik_can_gw.cia301.heartbeat import NEVER
 from kontronik_can_gw.dbc_output.layout import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
 from kontronik_can_gw.dbc_output.packer import Pack, compile_pack, place
@@ -72,8 +72,8 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePla
         length = bits_of(variable)
         signed = variable.entry.data_type in _SIGNED
         if bound is None:
-            value = "value" if variable.read is None else "read(now)"
-            storage = f"storage[{variable.entry.index << 8 | variable.entry.sub:#x}].{value}"
+            number = f"{variable.entry.index << 8 | variable.entry.sub:#x}"
+            storage = f"storage[{number}].value" if variable.read is None else f"shown({number}, now)"
             source = Source(variable.entry.name, "", Group.GATEWAY, storage)
         else:
             source = bound.source
@@ -415,7 +415,7 @@ class Tpdo:
         if not self._mapped:
             return
         plan = message_plan(f"TPDO {self.number + 1}", self.cob_id, self._mapped)
-        self._pack = compile_pack(plan, {"storage": self._dictionary.variables})
+        self._pack = compile_pack(plan, {"storage": self._dictionary.variables, "shown": self._shown})
         self._length = plan.length
         carries_link = False
         for entry, signal in zip(self._mapped, plan.signals, strict=True):
@@ -432,3 +432,10 @@ class Tpdo:
             self._triggers |= Event.LIVE | Event.LINK | Event.INFO
         live = any(entry.bound and entry.bound.source.group is Group.LIVE for entry in self._mapped)
         self._needs_live = live and not carries_link
+
+    def _shown(self, number: int, now: int) -> Value:
+        """What a service's object holds; -1, which no unsigned object can hold, where it has nothing (1003h)."""
+        try:
+            return self._dictionary.value(self._dictionary.variables[number], now)
+        except SdoAbort:
+            return -1

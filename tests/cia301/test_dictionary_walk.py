@@ -1,0 +1,476 @@
+"""A walk by SDO over the whole index space: size, access and limits of each object, and the values of 2000h in each state of the link."""
+
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from dialogue import QUIET, Bench, info, live, shipped_eds
+
+from kontronik_can_gw.cia301.eds import Entry, load, without
+from kontronik_can_gw.cia301.node import check_eds
+from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.protocol.codec import Layout
+from kontronik_can_gw.protocol.codec import encode as uart
+from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
+from kontronik_can_gw.sources import GatewayState
+from kontronik_can_gw.telemetry import EscSettings
+
+NO_OBJECT, NO_SUB, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
+TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x06070012, 0x06070013, 0x06090031, 0x06090032
+DEVICE_STATE, NO_DATA = 0x08000022, 0x08000024
+FORMATS = {0x01: "?", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I", 0x08: "f"}
+TEXTS = (0x09, 0x0F)
+
+LIVE = LiveData(70_000, 2442, -12, 34, 56, 789, 1234, 5678, 1500, -50, 60, -7, 8, 1 << 17, 26, 9)
+INFO = InfoData(
+    1 << 10 | 120, 4 << 8 | 17, 3, 6, 100_000, 2000, 2520, 100, 200, 300, 4, 5000, 99, 100, -10, 90, -11, 50
+)
+
+
+@pytest.fixture(scope="module")
+def bench() -> Bench:
+    """Never written to a lasting effect."""
+    return Bench(changes=QUIET)
+
+
+def entries() -> dict[tuple[int, int], Entry]:
+    return {(e.index, e.sub): e for e in shipped_eds().entries}
+
+
+def of(entry: Entry) -> str:
+    return f"{entry.index:04X}h:{entry.sub:02X} {entry.name}"
+
+
+def ends(entry: Entry) -> tuple[int, int]:
+    """Smallest and greatest value of the type."""
+    bits = 8 * struct.calcsize(FORMATS[entry.data_type])
+    return (-(1 << bits - 1), (1 << bits - 1) - 1) if FORMATS[entry.data_type].islower() else (0, (1 << bits) - 1)
+
+
+def test_every_other_index_is_06020000h(bench: Bench) -> None:
+    known = {index for index, _ in entries()}
+    gateway, codes = bench.gateway, set()
+    for index in set(range(0x10000)) - known:
+        answer = bench.ask(1, b"\x40" + index.to_bytes(2, "little") + bytes(5))
+        assert answer[1:3] == index.to_bytes(2, "little")
+        codes.add(answer[:1] + answer[3:])
+    assert codes == {b"\x80\0" + NO_OBJECT.to_bytes(4, "little")}
+    for index in (0x0000, 0x0001, 0x1006, 0x1200 + 1, 0x1400, 0x1600, 0x1806, 0x2003, 0x5FFF, 0x6000, 0xA000, 0xFFFF):
+        assert bench.write(index, 0, 0) == NO_OBJECT
+    assert gateway.take_frames() == []
+
+
+def test_every_other_sub_index_is_06090011h(bench: Bench) -> None:
+    known = entries()
+    for index in {index for index, _ in known}:
+        for sub in range(256):
+            if (index, sub) not in known:
+                assert bench.read(index, sub) == NO_SUB
+                assert bench.write(index, sub, 0) == NO_SUB
+
+
+@pytest.mark.parametrize("entry", shipped_eds().entries, ids=of)
+def test_size_and_access(bench: Bench, entry: Entry) -> None:
+    at = entry.index, entry.sub
+    data = bench.read(*at)
+    if entry.access == "wo":
+        assert data == WRITE_ONLY
+    elif isinstance(data, int):
+        assert data == NO_DATA  # nothing has come from the ESC
+        assert entry.index in (0x1003, 0x2000, 0x2001, 0x2010, 0x2011, 0x2020, 0x606C, 0x6079)
+    elif entry.data_type not in TEXTS:
+        assert len(data) == struct.calcsize(FORMATS[entry.data_type])
+    if entry.access in ("ro", "const"):
+        for size in (1, 2, 4, 9):
+            assert bench.write(*at, bytes(size)) == READ_ONLY
+        return
+    size = struct.calcsize(FORMATS[entry.data_type])
+    before = bench.read(*at)
+    for other in {1, 2, 3, 4, 5, 8, 300} - {size}:
+        assert bench.write(*at, bytes(other)) == (TOO_LONG if other > size else TOO_SHORT)
+    assert bench.write(*at, b"") == TOO_SHORT
+    assert bench.read(*at) == before
+
+
+LIMITED = [entry for entry in shipped_eds().entries if "w" in entry.access]
+# further rules than limits, tested by dialogues
+RULED = {0x1003, 0x1005, 0x1010, 0x1011, 0x1014, 0x2102}
+
+
+@pytest.mark.parametrize("entry", LIMITED, ids=of)
+def test_limits(entry: Entry, bench: Bench) -> None:
+    at = entry.index, entry.sub
+    least, most = ends(entry)
+    low, high = least if entry.low is None else entry.low, most if entry.high is None else entry.high
+    size = struct.calcsize(FORMATS[entry.data_type])
+    before = bench.read(*at)
+    if low > least:
+        assert bench.write(*at, low - 1, size=size) == TOO_LOW
+    if high < most:
+        assert bench.write(*at, high + 1, size=size) == TOO_HIGH
+        assert bench.write(*at, most, size=size) == TOO_HIGH
+    assert bench.read(*at) == before
+    if entry.index in RULED or 0x1800 <= entry.index < 0x1C00:
+        return
+    for value in (low, high):
+        assert bench.write(*at, value, size=size) is None
+        assert bench.number(*at) == value
+    if isinstance(before, bytes):
+        assert bench.write(*at, before) is None
+
+
+def test_the_defaults_are_those_of_the_eds() -> None:
+    bench = Bench(boot=False)
+    for (index, sub), entry in entries().items():
+        if entry.access == "wo" or (index >= 0x2000 and entry.access == "ro"):
+            continue
+        if entry.default is None or (index, bool(sub)) == (0x1003, True) or (index, sub) in ((0x1018, 4), (0x2101, 2)):
+            continue
+        data = bench.read(index, sub)
+        assert isinstance(data, bytes)
+        wanted = entry.default
+        if isinstance(wanted, bytes):
+            assert data == wanted
+        else:
+            assert int.from_bytes(data, "little") == wanted + entry.relative, of(entry)
+
+
+def test_the_serial_number_and_the_vendor_are_the_configurations() -> None:
+    bench = Bench(2, vendor_id=0x12345, version="1.2.3")
+    assert [bench.number(0x1018, 4, node) for node in (1, 2)] == [77, 78]
+    assert bench.number(0x1018, 1) == 0x12345
+    assert bench.read(0x100A) == b"1.2.3"
+
+
+# --- values of the ESC
+
+
+def values(record: type[LiveData] | type[InfoData], data: LiveData | InfoData) -> Iterator[tuple[str, bytes]]:
+    """Name and wire bytes of each field."""
+    for name, row in rows(record).items():
+        yield name, struct.pack("<" + row.wire, getattr(data, name))
+
+
+def all_live() -> list[tuple[int, int]]:
+    """Objects that come and go with live data."""
+    return [
+        *((0x2000, sub) for sub in range(1, 17)),
+        *((0x2001, sub) for sub in (1, 2, 3, 5)),
+        (0x606C, 0),
+        (0x6079, 0),
+    ]
+
+
+def fed(behaviour: int = 0) -> Bench:
+    """A node whose ESC has just sent both frames. ``behaviour``: 2100h:5."""
+    bench = Bench(changes=QUIET)
+    assert bench.write(0x2100, 5, behaviour, size=1) is None
+    bench.uart(uart(INFO, Layout.V4))
+    bench.uart(uart(LIVE, Layout.V4))
+    bench.take()
+    return bench
+
+
+def test_before_the_first_frame_there_is_no_data() -> None:
+    bench = Bench(changes=QUIET)
+    for at in [*all_live(), *((0x2010, sub) for sub in range(1, 8)), *((0x2011, sub) for sub in range(1, 15))]:
+        assert bench.read(*at) == NO_DATA
+    assert bench.number(0x2020, 1) == 0
+    assert bench.number(0x2020, 3) == bench.number(0x2020, 4) == 0xFFFF
+
+
+def test_fresh_values_are_those_of_the_uart_frame() -> None:
+    bench = fed()
+    for sub, (name, data) in enumerate(values(LiveData, LIVE), 1):
+        assert bench.read(0x2000, sub) == data, name
+    wanted = list(values(InfoData, INFO))
+    assert [bench.number(0x2010, sub) for sub in range(1, 6)] == [1, 120, 0x0411, 3, 6]
+    assert [bench.read(0x2010, sub) for sub in (6, 7)] == [b"KOSMIK", b"4.17"]
+    for sub, (name, data) in enumerate(wanted[4:], 1):
+        assert bench.read(0x2011, sub) == data, name
+    assert bench.number(0x2001, 1) == bench.number(0x606C) == 70_000
+    assert bench.number(0x2001, 5) == 4070
+    assert bench.number(0x6079) == 24420
+    assert bench.number(0x2020, 1) == 0x82
+
+
+def test_power_is_in_tenths_of_a_watt() -> None:
+    bench = fed()
+    data = bench.read(0x2001, 3)
+    assert isinstance(data, bytes)
+    assert int.from_bytes(data, "little", signed=True) == -293  # 24.42 V, -1.2 A: -29.304 W
+
+
+def lose(bench: Bench) -> None:
+    bench.wait(300)
+    bench.take()
+    assert bench.number(0x2020, 1) == 4
+
+
+def test_lost_values_abort() -> None:
+    bench = fed()
+    lose(bench)
+    for at in all_live():
+        assert bench.read(*at) == DEVICE_STATE, at
+
+
+def test_lost_values_by_setting_are_the_last() -> None:
+    bench = fed(behaviour=1)
+    fresh = {at: bench.read(*at) for at in all_live()}
+    lose(bench)
+    for at in all_live():
+        assert bench.read(*at) == fresh[at], at
+
+
+def test_lost_values_by_setting_are_codes() -> None:
+    bench = fed(behaviour=2)
+    lose(bench)
+    known = entries()
+    for at in all_live():
+        low, high = ends(known[at])
+        code = high if low == 0 else low
+        assert bench.read(*at) == struct.pack("<" + FORMATS[known[at].data_type], code), at
+
+
+@pytest.mark.parametrize("behaviour", [0, 1, 2])
+def test_information_counters_and_energy_keep_their_values(behaviour: int) -> None:
+    bench = fed(behaviour=behaviour)
+    kept = [*((0x2010, sub) for sub in range(1, 8)), *((0x2011, sub) for sub in range(1, 15)), (0x2001, 4), (0x2001, 6)]
+    before = {at: bench.read(*at) for at in kept}
+    assert not any(isinstance(data, int) for data in before.values())
+    lose(bench)
+    assert {at: bench.read(*at) for at in kept} == before
+    assert bench.number(0x2020, 3) == 300
+    bench.wait(100_000)
+    assert bench.number(0x2020, 3) == bench.number(0x2020, 4) == 0xFFFE
+    assert bench.number(0x2020, 10) == 1
+
+
+def test_status_registers() -> None:
+    bench = fed()
+    bench.can_state("ERROR_PASSIVE")
+    assert bench.number(0x1002) == 0x00030382
+    lose(bench)
+    assert bench.number(0x1002) == 0x00000304
+    bench.gateway.status.state = GatewayState.REPLAY
+    assert bench.number(0x1002) & 0xFF == bench.number(0x2020, 1) == 0x44
+
+
+# --- read only
+
+
+def test_read_only_refuses_every_download() -> None:
+    bench = Bench(changes=QUIET, read_only=True)
+    for entry in shipped_eds().entries:
+        for data in (b"\0", bytes(4), bytes(9)):
+            assert bench.write(entry.index, entry.sub, data) == DEVICE_STATE, of(entry)
+    assert bench.write(0x1A09, 0, 0) == NO_OBJECT
+    assert bench.write(0x1A00, 9, 0) == NO_SUB
+
+
+# --- another EDS
+
+
+def text() -> str:
+    return shipped("eds/kontronik_esc.eds").read_bytes().decode("ascii")
+
+
+def with_key(source: str, section: str, key: str, value: str) -> str:
+    """The text with another value of a key, or with the key."""
+    start = source.index(f"[{section}]")
+    end = source.find("\r\n[", start)
+    part = source[start : end if end >= 0 else None]
+    changed = re.sub(rf"(?m)^{key}=.*?\r$", f"{key}={value}\r", part)
+    if changed == part and f"{key}={value}\r" not in part:
+        changed = part.rstrip() + f"\r\n{key}={value}\r\n"
+    return source.replace(part, changed)
+
+
+def with_object(source: str, index: int, lines: str) -> str:
+    """The text with one more manufacturer object."""
+    count = int(re.search(r"\[ManufacturerObjects\]\r\nSupportedObjects=(\d+)", source)[1])  # type: ignore[index]
+    source = with_key(source, "ManufacturerObjects", "SupportedObjects", str(count + 1))
+    source = with_key(source, "ManufacturerObjects", str(count + 1), f"0x{index:04X}")
+    return source.rstrip() + f"\r\n\r\n[{index:04X}]\r\n" + "\r\n".join(lines.split()) + "\r\n"
+
+
+def bench_of(source: str, **settings: Any) -> Bench:
+    eds = load(source.encode("ascii"), "other.eds")
+    check_eds(eds, EscSettings())
+    return Bench(eds=eds, changes=QUIET, **settings)
+
+
+def plain(data_type: int, **keys: str) -> str:
+    lines = {
+        "ParameterName": "Plain",
+        "ObjectType": "0x7",
+        "DataType": f"0x{data_type:04X}",
+        "AccessType": "rw",
+        **keys,
+    }
+    return "\n".join(f"{key}={value}" for key, value in lines.items())
+
+
+@pytest.mark.parametrize("index", sorted({e.index for e in shipped_eds().entries} - {0x1000, 0x1001, 0x1018}))
+def test_each_optional_object_can_be_dropped(index: int) -> None:
+    gone = {index}
+    if 0x1800 <= index < 0x1A00:
+        gone.add(index + 0x200)
+    if 0x1A00 <= index < 0x1C00:
+        gone.add(index - 0x200)
+    if index >= 0x2000:  # and the PDOs that carry it
+        gone |= {0x1800, 0x1801, 0x1802, 0x1803, 0x1A00, 0x1A01, 0x1A02, 0x1A03}
+    eds = replace(shipped_eds(), entries=tuple(e for e in shipped_eds().entries if e.index not in gone))
+    check_eds(eds, EscSettings())
+    bench = Bench(eds=eds)
+    bench.start()
+    for other in gone:
+        assert bench.read(other) == NO_OBJECT
+    bench.uart(uart(INFO, Layout.V4))
+    bench.uart(uart(LIVE._replace(operating_errors=1), Layout.V4))
+    bench.put(0x80, "")
+    bench.put(0x705, "05")
+    bench.wait(2000)
+    for entry in eds.entries:
+        bench.read(entry.index, entry.sub)
+    bench.put(0, "81 01")
+    assert 0x701 in {frame.can_id for frame in bench.take()}
+
+
+def test_an_eds_without_an_object_is_what_1021h_gives() -> None:
+    data = without(shipped("eds/kontronik_esc.eds").read_bytes(), range(0x6000, 0x7000))
+    bench = Bench(eds=load(data, "shorter.eds"))
+    assert bench.read(0x606C) == NO_OBJECT
+    assert bench.read(0x1021) == data
+
+
+def test_changed_defaults_names_limits_and_access_are_followed() -> None:
+    source = with_key(text(), "2100sub1", "DefaultValue", "0x04")
+    source = with_key(source, "2100sub1", "HighLimit", "0x08")
+    source = with_key(source, "2100sub4", "AccessType", "ro")
+    source = with_key(source, "2100sub4", "DefaultValue", "0x1F4")
+    source = with_key(source, "1008", "DefaultValue", "My ESC")
+    source = with_key(source, "1017", "DefaultValue", "0x0064")
+    source = with_key(source, "2000sub1", "ParameterName", "Drehzahl")
+    eds = load(source.encode("ascii"), "other.eds")
+    check_eds(eds, EscSettings())
+    bench = Bench(eds=eds)
+    assert bench.number(0x2100, 1) == 4
+    assert bench.write(0x2100, 1, 9, size=1) == TOO_HIGH
+    assert bench.write(0x2100, 4, 100, size=2) == READ_ONLY
+    assert bench.gateway.escs[0].settings.timeout_ns == 500_000_000
+    assert bench.gateway.escs[0].settings.pole_pairs == 4
+    assert bench.read(0x1008) == b"My ESC"
+    bench.wait(100)
+    assert [frame.can_id for frame in bench.take()] == [0x701]
+
+
+def test_a_changed_pdo_mapping_is_followed() -> None:
+    source = with_key(text(), "1A00sub0", "DefaultValue", "0x2")
+    source = with_key(source, "1A00sub1", "DefaultValue", "0x20010120")
+    source = with_key(source, "1A00sub2", "DefaultValue", "0x20000C08")
+    source = with_key(source, "1800sub1", "DefaultValue", "$NODEID+0x40000200")
+    eds = load(source.encode("ascii"), "other.eds")
+    check_eds(eds, EscSettings())
+    bench = Bench(eds=eds).start()
+    bench.uart(uart(LIVE, Layout.V4))
+    assert bench.take()[0][:2] == (0x201, (70_000).to_bytes(4, "little") + b"\xf9")
+
+
+def test_a_default_mapping_that_cannot_be_is_refused_by_name() -> None:
+    for mapping in ("0x30000108", "0x20000108", "0x21000108"):
+        source = with_key(text(), "1A00sub1", "DefaultValue", mapping)
+        with pytest.raises(UserError, match="1A00"):
+            check_eds(load(source.encode("ascii"), "other.eds"), EscSettings())
+
+
+PLAIN = [
+    (0x05, "0x12", b"\x12", b"\xff"),
+    (0x06, "0x1234", b"\x34\x12", b"\xff\xff"),
+    (0x07, "0x12345678", b"\x78\x56\x34\x12", b"\xff\xff\xff\xff"),
+    (0x04, "-2", b"\xfe\xff\xff\xff", b"\0\0\0\x80"),
+    (0x08, "1.5", b"\0\0\xc0\x3f", b"\0\0\xc0\xbf"),
+    (0x09, "abc", b"abc", b"a longer text than one segment"),
+]
+
+
+@pytest.mark.parametrize(("data_type", "value", "data", "other"), PLAIN)
+def test_an_object_bound_to_nothing_is_plain_storage(data_type: int, value: str, data: bytes, other: bytes) -> None:
+    source = with_object(text(), 0x3000, plain(data_type, DefaultValue=value, PDOMapping="0"))
+    bench = bench_of(source)
+    assert bench.read(0x3000) == data
+    assert bench.write(0x3000, 0, other) is None
+    assert bench.read(0x3000) == other
+    stored = bench.store()
+    assert stored.application == {0x300000: other}
+    bench.put(0, "81 01")
+    assert bench.read(0x3000) == other
+    again = bench_of(source, stored=[Stored(None, {}, stored.application)])
+    assert again.read(0x3000) == other
+    assert again.write(0x1011, 1, b"load") is None
+    again.put(0, "81 01")
+    assert again.read(0x3000) == data
+
+
+def test_a_domain_is_plain_storage() -> None:
+    lines = "\n".join(("ParameterName=Plain", "ObjectType=0x2", "DataType=0x000F", "AccessType=rw"))
+    bench = bench_of(with_object(text(), 0x3000, lines))
+    assert bench.read(0x3000) == b""
+    data = bytes(range(256)) * 4
+    assert bench.write(0x3000, 0, data) is None
+    assert bench.read(0x3000) == data
+    assert bench.store().application == {0x300000: data}
+
+
+def test_limits_of_plain_objects_hold() -> None:
+    bench = bench_of(with_object(text(), 0x3000, plain(0x04, LowLimit="-5", HighLimit="5", DefaultValue="0")))
+    assert [bench.write(0x3000, 0, value) for value in (-6, -5, 0, 5, 6)] == [TOO_LOW, None, None, None, TOO_HIGH]
+
+
+@pytest.mark.parametrize(
+    ("section", "data_type"),
+    [
+        ("2100sub1", 0x08),
+        ("2100sub4", 0x09),
+        ("2101sub2", 0x08),
+        ("2101sub3", 0x06),
+        ("2102sub1", 0x06),
+        ("2010sub6", 0x07),
+        ("2010sub7", 0x05),
+        ("603F", 0x05),
+        ("2000sub1", 0x08),
+        ("2000sub2", 0x09),
+        ("2020sub1", 0x01),
+    ],
+)
+def test_an_object_of_a_type_that_cannot_hold_what_it_shows_is_refused_by_name(section: str, data_type: int) -> None:
+    source = text()
+    if section == "2000sub1" or section == "2000sub2":
+        source = with_key(source, "1A00sub0", "DefaultValue", "0x0")
+    if section == "2020sub1":
+        source = with_key(source, "1A03sub0", "DefaultValue", "0x0")
+    source = with_key(source, section, "DataType", f"0x{data_type:04X}")
+    for key, value in (("LowLimit", ""), ("HighLimit", ""), ("DefaultValue", ""), ("PDOMapping", "0")):
+        source = with_key(source, section, key, value)
+    with pytest.raises(UserError, match=section[:4]):
+        check_eds(load(source.encode("ascii"), "other.eds"), EscSettings())
+
+
+@pytest.mark.parametrize("section", ["1003sub1", "1001", "1002", "603F", "2101sub1"])
+def test_objects_of_services_that_an_eds_makes_mappable_can_be_sent(section: str) -> None:
+    bench = bench_of(with_key(text(), section, "PDOMapping", "1"))
+    index, sub = int(section[:4], 16), int(section[7:] or "0", 16)
+    size = struct.calcsize(FORMATS[entries()[index, sub].data_type])
+    assert bench.write(0x1A04, 1, index << 16 | sub << 8 | 8 * size) is None
+    assert bench.write(0x1A04, 0, b"\x01") is None
+    assert bench.write(0x1804, 1, 0x40000333) is None
+    bench.start()
+    bench.uart(live(operating_errors=1))
+    bench.uart(info())
+    bench.wait(1500)
+    assert 0x81 in {frame.can_id for frame in bench.take()}
