@@ -1,0 +1,77 @@
+#!/bin/sh
+# Installs the CANopen masters and the decoder of others that tests/vcan/test_foreign_masters.py uses:
+#   zencan-cli  a master in Rust, by cargo             about 90 s, needs cargo and a C linker
+#   canopen     a master in JavaScript, by npm         about 10 s, needs node, npm, make, g++ and python3
+#   tshark      Wireshark's decoder, from Debian       about 25 s, needs root or a sudo that asks nothing
+# They go to tests/foreign/.cache, tshark to the system. What is there already is left alone. What cannot be had is
+# named, and the others are installed all the same; the exit code then is 1.
+# VM_APT_UPDATED=1: the package lists are fresh.
+set -u
+
+here=$(cd "$(dirname "$0")" && pwd)
+cache=$here/.cache
+zencan=0.0.5
+missing=0
+
+say() { echo "foreign masters: $*" >&2; }
+lacks() { say "$@"; missing=1; }
+have() { command -v "$1" >/dev/null 2>&1; }
+
+# Quiet, but the end of the log when it fails.
+quietly() {
+    if "$@" >"$log" 2>&1 </dev/null; then return; fi
+    tail -n 30 "$log" >&2
+    return 1
+}
+
+mkdir -p "$cache" || exit 1
+log=$(mktemp) || exit 1
+trap 'rm -f "$log"' EXIT
+
+# Not optimised: the tests wait for the bus, not for the master, and it builds in half the time.
+install_zencan() {
+    grep -qs "\"zencan-cli $zencan " "$cache/zencan/.crates.toml" && [ -x "$cache/zencan/bin/zencan-cli" ] && return
+    have cargo || { lacks "zencan-cli: no cargo: install Rust and run $0 again"; return; }
+    say "zencan-cli $zencan (cargo install)"
+    quietly env CARGO_PROFILE_RELEASE_OPT_LEVEL=0 CARGO_PROFILE_RELEASE_STRIP=true \
+        cargo install --locked --root "$cache/zencan" --version "$zencan" zencan-cli ||
+        lacks "zencan-cli: cargo install failed"
+}
+
+install_node_canopen() {
+    key="$(cksum <"$here/package-lock.json") $(node --version 2>/dev/null)"
+    [ "$(cat "$cache/node/installed" 2>/dev/null)" = "$key" ] && return
+    for tool in node npm make g++; do
+        have $tool || { lacks "node canopen: no $tool:  sudo apt-get install nodejs npm make g++"; return; }
+    done
+    say "canopen for node (npm ci)"
+    rm -rf "$cache/node"
+    mkdir -p "$cache/node"
+    cp "$here/package.json" "$here/package-lock.json" "$cache/node"
+    if quietly npm ci --prefix "$cache/node" --no-audit --no-fund --loglevel=error; then
+        echo "$key" >"$cache/node/installed"
+    else
+        lacks "node canopen: npm ci failed"
+    fi
+}
+
+install_tshark() {
+    have tshark && return
+    if [ "$(id -u)" = 0 ]; then
+        sudo=
+    elif sudo -n true 2>/dev/null; then
+        sudo="sudo -n"
+    else
+        lacks "tshark is missing:  sudo apt-get install tshark"
+        return
+    fi
+    apt="$sudo env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120"
+    say "tshark"
+    [ -n "${VM_APT_UPDATED:-}" ] || quietly $apt update || say "apt-get update: failed; going on"
+    quietly $apt install -y --no-install-recommends tshark || lacks "tshark: apt-get install failed"
+}
+
+install_tshark
+install_node_canopen
+install_zencan
+exit $missing

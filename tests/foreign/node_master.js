@@ -1,0 +1,110 @@
+'use strict';
+/* A CANopen master around the npm package "canopen", driven by a test through lines of JSON.
+
+   node node_master.js PACKAGES INTERFACE
+     PACKAGES   the folder with node_modules/canopen and node_modules/socketcan
+
+   In:   {"call": NAME, ...}   one of the functions in `calls`; calls are done one after the other
+   Out:  {"result": ...} or {"error": TEXT, "code": ABORT CODE or LSS error}   for each call, in their order
+         {"event": "heartbeat" | "timeout" | "emergency" | "pdo", ...}
+   Bytes are hexadecimal texts. Ends with its input. */
+
+const path = require('path');
+const readline = require('readline');
+
+const [packages, networkInterface] = process.argv.slice(2);
+const load = (name) => require(path.join(packages, 'node_modules', name));
+const { Device, Eds, LssMode } = load('canopen');
+
+const MASTER = 0x7c;
+const SDO_TIMEOUT = 1000;
+const tell = (message) => process.stdout.write(JSON.stringify(message) + '\n');
+
+const channel = load('socketcan').createRawChannel(networkInterface, true);
+const master = new Device({ id: MASTER });
+channel.addListener('onMessage', (m) => { if (!m.ext && !m.rtr && !m.err) master.receive(m); });
+master.addListener('message', (m) => channel.send({ id: m.id, data: m.data, ext: false, rtr: false }));
+channel.start();
+master.start();
+master.lss.start();
+master.nmt.startNode(); // itself, or it would take no PDO
+master.nmt.on('heartbeat', ({ deviceId, state }) => tell({ event: 'heartbeat', node: deviceId, state }));
+master.nmt.on('timeout', (deviceId) => tell({ event: 'timeout', node: deviceId }));
+master.emcy.on('emergency', ({ cobId, em }) => tell({
+    event: 'emergency', cob_id: cobId, code: em.code, register: em.register, info: Buffer.from(em.info).toString('hex'),
+}));
+master.pdo.on('pdo', ({ cobId, dataObjects }) => tell({
+    event: 'pdo', cob_id: cobId, values: dataObjects.map((o) => [o.parameterName, o.value]),
+}));
+
+const address = ({ node, index, sub = 0, block = false }) =>
+    ({ deviceId: node, index, subIndex: sub, blockTransfer: block, timeout: SDO_TIMEOUT });
+// [sub-index, variable]; the package's own subIndex is wrong from 10 on
+const variables = (entry) => Array.from((entry.subNumber ? entry._subObjects : [entry]).entries()).filter(([, v]) => v);
+
+let nextReceived = 0x3000;
+const calls = {
+    /** Take a node under control: its SDO server, its heartbeat (ms until it counts as lost), its emergencies. */
+    add({ node, heartbeat }) {
+        master.eds.addSdoClientParameter(node, 0x600 + node, 0x580 + node);
+        master.eds.addHeartbeatConsumer(node, heartbeat);
+        master.eds.addEmcyConsumer(0x80 + node);
+    },
+    /** All that the package reads in an EDS: [index, sub-index, name, data type, access type] of each variable. */
+    eds({ file }) {
+        return Array.from(Eds.fromFile(file).values()).flatMap((entry) => variables(entry).map(
+            ([sub, v]) => [entry.index, sub, v.parameterName, v.dataType, v.accessType]));
+    },
+    async upload(request) {
+        return (await master.sdo.upload(address(request))).toString('hex');
+    },
+    async download(request) {
+        await master.sdo.download({ ...address(request), data: Buffer.from(request.data, 'hex') });
+    },
+    /** Receive a node's TPDO as the node itself tells its COB-ID and mapping; names and types are those of the EDS. */
+    async receivePdo({ node, file, number }) {
+        const eds = Eds.fromFile(file);
+        const ask = (index, sub) => master.sdo.upload(address({ node, index: index + number - 1, sub }));
+        const cobId = (await ask(0x1800, 1)).readUInt32LE() & 0x7ff;
+        const count = (await ask(0x1a00, 0)).readUInt8();
+        const dataObjects = [];
+        for (let i = 1; i <= count; ++i) {
+            const mapped = (await ask(0x1a00, i)).readUInt32LE();
+            const { parameterName, dataType } = eds.getEntry(mapped >>> 16).at((mapped >> 8) & 0xff);
+            dataObjects.push(master.eds.addEntry(nextReceived++, { parameterName, dataType }));
+        }
+        master.eds.addReceivePdo({ cobId, dataObjects });
+        return cobId;
+    },
+    /** startNode, stopNode, enterPreOperational, resetNode, resetCommunication */
+    nmt({ command, node }) {
+        master.nmt[command](node);
+    },
+    fastscan({ timeout }) {
+        return master.lss.fastscan({ timeout });
+    },
+    /** inquireVendorId ..., configureNodeId, storeConfiguration */
+    lss({ command, args }) {
+        return master.lss[command](...args);
+    },
+    select(identity) {
+        return master.lss.switchModeSelective({ ...identity, timeout: SDO_TIMEOUT }).then(() => null);
+    },
+    waiting() {
+        master.lss.switchModeGlobal(LssMode.OPERATION);
+    },
+};
+
+(async () => {
+    tell({ event: 'ready' });
+    for await (const line of readline.createInterface({ input: process.stdin })) {
+        const { call, ...request } = JSON.parse(line);
+        try {
+            const result = await calls[call](request);
+            tell({ result: result === undefined ? null : result });
+        } catch (error) {
+            tell({ error: String(error), code: error.code });
+        }
+    }
+    process.exit(0);
+})();

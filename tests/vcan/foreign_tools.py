@@ -1,0 +1,180 @@
+"""CANopen masters and a decoder of others, run as processes. tests/foreign/install.sh gets them."""
+
+import json
+import os
+import queue
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import pytest
+
+FOREIGN = Path(__file__).resolve().parents[1] / "foreign"
+PACKAGES = FOREIGN / ".cache"
+ZENCAN = PACKAGES / "zencan" / "bin" / "zencan-cli"
+NODE_CANOPEN = PACKAGES / "node" / "node_modules" / "canopen"
+
+
+def need(there: bool, what: str) -> None:
+    """Skip a test whose foreign program was not to be had; the test run names it."""
+    if not there:
+        pytest.skip(f"{what} is not installed: run tests/foreign/install.sh")
+
+
+def zencan(interface: str, command: str, seconds: float = 30) -> str:
+    """What zencan-cli prints for one command. It exits with 0 even when it reports an error."""
+    run = subprocess.run(
+        [str(ZENCAN), interface, "-c", command], capture_output=True, text=True, check=True, timeout=seconds
+    )
+    return run.stdout.strip()
+
+
+class Refused(Exception):
+    """The node answered with an abort code or an LSS error code, or did not answer."""
+
+    def __init__(self, text: str, code: int | None) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class NodeMaster:
+    """The JavaScript master on an interface: calls of node_master.js and the events it tells."""
+
+    def __init__(self, interface: str) -> None:
+        command = ["node", str(FOREIGN / "node_master.js"), str(PACKAGES / "node"), interface]
+        self.events: list[dict[str, Any]] = []
+        self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._ready = threading.Event()
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+        assert self._ready.wait(20), "node_master.js did not start"
+
+    def _read(self) -> None:
+        assert self._process.stdout
+        for line in self._process.stdout:
+            message = json.loads(line)
+            if message.get("event") == "ready":
+                self._ready.set()
+            elif "event" in message:
+                self.events.append(message)
+            else:
+                self._answers.put(message)
+
+    def __call__(self, call: str, **arguments: Any) -> Any:
+        """The result of a call; raises Refused."""
+        assert self._process.stdin
+        self._process.stdin.write(json.dumps({"call": call, **arguments}) + "\n")
+        answer = self._answers.get(timeout=30)
+        if "error" in answer:
+            raise Refused(answer["error"], answer.get("code"))
+        return answer["result"]
+
+    def upload(self, node: int, index: int, sub: int = 0, block: bool = False) -> bytes:
+        return bytes.fromhex(self("upload", node=node, index=index, sub=sub, block=block))
+
+    def download(self, node: int, index: int, sub: int, data: bytes, block: bool = False) -> None:
+        self("download", node=node, index=index, sub=sub, data=data.hex(), block=block)
+
+    def of(self, event: str) -> list[dict[str, Any]]:
+        """The events of one kind so far."""
+        return [told for told in list(self.events) if told["event"] == event]
+
+    def states(self, node: int) -> list[int]:
+        """The NMT states that this node's heartbeat told so far, without repetition."""
+        return [told["state"] for told in self.of("heartbeat") if told["node"] == node]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self._process.stdin
+        assert self._process.stdout
+        self._process.stdin.close()
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._thread.join(5)
+        self._process.stdout.close()
+
+
+@contextmanager
+def recording(interface: str, log: Path) -> Iterator[Path]:
+    """Every frame of an interface in a candump log, complete when the block ends."""
+    with log.open("wb") as out:
+        command = ["candump", "-D", "-L", "-r", "4194304", f"{interface},0:0,#FFFFFFFF"]
+        process = subprocess.Popen(["stdbuf", "-oL", *command], stdout=out)
+        try:
+            yield log
+            threading.Event().wait(0.2)  # what the kernel still holds for it
+        finally:
+            process.terminate()
+            process.wait()
+
+
+class Decoded(NamedTuple):
+    """A frame as tshark sees it; what a frame of its kind does not have is an empty text, numbers are texts as tshark writes them."""
+
+    can_id: str
+    function: str
+    node: str
+    sdo_command: str
+    sdo_index: str
+    sdo_sub: str
+    sdo_abort: str
+    emcy_code: str
+    state: str
+    nmt_command: str
+    lss_command: str
+    pdo: str
+    malformed: str
+
+
+FIELDS = (
+    "can.id",
+    "canopen.function_code",
+    "canopen.node_id",
+    "canopen.sdo.cmd",
+    "canopen.sdo.main_idx",
+    "canopen.sdo.sub_idx",
+    "canopen.sdo.abort_code",
+    "canopen.em.err_code",
+    "canopen.nmt_guard.state",
+    "canopen.nmt_ctrl.cd",
+    "canopen.lss.cs",
+    "canopen.pdo.data.bytes",
+    "_ws.malformed",
+)
+
+
+def tshark(log: Path, show: Sequence[str] = FIELDS) -> list[Decoded]:
+    """A candump log decoded by tshark's CANopen dissector."""
+    options = [
+        "-r",
+        str(log),
+        "-d",
+        "can.subdissector,canopen",
+        "-T",
+        "fields",
+        "-E",
+        "separator=/t",
+        "-E",
+        "occurrence=f",
+    ]
+    for name in show:
+        options += ["-e", name]
+    # it writes its settings to HOME, which may be read-only
+    run = subprocess.run(
+        ["tshark", *options], capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(log.parent)}
+    )
+    return [Decoded(*line.split("\t")) for line in run.stdout.splitlines()]
+
+
+def has_tshark() -> bool:
+    return shutil.which("tshark") is not None
