@@ -295,7 +295,7 @@ def _screen(logger: Logger, master: Master, seconds: float) -> "Group":
     )
     body = Table.grid(padding=(0, 2), expand=True)
     for _ in range(2):
-        body.add_column(min_width=21, ratio=5, no_wrap=True)
+        body.add_column(width=21, no_wrap=True)
         body.add_column(ratio=2, justify="right", no_wrap=True)
         body.add_column(ratio=2, style="dim", no_wrap=True)
     for left, right in zip(*_SHOWN, strict=True):
@@ -310,6 +310,6 @@ def _screen(logger: Logger, master: Master, seconds: float) -> "Group":
         f"{seconds:.0f} s, {logger.frames} CAN frames on the bus, uptime {logger.text('Uptime')} s. Ctrl-C ends.",
         "dim",
     )
-    title = "demo: simulated ESC -> UART -> gateway -> CAN -> logger with the DBC, CANopen master"
+    title = "demo: simulated ESC -> UART -> gateway -> CAN -> logger, CANopen master"
     canopen = Text(f"CANopen: {master.line()}", "cyan")
     return Group(Panel(Group(head, "", body, "", faults, "", canopen), title=title, title_align="left"), foot)
