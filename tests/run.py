@@ -32,7 +32,7 @@ from xml.etree import ElementTree as ET
 PROJECT = Path(__file__).resolve().parent.parent
 STEPS = ("lint", "types", "unit", "vcan")
 VM_RUN = PROJECT / "tests" / "vm" / "vm_run.py"
-VCAN_TIMEOUT_S = 900
+VCAN_TIMEOUT_S = 1400
 STEP_TIMEOUT_S = 1500
 SEARCH_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
 
