@@ -1,0 +1,294 @@
+"""Whatever comes: nothing raises, each SDO request has one right answer, states change as the standard says.
+
+Equal input gives equal output.
+"""
+
+from typing import Any
+
+from dialogue import MS, NO_HEARTBEAT, Bench, default, info, live
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.sources import CanState
+
+FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+NODES = 2
+
+data8 = st.binary(min_size=8, max_size=8)
+known_ids = st.sampled_from([0, 0x80, 0x81, 0x181, 0x581, 0x601, 0x602, 0x67F, 0x701, 0x705, 0x7E4, 0x7E5])
+objects = st.sampled_from(
+    [
+        *(0x1000, 0x1003, 0x1005, 0x1008, 0x1010, 0x1011, 0x1014, 0x1016, 0x1017, 0x1019, 0x1021, 0x1029),
+        *(0x1800, 0x1801, 0x1A00, 0x1F80, 0x2000, 0x2020, 0x2100, 0x2101, 0x2102, 0x603F, 0x3000),
+    ]
+)
+
+
+@st.composite
+def sdo_requests(draw: st.DrawFn) -> CanFrame:
+    """Requests that are more than noise: known objects, useful values."""
+    command = draw(
+        st.sampled_from(
+            [0x2F, 0x2B, 0x23, 0x21, 0x22, 0x40, 0x60, 0x70, 0x00, 0x10, 0x01, 0x80, 0xA0, 0xA4, 0xC2, 0xC6]
+        )
+    )
+    value = draw(
+        st.one_of(
+            st.binary(min_size=4, max_size=4),
+            st.sampled_from([b"save", b"load", b"rset", bytes(4), b"\x81\x01\0\x40", b"\x81\x01\0\xc0", b"\xc8\0\5\0"]),
+        )
+    )
+    multiplexer = draw(objects).to_bytes(2, "little") + bytes((draw(st.integers(0, 9)),))
+    return CanFrame(0x600 + draw(st.integers(1, NODES)), bytes((command,)) + multiplexer + value)
+
+
+@st.composite
+def lss_requests(draw: st.DrawFn) -> CanFrame:
+    service = draw(st.sampled_from([0x04, 0x11, 0x13, 0x15, 0x17, 0x40, 0x43, 0x46, 0x4C, 0x51, 0x5A, 0x5E]))
+    return CanFrame(0x7E5, bytes((service, draw(st.sampled_from([0, 1, 2, 9, 128, 255])))) + bytes(6))
+
+
+any_frames = st.builds(
+    CanFrame,
+    st.one_of(known_ids, st.integers(0, 0x7FF), st.integers(0, 0x1FFFFFFF)),
+    st.one_of(st.binary(max_size=8), st.binary(max_size=64)),
+    extended=st.booleans(),
+    fd=st.booleans(),
+    remote=st.booleans(),
+)
+plain_frames = st.tuples(known_ids, st.binary(max_size=8)).map(lambda frame: CanFrame(*frame))
+sdo_noise = st.tuples(st.sampled_from([0x601, 0x602]), data8).map(lambda frame: CanFrame(*frame))
+nmt_frames = st.builds(
+    lambda command, node: CanFrame(0, bytes((command, node))),
+    st.sampled_from([1, 2, 128, 129, 130]),
+    st.sampled_from([0, 1, 2]),
+)
+frames = st.one_of(any_frames, plain_frames, nmt_frames, sdo_requests(), lss_requests())
+happenings = st.one_of(
+    st.tuples(st.just("frame"), frames),
+    st.tuples(st.just("uart"), st.integers(0, NODES - 1), st.integers(0, 0xFFFFFFFF)),
+    st.tuples(st.just("info"), st.integers(0, NODES - 1)),
+    st.tuples(st.just("bytes"), st.integers(0, NODES - 1), st.binary(max_size=60)),
+    st.tuples(st.just("can"), st.sampled_from(CanState)),
+    st.tuples(st.sampled_from(["lost", "opened"]), st.integers(0, NODES - 1)),
+    st.tuples(st.sampled_from(["overrun", "returned"])),
+    st.tuples(st.just("saved"), st.booleans()),
+    st.tuples(st.just("wait"), st.integers(0, 3000)),
+)
+
+
+def happen(bench: Bench, what: tuple[Any, ...]) -> None:
+    gateway, now = bench.gateway, bench.now
+    match what:
+        case "frame", frame:
+            gateway.receive_frame(frame, now)
+        case "uart", esc, word:
+            gateway.receive_bytes(esc, live(operating_errors=word, electrical_speed=word), now)
+        case "info", esc:
+            gateway.receive_bytes(esc, info(device_and_variant=1 << 10, cell_count=6), now)
+        case "bytes", esc, data:
+            gateway.receive_bytes(esc, data, now)
+        case "can", state:
+            gateway.set_can_state(state, now)
+        case "lost", esc:
+            gateway.port_lost(esc, now)
+        case "opened", esc:
+            gateway.port_opened(esc, now)
+        case ("overrun",):
+            gateway.receive_overrun(now)
+        case ("returned",):
+            gateway.can_returned(now)
+        case "saved", ok:
+            bench.answer_saves(None if ok else "disk full")
+        case "wait", ms:
+            bench.wait(ms)
+    bench._collect()
+
+
+@given(st.lists(happenings, max_size=60))
+@FEW
+def test_nothing_raises_and_every_frame_is_one_that_the_bus_can_carry(story: list[tuple[Any, ...]]) -> None:
+    bench = Bench(NODES)
+    for what in story:
+        happen(bench, what)
+    for frame in bench.take():
+        assert 0 <= frame.can_id <= 0x7FF
+        assert len(frame.data) <= 8
+        assert not (frame.extended or frame.fd or frame.remote)
+
+
+@given(st.lists(happenings, max_size=40))
+@FEW
+def test_equal_input_gives_equal_output(story: list[tuple[Any, ...]]) -> None:
+    one, other = Bench(NODES), Bench(NODES)
+    for what in story:
+        happen(one, what)
+        happen(other, what)
+        assert one.heard == other.heard
+        assert one.gateway.next_deadline() == other.gateway.next_deadline()
+        assert one.gateway.receive_ids == other.gateway.receive_ids
+
+
+# --- SDO
+
+
+def is_answer_to(request: bytes, answer: bytes) -> bool:
+    """By CiA 301, 7.2.4.3: the server command that fits the client command, or an abort; the multiplexer of an initiate."""
+    client, server = request[0] >> 5, answer[0] >> 5
+    if len(answer) != 8:
+        return False
+    initiate = client in (1, 2) or (client == 5 and request[0] & 3 == 0) or (client == 6 and not request[0] & 1)
+    if answer[0] == 0x80:
+        return not initiate or answer[1:4] == request[1:4]
+    if initiate and answer[1:4] != request[1:4]:
+        return False
+    # 2 also answers a block upload that is smaller than the client's threshold
+    return server in {0: (1,), 1: (3,), 2: (2,), 3: (0,), 5: (6, 2), 6: (5,)}.get(client, ())
+
+
+@given(st.lists(st.one_of(sdo_requests(), sdo_noise), max_size=50))
+@FEW
+def test_each_sdo_request_gets_exactly_one_right_answer_from_its_node(requests: list[CanFrame]) -> None:
+    bench = Bench(NODES, changes=NO_HEARTBEAT)
+    in_block = dict.fromkeys(range(1, NODES + 1), False)
+    for request in requests:
+        before = [(node.node_id, node.state) for node in bench.nodes]
+        node_id, client = request.can_id - 0x600, request.data[0] >> 5
+        server = bench.nodes[node_id - 1].sdo
+        in_block[node_id] &= server.busy
+        bench.gateway.receive_frame(request, bench.now)
+        bench.answer_saves()
+        answers = [frame for frame in bench.take() if 0x581 <= frame.can_id <= 0x5FF]
+        assert [(node.node_id, node.state) for node in bench.nodes] == before
+        assert all(answer.can_id == request.can_id - 0x80 for answer in answers)
+        if in_block[node_id]:
+            assert len(answers) <= 127  # the segments of a sub-block, or none within one
+        elif client == 4:
+            assert answers == []  # an abort has no answer
+        else:
+            (answer,) = answers
+            assert is_answer_to(request.data, answer.data), (request.data.hex(), answer.data.hex())
+            in_block[node_id] = answer.data[0] >> 5 in (5, 6)
+        if in_block[node_id] and not server.busy:
+            bench.wait(60)  # segments that a client sends before it sees an abort are swallowed
+            bench.take()
+
+
+@given(st.lists(st.one_of(any_frames, plain_frames, nmt_frames, lss_requests()), max_size=60))
+@FEW
+def test_no_sdo_answer_comes_from_a_node_that_was_not_asked(story: list[CanFrame]) -> None:
+    bench = Bench(NODES, changes=NO_HEARTBEAT)
+    for frame in story:
+        asked = {node.node_id for node in bench.nodes if frame.can_id == 0x600 + node.node_id}
+        bench.gateway.receive_frame(frame, bench.now)
+        bench._collect()
+        for answer in bench.take():
+            if 0x581 <= answer.can_id <= 0x5FF:
+                assert answer.can_id - 0x580 in asked
+            if answer.can_id == 0x7E4:
+                assert frame.can_id == 0x7E5
+
+
+# --- states
+
+
+class Model:
+    """What CiA 301 says of one node: its state, and the boot-up messages it owes."""
+
+    def __init__(self, node_id: int) -> None:
+        self.node_id = node_id
+        self.state = 127
+        self.boot_ups = 0
+
+    def take(self, frame: CanFrame) -> None:
+        if frame.can_id or frame.extended or frame.remote or frame.fd or len(frame.data) != 2:
+            return
+        command, node_id = frame.data
+        if node_id not in (0, self.node_id):
+            return
+        if command in (129, 130):
+            self.boot_ups += 1
+        self.state = {1: 5, 2: 4, 128: 127, 129: 127, 130: 127}.get(command, self.state)
+
+
+@given(st.lists(st.one_of(any_frames, plain_frames, nmt_frames, sdo_requests()), max_size=80))
+@FEW
+def test_the_state_changes_only_by_nmt_commands(story: list[CanFrame]) -> None:
+    bench = Bench(NODES, changes={**NO_HEARTBEAT, **default(0x1029, 1, 1)})
+    models = [Model(n + 1) for n in range(NODES)]
+    for frame in story:
+        if frame.can_id in (0x601, 0x602) and frame.data[1:3] == b"\x01\x21":
+            continue  # 2101h: another node-ID from the next reset on
+        bench.gateway.receive_frame(frame, bench.now)
+        bench._collect()
+        heard = bench.take()
+        for model, node in zip(models, bench.nodes, strict=True):
+            boot_ups = model.boot_ups
+            model.take(frame)
+            assert node.state == model.state
+            told = [f for f in heard if f.can_id == 0x700 + model.node_id]
+            assert [f.data for f in told] == [b"\0"] * (model.boot_ups - boot_ups)
+
+
+@given(st.lists(st.one_of(nmt_frames, st.integers(1, 5000)), max_size=30))
+@FEW
+def test_heartbeats_tell_the_state_at_their_times(story: list[CanFrame | int]) -> None:
+    bench = Bench(1)
+    model, booted = Model(1), 0
+    for part in story:
+        if isinstance(part, CanFrame):
+            boot_ups = model.boot_ups
+            model.take(part)
+            bench.gateway.receive_frame(part, bench.now)
+            bench.gateway.take_frames()
+            booted = bench.now if model.boot_ups > boot_ups else booted
+            continue
+        begin = bench.now
+        bench.wait(part)
+        told = [(time, frame.data[0]) for time, frame in bench.heard if frame.can_id == 0x701]
+        bench.take()
+        period = 1000 * MS
+        first = booted + ((begin - booted) // period + 1) * period
+        assert told == [(time, model.state) for time in range(first, bench.now + 1, period)]
+
+
+@given(st.lists(st.one_of(any_frames, plain_frames, nmt_frames, sdo_requests(), lss_requests()), max_size=50))
+@FEW
+def test_a_node_says_nothing_unless_asked_but_by_its_timers(story: list[CanFrame]) -> None:
+    """Foreign ids and other nodes' ids cause no frame at all."""
+    bench = Bench(NODES, changes=NO_HEARTBEAT)
+    for frame in story:
+        listened = bench.gateway.receive_ids
+        bench.gateway.receive_frame(frame, bench.now)
+        bench._collect()
+        heard = bench.take()
+        if frame.extended or frame.remote or frame.fd or frame.can_id not in listened:
+            assert heard == []
+
+
+@given(st.lists(happenings, max_size=40))
+@FEW
+def test_no_pdo_outside_operational_no_emergency_while_stopped_nothing_without_a_node_id(
+    story: list[tuple[Any, ...]],
+) -> None:
+    bench = Bench(NODES, changes={})
+    for what in story:
+        if what[0] == "frame" and what[1].can_id in (0x601, 0x602):
+            continue  # may move COB-IDs
+        states = {node.node_id: node.state for node in bench.nodes}
+        happen(bench, what)
+        for node in bench.nodes:
+            states.setdefault(node.node_id, node.state)
+        for frame in bench.take():
+            node_id, service = frame.can_id & 0x7F, frame.can_id & 0x780
+            if frame.can_id == 0x7E4:
+                continue
+            assert node_id in states, frame
+            changed_state = states[node_id] != next((n.state for n in bench.nodes if n.node_id == node_id), None)
+            if changed_state:
+                continue
+            if service in (0x180, 0x280, 0x380, 0x480):
+                assert states[node_id] == 5
+            if service == 0x80 and not (what[0] == "frame" and what[1].can_id == 0):
+                assert states[node_id] != 4
