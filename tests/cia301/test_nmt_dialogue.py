@@ -348,6 +348,51 @@ def test_a_node_that_lss_makes_unconfigured_falls_silent_at_its_reset() -> None:
     assert bench.gateway.receive_ids == {0x7E5}
 
 
+def test_what_several_nodes_say_by_lss_is_one_frame() -> None:
+    play(
+        """
+        0 <- 7E5 4C 00 00 00 00 00 00 00
+        0 -> 7E4 50 00 00 00 00 00 00 00
+        1 <- 7E5 51 00 00 00 00 80 00 00
+        1 -> 7E4 4F 00 00 00 00 00 00 00
+    """,
+        Bench(node_ids=[255, 255, 3], changes=QUIET),
+    )
+
+
+def test_lss_cannot_give_a_node_the_node_id_of_another() -> None:
+    play(
+        f"""
+        {LSS_SELECT_SECOND}
+        10 -> 7E4 44 00 00 00 00 00 00 00
+        11 <- 7E5 11 01 00 00 00 00 00 00
+        11 -> 7E4 11 FF 01 00 00 00 00 00
+        12 <- 7E5 11 00 00 00 00 00 00 00
+        12 -> 7E4 11 01 00 00 00 00 00 00
+        13 <- 7E5 11 80 00 00 00 00 00 00
+        13 -> 7E4 11 01 00 00 00 00 00 00
+        14 <- 7E5 11 02 00 00 00 00 00 00
+        14 -> 7E4 11 00 00 00 00 00 00 00
+    """,
+        Bench(2, changes=QUIET),
+    )
+
+
+def test_errors_that_rose_before_the_node_had_a_node_id_are_told_when_it_has() -> None:
+    play(
+        """
+        1 uart 0 live operating_errors=1
+        2 <- 7E5 04 01 00 00 00 00 00 00
+        3 <- 7E5 11 07 00 00 00 00 00 00
+        3 -> 7E4 11 00 00 00 00 00 00 00
+        4 <- 7E5 04 00 00 00 00 00 00 00
+        4 -> 707 00
+        4 -> 087 20 32 05 00 01 00 00 00
+    """,
+        Bench(node_ids=[255], changes=QUIET),
+    )
+
+
 def _tpdos_off() -> dict[tuple[int, int], dict[str, object]]:
     off: dict[tuple[int, int], dict[str, object]] = {
         (0x1800 + n, 1): {"default": 0xC0000180 + 0x100 * n, "relative": True} for n in range(4)

@@ -115,11 +115,11 @@ def test_the_start_of_the_node_sends_event_driven_pdos_once() -> None:
     )
 
 
-@pytest.mark.parametrize("kind", range(256))
-def test_reserved_and_remote_types_are_refused(kind: int) -> None:
+def test_reserved_and_remote_types_are_refused() -> None:
     bench = _quiet_bench()
-    allowed = kind <= 240 or kind >= 254
-    assert bench.write(0x1800, 2, kind, size=1) == (None if allowed else VALUE)
+    for kind in range(256):
+        allowed = kind <= 240 or kind >= 254
+        assert bench.write(0x1800, 2, kind, size=1) == (None if allowed else VALUE), kind
 
 
 _KEPT: list[Bench] = []
