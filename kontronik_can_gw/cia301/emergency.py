@@ -189,10 +189,12 @@ class Emergencies:
 
     def tell_again(self, now: int) -> None:
         """After an outage in which emergencies were lost: tell all that is wrong once more, or that nothing is."""
+        was_open = self._open
         self.close()
         self._untold = list(self._active)
         self._told = True
-        self.open(now)
+        if was_open:
+            self.open(now)
 
     def advance(self, now: int) -> None:
         """Send what waits, no closer than the inhibit time."""

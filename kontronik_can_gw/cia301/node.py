@@ -308,8 +308,6 @@ class Node:
 
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost: say once more what is wrong, and what is sent on change only."""
-        if self.state not in _VALID:
-            return
         self.emergencies.tell_again(now)
         if self.state is NmtState.OPERATIONAL:
             for tpdo in self.tpdos:

@@ -506,6 +506,17 @@ def test_all_is_told_again_after_an_outage_of_the_bus() -> None:
     """)
 
 
+def test_what_was_lost_in_an_outage_is_told_when_the_node_leaves_stopped() -> None:
+    play(f"""
+         0 uart 0 live operating_errors=1
+         0 -> {emcy(0x3220, 0x05, 0, 1)}
+         1 <- 000 02 01
+        10 do gateway.can_returned(now)
+        20 <- 000 80 01
+        20 -> {emcy(0x3220, 0x05, 0, 1)}
+    """)
+
+
 # --- 1029h:2 and the rest
 
 
