@@ -147,7 +147,10 @@ def sources(settings: EscSettings) -> dict[str, Source]:
         Source("uptime", "s", gateway, f"(now - gateway.started_ns) // {MS}", Fraction(1000), 0),
         *(
             Source(name, "", gateway, f"gateway.{name}", low=0, rolls=True)
-            for name in ("sent_frames", "replaced_frames", "send_failures")
+            for name in (
+                *("sent_frames", "replaced_frames", "send_failures"),
+                *("received_frames", "bus_off_count", "dropped_frames"),
+            )
         ),
     ]
     return {source.name: source for source in listed}

@@ -93,7 +93,7 @@ def bindings(settings: EscSettings) -> dict[tuple[int, int], Bound]:
     for sub, name in enumerate(
         ("sent_frames", "received_frames", "send_failures", "bus_off_count", "replaced_frames"), 3
     ):
-        bind(GATEWAY, sub, Source(name, "", Group.GATEWAY, f"gateway.{name}", low=0, rolls=True))
+        bind(GATEWAY, sub, known[name])
     bind(GATEWAY, 8, known["esc_count"])
     bind(GATEWAY, 9, known["escs_ok"])
     bind(VELOCITY, 0, known["motor_speed"])

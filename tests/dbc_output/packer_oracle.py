@@ -283,6 +283,9 @@ KNOWN: dict[str, Known] = {
     "sent_frames": Known("", _of_gateway(lambda g, _: g.sent_frames), rolls=True, gateway=True),
     "replaced_frames": Known("", _of_gateway(lambda g, _: g.replaced_frames), rolls=True, gateway=True),
     "send_failures": Known("", _of_gateway(lambda g, _: g.send_failures), rolls=True, gateway=True),
+    "received_frames": Known("", _of_gateway(lambda g, _: g.received_frames), rolls=True, gateway=True),
+    "bus_off_count": Known("", _of_gateway(lambda g, _: g.bus_off_count), rolls=True, gateway=True),
+    "dropped_frames": Known("", _of_gateway(lambda g, _: g.dropped_frames), rolls=True, gateway=True),
 }
 
 # unit -> other unit -> (text, factor, shift): value in other = value * factor + shift
@@ -738,4 +741,7 @@ def random_gateway(rng: random.Random, now: int) -> GatewayStatus:
         sent_frames=rng.randrange(10**10),
         replaced_frames=rng.randrange(1000),
         send_failures=rng.randrange(100000),
+        received_frames=rng.randrange(100000),
+        bus_off_count=rng.randrange(100000),
+        dropped_frames=rng.randrange(100000),
     )
