@@ -8,14 +8,17 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
+import canopen
 import cantools.database
 from cantools.database.can import Database
 
+from kontronik_can_gw.config import shipped
 from kontronik_can_gw.offline import pty
 from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
-from kontronik_can_gw.simulator import EscOptions, Sent, SimulatedEsc
+from kontronik_can_gw.protocol.states import OperatingState
+from kontronik_can_gw.simulator import EscOptions, Phase, Sent, SimulatedEsc
 
 SNA = "NotAvailable"
 
@@ -217,3 +220,89 @@ def agrees(decoded: dict[str, Any], data: LiveData | InfoData, prefix: str) -> b
     found = {snake(name, prefix): value for name, value in decoded.items()}
     common = [name for name in found if name in wanted]
     return all(abs(found[name] - wanted[name]) < 1e-6 for name in common)
+
+
+# --- CANopen
+
+EDS = shipped("eds/kontronik_esc.eds")
+SERIAL = 0x00100200
+"""Of the first node. Few ones: each costs a fastscan a time-out."""
+LIVELY = (Phase("up", 0.5, 90, OperatingState.Forward, 0.5), Phase("down", 0.5, 30, OperatingState.Forward, 0.5))
+"""A flight in which no two frames are alike."""
+
+
+def canopen_configuration(
+    interface: str, ports: Sequence[str], store: Path, node_id: int = 1, canopen: str = "", dbc: str = "", esc: str = ""
+) -> str:
+    """A configuration text with CANopen nodes from ``node_id`` on; the DBC output is on too unless ``dbc`` says otherwise."""
+    table = f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{store}"\n{canopen}'
+    return configuration(interface, ports, f"{dbc}\n{table}", esc)
+
+
+@contextmanager
+def gateway_process(file: Path, toml: str) -> Iterator[GatewayProcess]:
+    """A gateway that has opened everything, with this configuration text, killed at the end if it still runs."""
+    file.write_text(toml)
+    process = GatewayProcess(file)
+    try:
+        process.wait_for_line(f"esc{toml.count('[[esc]]')}: /dev/pts")
+        yield process
+    finally:
+        process.kill()
+
+
+class Master:
+    """The canopen library as the master of a bus: its network and remote nodes made from the shipped EDS."""
+
+    def __init__(self, interface: str) -> None:
+        self.network = canopen.Network()
+        self.network.connect(interface="socketcan", channel=interface)
+        self._objects = canopen.import_od(str(EDS))
+
+    def node(self, node_id: int) -> canopen.RemoteNode:
+        """The node with this ID, from now on or since an earlier call."""
+        if node_id in self.network:
+            return cast(canopen.RemoteNode, self.network[node_id])
+        node = canopen.RemoteNode(node_id, self._objects)
+        node.sdo.RESPONSE_TIMEOUT = 2  # a slow machine is not what is tested
+        self.network.add_node(node)
+        return node
+
+    def upload(self, node_id: int, index: int, sub: int = 0) -> bytes:
+        return bytes(self.node(node_id).sdo.upload(index, sub))
+
+    def number(self, node_id: int, index: int, sub: int = 0) -> int:
+        """A whole number by SDO, without sign."""
+        return int.from_bytes(self.upload(node_id, index, sub), "little")
+
+    def write(self, node_id: int, index: int, sub: int, value: int, size: int) -> None:
+        self.node(node_id).sdo.download(index, sub, value.to_bytes(size, "little"))
+
+    def refusal(self, act: Callable[[], object]) -> int:
+        """The code of the abort that an act ends with."""
+        try:
+            act()
+        except canopen.SdoAbortedError as error:
+            return int(error.code)
+        raise AssertionError("it was not refused")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.network.disconnect()
+
+
+@contextmanager
+def nodes_running(
+    interface: str, folder: Path, *escs: EscOptions, options: str = "", dbc: str = "", esc: str = "", node_id: int = 1
+) -> Iterator[tuple[Bench, Candump, GatewayProcess, Master]]:
+    """Simulated ESCs (not started yet), their gateway with CANopen nodes, a recording of the bus, and a master."""
+    with bench(*escs) as run, Candump(interface) as dump, Master(interface) as master:
+        toml = canopen_configuration(
+            interface, [port.path for port in run.ports], folder / "store", node_id, options, dbc, esc
+        )
+        with gateway_process(folder / "gateway.toml", toml) as gateway:
+            if node_id < 128:
+                wait_for(lambda: bool(dump.of(0x700 + node_id)), 5, "a boot-up")
+            yield run, dump, gateway, master
