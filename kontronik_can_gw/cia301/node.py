@@ -49,6 +49,7 @@ _UNSIGNED = {
 """Objects that services read or write: the bytes they need at least."""
 _NOT_VALID = 1 << 31  # of 1014h
 _MOST_SAVES = 4
+_LEAST_TIMEOUT_MS, _MOST_TIMEOUT_MS = 20, 60_000  # whatever the limits of an EDS are
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
 
 
@@ -107,7 +108,7 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
         base,
         pole_pairs=number(at.SETTINGS, 1, base.pole_pairs) or 1,
         gear=gear,
-        timeout_ns=number(at.SETTINGS, 4, base.timeout_ns // MS) * MS,
+        timeout_ns=min(max(_LEAST_TIMEOUT_MS, number(at.SETTINGS, 4, base.timeout_ns // MS)), _MOST_TIMEOUT_MS) * MS,
         cell_count=number(at.SETTINGS, 7, base.cell_count),
         crc_error_threshold=number(at.SETTINGS, 8, base.crc_error_threshold),
     )

@@ -1,5 +1,6 @@
 """All CANopen nodes of a gateway on one bus: routing by COB-ID, one stream of frames out, no node disturbing another."""
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -83,6 +84,8 @@ class Nodes:
         self._foreign_ids = foreign_ids or {}
         self._routes: dict[int, list[Callable[[bytes, int], None]]] = {}
         self._rerouted = True
+        self._watched: frozenset[int] = frozenset()
+        self._to_watchers: deque[CanFrame] = deque()
         self._started = False
         self.nodes: list[Node] = []
         bases = setup.escs or tuple(esc.settings for esc in escs)
@@ -97,7 +100,7 @@ class Nodes:
         self._started = True
         for node in self.nodes:
             node.power_on(now)
-        self._after()
+        self._after(now)
 
     def receive(self, frame: CanFrame, now: int) -> None:
         """A frame from the bus. 29-bit and RTR frames are not CANopen frames of ours."""
@@ -109,18 +112,18 @@ class Nodes:
         if frame.can_id == LSS_REQUEST:
             # what several slaves say at the same time is one frame on a bus
             self.frames[begin:] = dict.fromkeys(self.frames[begin:])
-        self._after()
+        self._after(now)
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed."""
         self.nodes[esc].on_event(events, now)
-        self._after()
+        self._after(now)
 
     def on_can_state(self, state: CanState, now: int) -> None:
         """The CAN controller's state changed."""
         for node in self.nodes:
             node.on_can_state(state, now)
-        self._after()
+        self._after(now)
 
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost, or for the first time."""
@@ -129,23 +132,23 @@ class Nodes:
             return
         for node in self.nodes:
             node.can_returned(now)
-        self._after()
+        self._after(now)
 
     def overrun(self, now: int) -> None:
         """The CAN controller lost received frames."""
         for node in self.nodes:
             node.overrun(now)
-        self._after()
+        self._after(now)
 
     def parameters_damaged(self, esc: int, now: int) -> None:
         """A node's parameter file could not be read: it runs on defaults."""
         self.nodes[esc].set_error(GatewayError.PARAMETER_FILE, True, now)
-        self._after()
+        self._after(now)
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
         """The oldest request of an ESC's node to store is on disk, or failed for a reason."""
         self.nodes[esc].saved(error, now)
-        self._after()
+        self._after(now)
 
     def advance(self, now: int) -> None:
         """Let time pass."""
@@ -153,7 +156,7 @@ class Nodes:
             return
         for node in self.nodes:
             node.advance(now)
-        self._after()
+        self._after(now)
 
     def cob_ids(self) -> dict[int, str]:
         """Every COB-ID the nodes use, and what for."""
@@ -181,6 +184,8 @@ class Nodes:
 
     def send(self, frame: CanFrame) -> None:
         self.frames.append(frame)
+        if frame.can_id in self._watched:
+            self._to_watchers.append(frame)
 
     def save(self, node: Node, stored: Stored) -> None:
         self.saves.append((self.nodes.index(node), stored))
@@ -207,9 +212,16 @@ class Nodes:
             return True
         return any(node_id in (other.node_id, other.pending_node_id) for other in self.nodes if other is not node)
 
-    def _after(self) -> None:
+    def _after(self, now: int) -> None:
+        while self._to_watchers:  # what we send does not come back from the bus: one of our nodes may watch another
+            frame = self._to_watchers.popleft()
+            for taker in self._routes.get(frame.can_id, ()):
+                taker(frame.data, now)
         if self._rerouted:
             self._rerouted = False
+            self._watched = frozenset(
+                heartbeat.COB_ID + node_id for node in self.nodes for node_id in node.consumer.node_ids
+            )
             self._routes = {}
             for node in self.nodes:
                 for cob_id, taker in node.routes():

@@ -242,3 +242,23 @@ def test_a_stored_watch_survives_a_reset_and_is_of_this_node_only() -> None:
 
 def test_other_peoples_heartbeats_are_not_listened_to() -> None:
     assert Bench(changes=NO_HEARTBEAT).gateway.receive_ids == {0, 0x80, 0x601, 0x7E5}
+
+
+def test_a_node_may_watch_another_of_the_same_gateway() -> None:
+    """What a gateway sends does not come back to it from the bus."""
+    bench = Bench(2, changes={**NO_PDOS, **default(0x1017, 0, 100)})
+    play(
+        """
+        50 write 2 1017:00 00 00
+        60 write 2 1016:01 96 00 01 00   ; node 2 watches node 1, 150 ms
+       100 -> 701 7F
+       200 -> 701 7F
+       210 write 1 1017:00 00 00
+       350 -> 082 30 81 11 FF 01 00 00 00
+       400 <- 000 82 01
+       400 -> 701 00
+       400 -> 082 00 00 00 FF 00 00 00 00
+       500 -> 701 7F
+    """,
+        bench,
+    )
