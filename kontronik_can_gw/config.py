@@ -468,6 +468,10 @@ def _check_outputs(config: Config, problems: list[str]) -> None:
     seen: dict[int, int] = {}
     for number, node_id in enumerate(config.node_ids, 1):
         if node_id == UNCONFIGURED:
+            if canopen.read_only:
+                problems.append(
+                    f"{file}: esc[{number}]: waits for a node-ID by LSS, which canopen.read_only = true refuses. Give it a node_id."
+                )
             continue
         if not 1 <= node_id <= 127:
             problems.append(

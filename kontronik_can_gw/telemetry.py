@@ -115,10 +115,10 @@ class EscTelemetry:
         return self.live is not None
 
     def bec_current_supplied(self, raw: int) -> bool:
-        """False where BEC current means nothing: on a JIVEPro, and at 0 as long as the device is not known."""
-        if self.info is None:
-            return raw != 0
-        return self.info.device != Device.JIVEPRO
+        """False where BEC current means nothing: on a JIVEPro, the last known one too, and at 0 as long as the device is not known."""
+        if self.info is not None:
+            return self.info.device != Device.JIVEPRO
+        return raw != 0 and (self.last_info is None or self.last_info.device != Device.JIVEPRO)
 
     def age_ms(self, now: int) -> int | None:
         """Age of the newest live frame, None before the first."""
@@ -208,7 +208,7 @@ class EscTelemetry:
         if layout != self.layout:
             self.layout = layout
             self._forget_device()
-            self.last_info = None  # of another device
+            self.last_live = self.last_info = None  # of another device
             self.last_info_ns = None
             events = Event.INFO | Event.LINK
         data = frame.data
@@ -275,7 +275,10 @@ class EscTelemetry:
         frames = new.live - old.live
         self.frame_rate = round(frames * 10 * SECOND / (now - self._window_ns)) if self.up else 0
         dropped, received = new.dropped_bytes - old.dropped_bytes, new.bytes - old.bytes
-        bad = new.crc_errors - old.crc_errors >= self.settings.crc_error_threshold or dropped * _DEGRADED_DROPPED_SHARE > received
+        bad = (
+            new.crc_errors - old.crc_errors >= self.settings.crc_error_threshold
+            or dropped * _DEGRADED_DROPPED_SHARE > received
+        )
         self._window_ns = now
         self._diagnosis_counters = old
         self._window_counters = new.copy()

@@ -8,6 +8,7 @@ section names that CiA 306 does not know are passed over. Types of 24, 40, 48 an
 storage, so they are taken from 2000h on only.
 """
 
+import codecs
 import io
 import re
 import struct
@@ -257,6 +258,9 @@ class _Checker:
         self.problems.append(f"{self._name}: [{section}] {text}" if section else f"{self._name}: {text}")
 
     def _decode(self, data: bytes) -> str:
+        if data.startswith(codecs.BOM_UTF8):
+            self._say("", "begins with a byte order mark. Save it as plain ASCII, without one.")
+            data = data.removeprefix(codecs.BOM_UTF8)
         for number, line in enumerate(data.split(b"\n"), 1):
             if not line.isascii():
                 text = line.decode("ascii", "backslashreplace").strip()

@@ -103,7 +103,7 @@ class Emergencies:
         self._word = 0
         self._word_register = 0
         self._active: dict[Condition, None] = {}
-        self._untold: list[Condition] = []
+        self._untold: dict[Condition, None] = {}
         self._told = False  # what was sent last is an error, not 0000h
         self._pending: deque[tuple[Condition | None, bytes]] = deque(maxlen=_MAX_PENDING)
         self._open = False
@@ -164,17 +164,17 @@ class Emergencies:
     def open(self, now: int) -> None:
         """Emergencies may be sent (PRE-OPERATIONAL, OPERATIONAL): what rose and is still there is told."""
         self._open = True
-        for condition in dict.fromkeys(self._untold):
+        for condition in self._untold:
             if condition in self._active:
                 self._tell(condition)
-        self._untold = []
+        self._untold = {}
         self._end(now)
         self.advance(now)
 
     def close(self) -> None:
         """No emergencies (STOPPED): what waits is told later, if it is still true then."""
         self._open = False
-        self._untold += [condition for condition, _ in self._pending if condition is not None]
+        self._untold |= {condition: None for condition, _ in self._pending if condition is not None}
         self._pending.clear()
 
     def reset(self) -> None:
@@ -185,13 +185,13 @@ class Emergencies:
         for condition in self._active:
             self._note(condition)
         self._told = False
-        self._untold = list(self._active)
+        self._untold = dict(self._active)
 
     def tell_again(self, now: int) -> None:
         """After an outage in which emergencies were lost: tell all that is wrong once more, or that nothing is."""
         was_open = self._open
         self.close()
-        self._untold = list(self._active)
+        self._untold = dict(self._active)
         self._told = True
         if was_open:
             self.open(now)
@@ -211,7 +211,7 @@ class Emergencies:
             self._tell(condition)
             self.advance(now)
         else:
-            self._untold.append(condition)
+            self._untold[condition] = None
 
     def _note(self, condition: Condition) -> None:
         self.history.appendleft(condition.detail << 24 | condition.source << 16 | condition.code)

@@ -5,7 +5,7 @@ telemetry and services, and leaves the rest plain storage.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -15,7 +15,7 @@ from kontronik_can_gw.cia301 import bindings as at
 from kontronik_can_gw.cia301 import heartbeat, nmt, sync
 from kontronik_can_gw.cia301.abort import Abort, SdoAbort
 from kontronik_can_gw.cia301.bindings import Bound, bindings, reader_text
-from kontronik_can_gw.cia301.dictionary import Dictionary, Value, Variable, fits
+from kontronik_can_gw.cia301.dictionary import Dictionary, Value, Variable, fits, key
 from kontronik_can_gw.cia301.eds import Eds
 from kontronik_can_gw.cia301.emergency import Emergencies, GatewayError
 from kontronik_can_gw.cia301.heartbeat import NEVER
@@ -24,7 +24,6 @@ from kontronik_can_gw.cia301.pdo import COB_ID, COMMUNICATION, INVALID_BIT, MAPP
 from kontronik_can_gw.cia301.sdo import SdoServer
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.cia305.lss import LssSlave
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.protocol.states import Device, device_text
 from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus, Group
@@ -33,20 +32,11 @@ from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry, Ev
 UNCONFIGURED = 255
 SAVE, LOAD, RESET = (int.from_bytes(word, "little") for word in (b"save", b"load", b"rset"))
 SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x600, 0x580, 0x7E5, 0x7E4
-_COMMUNICATION, _APPLICATION = (0x1000, 0x1FFF), (0x2000, 0x9FFF)
+COMMUNICATION_PROFILE, APPLICATION_PROFILE = (0x1000, 0x1FFF), (0x2000, 0xFFFF)
+CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
+"""Objects of services whose values have rules beyond type and limits (those of PDOs have their own)."""
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 _SELF_START_OFF = 4
-_WHOLE = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x15, 0x1B})  # data types
-_UNSIGNED = {
-    **dict.fromkeys(((at.SETTINGS, sub) for sub in range(1, 9)), 1),
-    (at.NODE_ID, 1): 1,
-    (at.NODE_ID, 2): 1,
-    (at.NODE_ID, 3): 4,
-    (at.NODE_ID, 4): 4,
-    (at.RESET_STATISTICS, 1): 4,
-    (at.ERROR_CODE, 0): 2,
-}
-"""Objects that services read or write: the bytes they need at least."""
 _NOT_VALID = 1 << 31  # of 1014h
 _MOST_SAVES = 4
 _LEAST_TIMEOUT_MS, _MOST_TIMEOUT_MS = 20, 60_000  # whatever the limits of an EDS are
@@ -106,7 +96,7 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
     )
     return replace(
         base,
-        pole_pairs=number(at.SETTINGS, 1, base.pole_pairs) or 1,
+        pole_pairs=max(1, number(at.SETTINGS, 1, base.pole_pairs)),
         gear=gear,
         timeout_ns=min(max(_LEAST_TIMEOUT_MS, number(at.SETTINGS, 4, base.timeout_ns // MS)), _MOST_TIMEOUT_MS) * MS,
         cell_count=number(at.SETTINGS, 7, base.cell_count),
@@ -139,7 +129,7 @@ def make_dictionary(
     if settings.self_start and (variable := dictionary.get(0x1F80)) is not None:
         variable.power_on = int(variable.power_on) & ~_SELF_START_OFF
     dictionary.read_only = settings.read_only
-    misfits = dictionary.reset(*_APPLICATION, settings.node_id, dict(stored.application))
+    misfits = dictionary.reset(*APPLICATION_PROFILE, settings.node_id, dict(stored.application))
     return dictionary, misfits
 
 
@@ -202,7 +192,7 @@ class Node:
         self._stop_pdos()
         self.emergencies.close()  # nothing is said before the boot-up message
         node_id = self.pending_node_id
-        self.misfits = self.dictionary.reset(_APPLICATION[0], 0xFFFF, node_id, dict(self._stored.application))
+        self.misfits = self.dictionary.reset(*APPLICATION_PROFILE, node_id, dict(self._stored.application))
         self._apply_settings(now)
         self.reset_communication(now, keep_misfits=True)
 
@@ -215,7 +205,8 @@ class Node:
         self.lss.reset()
         self.emergencies.reset()
         self.node_id = self.pending_node_id
-        self.misfits += self.dictionary.reset(*_COMMUNICATION, self.node_id, dict(self._stored.communication))
+        self.misfits += self.dictionary.reset(*COMMUNICATION_PROFILE, self.node_id, dict(self._stored.communication))
+        self._drop_what_breaks_rules()
         for tpdo in self.tpdos:
             tpdo.valid = False  # what one had is free for another
         for tpdo in self.tpdos:
@@ -228,7 +219,8 @@ class Node:
         else:
             self._send(heartbeat.COB_ID + self.node_id, bytes([NmtState.INITIALISING]))
             self._enter(NmtState.PRE_OPERATIONAL, now)
-            if not self.dictionary.number(0x1F80, otherwise=_SELF_START_OFF) & _SELF_START_OFF:
+            otherwise = 0 if self.settings.self_start else _SELF_START_OFF
+            if not self.dictionary.number(0x1F80, otherwise=otherwise) & _SELF_START_OFF:
                 self._enter(NmtState.OPERATIONAL, now)
         self._around.routes_changed()
         self._around.state_changed()
@@ -516,9 +508,26 @@ class Node:
                     variable.value = default
             tpdo.configure(now)
             cob_id = self.dictionary.get(COMMUNICATION + tpdo.number, COB_ID)
-            if cob_id is not None and self._around.cob_id_taken(tpdo.cob_id, tpdo):
+            if cob_id is not None and tpdo.valid and not self._is_free(tpdo):
                 cob_id.value = int(cob_id.value) | INVALID_BIT
+                self.misfits.append(key(COMMUNICATION + tpdo.number, COB_ID))
                 tpdo.configure(now)
+
+    def _is_free(self, tpdo: Tpdo) -> bool:
+        return not restricted(tpdo.cob_id) and not self._around.cob_id_taken(tpdo.cob_id, tpdo)
+
+    def _drop_what_breaks_rules(self) -> None:
+        """Stored communication parameters pass the same checks as downloads, or give way to the defaults."""
+        for number in self._stored.communication:
+            variable = self.dictionary.variables.get(number)
+            if variable is None or variable.check is None or number >> 8 not in CHECKED:
+                continue
+            assert isinstance(variable.value, int)
+            try:
+                variable.check(variable.value)
+            except SdoAbort:
+                variable.value = variable.default(self.node_id)
+                self.misfits.append(number)
 
     def _configure_heartbeat(self, now: int) -> None:
         self.producer.configure(self.dictionary.number(0x1017), now)
@@ -551,9 +560,9 @@ class Node:
         """1010h: sub-index 1 all, 2 communication, 3 application parameters."""
         stored = self._wanted
         if part in (1, 2):
-            stored = replace(stored, communication=self.dictionary.to_store(*_COMMUNICATION, self.node_id))
+            stored = replace(stored, communication=self.dictionary.to_store(*COMMUNICATION_PROFILE, self.node_id))
         if part in (1, 3):
-            application = self.dictionary.to_store(*_APPLICATION, self.node_id)
+            application = self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id)
             stored = replace(stored, application=application, node_id=self._bus_node_id)
         self._save(self.sdo.waiting, stored)
 
@@ -594,8 +603,8 @@ class Node:
         version = self.settings.version.encode("ascii", "replace")
         read(0x100A, 0, lambda _now: version)
         for part in (1, 2, 3):
-            read(0x1010, part, lambda _now: 1)
-            read(0x1011, part, lambda _now: 1)
+            read(0x1010, part, lambda _now: int(not self.settings.read_only))
+            read(0x1011, part, lambda _now: int(not self.settings.read_only))
             hook(0x1010, part, _signature(SAVE), partial(self._later, self._store, part))
             hook(0x1011, part, _signature(LOAD), partial(self._later, self._restore, part))
         hook(0x1014, 0, self._check_emergency_cob_id)
@@ -605,6 +614,7 @@ class Node:
             variable.written = self._watches_changed
         hook(0x1017, 0, None, self._heartbeat_changed)
         hook(0x1019, 0, sync.check_overflow)
+        hook(0x1F80, 0, _no_master)
         data = eds.data
         read(0x1021, 0, lambda _now: data)
         for tpdo in self.tpdos:
@@ -632,17 +642,16 @@ class Node:
 
     def _bind_sources(self) -> None:
         """Objects that show a source. Done again when pole pairs or gear change, which are worked into the sources."""
-        self._bound.clear()
         for (index, sub), bound in bindings(self.esc.settings).items():
             variable = self.dictionary.get(index, sub)
-            if variable is None:
+            if variable is None or self._bound.get((index, sub)) == bound:
                 continue
             self._bound[index, sub] = bound
             variable.read = self._reader(variable, bound)
 
     def _reader(self, variable: Variable, bound: Bound) -> Callable[[int], Value]:
         esc, gateway, dictionary = self.esc, self._gateway, self.dictionary
-        low, high = _range(variable)
+        low, high = range_of(variable)
         names: dict[str, Callable[[EscTelemetry, object, GatewayStatus, int], int | None]] = {}
         exec(reader_text(bound, high), names)  # noqa: S102  text made by us, from sources of ours
         value_of = names["read"]
@@ -781,6 +790,12 @@ def _only_zero(value: int) -> None:
         raise SdoAbort(Abort.VALUE)
 
 
+def _no_master(value: int) -> None:
+    """1F80h of a slave: only the bits about starting by itself (2) and starting others (3, without meaning here)."""
+    if value & ~0x0C:
+        raise SdoAbort(Abort.VALUE)
+
+
 def _signature(wanted: int) -> Callable[[int], None]:
     def check(value: int) -> None:
         if value != wanted:
@@ -789,60 +804,10 @@ def _signature(wanted: int) -> Callable[[int], None]:
     return check
 
 
-def _range(variable: Variable) -> tuple[int, int]:
+def range_of(variable: Variable) -> tuple[int, int]:
     """Smallest and greatest value of a whole-number type; (0, -1) for other types."""
     size = variable.size
     if size is None:
         return 0, -1
     bits = 8 * size
     return (-(1 << bits - 1), (1 << bits - 1) - 1) if fits(variable, -1, 1) else (0, (1 << bits) - 1)
-
-
-def check_eds(eds: Eds, settings: EscSettings) -> None:
-    """Whether a node can be built from an EDS: bound objects can show their source, the PDO defaults make sense.
-
-    UserError with every mistake.
-    """
-    problems: list[str] = []
-    dictionary = Dictionary(eds)
-    bound: Mapping[tuple[int, int], Bound] = bindings(settings)
-    for (index, sub), binding in bound.items():
-        variable = dictionary.get(index, sub)
-        if variable is None:
-            continue
-        where = f"{eds.name}: {index:04X}h:{sub:02X} {variable.entry.name}"
-        if variable.entry.data_type not in _WHOLE:
-            problems.append(f"{where}: shows {binding.source.name}, so it must be of a whole-number type.")
-        elif variable.writable:
-            problems.append(f"{where}: shows {binding.source.name}, so it must be read only (AccessType=ro).")
-    for (index, sub), size in _UNSIGNED.items():
-        variable = dictionary.get(index, sub)
-        if variable is None:
-            continue
-        whole = variable.entry.data_type in _WHOLE
-        if not whole or _range(variable)[0] < 0 or (variable.size or 0) < size:
-            problems.append(
-                f"{eds.name}: {index:04X}h:{sub:02X} {variable.entry.name}: must be of an unsigned type of {8 * size} bits or more."
-            )
-    for sub in (6, 7):
-        variable = dictionary.get(at.INFO, sub)
-        if variable is not None and variable.size is not None:
-            problems.append(
-                f"{eds.name}: {at.INFO:04X}h:{sub:02X} {variable.entry.name}: is a text, so it must be a VISIBLE_STRING."
-            )
-    esc = EscTelemetry(settings, 0)
-    dictionary.reset(*_COMMUNICATION, 1, {})
-    for number in range(MOST):
-        if dictionary.get(COMMUNICATION + number) is None:
-            continue
-        tpdo = Tpdo(number, dictionary, bound, esc, GatewayStatus(), lambda _frame: None)
-        try:
-            tpdo.configure(0)
-            tpdo.check(lambda _cob_id: False)
-        except SdoAbort as error:
-            problems.append(
-                f"{eds.name}: TPDO {number + 1}: the defaults of {COMMUNICATION + number:04X}h and "
-                f"{MAPPING + number:04X}h do not make a PDO ({error})."
-            )
-    if problems:
-        raise UserError(*problems)

@@ -18,7 +18,7 @@ from typing import Any
 
 VERSION = 1
 COMMUNICATION = range(0x1000, 0x2000)
-APPLICATION = range(0x2000, 0xA000)
+APPLICATION = range(0x2000, 0x10000)
 
 _HEADER_START = re.compile(rb'\{"format":"kontronik-can-gw parameters","version":([0-9]{1,9})[,}]')
 _CRC = re.compile(rb'"crc32":"([0-9A-F]{8})"\}')
@@ -35,7 +35,7 @@ class Stored:
     communication: Mapping[int, bytes] = field(default_factory=dict)
     """Objects 1000h..1FFFh."""
     application: Mapping[int, bytes] = field(default_factory=dict)
-    """Objects 2000h..9FFFh."""
+    """Objects 2000h..FFFFh."""
 
 
 def encode(stored: Stored) -> bytes:

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.cia301.check import check_eds
 from kontronik_can_gw.cia301.eds import Eds, without
 from kontronik_can_gw.cia301.eds import load as eds_of
-from kontronik_can_gw.cia301.node import NodeSettings, check_eds
+from kontronik_can_gw.cia301.node import NodeSettings
 from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.cia301.storage import Stored, decode
 from kontronik_can_gw.config import UNCONFIGURED, Config, load, shipped
@@ -116,7 +117,7 @@ def load_eds(config: Config) -> Eds:
     eds = eds_of(data, str(path))
     if not config.canopen.cia402_mirrors:
         eds = eds_of(without(data, range(0x6000, 0x6800)), str(path))
-    check_eds(eds, config.escs[0])
+    check_eds(eds, config.escs[0], [node_id for node_id in config.node_ids if node_id != UNCONFIGURED])
     return eds
 
 
@@ -131,11 +132,19 @@ def _canopen(config: Config, store: ParameterStore | None) -> tuple[CanopenSetup
     canopen = config.canopen
     eds = load_eds(config)
     identity = machine_identity()
+    if not identity and canopen.serial is None:
+        say(
+            "warning: this machine has no id, so serial numbers (1018h:4) are 0 and LSS cannot tell nodes apart: set canopen.serial"
+        )
     settings: list[NodeSettings] = []
     kept: list[Stored] = []
     damaged: list[tuple[int, str]] = []
     for number, (esc, node_id) in enumerate(zip(config.esc, config.node_ids, strict=True)):
-        serial = serial_number(number + 1, identity) if canopen.serial is None else canopen.serial + number & 0xFFFFFFFF
+        serial = (
+            serial_number(number + 1, esc.name, identity)
+            if canopen.serial is None
+            else canopen.serial + number & 0xFFFFFFFF
+        )
         settings.append(
             NodeSettings(
                 node_id,
@@ -149,9 +158,11 @@ def _canopen(config: Config, store: ParameterStore | None) -> tuple[CanopenSetup
                 device=next((device for device in Device if device.text == esc.device), None),
             )
         )
-        found, reason = (
-            _look_at(parameter_folder(config) / f"{esc.name}.params") if store is None else store.load(esc.name)
-        )
+        if store is None:
+            found, reason = _look_at(parameter_folder(config) / f"{esc.name}.params")
+        else:
+            store.claim(esc.name)
+            found, reason = store.load(esc.name)
         kept.append(found)
         if reason is not None:
             damaged.append((number, reason))

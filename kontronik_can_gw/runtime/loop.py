@@ -30,7 +30,7 @@ log = logging.getLogger("kontronik_can_gw")
 FIRST_RETRY_NS, LONGEST_RETRY_NS = 100 * MS, SECOND
 BUSY_RETRY_NS = 2 * MS
 LASTING_BUSY_NS = SECOND
-SUSPENDED_NS = 250 * MS
+LEAST_SUSPENDED_NS, SUSPENDED_NS = 20 * MS, 250 * MS
 """A loop that comes round this much too late was held up or suspended: what waits on the ports is old."""
 _LAST_SAVE_S = 0.2
 DIAGNOSIS_NS = 3 * SECOND
@@ -101,9 +101,9 @@ class Loop:
         self._receive_ids: frozenset[int] | None = None
         """What the open CAN port was told to receive."""
         self._mailboxes = Mailboxes()
-        self._suspended_ns = min([SUSPENDED_NS, *(esc.settings.timeout_ns for esc in gateway.escs)])
         self._busy_until: int | None = None
         self._busy_since: int | None = None
+        self._stalled = False
         self._selector = selectors.DefaultSelector()
         self._held: list[str] | None = []  # what was opened is said when all is: an error at start is the only line
         self._stopping = False
@@ -151,7 +151,7 @@ class Loop:
                 pause = max(0, self._next_deadline() - clock())
                 ready = self._selector.select(pause / SECOND)
                 now = clock()
-                if now - last - pause > self._suspended_ns:
+                if now - last - pause > LEAST_SUSPENDED_NS and now - last - pause > self._suspended_ns():
                     self._discard_input(now - last - pause, now)
                     ready = []  # what they announced is gone; a hang-up comes again
                 for key, _ in ready:
@@ -210,6 +210,10 @@ class Loop:
         else:
             with contextlib.suppress(OSError):
                 os.read(self._wake_read, 64)
+
+    def _suspended_ns(self) -> int:
+        """Held up for longer, what waits on the ports is old: a master may change the ESCs' time-outs."""
+        return min([SUSPENDED_NS, *(esc.settings.timeout_ns for esc in self.gateway.escs)])
 
     def _discard_input(self, late: int, now: int) -> None:
         log.warning(
@@ -416,15 +420,30 @@ class Loop:
             self._can_works()
         else:
             status.send_failures += 1
-            if answer is Sent.BUSY and not self._can.tells_busy_from_gone:
+            if answer is Sent.BUSY:
                 self._busy_since = self._busy_since or now
                 if now - self._busy_since > LASTING_BUSY_NS:
-                    answer = Sent.GONE
+                    if self._can.tells_busy_from_gone:
+                        self._stall()
+                    else:
+                        answer = Sent.GONE
             if answer is not Sent.BUSY:
                 self._can_lost(answer, now)
                 return
             self._busy_until = now + BUSY_RETRY_NS
+        if count and self._stalled:
+            self._stalled = False
+            self.gateway.can_returned(now)
         self.gateway.set_can_state(self._can.state, now)
+
+    def _stall(self) -> None:
+        """The bus has not taken a frame for long: what waits is too old to be of use."""
+        self._clear_mailboxes()
+        if not self._stalled:
+            self._stalled = True
+            name = self._can_config.channel
+            self._can_complaint = f"CAN {name}: no frame can be sent: nobody acknowledges, or the bus is full."
+            log.warning("%s Trying again.", self._can_complaint)
 
     def _can_works(self) -> None:
         self._can_retry.succeeded()

@@ -22,11 +22,14 @@ def machine_identity(root: Path = Path("/")) -> bytes:
     return found
 
 
-def serial_number(number: int, identity: bytes) -> int:
-    """1018h:4 of the ESC with this number (1 ...): always the same on this board, different on others; 0 without an identity."""
+def serial_number(number: int, name: str, identity: bytes) -> int:
+    """1018h:4 of the ESC with this number (1 ...) and name: always the same on this board, different on others.
+
+    0 without an identity.
+    """
     if not identity:
         return 0
-    digest = hashlib.sha256(identity + f"{_NAME} {number}".encode()).digest()
+    digest = hashlib.sha256(identity + f"{_NAME} {number} {name}".encode()).digest()
     return int.from_bytes(digest[:4], "big") or 1
 
 

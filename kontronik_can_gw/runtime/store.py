@@ -10,6 +10,8 @@ the old one (the new one, if only the last step failed).
 """
 
 import contextlib
+import errno
+import fcntl
 import os
 import re
 import signal
@@ -18,6 +20,7 @@ from collections import deque
 from pathlib import Path
 
 from kontronik_can_gw.cia301.storage import Stored, decode
+from kontronik_can_gw.errors import RunError
 
 CAPACITY = 32
 """Savings that may wait for the disk."""
@@ -38,6 +41,29 @@ class ParameterStore:
         self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         # Names whose file could not be used and is still in its place: it is moved aside before a new one takes that.
         self._unusable: set[str] = set()
+        self._claims: list[int] = []
+
+    def claim(self, name: str) -> None:
+        """Keep other gateways from a node's file until ``close``: RunError where one has it.
+
+        Where no lock can be made nothing can be saved either, which is said when it is tried.
+        """
+        path = self._path(name)
+        try:
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError:
+            return
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(lock)
+            if error.errno in (errno.EAGAIN, errno.EACCES):
+                raise RunError(
+                    f"{path}: is in use by another gateway. Give this one its own canopen.store, or its ESC another name."
+                ) from None
+            return
+        self._claims.append(lock)
 
     def load(self, name: str) -> tuple[Stored, str | None]:
         """Read what a node kept; to be called before its first saving.
@@ -105,6 +131,9 @@ class ParameterStore:
             if self._event >= 0:
                 os.close(self._event)
                 self._event = -1
+        for lock in self._claims:
+            os.close(lock)
+        self._claims = []
         return thread is None or not thread.is_alive()
 
     def _path(self, name: str) -> Path:

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from dialogue import QUIET, Bench, info, live, shipped_eds
 
+from kontronik_can_gw.cia301.check import check_eds
 from kontronik_can_gw.cia301.eds import Entry, load, without
-from kontronik_can_gw.cia301.node import check_eds
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.errors import UserError
@@ -99,7 +99,7 @@ def test_size_and_access(bench: Bench, entry: Entry) -> None:
 
 LIMITED = [entry for entry in shipped_eds().entries if "w" in entry.access]
 # further rules than limits, tested by dialogues
-RULED = {0x1003, 0x1005, 0x1010, 0x1011, 0x1014, 0x2102}
+RULED = {0x1003, 0x1005, 0x1010, 0x1011, 0x1014, 0x1F80, 0x2102}
 
 
 @pytest.mark.parametrize("entry", LIMITED, ids=of)

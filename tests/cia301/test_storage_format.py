@@ -177,7 +177,6 @@ def test_other_json_with_a_right_crc_is_refused(value: Any) -> None:
         (with_crc(content(communication={"2000:00": "00"})), "2000h"),
         (with_crc(content(communication={"0FFF:00": "00"})), "0FFFh"),
         (with_crc(content(application={"1FFF:FF": "00"})), "1FFFh"),
-        (with_crc(content(application={"A000:00": "00"})), "A000h"),
         (with_crc(content(communication={"1018:00": "00", "1017:00": "00"})), "form"),
         (with_crc(content().replace("{}", '{"1017:00":"00","1017:00":"01"}', 1)), "form"),
         (with_crc(content().replace(",", ", ")), "form"),
@@ -199,7 +198,6 @@ def test_the_reason_is_said(data: bytes, reason: str) -> None:
         Stored(None, {0x200000: b""}),
         Stored(None, {-1: b""}),
         Stored(None, {}, {0x1FFFFF: b""}),
-        Stored(None, {}, {0xA00000: b""}),
     ],
 )
 def test_what_could_not_be_read_back_is_not_written(stored: Stored) -> None:

@@ -199,7 +199,8 @@ def _device_word(reckon: Callable[[int], int], word: str = "device_and_variant")
 
 def _bec_current(esc: EscTelemetry, live: LiveData) -> Fraction | None:
     if esc.info is None:
-        return Fraction(live.bec_current, 1000) if live.bec_current else None
+        was_jive = esc.last_info is not None and esc.last_info.device_and_variant >> 10 == JIVEPRO
+        return Fraction(live.bec_current, 1000) if live.bec_current and not was_jive else None
     return None if esc.info.device_and_variant >> 10 == JIVEPRO else Fraction(live.bec_current, 1000)
 
 

@@ -1,0 +1,122 @@
+"""What an EDS must keep to so that a node of ours can be built from it, beyond CiA 306: found at start, each mistake by name."""
+
+from collections.abc import Iterable, Iterator
+
+from kontronik_can_gw.cia301 import bindings as at
+from kontronik_can_gw.cia301.abort import SdoAbort
+from kontronik_can_gw.cia301.bindings import bindings
+from kontronik_can_gw.cia301.dictionary import Dictionary, Variable
+from kontronik_can_gw.cia301.eds import Eds
+from kontronik_can_gw.cia301.node import (
+    CHECKED,
+    COMMUNICATION_PROFILE,
+    SDO_ANSWER,
+    SDO_REQUEST,
+    NodeSettings,
+    range_of,
+)
+from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
+from kontronik_can_gw.cia301.pdo import COMMUNICATION, MAPPING
+from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.sources import GatewayStatus
+from kontronik_can_gw.telemetry import EscSettings, EscTelemetry
+
+_WHOLE = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x15, 0x1B})  # data types
+_UNSIGNED = {
+    **dict.fromkeys(((at.SETTINGS, sub) for sub in range(1, 9)), 1),
+    (at.NODE_ID, 1): 1,
+    (at.NODE_ID, 2): 1,
+    (at.NODE_ID, 3): 4,
+    (at.NODE_ID, 4): 4,
+    (at.RESET_STATISTICS, 1): 4,
+    (at.ERROR_CODE, 0): 2,
+}
+"""Objects that services read or write: the bytes they need at least."""
+_SHOWN = (
+    *((index, 0) for index in (0x1001, 0x1002, 0x100A, 0x1021, at.ERROR_CODE)),
+    *((0x1018, sub) for sub in range(1, 5)),
+    *((0x1200, sub) for sub in range(1, 3)),
+    *((at.INFO, sub) for sub in (6, 7)),
+    *((at.NODE_ID, sub) for sub in (1, 3, 4)),
+)
+"""What the node itself shows: nobody can write it."""
+_SERVER = {1: SDO_REQUEST, 2: SDO_ANSWER}
+
+
+def check_eds(eds: Eds, settings: EscSettings, node_ids: Iterable[int] = (1,)) -> None:
+    """Whether nodes with these node-IDs can be built from an EDS. UserError with every mistake."""
+    dictionary = Dictionary(eds)
+    problems = [
+        f"{eds.name}: {variable.entry.index:04X}h:{variable.entry.sub:02X} {variable.entry.name}: {what}"
+        for variable, what in (*_objects(dictionary, settings), *_store_objects(dictionary))
+    ]
+    if not problems:
+        for node_id in node_ids:
+            problems += [f"{eds.name}: {what}" for what in _defaults(eds, settings, node_id)]
+    if problems:
+        raise UserError(*dict.fromkeys(problems))
+
+
+def _objects(dictionary: Dictionary, settings: EscSettings) -> Iterator[tuple[Variable, str]]:
+    """Types and access of what telemetry and services show and read."""
+    for (index, sub), binding in bindings(settings).items():
+        variable = dictionary.get(index, sub)
+        if variable is None:
+            continue
+        if variable.entry.data_type not in _WHOLE:
+            yield variable, f"shows {binding.source.name}, so it must be of a whole-number type."
+        elif variable.writable or not variable.readable:
+            yield variable, f"shows {binding.source.name}, so it must be read only (AccessType=ro)."
+    for (index, sub), size in _UNSIGNED.items():
+        variable = dictionary.get(index, sub)
+        if variable is None:
+            continue
+        whole = variable.entry.data_type in _WHOLE
+        if not whole or range_of(variable)[0] < 0 or (variable.size or 0) < size:
+            yield variable, f"must be of an unsigned type of {8 * size} bits or more."
+    for sub in (6, 7):
+        variable = dictionary.get(at.INFO, sub)
+        if variable is not None and variable.size is not None:
+            yield variable, "is a text, so it must be a VISIBLE_STRING."
+    for index, sub in _SHOWN:
+        variable = dictionary.get(index, sub)
+        if variable is not None and (variable.writable or not variable.readable):
+            yield variable, "is shown by the node, so it must be read only (AccessType=ro or const)."
+    for sub, first in _SERVER.items():
+        variable = dictionary.get(0x1200, sub)
+        if variable is not None and (variable.entry.default != first or not variable.entry.relative):
+            yield variable, f"must be $NODEID+0x{first:X}: the SDO server has no other."
+
+
+def _store_objects(dictionary: Dictionary) -> Iterator[tuple[Variable, str]]:
+    for index in (0x1010, 0x1011):
+        for variable in dictionary.subs(index):
+            if variable.entry.sub > 3:
+                yield variable, "this node stores all, communication and application parameters, sub-index 1 to 3."
+
+
+def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
+    """Defaults that a download would be refused: of single services, then of the PDOs."""
+    setup = CanopenSetup(eds, (NodeSettings(node_id),), (Stored(),))
+    (node,) = Nodes(setup, [EscTelemetry(settings, 0)], GatewayStatus(), lambda _esc, _settings: None).nodes
+    dictionary = node.dictionary
+    dictionary.reset(*COMMUNICATION_PROFILE, node_id, {})
+    for variable in dictionary.variables.values():
+        if variable.entry.index not in CHECKED or variable.check is None:
+            continue
+        assert isinstance(variable.value, int)
+        try:
+            variable.check(variable.value)
+        except SdoAbort as error:
+            where = f"{variable.entry.index:04X}h:{variable.entry.sub:02X} {variable.entry.name}"
+            yield f"{where}: DefaultValue {variable.value:#x} (node-ID {node_id}) is not allowed ({error})."
+    for tpdo in node.tpdos:
+        try:
+            tpdo.configure(0)
+            tpdo.check(lambda _cob_id: False)
+        except SdoAbort as error:
+            yield (
+                f"TPDO {tpdo.number + 1}: the defaults of {COMMUNICATION + tpdo.number:04X}h and "
+                f"{MAPPING + tpdo.number:04X}h do not make a PDO of node {node_id} ({error})."
+            )
