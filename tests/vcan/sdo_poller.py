@@ -78,6 +78,29 @@ def poll(
     return answered, unanswered
 
 
+def segmented_upload(interface: str, node: int, index: int, sub: int) -> bytes:
+    """The whole value. RuntimeError when the transfer goes wrong."""
+    sdo = Sdo(interface, 0x580 + node)
+    first = sdo.upload(node, index, sub)
+    if first is None or first[0] != 0x41:
+        raise RuntimeError(f"segmented upload: {first!r}")
+    data = bytearray()
+    toggle = last = 0
+    while not last:
+        sdo.send(node, 0x60 | toggle)
+        found = sdo.receive(2)
+        if found is None or found[1][0] & 0xF0 != toggle:
+            raise RuntimeError(f"segmented upload: {found}")
+        segment = found[1]
+        data += segment[1 : 8 - (segment[0] >> 1 & 7)]
+        last = segment[0] & 1
+        toggle ^= 0x10
+    sdo.close()
+    if len(data) != int.from_bytes(first[4:8], "little"):
+        raise RuntimeError(f"segmented upload: {len(data)} bytes instead of {first[4:8].hex()}")
+    return bytes(data)
+
+
 def block_upload(interface: str, node: int, index: int, sub: int) -> bytes:
     """The whole value. RuntimeError when the transfer goes wrong."""
     sdo = Sdo(interface, 0x580 + node)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from canopen.nmt import NmtError
 from canopen.sdo.exceptions import SdoCommunicationError
-from sdo_poller import Sdo
+from sdo_poller import Sdo, segmented_upload
 from vcan_tools import (
     EDS,
     LIVELY,
@@ -37,8 +37,9 @@ from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults
 
 Start = Callable[..., GatewayProcess]
 
-SLACK_S = 0.06
-"""What a VM with one CPU for master, gateway and ESCs may add to a time."""
+NO_DBC = "[dbc]\nenabled = false"
+SLACK_S = 0.15
+"""What a VM with one CPU for master, gateway and ESCs, on a machine with other work, may add to a time; as a rule it is 2 ms."""
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 TPDO1, TPDO2, TPDO3, TPDO4 = 0x180, 0x280, 0x380, 0x480
 LIVE_PDOS = (TPDO1, TPDO2, TPDO3)
@@ -100,7 +101,7 @@ def test_a_request_right_behind_the_boot_up_message_is_answered(
 ) -> None:
     with PtyEsc() as port:
         master = Sdo(vcan, 0x701, 0x581)
-        start_gateway(canopen_configuration(vcan, [port.path], tmp_path, dbc="[dbc]\nenabled = false"))
+        start_gateway(canopen_configuration(vcan, [port.path], tmp_path, dbc=NO_DBC))
         assert master.receive(20) == (0x701, b"\0")
         asked = time.monotonic()
         assert master.upload(1, 0x1000, 0) == b"\x43\x00\x10\x00\0\0\0\0"
@@ -153,7 +154,7 @@ def test_boot_up_heartbeats_and_nmt_commands(vcan: str, tmp_path: Path) -> None:
 def test_every_object_of_the_eds_is_what_the_esc_sent(vcan: str, tmp_path: Path) -> None:
     # the values stay when the ESC falls silent, so that all objects can be compared with one frame
     with nodes_running(
-        vcan, tmp_path, EscOptions(profile=LIVELY, info_every=20), esc="telemetry_timeout_ms = 60000"
+        vcan, tmp_path, EscOptions(profile=LIVELY, info_every=20), esc="telemetry_timeout_ms = 60000", dbc=NO_DBC
     ) as (run, dump, _, master):
         run.start()
         wait_for(lambda: len(run.live(0)) > 250, 10, "telemetry")
@@ -167,7 +168,7 @@ def test_every_object_of_the_eds_is_what_the_esc_sent(vcan: str, tmp_path: Path)
         for entry in entries:
             where = entry.index, entry.sub
             if entry.index == 0x1021:
-                continue  # takes seconds, see below
+                continue  # see below
             if entry.access == "wo":
                 assert master.refusal(partial(master.upload, 1, *where)) == WRITE_ONLY, entry
             elif entry.index == 0x1003 and entry.sub:
@@ -199,7 +200,7 @@ def test_every_object_of_the_eds_is_what_the_esc_sent(vcan: str, tmp_path: Path)
         assert read[0x1008, 0] == b"KONTRONIK ESC gateway"
 
         file = EDS.read_bytes()
-        assert master.upload(1, 0x1021) == file, "by segments"
+        assert segmented_upload(vcan, 1, 0x1021, 0) == file, "by segments"
         with master.node(1).sdo.open(0x1021, 0, "rb", block_transfer=True) as stream:
             assert stream.read() == file, "by blocks"
         assert not emergencies(dump)
@@ -369,6 +370,7 @@ def test_telemetry_loss_and_return(vcan: str, tmp_path: Path) -> None:
             emergency = emergencies(dump)[-1]
             assert emergency.data == bytes((0x10, 0x75, 0x01, 0xFF, 1, 0, 0, 0))
             assert abs(emergency.time - lost) < 0.02 + SLACK_S
+            assert abs(emergency.time - said[0].time) < 0.02, "all that is to be said is said together"
 
             assert master.refusal(lambda: master.upload(1, 0x2000, 1)) == DEVICE_STATE
             assert master.refusal(lambda: master.upload(1, 0x2001, 1)) == DEVICE_STATE
