@@ -133,10 +133,10 @@ def _has_value(entry: Entry) -> bool:
 
 @pytest.mark.parametrize("node_id", [1, 127])
 def test_canmatrix_makes_the_default_pdos_of_it(shipped: Eds, caplog: pytest.LogCaptureFixture, node_id: int) -> None:
-    import canmatrix.formats.eds  # type: ignore[import-untyped]  # by name: where asammdf loads canmatrix it misses this one
+    from canmatrix.formats import eds  # type: ignore[import-untyped]  # missing in its list where asammdf loads it
 
     with caplog.at_level(logging.WARNING), SHIPPED.open("rb") as file:
-        matrix = next(iter(canmatrix.formats.load(file, "eds", eds_node_id=node_id).values()))
+        matrix = eds.load(file, eds_node_id=node_id)
     assert caplog.records == []
     numbers = {entry.name.replace(" ", "_"): entry for entry in shipped.entries}
     for number, names in enumerate(PDO_NAMES):
