@@ -276,11 +276,12 @@ class Node:
         esc = self.esc
         if events & Event.LIVE and esc.live is not None:
             self.emergencies.set_word(esc.live.operating_errors, now)
-        if events & (Event.LINK | Event.LIVE | Event.INFO):
+        if events & (Event.LINK | Event.INFO) or self._live is (esc.live is None):
             self._follow_link(events, now)
         if self.state is NmtState.OPERATIONAL:
             for tpdo in self.tpdos:
-                tpdo.on_event(events, now)
+                if events & tpdo.triggers:
+                    tpdo.on_event(now)
         self._set_due()
 
     def on_can_state(self, state: CanState, now: int) -> None:
@@ -482,12 +483,10 @@ class Node:
         self._live = esc.live is not None
 
     def _set_due(self) -> None:
-        due = min(self.producer.due, self.consumer.due, self.emergencies.due)
+        due = [self.producer.due, self.consumer.due, self.emergencies.due, *[tpdo.due for tpdo in self.tpdos]]
         if (sdo := self.sdo.next_deadline()) is not None:
-            due = min(due, sdo)
-        for tpdo in self.tpdos:
-            due = min(due, tpdo.due)
-        self.due = due
+            due.append(sdo)
+        self.due = min(due)
 
     # --- parameters
 

@@ -227,4 +227,4 @@ class Nodes:
                 for cob_id, taker in node.routes():
                     self._routes.setdefault(cob_id, []).append(taker)
             self.receive_ids = frozenset(self._routes)
-        self.due = min((node.due for node in self.nodes), default=NEVER)
+        self.due = min([node.due for node in self.nodes])

@@ -155,7 +155,8 @@ class Tpdo:
         self._compiled: tuple[object, ...] = ()
         self._pack: Pack | None = None
         self._length = 0
-        self._triggers = 0
+        self.triggers = 0
+        """The events (of telemetry.Event) that are news to it."""
         self._status_mask = 0
         self._needs_live = False
         self._last_status = -1
@@ -201,7 +202,7 @@ class Tpdo:
         cycle = SECOND / self._event_ns if self._event_ns else 0.0
         if self.on_change:
             return cycle or 1.0
-        events = EXPECTED_LIVE_HZ if self._triggers & Event.LIVE else 1.0
+        events = EXPECTED_LIVE_HZ if self.triggers & Event.LIVE else 1.0
         return max(cycle, min(events, SECOND / self._inhibit_ns) if self._inhibit_ns else events)
 
     def configure(self, now: int) -> None:
@@ -321,12 +322,11 @@ class Tpdo:
         self._pending = False
         self._event_due = self.due = NEVER
 
-    def on_event(self, events: int, now: int) -> None:
-        """Something of the ESC or the gateway changed."""
-        if not self._started or not events & self._triggers or not self._running:
+    def on_event(self, now: int) -> None:
+        """Something of ``triggers`` happened."""
+        if not self._started or not self.valid or self._pack is None:
             return
         if self._status_mask:
-            assert self._pack is not None
             status = self._pack((self._esc,), self._gateway, now, 0, 0) & self._status_mask
             if status == self._last_status:
                 return
@@ -411,7 +411,7 @@ class Tpdo:
             return
         self._compiled = made_from
         self._pack = None
-        self._triggers = self._status_mask = 0
+        self.triggers = self._status_mask = 0
         if not self._mapped:
             return
         plan = message_plan(f"TPDO {self.number + 1}", self.cob_id, self._mapped)
@@ -427,9 +427,9 @@ class Tpdo:
             if entry.bound.status:
                 self._status_mask |= place(signal.pieces, -1)
         for pace in plan.paces:
-            self._triggers |= _EVENT_OF_PACE[pace]
+            self.triggers |= _EVENT_OF_PACE[pace]
         if self._status_mask:
-            self._triggers |= Event.LIVE | Event.LINK | Event.INFO
+            self.triggers |= Event.LIVE | Event.LINK | Event.INFO
         live = any(entry.bound and entry.bound.source.group is Group.LIVE for entry in self._mapped)
         self._needs_live = live and not carries_link
 
