@@ -19,7 +19,6 @@ from sdo_poller import FRAME, Sdo
 from vcan_tools import (
     EDS,
     LIVELY,
-    Bench,
     GatewayProcess,
     Recorded,
     bench,
@@ -96,7 +95,7 @@ def without_stalls(begin: float, end: float, standstill: Sequence[tuple[float, f
 
 
 def answers(frames: Sequence[Recorded], node: int) -> list[tuple[float, float]]:
-    """(time of the request, time of the first frame of its answer) of one node.
+    """(time of the request, time of the first frame of its answer) of one node; what is not answered is left out.
 
     Requests are told apart by their object; those of a block transfer have none, and the next frame is the answer.
     """
@@ -112,7 +111,6 @@ def answers(frames: Sequence[Recorded], node: int) -> list[tuple[float, float]]:
                 if name in open_requests:
                     found.append((open_requests.pop(name), frame.time))
                     break
-    assert not open_requests, "requests without an answer"
     return found
 
 
@@ -136,20 +134,21 @@ def output(process: subprocess.Popen[str]) -> str:
 
 
 @contextmanager
-def four_nodes(vcan: str, folder: Path) -> Iterator[Bench]:
+def four_nodes(vcan: str, folder: Path) -> Iterator[GatewayProcess]:
     """Four ESCs at 100 Hz, their nodes OPERATIONAL, PDOs and the DBC's messages on the bus."""
     with bench(*[EscOptions(profile=LIVELY)] * 4) as run:
         ports = [port.path for port in run.ports]
         toml = canopen_configuration(vcan, ports, folder / "store", canopen="self_start = true")
-        with gateway_process(folder / "gateway.toml", toml):
+        with gateway_process(folder / "gateway.toml", toml) as gateway:
             run.start()
             wait_for(lambda: all(len(run.live(i)) > 100 for i in range(4)), 10, "telemetry")
-            yield run
+            yield gateway
 
 
 class Round(NamedTuple):
     """What one round of polling showed; times in seconds, ``running`` and ``gaps`` less the machine's standstill."""
 
+    unanswered: int
     raw: list[float]
     running: list[float]
     gaps: dict[int, float]
@@ -160,7 +159,7 @@ class Round(NamedTuple):
     @property
     def good(self) -> bool:
         # inhibit time, frame period, and what an answer may take
-        return max(self.running) < LIMIT_S and max(self.gaps.values()) < 0.02 + 0.01 + LIMIT_S
+        return not self.unanswered and max(self.running) < LIMIT_S and max(self.gaps.values()) < 0.02 + 0.01 + LIMIT_S
 
 
 def poll_and_measure(vcan: str, folder: Path) -> Round:
@@ -175,7 +174,6 @@ def poll_and_measure(vcan: str, folder: Path) -> Round:
         eds = bytes.fromhex(output(poller(vcan, "block", "4", "1021")))
         counts += [output(process).split() for process in pair]
     assert eds == EDS.read_bytes()
-    assert [unanswered for _, unanswered in counts] == ["0"] * 4
     frames, standstill = recorded(log), stalls(beats)
     pairs = [pair for node in NODES for pair in answers(frames, node)]
     assert len(pairs) >= sum(int(answered) for answered, _ in counts) > 500
@@ -198,15 +196,16 @@ def poll_and_measure(vcan: str, folder: Path) -> Round:
         gaps[node] = max(without_stalls(a, b, standstill) for a, b in itertools.pairwise([first, *times, last]))
         rates[node] = len(times) / (last - first)
         print(f"     node {node}: {rates[node]:.0f}/s, longest gap {gaps[node] * 1000:.1f} ms")
-    return Round(raw, running, gaps, rates)
+    return Round(sum(int(unanswered) for _, unanswered in counts), raw, running, gaps, rates)
 
 
 def test_two_masters_get_every_answer_within_40_ms_and_pdos_go_on(vcan: str, tmp_path: Path) -> None:
-    with four_nodes(vcan, tmp_path):
+    with four_nodes(vcan, tmp_path) as gateway:
         for _ in range(ROUNDS):
             found = poll_and_measure(vcan, tmp_path)
             if found.good:
                 break
+    assert not found.unanswered, gateway.log  # "suspended": the machine held it up, and it threw old requests away
     assert max(found.running) < LIMIT_S
     assert max(found.gaps.values()) < 0.02 + 0.01 + LIMIT_S
     assert min(found.rates.values()) > 0.7 * 50
