@@ -253,7 +253,7 @@ class _NodeMessages:
         ]
         delay = self._node.dictionary.number(0x1015) // 10
         name = self._message_names.take(self._message_prefix, "Emergency")
-        comment = f"Emergencies of {self._who}, each sent once when an error comes, NoError when all are gone."
+        comment = f"Emergencies of {self._who}, sent when an error comes, again after a reset or outage, NoError when all are gone."
         return _Message(cob_id, name, 8, comment, "Event", 0, delay, signals)
 
     # --- PDOs

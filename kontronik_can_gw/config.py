@@ -489,9 +489,11 @@ def name_problem(names: Sequence[str]) -> str | None:
     return problems[0].partition(".name: ")[2] if problems else None
 
 
-def _nearest(name: str, known: Any) -> str:
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f" Did you mean {near[0]}?" if near else f" Known: {', '.join(known)}."
+def _nearest(name: str, names: Any, known: bool = True) -> str:
+    near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.5)
+    if near:
+        return f" Did you mean {near[0]}?"
+    return f" Known: {', '.join(names)}." if known else ""
 
 
 def _schema_of(f: Field[Any]) -> dict[str, Any]:

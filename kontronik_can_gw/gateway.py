@@ -81,6 +81,13 @@ class Gateway:
         saves, self.nodes.saves = self.nodes.saves, []
         return saves
 
+    def take_misfits(self) -> list[tuple[int, int]]:
+        """Stored values that did not hold at a node's reset: (ESC, index << 8 | sub-index)."""
+        if self.nodes is None or not self.nodes.misfits:
+            return []
+        misfits, self.nodes.misfits = self.nodes.misfits, []
+        return misfits
+
     def saved(self, esc: int, error: str | None, now: int) -> None:
         """An ESC's parameters are on disk; or could not be stored, and why."""
         if self.nodes is not None:

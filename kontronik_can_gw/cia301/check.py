@@ -1,11 +1,11 @@
 """What an EDS must keep to so that a node of ours can be built from it, beyond CiA 306: found at start, each mistake by name."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from kontronik_can_gw.cia301 import bindings as at
 from kontronik_can_gw.cia301.abort import SdoAbort
 from kontronik_can_gw.cia301.bindings import bindings
-from kontronik_can_gw.cia301.dictionary import Dictionary, Variable
+from kontronik_can_gw.cia301.dictionary import Dictionary, Variable, fits
 from kontronik_can_gw.cia301.eds import Eds
 from kontronik_can_gw.cia301.node import (
     CHECKED,
@@ -13,6 +13,7 @@ from kontronik_can_gw.cia301.node import (
     SDO_ANSWER,
     SDO_REQUEST,
     NodeSettings,
+    configured_settings,
     range_of,
 )
 from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
@@ -44,12 +45,18 @@ _SHOWN = (
 _SERVER = {1: SDO_REQUEST, 2: SDO_ANSWER}
 
 
-def check_eds(eds: Eds, settings: EscSettings, node_ids: Iterable[int] = (1,)) -> None:
-    """Whether nodes with these node-IDs can be built from an EDS. UserError with every mistake."""
+def check_eds(eds: Eds, escs: EscSettings | Sequence[EscSettings], node_ids: Iterable[int] = (1,)) -> None:
+    """Whether nodes with these node-IDs, for these ESCs, can be built from an EDS. UserError with every mistake."""
+    all_escs = [escs] if isinstance(escs, EscSettings) else escs
+    settings = all_escs[0]
     dictionary = Dictionary(eds)
     problems = [
         f"{eds.name}: {variable.entry.index:04X}h:{variable.entry.sub:02X} {variable.entry.name}: {what}"
-        for variable, what in (*_objects(dictionary, settings), *_store_objects(dictionary))
+        for variable, what in (
+            *_objects(dictionary, settings),
+            *_store_objects(dictionary),
+            *_settings(dictionary, all_escs),
+        )
     ]
     if not problems:
         for node_id in node_ids:
@@ -87,6 +94,22 @@ def _objects(dictionary: Dictionary, settings: EscSettings) -> Iterator[tuple[Va
         variable = dictionary.get(0x1200, sub)
         if variable is not None and (variable.entry.default != first or not variable.entry.relative):
             yield variable, f"must be $NODEID+0x{first:X}: the SDO server has no other."
+
+
+def _settings(dictionary: Dictionary, escs: Sequence[EscSettings]) -> Iterator[tuple[Variable, str]]:
+    """Settings of the configuration that their objects cannot hold."""
+    for esc in escs:
+        for sub, value in configured_settings(esc).items():
+            variable = dictionary.get(at.SETTINGS, sub)
+            if variable is None or variable.entry.data_type not in _WHOLE:
+                continue
+            low, high = variable.entry.low, variable.entry.high
+            inside = (low is None or low <= value) and (high is None or value <= high)
+            if not inside or not fits(variable, value, value):
+                yield (
+                    variable,
+                    f"cannot hold {value}, which the configuration says of {esc.name}. Use a larger DataType or limit.",
+                )
 
 
 def _store_objects(dictionary: Dictionary) -> Iterator[tuple[Variable, str]]:

@@ -49,6 +49,7 @@ _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 _LISTS = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
 _MANDATORY = (0x1000, 0x1001, 0x1018)
 _LONGEST_NAME = 241
+_MOST_PROBLEMS = 20
 _PDO_BITS = 64
 
 _HEADING = re.compile(r"\s*\[([^\]]*)\]")
@@ -201,8 +202,13 @@ class _Object:
 
 def load(data: bytes, name: str) -> Eds:
     """Check and read an EDS by CiA 306. UserError with every mistake at once: file, section, key, what is wrong and what to do."""
+    if not any(section in data.lower() for section in (b"[fileinfo]", b"[deviceinfo]", b"[mandatoryobjects]")):
+        raise UserError(f"{name}: is no EDS: it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects].")
     checker = _Checker(name)
     checker.read(data)
+    if len(checker.problems) > _MOST_PROBLEMS:
+        more = len(checker.problems) - _MOST_PROBLEMS
+        raise UserError(*checker.problems[:_MOST_PROBLEMS], f"{name}: and {more} more mistakes.")
     if checker.problems:
         raise UserError(*checker.problems)
     objects = checker.objects

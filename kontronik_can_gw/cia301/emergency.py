@@ -92,9 +92,9 @@ def register_of(code: int) -> int:
 
 
 class Emergencies:
-    """State of one node's errors. ``send`` is called with the 8 bytes of each emergency."""
+    """State of one node's errors. ``send`` is called with the 8 bytes of each emergency; False: none is sent."""
 
-    def __init__(self, send: Callable[[bytes], None], history_size: int) -> None:
+    def __init__(self, send: Callable[[bytes], bool], history_size: int) -> None:
         self._send = send
         self.history: deque[int] = deque(maxlen=history_size)
         """1003h, newest first: bits 15..0 code, 23..16 byte 3, 31..24 byte 4."""
@@ -107,7 +107,8 @@ class Emergencies:
         self._told = False  # what was sent last is an error, not 0000h
         self._pending: deque[tuple[Condition | None, bytes]] = deque(maxlen=_MAX_PENDING)
         self._open = False
-        self._free_at = -NEVER
+        self._last_ns = -NEVER
+        self._risen = False  # since the last reset something was wrong
 
     @property
     def register(self) -> int:
@@ -124,7 +125,7 @@ class Emergencies:
 
     @property
     def due(self) -> int:
-        return self._free_at if self._pending else NEVER
+        return self._last_ns + self.inhibit_ns if self._pending else NEVER
 
     def set_word(self, word: int, now: int, force: bool = False) -> None:
         """The ESC's error word of a new live frame (or, with ``force``, a new mask)."""
@@ -186,26 +187,29 @@ class Emergencies:
             self._note(condition)
         self._told = False
         self._untold = dict(self._active)
+        self._risen = bool(self._active)
+        self._last_ns = -NEVER
 
     def tell_again(self, now: int) -> None:
         """After an outage in which emergencies were lost: tell all that is wrong once more, or that nothing is."""
         was_open = self._open
         self.close()
         self._untold = dict(self._active)
-        self._told = True
+        self._told = self._risen
         if was_open:
             self.open(now)
 
     def advance(self, now: int) -> None:
         """Send what waits, no closer than the inhibit time."""
-        while self._pending and now >= self._free_at:
+        while self._pending and now >= self._last_ns + self.inhibit_ns:
             condition, data = self._pending.popleft()
-            self._told = condition is not None
-            self._send(data)
-            self._free_at = now + self.inhibit_ns
+            if self._send(data):
+                self._told = condition is not None
+                self._last_ns = now
 
     def _rise(self, condition: Condition, now: int) -> None:
         self._active[condition] = None
+        self._risen = True
         self._note(condition)
         if self._open:
             self._tell(condition)

@@ -39,3 +39,8 @@ def command(data: bytes, node_id: int) -> Command | None:
     if len(data) != 2 or data[1] not in (0, node_id) or data[0] not in Command._value2member_map_:
         return None
     return Command(data[0])
+
+
+def is_reset_of_all(data: bytes) -> bool:
+    """True for a reset of every node on the bus."""
+    return len(data) == 2 and data[1] == 0 and data[0] in (Command.RESET_NODE, Command.RESET_COMMUNICATION)

@@ -77,6 +77,9 @@ class Surroundings(Protocol):
     def routes_changed(self) -> None:
         """The node listens to other COB-IDs now."""
 
+    def passed_over(self, node: "Node", keys: list[int]) -> None:
+        """Stored values that did not hold at a reset: they do not fit the EDS, or clash."""
+
     def state_changed(self) -> None:
         """The node's NMT state or node-ID is another one."""
 
@@ -104,6 +107,19 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
     )
 
 
+def configured_settings(base: EscSettings) -> dict[int, int]:
+    """Sub-indices of 2100h that the configuration sets, and to what."""
+    standard = EscSettings()
+    listed = (
+        (1, base.pole_pairs, standard.pole_pairs),
+        (2, base.gear.numerator, 1),
+        (3, base.gear.denominator, 1),
+        (4, base.timeout_ns // MS, standard.timeout_ns // MS),
+        (7, base.cell_count, standard.cell_count),
+    )
+    return {sub: given for sub, given, default in listed if given != default}
+
+
 def make_dictionary(
     eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored
 ) -> tuple[Dictionary, list[int]]:
@@ -112,15 +128,8 @@ def make_dictionary(
     Where the configuration leaves a setting at its default, the EDS's default holds. Returns the keys of stored values that do not fit.
     """
     dictionary = Dictionary(eds)
-    standard = EscSettings()
-    for sub, given, default in (
-        (1, base.pole_pairs, standard.pole_pairs),
-        (2, base.gear.numerator, 1),
-        (3, base.gear.denominator, 1),
-        (4, base.timeout_ns // MS, standard.timeout_ns // MS),
-        (7, base.cell_count, standard.cell_count),
-    ):
-        if given != default and (variable := dictionary.get(at.SETTINGS, sub)) is not None:
+    for sub, given in configured_settings(base).items():
+        if (variable := dictionary.get(at.SETTINGS, sub)) is not None:
             variable.power_on = given
     if settings.vendor_id is not None and (variable := dictionary.get(0x1018, 1)) is not None:
         variable.power_on = settings.vendor_id
@@ -206,9 +215,8 @@ class Node:
         self.emergencies.reset()
         self.node_id = self.pending_node_id
         self.misfits += self.dictionary.reset(*COMMUNICATION_PROFILE, self.node_id, dict(self._stored.communication))
+        self.release_ids()
         self._drop_what_breaks_rules()
-        for tpdo in self.tpdos:
-            tpdo.valid = False  # what one had is free for another
         for tpdo in self.tpdos:
             self._configure_or_default(tpdo, now)
         self._configure_heartbeat(now)
@@ -222,9 +230,27 @@ class Node:
             otherwise = 0 if self.settings.self_start else _SELF_START_OFF
             if not self.dictionary.number(0x1F80, otherwise=otherwise) & _SELF_START_OFF:
                 self._enter(NmtState.OPERATIONAL, now)
+        if self.misfits:
+            self._around.passed_over(self, self.misfits)
         self._around.routes_changed()
         self._around.state_changed()
         self._set_due()
+
+    def release_ids(self) -> None:
+        """What PDOs had is free for another."""
+        for tpdo in self.tpdos:
+            tpdo.valid = False
+
+    def future_ids(self, node_id: int) -> set[int]:
+        """COB-IDs that this node would choose by its defaults with another node-ID."""
+        found = set()
+        for number, variable in self.dictionary.variables.items():
+            is_cob_id = number == key(0x1014, 0) or (
+                number >> 8 in range(COMMUNICATION, MAPPING) and number & 0xFF == COB_ID
+            )
+            if is_cob_id and not (cob_id := int(variable.default(node_id))) & INVALID_BIT:
+                found.add(cob_id & 0x7FF)
+        return found
 
     def routes(self) -> Iterator[tuple[int, Callable[[bytes, int], None]]]:
         """COB-IDs this node listens to, and who takes them."""
@@ -286,7 +312,12 @@ class Node:
 
     def on_can_state(self, state: CanState, now: int) -> None:
         """The CAN controller's state changed."""
-        self.emergencies.set(GatewayError.CAN_PASSIVE, state is CanState.ERROR_PASSIVE, now)
+        if state in (
+            CanState.ERROR_PASSIVE,
+            CanState.ERROR_ACTIVE,
+            CanState.ERROR_WARNING,
+        ):  # bus-off is worse, not better
+            self.emergencies.set(GatewayError.CAN_PASSIVE, state is CanState.ERROR_PASSIVE, now)
         if state is CanState.BUS_OFF:
             self._off_bus = True
             self._communication_error(now)
@@ -427,9 +458,11 @@ class Node:
     def _send_lss(self, data: bytes) -> None:
         self._send(LSS_ANSWER, data)
 
-    def _send_emergency(self, data: bytes) -> None:
-        if not self._emergency_id & _NOT_VALID:
-            self._send(self._emergency_id & 0x7FF, data)
+    def _send_emergency(self, data: bytes) -> bool:
+        if self._emergency_id & _NOT_VALID:
+            return False
+        self._send(self._emergency_id & 0x7FF, data)
+        return True
 
     @property
     def _emergency_id(self) -> int:

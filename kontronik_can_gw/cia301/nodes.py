@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from kontronik_can_gw.cia301 import heartbeat
+from kontronik_can_gw.cia301 import heartbeat, nmt
 from kontronik_can_gw.cia301.eds import Eds
 from kontronik_can_gw.cia301.emergency import GatewayError
 from kontronik_can_gw.cia301.heartbeat import NEVER
@@ -49,10 +49,10 @@ class CanopenSetup:
             for esc, node, stored in zip(escs, self.settings, self.stored, strict=True)
         ]
 
-    def nodes(self, escs: Sequence[EscSettings]) -> "Nodes":
+    def nodes(self, escs: Sequence[EscSettings], foreign_ids: Mapping[int, str] | None = None) -> "Nodes":
         """The nodes as they are after power-on, without a gateway around them: to see their COB-IDs and objects."""
         telemetry = [EscTelemetry(settings, 0) for settings in escs]
-        nodes = Nodes(self, telemetry, GatewayStatus(), lambda _esc, _settings: None)
+        nodes = Nodes(self, telemetry, GatewayStatus(), lambda _esc, _settings: None, foreign_ids)
         nodes.start(0)
         return nodes
 
@@ -78,6 +78,8 @@ class Nodes:
         self.saves: list[tuple[int, Stored]] = []
         self.receive_ids: frozenset[int] = frozenset()
         self.due = NEVER
+        self.misfits: list[tuple[int, int]] = []
+        """(ESC, index << 8 | sub-index) of stored values that did not hold at a reset; the owner empties it."""
         self.state_changes = 0
         """Grows with each change of a node's NMT state or node-ID."""
         self._settings_changed = settings_changed
@@ -107,6 +109,9 @@ class Nodes:
         if frame.extended or frame.remote or frame.fd:
             return
         begin = len(self.frames)
+        if frame.can_id == nmt.COB_ID and nmt.is_reset_of_all(frame.data):
+            for node in self.nodes:
+                node.release_ids()
         for taker in self._routes.get(frame.can_id, ()):
             taker(frame.data, now)
         if frame.can_id == LSS_REQUEST:
@@ -196,6 +201,9 @@ class Nodes:
     def routes_changed(self) -> None:
         self._rerouted = True
 
+    def passed_over(self, node: Node, keys: list[int]) -> None:
+        self.misfits += [(self.nodes.index(node), key) for key in keys]
+
     def state_changed(self) -> None:
         self.state_changes += 1
 
@@ -210,7 +218,11 @@ class Nodes:
             return False
         if any(first + node_id in self._foreign_ids for first in _FIRST_IDS):
             return True
-        return any(node_id in (other.node_id, other.pending_node_id) for other in self.nodes if other is not node)
+        others = [other for other in self.nodes if other is not node]
+        used = {cob_id for other in others for _, cob_id in other.chosen_ids()} | set(self._foreign_ids)
+        if node.future_ids(node_id) & used:
+            return True
+        return any(node_id in (other.node_id, other.pending_node_id) for other in others)
 
     def _after(self, now: int) -> None:
         while self._to_watchers:  # what we send does not come back from the bus: one of our nodes may watch another

@@ -4,35 +4,31 @@ import io
 import logging
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw import __version__
-from kontronik_can_gw.cia301.check import check_eds
-from kontronik_can_gw.cia301.eds import Eds, without
-from kontronik_can_gw.cia301.eds import load as eds_of
-from kontronik_can_gw.cia301.node import NodeSettings
-from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
-from kontronik_can_gw.cia301.storage import Stored, decode
-from kontronik_can_gw.config import UNCONFIGURED, Config, load, shipped
+from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cli.node_setup import (
+    check_cob_ids,
+    load_of_stored,
+    parameter_folder,
+    plain_setup,
+    read_stored,
+    with_stored,
+)
+from kontronik_can_gw.config import Config, load
 from kontronik_can_gw.dbc_output.layout import Layout, load_database
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.runtime.can_port import check_interface
-from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
 from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.telemetry import EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
-
-
-_FRAME_BITS = 135
-"""Of a CAN frame with 8 data bytes, with the most stuffing; block uploads take every second place on the bus."""
 
 
 def say(text: str) -> None:
@@ -53,6 +49,7 @@ class Loaded:
     damaged: tuple[tuple[int, str], ...]
     """ESCs whose stored parameters cannot be read, and why."""
     store: ParameterStore | None
+    warnings: tuple[str, ...] = ()
 
 
 def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) -> Loaded:
@@ -63,139 +60,41 @@ def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) 
     config = load(path)
     check_interface(config.can)
     loaded = assemble(config, store(parameter_folder(config)) if store and config.canopen.enabled else None)
-    nodes = loaded.canopen.nodes(loaded.escs).bits_per_second() if loaded.canopen else 0
-    load_warning = check_load(loaded.layout, config.can.bitrate, config.can.data_bitrate, nodes)
-    unread = (
-        [] if store else [f"{loaded.escs[esc].name}: stored parameters: {reason}" for esc, reason in loaded.damaged]
-    )
-    for warning in (*loaded.layout.warnings, load_warning, *unread):
-        if warning:
-            say(f"warning: {warning}")
+    for warning in (*loaded.layout.warnings, *loaded.warnings):
+        say(f"warning: {warning}")
     return loaded
 
 
 def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
-    """What belongs to a configuration. Without a store its files are only looked at."""
-    escs = config.escs
-    canopen: CanopenSetup | None = None
-    damaged: list[tuple[int, str]] = []
+    """What belongs to a configuration. Without a store its files are only looked at.
+
+    Configuration, DBC and EDS may be refused here. What masters stored may not: it gives way, with a warning, where it does not fit them.
+    """
+    escs, plain, kept = config.escs, None, None
     taken: dict[int, str] = {}
+    bits = 0.0
     if config.canopen.enabled:
-        canopen, damaged = _canopen(config, store)
-        escs = canopen.esc_settings(escs)
-        nodes = canopen.nodes(escs)
-        _check_cob_ids(nodes, canopen.eds.name)
-        taken = nodes.cob_ids()
-    if not config.dbc.enabled:
-        return Loaded(config, escs, None, Layout("", "", ()), canopen, tuple(damaged), store)
-    file = config.dbc_path
-    database, layout = prepare(load_database(file), str(file), escs, config.dbc_settings, config.can.fd, taken)
-    return Loaded(config, escs, database, layout, canopen, tuple(damaged), store)
-
-
-def _check_cob_ids(nodes: Nodes, eds: str) -> None:
-    """Two nodes, or two services, with one COB-ID: as where an EDS gives EMCY or a PDO an id without $NODEID."""
-    problems: list[str] = []
-    users: dict[int, str] = {}
-    for node in nodes.nodes:
-        for cob_id, what in node.cob_ids():
-            if users.setdefault(cob_id, what) != what:
-                problems.append(
-                    f"{eds}: COB-ID {cob_id:03X}h is that of {users[cob_id]} and of {what}. Change one default (or add $NODEID)."
-                )
-    if problems:
-        raise UserError(*problems)
-
-
-def load_eds(config: Config) -> Eds:
-    """The EDS in use, checked."""
-    path = config.eds_path
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file.") from None
-    eds = eds_of(data, str(path))
-    if not config.canopen.cia402_mirrors:
-        eds = eds_of(without(data, range(0x6000, 0x6800)), str(path))
-    check_eds(eds, config.escs[0], [node_id for node_id in config.node_ids if node_id != UNCONFIGURED])
-    return eds
-
-
-def parameter_folder(config: Config) -> Path:
-    """Where masters' parameters are kept."""
-    if config.canopen.store is None:
-        return state_folder()
-    return Path(config.file).parent / config.canopen.store
-
-
-def _canopen(config: Config, store: ParameterStore | None) -> tuple[CanopenSetup, list[tuple[int, str]]]:
-    canopen = config.canopen
-    eds = load_eds(config)
-    identity = machine_identity()
-    if not identity and canopen.serial is None:
-        say(
-            "warning: this machine has no id, so serial numbers (1018h:4) are 0 and LSS cannot tell nodes apart: set canopen.serial"
-        )
-    settings: list[NodeSettings] = []
-    kept: list[Stored] = []
-    damaged: list[tuple[int, str]] = []
-    for number, (esc, node_id) in enumerate(zip(config.esc, config.node_ids, strict=True)):
-        serial = (
-            serial_number(number + 1, esc.name, identity)
-            if canopen.serial is None
-            else canopen.serial + number & 0xFFFFFFFF
-        )
-        settings.append(
-            NodeSettings(
-                node_id,
-                serial,
-                canopen.vendor_id,
-                canopen.self_start,
-                canopen.read_only,
-                config.can.bitrate,
-                segment_ns=2 * _FRAME_BITS * 1_000_000_000 // config.can.bitrate,
-                version=__version__,
-                device=next((device for device in Device if device.text == esc.device), None),
-            )
-        )
-        if store is None:
-            found, reason = _look_at(parameter_folder(config) / f"{esc.name}.params")
-        else:
-            store.claim(esc.name)
-            found, reason = store.load(esc.name)
-        kept.append(found)
-        if reason is not None:
-            damaged.append((number, reason))
-    _forget_clashing_ids(config, settings, kept)
-    return CanopenSetup(eds, tuple(settings), tuple(kept), tuple(config.escs)), damaged
-
-
-def _look_at(path: Path) -> tuple[Stored, str | None]:
-    """What a node stored, and why that cannot be read; nothing is changed."""
-    try:
-        return decode(path.read_bytes()), None
-    except FileNotFoundError:
-        return Stored(), None
-    except (OSError, ValueError) as error:
-        return Stored(), f"{path}: {error}"
-
-
-def _forget_clashing_ids(config: Config, settings: list[NodeSettings], kept: list[Stored]) -> None:
-    """A node-ID that was stored over the bus and has become another's by a changed configuration gives way."""
-    taken: dict[int, str] = {}
-    for number, (esc, own, stored) in enumerate(zip(config.esc, settings, kept, strict=True)):
-        node_id = own.node_id if stored.node_id is None else stored.node_id
-        if node_id in taken and stored.node_id is not None and own.node_id not in taken:
-            say(f"warning: {esc.name}: the stored node-ID {node_id} is that of {taken[node_id]}; taking {own.node_id}")
-            kept[number] = replace(stored, node_id=None)
-            node_id = own.node_id
-        elif node_id in taken:
-            raise UserError(
-                f"{config.file}: {esc.name}: node-ID {node_id} is that of {taken[node_id]}, which a master stored. "
-                f"Choose another node_id, or remove what is stored: {parameter_folder(config)}."
-            )
-        if node_id != UNCONFIGURED:
-            taken[node_id] = esc.name
+        plain = plain_setup(config)
+        nodes = plain.nodes(plain.esc_settings(config.escs))
+        check_cob_ids(nodes, plain.eds.name)
+        taken, bits = nodes.cob_ids(), nodes.bits_per_second()
+        kept = read_stored(config, store)
+        escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
+    database, layout = None, Layout("", "", ())
+    if config.dbc.enabled:
+        file = str(config.dbc_path)
+        found = load_database(config.dbc_path)
+        database, layout = prepare(found, file, escs, config.dbc_settings, config.can.fd, taken)
+    bitrate, data_bitrate = config.can.bitrate, config.can.data_bitrate
+    warnings = [check_load(layout, bitrate, data_bitrate, bits)]
+    canopen = None
+    if plain is not None and kept is not None:
+        foreign = {message.can_id: message.name for message in layout.messages if not message.extended}
+        canopen, given_way = with_stored(plain, kept.stored, config, escs, foreign)
+        bits = canopen.nodes(escs).bits_per_second()
+        warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
+    damaged = () if kept is None else tuple(kept.damaged)
+    return Loaded(config, escs, database, layout, canopen, damaged, store, tuple(w for w in warnings if w))
 
 
 def set_up_log(verbose: bool = False) -> None:
@@ -244,13 +143,6 @@ def canopen_of(loaded: Loaded) -> CanopenSetup:
     if loaded.canopen is None:
         raise UserError(f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. Set it to true.")
     return loaded.canopen
-
-
-def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:
-    """Nodes by the shipped EDS, as they are without a configuration."""
-    file = shipped("eds/kontronik_esc.eds")
-    settings = tuple(NodeSettings(node_id, version=__version__) for node_id in node_ids)
-    return CanopenSetup(eds_of(file.read_bytes(), str(file)), settings, (Stored(),) * len(settings))
 
 
 def write_output(where: str, text: str, encoding: str) -> None:

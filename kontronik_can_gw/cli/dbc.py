@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen_dbc import database as canopen_database
 from kontronik_can_gw.canopen_dbc import waiting_for_lss
-from kontronik_can_gw.cli.common import canopen_of, load_all, say, shipped_canopen, write_output
+from kontronik_can_gw.cli.common import canopen_of, load_all, say, write_output
+from kontronik_can_gw.cli.node_setup import shipped_canopen
 from kontronik_can_gw.config import name_problem, shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.telemetry import EscSettings

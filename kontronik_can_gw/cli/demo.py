@@ -147,7 +147,8 @@ class Master:
     def line(self) -> str:
         """What the master knows."""
         pdos = " ".join(f"TPDO{number} {count}" for number, count in sorted(self.counts.items())) or "no PDO yet"
-        return f"node {self.node_id} {self.state}  {pdos}  SDO 2001h:5 {self.cell_voltage}  EMCY {self.emergency}"
+        # no-break spaces: on a narrow terminal the line is broken in front of SDO, not behind it
+        return f"node {self.node_id} {self.state}  {pdos}  SDO\N{NO-BREAK SPACE}2001h:5 {self.cell_voltage}  EMCY {self.emergency}"
 
     def _send(self, cob_id: int, data: bytes) -> None:
         import can

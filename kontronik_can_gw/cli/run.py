@@ -51,8 +51,8 @@ def main(args: argparse.Namespace) -> int:
     status_ns = int((args.status or 0) * SECOND)
     loop = Loop(gateway, [esc.port for esc in config.esc], config.can, wait, loaded.store, status_ns)
     with stopping_on_signals(loop.stop):
+        _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
         loop.open()
-        _say_parameters(loaded)
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
         loop.run()
@@ -64,10 +64,6 @@ def _say_parameters(loaded: Loaded) -> None:
         log.error("%s: stored parameters: %s. Running on defaults.", loaded.escs[esc].name, reason)
     if loaded.canopen is None:
         return
-    for node, esc_settings in zip(loaded.canopen.nodes(loaded.escs).nodes, loaded.escs, strict=True):
-        for key in node.misfits:
-            where = f"{key >> 8:04X}h:{key & 0xFF:02X}"
-            log.warning("%s: the stored %s does not fit this EDS and is passed over", esc_settings.name, where)
     for configured, holds in zip(loaded.config.escs, loaded.escs, strict=True):
         for name in ("pole_pairs", "gear", "cell_count", "timeout_ns"):
             if getattr(configured, name) != getattr(holds, name):

@@ -463,6 +463,11 @@ class Loop:
         if self.gateway.node_changes == self._node_changes:
             return
         self._node_changes = self.gateway.node_changes
+        for index, key in self.gateway.take_misfits():
+            where = f"{key >> 8:04X}h:{key & 0xFF:02X}"
+            log.warning(
+                "%s: the stored %s is passed over: it does not fit this EDS, or clashes", self._escs[index].name, where
+            )
         states = [(node_id, state) for node_id, state, _ in self.gateway.node_states()]
         before, self._node_states = self._node_states, states
         for index, (node_id, state) in enumerate(states):

@@ -29,7 +29,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,11}")
 
 
 class ParameterStore:
-    """One file ``NAME.params`` for each node in one folder (mode 0700, made at the first saving), readable by the owner only (0600)."""
+    """One file ``NAME.params`` for each node in one folder (mode 0700, made when it is first needed), readable by the owner only (0600)."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -43,17 +43,17 @@ class ParameterStore:
         self._unusable: set[str] = set()
         self._claims: list[int] = []
 
-    def claim(self, name: str) -> None:
+    def claim(self, name: str) -> str | None:
         """Keep other gateways from a node's file until ``close``: RunError where one has it.
 
-        Where no lock can be made nothing can be saved either, which is said when it is tried.
+        Where no lock can be made nothing can be saved either: the reason, to be told.
         """
         path = self._path(name)
         try:
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _make_folder(path.parent)
             lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        except OSError:
-            return
+        except OSError as error:
+            return f"{path}: {_reason(error)}"
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -62,8 +62,9 @@ class ParameterStore:
                 raise RunError(
                     f"{path}: is in use by another gateway. Give this one its own canopen.store, or its ESC another name."
                 ) from None
-            return
+            return f"{path}: {_reason(error)}"
         self._claims.append(lock)
+        return None
 
     def load(self, name: str) -> tuple[Stored, str | None]:
         """Read what a node kept; to be called before its first saving.

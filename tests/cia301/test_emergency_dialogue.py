@@ -280,7 +280,7 @@ def test_an_inhibit_time_of_0_ends_the_waiting() -> None:
          10 -> {emcy(0x3220, 0x05, 0, 1)}
          20 uart 0 live
          30 write 1 1015:00 00 00
-        110 -> {NOTHING}
+         30 -> {NOTHING}
     """)
     assert bench.number(0x1015) == 0
 

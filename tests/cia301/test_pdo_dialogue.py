@@ -528,15 +528,16 @@ def test_gateway_values_follow_the_second() -> None:
     bench.talk("1000 -> 181 01\n 2000 -> 181 01\n 2500 -")
 
 
-def test_a_node_id_whose_cob_ids_the_dbc_has_is_refused_and_a_pdo_whose_id_it_has_is_off() -> None:
-    taken = {0x705: 5, 0x606: 6, 0x587: 7, 0x88: 8}
-    layout = Layout("", "", tuple(message_plan(f"M{i}", i, ()) for i in (*taken, 0x18A)))
+def test_a_node_id_whose_cob_ids_the_dbc_has_is_refused() -> None:
+    taken = {0x705: 5, 0x606: 6, 0x587: 7, 0x88: 8, 0x18A: 10}
+    layout = Layout("", "", tuple(message_plan(f"M{i}", i, ()) for i in taken))
     bench = Bench(changes=NO_HEARTBEAT, layout=layout)
     for node_id in taken.values():
         assert bench.write(0x2101, 2, node_id, size=1) == TAKEN
-    assert bench.write(0x2101, 2, 10, size=1) is None
-    bench.put(0, "82 01")
-    bench.start()
-    bench.uart(live())
-    assert [frame.can_id for frame in bench.take()] == [0x28A, 0x38A, 0x48A]
-    assert bench.number(0x1800, 1, node=10) == 0xC000018A
+    assert bench.write(0x2101, 2, 9, size=1) is None
+
+
+def test_a_node_id_whose_cob_ids_another_node_chose_is_refused() -> None:
+    bench = Bench(2, changes=NO_HEARTBEAT)
+    assert bench.write(0x1805, 1, 0x40000087, node=2) is None
+    assert bench.write(0x2101, 2, 7, size=1) == TAKEN

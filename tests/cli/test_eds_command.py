@@ -16,7 +16,7 @@ from kontronik_can_gw import __version__
 from kontronik_can_gw.cia301.eds import load, without
 from kontronik_can_gw.cia301.storage import Stored, encode
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.cli.common import shipped_canopen
+from kontronik_can_gw.cli.node_setup import shipped_canopen
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.telemetry import EscSettings
 

@@ -373,7 +373,7 @@ def test_the_demonstration_on_a_terminal_shows_the_table_in_place() -> None:
     assert "\x1b[" in text
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
     assert "demo: simulated ESC -> UART -> gateway -> CAN -> logger, CANopen master" in plain
-    assert re.search(r"CANopen: node 1 OPERATIONAL  TPDO1 \d+ TPDO2 \d+ TPDO3 \d+ TPDO4 \d+  SDO 2001h:5", plain)
+    assert re.search(r"CANopen: node 1 OPERATIONAL  TPDO1 \d+ TPDO2 \d+ TPDO3 \d+ TPDO4 \d+  SDO\W2001h:5", plain)
     assert re.search(r"link Ok\b.*device Kosmik firmware 4\.17 layout V4", plain)
     assert re.search(r"BatteryVoltage +2\d\.\d\d +V", plain)
     assert "0 bytes sent to the ESC" in plain

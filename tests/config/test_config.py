@@ -159,11 +159,13 @@ def test_a_node_id_may_be_255_for_a_node_that_waits_for_lss(table: str, key: str
 
 
 def test_node_ids_count_on_from_the_base_unless_an_esc_has_its_own() -> None:
-    made = {"canopen": {"enabled": True, "node_id": 10}, "esc": [{"port": f"p{n}"} for n in range(4)]}
+    canopen: dict[str, Any] = {"enabled": True, "node_id": 10}
+    escs: list[dict[str, Any]] = [{"port": f"p{n}"} for n in range(4)]
+    made = {"canopen": canopen, "esc": escs}
     assert parse(made, "a.toml").node_ids == [10, 11, 12, 13]
-    made["esc"][2]["node_id"] = 99  # type: ignore[index]
+    escs[2]["node_id"] = 99
     assert parse(made, "a.toml").node_ids == [10, 11, 99, 13]
-    made["canopen"]["node_id"] = 255  # type: ignore[call-overload]
+    canopen["node_id"] = 255
     assert parse(made, "a.toml").node_ids == [255, 255, 99, 255]
 
 

@@ -1,0 +1,210 @@
+"""From a configuration to its CANopen nodes: EDS, node-IDs, serial numbers, and what masters stored.
+
+A faulty configuration or EDS is refused. What was stored over the bus never keeps the gateway from starting: where it clashes with the
+configuration, another node or a DBC message, it gives way, and that is said.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.cia301.check import check_eds
+from kontronik_can_gw.cia301.eds import Eds, without
+from kontronik_can_gw.cia301.eds import load as eds_of
+from kontronik_can_gw.cia301.node import NodeSettings
+from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
+from kontronik_can_gw.cia301.storage import Stored, decode
+from kontronik_can_gw.config import UNCONFIGURED, Config, shipped
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
+from kontronik_can_gw.runtime.store import ParameterStore
+from kontronik_can_gw.telemetry import EscSettings
+
+_FRAME_BITS = 135
+"""Of a CAN frame with 8 data bytes, with the most stuffing; block uploads take every second place on the bus."""
+
+
+@dataclass
+class Kept:
+    """What masters stored, ESC by ESC; ``damaged``: (ESC, why it could not be read)."""
+
+    stored: list[Stored] = field(default_factory=list)
+    damaged: list[tuple[int, str]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def load_eds(config: Config) -> Eds:
+    """The EDS in use, checked."""
+    path = config.eds_path
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file.") from None
+    eds = eds_of(data, str(path))
+    if not config.canopen.cia402_mirrors:
+        eds = eds_of(without(data, range(0x6000, 0x6800)), str(path))
+    node_ids = [node_id for node_id in config.node_ids if node_id != UNCONFIGURED]
+    check_eds(eds, config.escs, node_ids)
+    return eds
+
+
+def parameter_folder(config: Config) -> Path:
+    """Where masters' parameters are kept."""
+    if config.canopen.store is None:
+        return state_folder()
+    return Path(config.file).parent / config.canopen.store
+
+
+def plain_setup(config: Config) -> CanopenSetup:
+    """The nodes by configuration and EDS alone."""
+    canopen, identity = config.canopen, machine_identity()
+    settings = []
+    for number, (esc, node_id) in enumerate(zip(config.esc, config.node_ids, strict=True)):
+        serial = serial_number(number + 1, esc.name, identity)
+        if canopen.serial is not None:
+            serial = canopen.serial + number & 0xFFFFFFFF
+        settings.append(
+            NodeSettings(
+                node_id,
+                serial,
+                canopen.vendor_id,
+                canopen.self_start,
+                canopen.read_only,
+                config.can.bitrate,
+                segment_ns=2 * _FRAME_BITS * 1_000_000_000 // config.can.bitrate,
+                version=__version__,
+                device=next((device for device in Device if device.text == esc.device), None),
+            )
+        )
+    return CanopenSetup(load_eds(config), tuple(settings), (Stored(),) * len(settings), tuple(config.escs))
+
+
+def check_cob_ids(nodes: Nodes, eds: str) -> None:
+    """Two nodes, or two services, with one COB-ID: as where an EDS gives EMCY or a PDO an id without $NODEID."""
+    users: dict[int, str] = {}
+    problems = [
+        f"{eds}: COB-ID {cob_id:03X}h is that of {users[cob_id]} and of {what}. Change one default (or add $NODEID)."
+        for node in nodes.nodes
+        for cob_id, what in node.cob_ids()
+        if users.setdefault(cob_id, what) != what
+    ]
+    if problems:
+        raise UserError(*problems)
+
+
+def read_stored(config: Config, store: ParameterStore | None) -> Kept:
+    """What masters stored. Without a store its files are only looked at."""
+    kept = Kept()
+    if config.canopen.serial is None and not machine_identity():
+        kept.warnings.append(
+            "this machine has no id, so serial numbers (1018h:4) are 0 and LSS cannot tell nodes apart: set canopen.serial"
+        )
+    for number, esc in enumerate(config.esc):
+        if store is None:
+            found, reason = _look_at(parameter_folder(config) / f"{esc.name}.params")
+            if reason is not None:
+                kept.warnings.append(f"{esc.name}: stored parameters: {reason}")
+        else:
+            trouble = store.claim(esc.name)
+            if trouble is not None:
+                kept.warnings.append(f"{esc.name}: parameters could not be stored: {trouble}")
+            found, reason = store.load(esc.name)
+        kept.stored.append(found)
+        if reason is not None:
+            kept.damaged.append((number, reason))
+    return kept
+
+
+def _look_at(path: Path) -> tuple[Stored, str | None]:
+    """What a node stored, and why that cannot be read; nothing is changed."""
+    try:
+        return decode(path.read_bytes()), None
+    except FileNotFoundError:
+        return Stored(), None
+    except OSError as error:
+        return Stored(), f"{path}: cannot be read: {error.strerror}"
+    except ValueError as error:
+        return Stored(), f"{path}: {error}"
+
+
+def with_stored(
+    plain: CanopenSetup,
+    stored: Sequence[Stored],
+    config: Config,
+    escs: Sequence[EscSettings],
+    foreign: Mapping[int, str],
+) -> tuple[CanopenSetup, list[str]]:
+    """The nodes with what masters stored, less what clashes; and what is to be said of that."""
+    said: list[str] = []
+    kept = list(stored)
+    names = [esc.name for esc in config.esc]
+    while clash := _clashing_node_ids(plain.settings, kept):
+        for number in clash:
+            said.append(
+                f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: it cannot be this node's"
+            )
+            kept[number] = replace(kept[number], node_id=None)
+    setup = replace(plain, stored=tuple(kept))
+    while clash := [n for n in _clashing_nodes(setup.nodes(escs, foreign), foreign) if kept[n] != Stored()]:
+        for number in clash:
+            ids = {key for key in kept[number].communication if key >> 8 in _WITH_COB_ID}
+            if ids:
+                left = {key: value for key, value in kept[number].communication.items() if key not in ids}
+                kept[number] = replace(kept[number], communication=left)
+                said.append(f"{names[number]}: the stored COB-IDs are passed over: one is used otherwise now")
+            elif kept[number].node_id is not None:
+                said.append(
+                    f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: its COB-IDs are used otherwise"
+                )
+                kept[number] = replace(kept[number], node_id=None)
+            else:
+                kept[number] = Stored()
+        setup = replace(plain, stored=tuple(kept))
+    return setup, said
+
+
+_WITH_COB_ID = frozenset({0x1005, 0x1014, *range(0x1800, 0x1A00)})
+
+
+def _clashing_node_ids(settings: Sequence[NodeSettings], kept: Sequence[Stored]) -> list[int]:
+    """Nodes whose stored node-ID is that of another, or none where LSS is refused."""
+    ids = [own.node_id if s.node_id is None else s.node_id for own, s in zip(settings, kept, strict=True)]
+    return [
+        number
+        for number, (own, node_id) in enumerate(zip(settings, ids, strict=True))
+        if kept[number].node_id is not None
+        and ((node_id != UNCONFIGURED and ids.count(node_id) > 1) or (node_id == UNCONFIGURED and own.read_only))
+    ]
+
+
+def _clashing_nodes(nodes: Nodes, foreign: Mapping[int, str]) -> list[int]:
+    """Nodes with a COB-ID that another service, another node or a DBC message has."""
+    users: dict[int, list[tuple[int, str]]] = {}
+    for number, node in enumerate(nodes.nodes):
+        for cob_id, what in node.cob_ids():
+            users.setdefault(cob_id, []).append((number, what))
+    found = {
+        number
+        for cob_id, those in users.items()
+        if cob_id in foreign or len({what for _, what in those}) > 1
+        for number, _ in those
+    }
+    return sorted(found)
+
+
+def load_of_stored(before: str | None, layout: Layout, bitrate: int, data_bitrate: int, bits: float) -> list[str]:
+    """A warning where it is what masters stored that fills the bus; such a gateway runs all the same."""
+    load = layout.bus_load(bitrate, data_bitrate) + bits / bitrate
+    if before is not None or load <= 0.5:
+        return []
+    return [f"with what masters stored, {load:.0%} of {bitrate // 1000} kbit/s are needed; other nodes get little"]
+
+
+def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:
+    """Nodes by the shipped EDS, as they are without a configuration."""
+    file = shipped("eds/kontronik_esc.eds")
+    settings = tuple(NodeSettings(node_id, version=__version__) for node_id in node_ids)
+    return CanopenSetup(eds_of(file.read_bytes(), str(file)), settings, (Stored(),) * len(settings))
