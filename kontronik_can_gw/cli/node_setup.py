@@ -17,6 +17,7 @@ from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.cia301.storage import Stored, decode
 from kontronik_can_gw.config import UNCONFIGURED, Config, shipped
 from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.dbc_output.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
@@ -198,7 +199,7 @@ def _clashing_nodes(nodes: Nodes, foreign: Mapping[int, str]) -> list[int]:
 def load_of_stored(before: str | None, layout: Layout, bitrate: int, data_bitrate: int, bits: float) -> list[str]:
     """A warning where it is what masters stored that fills the bus; such a gateway runs all the same."""
     load = layout.bus_load(bitrate, data_bitrate) + bits / bitrate
-    if before is not None or load <= 0.5:
+    if before is not None or load <= WARN_LOAD:
         return []
     return [f"with what masters stored, {load:.0%} of {bitrate // 1000} kbit/s are needed; other nodes get little"]
 
