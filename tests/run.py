@@ -32,8 +32,8 @@ from xml.etree import ElementTree as ET
 PROJECT = Path(__file__).resolve().parent.parent
 STEPS = ("lint", "types", "unit", "vcan")
 VM_RUN = PROJECT / "tests" / "vm" / "vm_run.py"
-VCAN_TIMEOUT_S = 1400
-STEP_TIMEOUT_S = 1500
+VCAN_TIMEOUT_S = 2400
+STEP_TIMEOUT_S = 2500
 SEARCH_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
 
 ENABLE_VM = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
