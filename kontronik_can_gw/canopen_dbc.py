@@ -15,9 +15,10 @@ from kontronik_can_gw.cia301 import emergency, heartbeat
 from kontronik_can_gw.cia301.eds import Entry
 from kontronik_can_gw.cia301.emergency import GatewayError, code_of_bit
 from kontronik_can_gw.cia301.nmt import NmtState
-from kontronik_can_gw.cia301.node import UNCONFIGURED, Node
+from kontronik_can_gw.cia301.node import Node
 from kontronik_can_gw.cia301.nodes import Nodes
 from kontronik_can_gw.cia301.pdo import EVENT_TYPES, Mapped, Tpdo, message_plan
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.dbc_output.expand import esc_prefix
 from kontronik_can_gw.dbc_output.layout import SignalPlan
 from kontronik_can_gw.errors import UserError

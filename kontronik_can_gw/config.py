@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.dbc_output.layout import DbcSettings, normalize
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.states import Device
@@ -235,8 +236,6 @@ _TABLES: dict[str, type[Any]] = {
     "run": RunConfig,
     "esc": EscConfig,
 }
-UNCONFIGURED = 255
-"""The node-ID of a node that waits for LSS."""
 
 
 def shipped(name: str) -> Path:

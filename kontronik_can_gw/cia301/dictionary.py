@@ -4,7 +4,7 @@ Built from an EDS. A variable is either plain storage or bound: ``read`` then gi
 """
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from kontronik_can_gw.cia301.abort import Abort, SdoAbort
@@ -172,7 +172,7 @@ class Dictionary:
 
     # --- power-on and storage
 
-    def reset(self, first: int, last: int, node_id: int, stored: dict[int, bytes]) -> list[int]:
+    def reset(self, first: int, last: int, node_id: int, stored: Mapping[int, bytes]) -> list[int]:
         """Give the variables of these indices their power-on values: the stored one where there is one, else the default.
 
         Returns the keys of stored values that do not fit this EDS (any more); they are passed over.

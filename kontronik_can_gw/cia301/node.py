@@ -23,13 +23,12 @@ from kontronik_can_gw.cia301.nmt import Command, NmtState
 from kontronik_can_gw.cia301.pdo import COB_ID, COMMUNICATION, INVALID_BIT, MAPPING, MOST, Tpdo, restricted
 from kontronik_can_gw.cia301.sdo import SdoServer
 from kontronik_can_gw.cia301.storage import Stored
-from kontronik_can_gw.cia305.lss import LssSlave
+from kontronik_can_gw.cia305.lss import UNCONFIGURED, LssSlave
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.protocol.states import Device, device_text
 from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus, Group
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry, Event, LinkState
 
-UNCONFIGURED = 255
 SAVE, LOAD, RESET = (int.from_bytes(word, "little") for word in (b"save", b"load", b"rset"))
 SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x600, 0x580, 0x7E5, 0x7E4
 COMMUNICATION_PROFILE, APPLICATION_PROFILE = (0x1000, 0x1FFF), (0x2000, 0xFFFF)
@@ -37,7 +36,6 @@ CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
 """Objects of services whose values have rules beyond type and limits (those of PDOs have their own)."""
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 _SELF_START_OFF = 4
-_NOT_VALID = 1 << 31  # of 1014h
 _MOST_SAVES = 4
 _LEAST_TIMEOUT_MS, _MOST_TIMEOUT_MS = 20, 60_000  # whatever the limits of an EDS are
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
@@ -120,12 +118,10 @@ def configured_settings(base: EscSettings) -> dict[int, int]:
     return {sub: given for sub, given, default in listed if given != default}
 
 
-def make_dictionary(
-    eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored
-) -> tuple[Dictionary, list[int]]:
+def make_dictionary(eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored) -> Dictionary:
     """The dictionary of a node before its first reset, the configuration's values as power-on values and the stored ones in place.
 
-    Where the configuration leaves a setting at its default, the EDS's default holds. Returns the keys of stored values that do not fit.
+    Where the configuration leaves a setting at its default, the EDS's default holds.
     """
     dictionary = Dictionary(eds)
     for sub, given in configured_settings(base).items():
@@ -138,8 +134,8 @@ def make_dictionary(
     if settings.self_start and (variable := dictionary.get(0x1F80)) is not None:
         variable.power_on = int(variable.power_on) & ~_SELF_START_OFF
     dictionary.read_only = settings.read_only
-    misfits = dictionary.reset(*APPLICATION_PROFILE, settings.node_id, dict(stored.application))
-    return dictionary, misfits
+    dictionary.reset(*APPLICATION_PROFILE, settings.node_id, stored.application)
+    return dictionary
 
 
 class Node:
@@ -201,7 +197,7 @@ class Node:
         self._stop_pdos()
         self.emergencies.close()  # nothing is said before the boot-up message
         node_id = self.pending_node_id
-        self.misfits = self.dictionary.reset(*APPLICATION_PROFILE, node_id, dict(self._stored.application))
+        self.misfits = self.dictionary.reset(*APPLICATION_PROFILE, node_id, self._stored.application)
         self._apply_settings(now)
         self.reset_communication(now, keep_misfits=True)
 
@@ -214,7 +210,7 @@ class Node:
         self.lss.reset()
         self.emergencies.reset()
         self.node_id = self.pending_node_id
-        self.misfits += self.dictionary.reset(*COMMUNICATION_PROFILE, self.node_id, dict(self._stored.communication))
+        self.misfits += self.dictionary.reset(*COMMUNICATION_PROFILE, self.node_id, self._stored.communication)
         self.release_ids()
         self._drop_what_breaks_rules()
         for tpdo in self.tpdos:
@@ -277,7 +273,7 @@ class Node:
         yield heartbeat.COB_ID + self.node_id, f"the heartbeat of {who}"
         yield SDO_REQUEST + self.node_id, f"SDO requests to {who}"
         yield SDO_ANSWER + self.node_id, f"SDO answers of {who}"
-        if not self._emergency_id & _NOT_VALID:
+        if not self._emergency_id & INVALID_BIT:
             yield self._emergency_id & 0x7FF, f"emergencies of {who}"
         for tpdo in self.tpdos:
             if tpdo.valid:
@@ -289,7 +285,7 @@ class Node:
             return
         if self.dictionary.get(0x1005) is not None:
             yield sync, self.dictionary.number(0x1005) & 0x7FF
-        if not self._emergency_id & _NOT_VALID:
+        if not self._emergency_id & INVALID_BIT:
             yield self, self._emergency_id & 0x7FF
         for tpdo in self.tpdos:
             if tpdo.valid:
@@ -312,11 +308,8 @@ class Node:
 
     def on_can_state(self, state: CanState, now: int) -> None:
         """The CAN controller's state changed."""
-        if state in (
-            CanState.ERROR_PASSIVE,
-            CanState.ERROR_ACTIVE,
-            CanState.ERROR_WARNING,
-        ):  # bus-off is worse, not better
+        # bus-off is worse than passive, not its end
+        if state in (CanState.ERROR_PASSIVE, CanState.ERROR_ACTIVE, CanState.ERROR_WARNING):
             self.emergencies.set(GatewayError.CAN_PASSIVE, state is CanState.ERROR_PASSIVE, now)
         if state is CanState.BUS_OFF:
             self._off_bus = True
@@ -459,14 +452,14 @@ class Node:
         self._send(LSS_ANSWER, data)
 
     def _send_emergency(self, data: bytes) -> bool:
-        if self._emergency_id & _NOT_VALID:
+        if self._emergency_id & INVALID_BIT:
             return False
         self._send(self._emergency_id & 0x7FF, data)
         return True
 
     @property
     def _emergency_id(self) -> int:
-        return self.dictionary.number(0x1014, otherwise=_NOT_VALID)
+        return self.dictionary.number(0x1014, otherwise=INVALID_BIT)
 
     # --- states
 
@@ -746,10 +739,10 @@ class Node:
 
     def _check_emergency_cob_id(self, value: int) -> None:
         """1014h: bits 0..30 cannot change while it is valid; no 29-bit or restricted id, none that is taken."""
-        old, valid = self._emergency_id, not value & _NOT_VALID
+        old, valid = self._emergency_id, not value & INVALID_BIT
         if value & 0x7FFFF800 or (valid and restricted(value & 0x7FF)):
             raise SdoAbort(Abort.VALUE)
-        if valid and not old & _NOT_VALID and old != value:
+        if valid and not old & INVALID_BIT and old != value:
             raise SdoAbort(Abort.VALUE)
         if valid and self._around.cob_id_taken(value & 0x7FF, self):
             raise SdoAbort(Abort.INCOMPATIBLE)

@@ -12,19 +12,18 @@ from kontronik_can_gw.cia301.node import (
     LSS_REQUEST,
     SDO_ANSWER,
     SDO_REQUEST,
-    UNCONFIGURED,
     Node,
     NodeSettings,
     esc_settings,
     make_dictionary,
 )
 from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.dbc_output.layout import classic_bits
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import CanState, GatewayStatus
 from kontronik_can_gw.telemetry import EscSettings, EscTelemetry
 
-_FRAME_BITS = 47
-"""Of a frame without data and stuffing."""
 _FIRST_IDS = (0x80, SDO_ANSWER, SDO_REQUEST, heartbeat.COB_ID)
 """COB-IDs of EMCY, SDO and heartbeat, less the node-ID."""
 SettingsChanged = Callable[[int, EscSettings], None]
@@ -45,7 +44,7 @@ class CanopenSetup:
     def esc_settings(self, escs: Sequence[EscSettings]) -> list[EscSettings]:
         """The ESCs' settings with the EDS's defaults and what was stored over the bus worked in."""
         return [
-            esc_settings(make_dictionary(self.eds, esc, node, stored)[0], esc)
+            esc_settings(make_dictionary(self.eds, esc, node, stored), esc)
             for esc, node, stored in zip(escs, self.settings, self.stored, strict=True)
         ]
 
@@ -92,7 +91,7 @@ class Nodes:
         self.nodes: list[Node] = []
         bases = setup.escs or tuple(esc.settings for esc in escs)
         for esc, base, settings, stored in zip(escs, bases, setup.settings, setup.stored, strict=True):
-            dictionary, _ = make_dictionary(setup.eds, base, settings, stored)
+            dictionary = make_dictionary(setup.eds, base, settings, stored)
             self.nodes.append(Node(setup.eds, dictionary, esc, gateway, settings, stored, self))
 
     # --- what happens
@@ -173,7 +172,7 @@ class Nodes:
 
     def bits_per_second(self) -> float:
         """What these need on the bus, with the most stuffing."""
-        return sum((_FRAME_BITS + 8 * size + (33 + 8 * size) // 4) * rate for size, rate in self._traffic())
+        return sum(classic_bits(size) * rate for size, rate in self._traffic())
 
     def _traffic(self) -> Iterator[tuple[int, float]]:
         """(data bytes, frames a second)."""

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from kontronik_can_gw.cia301.nodes import Nodes
 from kontronik_can_gw.cia301.pdo import EVENT_TYPES, Tpdo
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.cli.common import Loaded, load_all
-from kontronik_can_gw.config import UNCONFIGURED, as_toml
+from kontronik_can_gw.config import as_toml
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
 from kontronik_can_gw.telemetry import MS
 

@@ -91,7 +91,8 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     if plain is not None and kept is not None:
         foreign = {message.can_id: message.name for message in layout.messages if not message.extended}
         canopen, given_way = with_stored(plain, kept.stored, config, escs, foreign)
-        bits = canopen.nodes(escs).bits_per_second()
+        if canopen is not plain:
+            bits = canopen.nodes(escs).bits_per_second()
         warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
     damaged = () if kept is None else tuple(kept.damaged)
     return Loaded(config, escs, database, layout, canopen, damaged, store, tuple(w for w in warnings if w))

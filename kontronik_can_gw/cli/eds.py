@@ -10,9 +10,9 @@ from kontronik_can_gw.cia301.dictionary import Value
 from kontronik_can_gw.cia301.eds import dcf
 from kontronik_can_gw.cia301.node import Node
 from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.cli.common import canopen_of, load_all, write_output
 from kontronik_can_gw.cli.node_setup import shipped_canopen
-from kontronik_can_gw.config import UNCONFIGURED
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.telemetry import EscSettings
 

@@ -15,17 +15,15 @@ from kontronik_can_gw.cia301.eds import load as eds_of
 from kontronik_can_gw.cia301.node import NodeSettings
 from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.cia301.storage import Stored, decode
-from kontronik_can_gw.config import UNCONFIGURED, Config, shipped
-from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.config import Config, shipped
+from kontronik_can_gw.dbc_output.layout import Layout, classic_bits
 from kontronik_can_gw.dbc_output.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
-from kontronik_can_gw.runtime.store import ParameterStore
-from kontronik_can_gw.telemetry import EscSettings
-
-_FRAME_BITS = 135
-"""Of a CAN frame with 8 data bytes, with the most stuffing; block uploads take every second place on the bus."""
+from kontronik_can_gw.runtime.store import ParameterStore, parameter_file
+from kontronik_can_gw.telemetry import SECOND, EscSettings
 
 
 @dataclass
@@ -62,6 +60,8 @@ def parameter_folder(config: Config) -> Path:
 def plain_setup(config: Config) -> CanopenSetup:
     """The nodes by configuration and EDS alone."""
     canopen, identity = config.canopen, machine_identity()
+    # block uploads take every second place on the bus
+    segment_ns = 2 * classic_bits(8) * SECOND // config.can.bitrate
     settings = []
     for number, (esc, node_id) in enumerate(zip(config.esc, config.node_ids, strict=True)):
         serial = serial_number(number + 1, esc.name, identity)
@@ -75,7 +75,7 @@ def plain_setup(config: Config) -> CanopenSetup:
                 canopen.self_start,
                 canopen.read_only,
                 config.can.bitrate,
-                segment_ns=2 * _FRAME_BITS * 1_000_000_000 // config.can.bitrate,
+                segment_ns=segment_ns,
                 version=__version__,
                 device=next((device for device in Device if device.text == esc.device), None),
             )
@@ -105,7 +105,7 @@ def read_stored(config: Config, store: ParameterStore | None) -> Kept:
         )
     for number, esc in enumerate(config.esc):
         if store is None:
-            found, reason = _look_at(parameter_folder(config) / f"{esc.name}.params")
+            found, reason = _look_at(parameter_file(parameter_folder(config), esc.name))
             if reason is not None:
                 kept.warnings.append(f"{esc.name}: stored parameters: {reason}")
         else:
@@ -139,6 +139,8 @@ def with_stored(
     foreign: Mapping[int, str],
 ) -> tuple[CanopenSetup, list[str]]:
     """The nodes with what masters stored, less what clashes; and what is to be said of that."""
+    if all(each == Stored() for each in stored):
+        return plain, []
     said: list[str] = []
     kept = list(stored)
     names = [esc.name for esc in config.esc]

@@ -121,6 +121,12 @@ class SignalPlan:
     """What resolution or range is lost, for people."""
 
 
+def classic_bits(length: int, extended: bool = False) -> int:
+    """Bits of a classic CAN frame with so many data bytes, with the most stuffing that is possible."""
+    head = 54 if extended else 34
+    return head + 13 + 8 * length + (head + 8 * length - 1) // 4
+
+
 @dataclass(frozen=True)
 class MessagePlan:
     """One message of ours, as it is sent."""
@@ -150,8 +156,7 @@ class MessagePlan:
             head = 36 if self.extended else 17
             data = 5 + 8 * self.length
             return head + head // 4 + 13, data + data // 4 + (33 if self.length > 16 else 28)
-        head = 54 if self.extended else 34
-        return head + 13 + 8 * self.length + (head + 8 * self.length - 1) // 4, 0
+        return classic_bits(self.length, self.extended), 0
 
     @property
     def rate_hz(self) -> float:

@@ -14,7 +14,8 @@ from collections.abc import Callable, Sequence
 
 from kontronik_can_gw.cia301.nmt import NmtState
 from kontronik_can_gw.cia301.storage import Stored, encode
-from kontronik_can_gw.config import UNCONFIGURED, CanConfig
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text

@@ -140,7 +140,7 @@ class ParameterStore:
     def _path(self, name: str) -> Path:
         if _NAME.fullmatch(name) is None:
             raise ValueError(f"{name!r} is not a node's name: a letter, then up to 11 letters, digits or underscores")
-        return self._folder / f"{name}.params"
+        return parameter_file(self._folder, name)
 
     def _started(self) -> bool:
         """Start the worker if it does not run yet. False: the system gives no thread."""
@@ -184,6 +184,11 @@ class ParameterStore:
                 temporary.unlink()
             return f"{path}: {_reason(error)}"
         return None
+
+
+def parameter_file(folder: Path, name: str) -> Path:
+    """Where the parameters of a node are."""
+    return folder / f"{name}.params"
 
 
 def _temporary(path: Path) -> Path:
