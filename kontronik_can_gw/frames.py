@@ -2,6 +2,9 @@
 
 from typing import NamedTuple
 
+EXTENDED = 0x80000000
+"""Marks a 29-bit id where ids of both lengths are numbers in one set, as SocketCAN does."""
+
 
 class CanFrame(NamedTuple):
     """A frame: id (11 or 29 bit), data (0 to 8 bytes, CAN FD to 64).
@@ -18,3 +21,8 @@ class CanFrame(NamedTuple):
     page: int = 0
     remote: bool = False
     queued: bool = False
+
+    @property
+    def key(self) -> int:
+        """The id, with ``EXTENDED`` if it has 29 bits."""
+        return self.can_id | EXTENDED if self.extended else self.can_id

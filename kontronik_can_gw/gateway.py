@@ -3,18 +3,39 @@
 ``now`` is integer nanoseconds of one monotonic clock: the loop's when live, the capture's in replay.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from kontronik_can_gw.cia301.nmt import NmtState
 from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.dbc_output.output import DbcOutput
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.telemetry import SECOND, EscSettings, EscTelemetry, Event
 
-_NO_IDS: frozenset[int] = frozenset()
+_CONFLICT_NS = 10 * SECOND
+"""So long without a further one, and a conflict of ids is over."""
+
+
+class Conflict:
+    """Somebody else sends with an id of ours. ``whose``: what it is here; ``over``: that has ceased."""
+
+    def __init__(self, key: int, whose: str, node: int | None, now: int) -> None:
+        self.key = key
+        self.whose = whose
+        self.node = node
+        self.begun = self.last = now
+        self.count = 0
+        self.over = False
+
+    @property
+    def can_id(self) -> int:
+        return self.key & ~EXTENDED
+
+    @property
+    def is_extended(self) -> bool:
+        return bool(self.key & EXTENDED)
 
 
 class Gateway:
@@ -35,10 +56,27 @@ class Gateway:
         if canopen is not None:
             ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
             self.nodes = Nodes(canopen, self.escs, self.status, self._apply, ids)
+        self._message_ids = {
+            m.can_id | (EXTENDED if m.extended else 0): (None, f"message {m.name}") for m in layout.messages
+        }
+        self._own_ids: Mapping[int, tuple[int | None, str]] = {}
+        self._receive_ids: frozenset[int] = frozenset()
+        self._routed: frozenset[int] | None = None
+        self._conflicts: dict[int, Conflict] = {}
+        self._conflict_news: list[Conflict] = []
+        self._follow_ids()
         self._link_changes: list[int] = []
         self._told_ns = now
         self._next_expiry = 0
         """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
+
+    def take_over(self, old: "Gateway") -> None:
+        """Go on with what an earlier gateway counted: of ESCs with the same name energy, run time and losses."""
+        before = {esc.settings.name: esc for esc in old.escs}
+        for esc in self.escs:
+            if (other := before.get(esc.settings.name)) is not None:
+                esc.energy, esc.run_time, esc.losses = other.energy, other.run_time, other.losses
+        self.status.started_ns = old.status.started_ns
 
     def start(self, now: int, can_open: bool = True) -> None:
         """The runtime has opened what it could: run. Nodes boot when there is a bus that can hear it."""
@@ -60,14 +98,31 @@ class Gateway:
 
     @property
     def receive_ids(self) -> frozenset[int]:
-        """The 11-bit ids of the data frames that ``receive_frame`` is to be given; the same object until they change."""
-        return _NO_IDS if self.nodes is None else self.nodes.receive_ids
+        """The ids (29-bit ones with EXTENDED) of the frames that ``receive_frame`` is to be given; the same object until they change.
+
+        Those that the nodes listen to, and those that only this gateway sends with: who else does is to be noticed.
+        """
+        self._follow_ids()
+        return self._receive_ids
 
     def receive_frame(self, frame: CanFrame, now: int) -> None:
-        """A data frame with one of ``receive_ids``, received at ``now``."""
+        """A data frame of somebody else with one of ``receive_ids``, received at ``now``."""
+        self._follow_ids()
+        if (own := self._own_ids.get(frame.key)) is not None and not frame.remote:
+            self._collide(frame.key, own, now)
         if self.nodes is not None:
             self._expire(now)
             self.nodes.receive(frame, now)
+
+    @property
+    def first_message_id(self) -> int | None:
+        """The lowest id of the DBC output's messages; None without any."""
+        return min(self._message_ids, default=None)
+
+    def take_conflicts(self) -> list[Conflict]:
+        """Conflicts of ids that have begun, or are over, since the last call."""
+        news, self._conflict_news = self._conflict_news, []
+        return news
 
     def receive_overrun(self, now: int) -> None:
         """The CAN controller lost received frames."""
@@ -117,10 +172,13 @@ class Gateway:
         """What the runtime knows of the CAN controller."""
         self._expire(now)
         if state is not self.status.can_state:
+            was_off = self.status.can_state is CanState.BUS_OFF
             self.status.can_state = state
             self._output.on_gateway_change(now)
             if self.nodes is not None:
                 self.nodes.on_can_state(state, now)
+            if was_off and state is not CanState.DOWN:  # what was handed over meanwhile never reached the bus
+                self._output.start(now)
 
     def advance(self, now: int) -> None:
         """Let time pass: time-outs, cyclic messages."""
@@ -177,6 +235,7 @@ class Gateway:
         self._next_expiry = min(esc.next_deadline() for esc in self.escs)
         if now - self._told_ns >= SECOND:
             self._told_ns = now
+            self._end_conflicts(now)
             self._output.on_gateway_change(now, each_second=True)
 
     def _follow(self, esc: int, events: int, now: int) -> None:
@@ -191,6 +250,37 @@ class Gateway:
             if escs_ok != self.status.escs_ok:
                 self.status.escs_ok = escs_ok
                 self._output.on_gateway_change(now)
+
+    def _follow_ids(self) -> None:
+        routed = frozenset() if self.nodes is None else self.nodes.receive_ids
+        if routed is self._routed:
+            return
+        self._routed = routed
+        own: dict[int, tuple[int | None, str]] = dict(self._message_ids)
+        if self.nodes is not None:
+            own |= self.nodes.own_ids()
+        self._own_ids = own
+        self._receive_ids = routed | frozenset(own)
+
+    def _collide(self, key: int, own: tuple[int | None, str], now: int) -> None:
+        self.status.id_conflicts += 1
+        conflict = self._conflicts.get(key)
+        if conflict is None:
+            conflict = self._conflicts[key] = Conflict(key, own[1], own[0], now)
+            self._conflict_news.append(conflict)
+            if self.nodes is not None and conflict.node is not None:
+                self.nodes.collision(conflict.node, True, now)
+        conflict.count += 1
+        conflict.last = now
+
+    def _end_conflicts(self, now: int) -> None:
+        for conflict in [c for c in self._conflicts.values() if now - c.last > _CONFLICT_NS]:
+            conflict.over = True
+            del self._conflicts[conflict.key]
+            self._conflict_news.append(conflict)
+            others = {other.node for other in self._conflicts.values()}
+            if self.nodes is not None and conflict.node is not None and conflict.node not in others:
+                self.nodes.collision(conflict.node, False, now)
 
     def _apply(self, esc: int, settings: EscSettings) -> None:
         """Settings that came over the bus: they hold for everything that is sent, the DBC's messages too."""

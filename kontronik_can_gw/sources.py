@@ -55,6 +55,8 @@ class GatewayStatus:
     bus_off_count: int = 0
     dropped_frames: int = 0
     """Frames to be sent in order that were lost: too many waited, or the interface was down."""
+    id_conflicts: int = 0
+    """Frames of others with ids that only this gateway may send with."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ def sources(settings: EscSettings) -> dict[str, Source]:
             Source(name, "", gateway, f"gateway.{name}", low=0, rolls=True)
             for name in (
                 *("sent_frames", "replaced_frames", "send_failures"),
-                *("received_frames", "bus_off_count", "dropped_frames"),
+                *("received_frames", "bus_off_count", "dropped_frames", "id_conflicts"),
             )
         ),
     ]

@@ -55,6 +55,8 @@ class GatewayError(Enum):
     HEARTBEAT_LOST = 0x8130, 0
     """Byte 4: the node-ID."""
     BUS_OFF_LEFT = 0x8140, 0
+    ID_COLLISION = 0x8150, 0
+    """Somebody else sends with an id of this node."""
     SYNC_LENGTH = 0x8240, 0
     PARAMETER_FILE = 0x6300, 0
 

@@ -169,6 +169,7 @@ class Node:
         self._waiting_saves: deque[tuple[int | None, Stored]] = deque()  # the SDO server's ticket, None for LSS
         self._next_overrun = 0
         self._off_bus = False
+        self._outage = False
         self._live = False  # for the edge of 1029h:2
         history = sum(1 for _ in dictionary.subs(0x1003))
         self.emergencies = Emergencies(self._send_emergency, max(1, history))
@@ -269,9 +270,15 @@ class Node:
             return
         if self.dictionary.get(0x1005) is not None:
             yield self.dictionary.number(0x1005) & 0x7FF, "SYNC"
+        yield SDO_REQUEST + self.node_id, f"SDO requests to CANopen node {self.node_id}"
+        yield from self.transmit_ids()
+
+    def transmit_ids(self) -> Iterator[tuple[int, str]]:
+        """COB-IDs that nobody else on the bus may send with, and what they are."""
+        if self.node_id == UNCONFIGURED:
+            return
         who = f"CANopen node {self.node_id}"
         yield heartbeat.COB_ID + self.node_id, f"the heartbeat of {who}"
-        yield SDO_REQUEST + self.node_id, f"SDO requests to {who}"
         yield SDO_ANSWER + self.node_id, f"SDO answers of {who}"
         if not self._emergency_id & INVALID_BIT:
             yield self._emergency_id & 0x7FF, f"emergencies of {who}"
@@ -311,12 +318,12 @@ class Node:
         # bus-off is worse than passive, not its end
         if state in (CanState.ERROR_PASSIVE, CanState.ERROR_ACTIVE, CanState.ERROR_WARNING):
             self.emergencies.set(GatewayError.CAN_PASSIVE, state is CanState.ERROR_PASSIVE, now)
-        if state is CanState.BUS_OFF:
-            self._off_bus = True
+        if state in (CanState.BUS_OFF, CanState.DOWN):
+            self._off_bus = self._off_bus or state is CanState.BUS_OFF
+            self._outage = True
             self._communication_error(now)
-        elif self._off_bus and state not in (CanState.DOWN, CanState.UNKNOWN):
-            self._off_bus = False
-            self.emergencies.pulse(GatewayError.BUS_OFF_LEFT, now)
+        elif self._outage and state is not CanState.UNKNOWN:
+            self._return_from_outage(now)
         self._set_due()
 
     def set_error(self, error: GatewayError, present: bool, now: int) -> None:
@@ -326,10 +333,10 @@ class Node:
 
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost: say once more what is wrong, and what is sent on change only."""
-        self.emergencies.tell_again(now)
-        if self.state is NmtState.OPERATIONAL:
-            for tpdo in self.tpdos:
-                tpdo.tell_again(now)
+        if self._outage:
+            self._return_from_outage(now)
+        else:
+            self._tell_again(now)
         self._set_due()
 
     def overrun(self, now: int) -> None:
@@ -486,6 +493,26 @@ class Node:
     def _communication_error(self, now: int) -> None:
         self._behave(self.dictionary.number(0x1029, 1), now)
 
+    def _return_from_outage(self, now: int) -> None:
+        """The controller left bus-off, or the interface is back. With 1029h:1 = 0 the node boots, so that its master sets it up anew.
+
+        CiA 301 asks for PRE-OPERATIONAL then; a boot-up besides is what brings a node without a master, self-starting, to work again.
+        """
+        off_bus, self._off_bus, self._outage = self._off_bus, False, False
+        if self.dictionary.number(0x1029, 1) == 0 and self.node_id != UNCONFIGURED:
+            self.reset_communication(now)
+        else:
+            self.producer.beat(now)
+            self._tell_again(now)
+        if off_bus:
+            self.emergencies.pulse(GatewayError.BUS_OFF_LEFT, now)
+
+    def _tell_again(self, now: int) -> None:
+        self.emergencies.tell_again(now)
+        if self.state is NmtState.OPERATIONAL:
+            for tpdo in self.tpdos:
+                tpdo.tell_again(now)
+
     def _behave(self, behaviour: int, now: int) -> None:
         """Error behaviour of 1029h: 0 PRE-OPERATIONAL (if OPERATIONAL), 1 no change, 2 STOPPED."""
         if behaviour == 0 and self.state is NmtState.OPERATIONAL:
@@ -632,7 +659,7 @@ class Node:
             read(0x1011, part, lambda _now: int(not self.settings.read_only))
             hook(0x1010, part, _signature(SAVE), partial(self._later, self._store, part))
             hook(0x1011, part, _signature(LOAD), partial(self._later, self._restore, part))
-        hook(0x1014, 0, self._check_emergency_cob_id)
+        hook(0x1014, 0, self._check_emergency_cob_id, self._rerouted)
         hook(0x1015, 0, None, lambda _now: self._set_emergency_inhibit())
         for variable in self.dictionary.subs(0x1016):
             variable.check = partial(self._check_watch, variable)
@@ -777,6 +804,7 @@ class Node:
 
     def _tpdo_changed(self, tpdo: Tpdo, now: int) -> bool:
         tpdo.configure(now)
+        self._around.routes_changed()  # its COB-ID may be another one
         return True
 
     def _device_name(self) -> bytes:

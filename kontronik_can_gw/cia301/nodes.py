@@ -138,6 +138,15 @@ class Nodes:
             node.can_returned(now)
         self._after(now)
 
+    def collision(self, node_index: int, present: bool, now: int) -> None:
+        """Somebody else begins, or has ceased, to send with an id of this node."""
+        self.nodes[node_index].set_error(GatewayError.ID_COLLISION, present, now)
+        self._after(now)
+
+    def own_ids(self) -> dict[int, tuple[int, str]]:
+        """COB-IDs that only our nodes send with: which node (0 ...), and what for."""
+        return {cob_id: (index, what) for index, node in enumerate(self.nodes) for cob_id, what in node.transmit_ids()}
+
     def overrun(self, now: int) -> None:
         """The CAN controller lost received frames."""
         for node in self.nodes:

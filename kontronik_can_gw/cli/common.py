@@ -2,11 +2,13 @@
 
 import io
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,6 +67,16 @@ def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) 
     return loaded
 
 
+def fingerprint(config: Config) -> bytes:
+    """What a configuration is made of, in short: its keys and the content of its DBC and EDS."""
+    digest = sha256(repr(replace(config, file="")).encode())
+    for path, used in ((config.dbc_path, config.dbc.enabled), (config.eds_path, config.canopen.enabled)):
+        if used:
+            with suppress(OSError):  # removed since
+                digest.update(path.read_bytes())
+    return digest.digest()
+
+
 def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     """What belongs to a configuration. Without a store its files are only looked at.
 
@@ -98,45 +110,60 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     return Loaded(config, escs, database, layout, canopen, damaged, store, tuple(w for w in warnings if w))
 
 
-def set_up_log(verbose: bool = False) -> None:
-    """Log lines to standard error; under systemd without time, with the priorities that journald reads."""
-    import os
+@contextmanager
+def logging_to_stderr() -> Iterator[None]:
+    """Log lines to standard error, by a thread; under systemd without time, with the priorities that journald reads."""
+    from kontronik_can_gw.runtime.log_writer import BackgroundHandler
+    from kontronik_can_gw.runtime.systemd import log_formatter
 
-    handler = logging.StreamHandler()
-    if "JOURNAL_STREAM" in os.environ:
-        handler.setFormatter(_JournalFormatter("%(message)s"))
-    else:
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
-    logging.getLogger("can").addHandler(
-        logging.NullHandler()
-    )  # what python-can says is said again by us, with the remedy
+    handler = BackgroundHandler(sys.stderr)
+    handler.setFormatter(log_formatter(sys.stderr) or logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
+    # what python-can says is said again by us, with the remedy
+    logging.getLogger("can").addHandler(logging.NullHandler())
     logger = logging.getLogger("kontronik_can_gw")
     logger.addHandler(handler)
-    logger.setLevel(logging.DEBUG if verbose else logging.INFO)
-
-
-class _JournalFormatter(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        level = 3 if record.levelno >= logging.ERROR else 4 if record.levelno >= logging.WARNING else 6
-        return f"<{level}>{super().format(record)}"
-
-
-@contextmanager
-def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """SIGTERM and SIGINT call ``stop``, once more end the process at once."""
-
-    def handler(_number: int, _frame: object) -> None:
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
-        stop()
-
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, handler) for number in numbers]
+    logger.setLevel(logging.INFO)
     try:
         yield
     finally:
-        for number, old in zip(numbers, before, strict=True):
+        logger.removeHandler(handler)
+        handler.close()
+
+
+@contextmanager
+def stopping_on_signals(stop: Callable[[], None], reload: Callable[[], None] | None = None) -> Iterator[None]:
+    """SIGTERM and SIGINT call ``stop``, once more end the process at once. SIGHUP calls ``reload``; ``stop`` if the terminal has gone."""
+    has_terminal = _has_terminal()
+
+    def end(_number: int, _frame: object) -> None:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_DFL)
+        stop()
+
+    def hang_up(_number: int, _frame: object) -> None:
+        if reload is None or (has_terminal and not _has_terminal()):
+            stop()
+        else:
+            reload()
+
+    handlers = {signal.SIGTERM: end, signal.SIGINT: end}
+    if reload is not None:
+        handlers[signal.SIGHUP] = hang_up
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
             signal.signal(number, old)
+
+
+def _has_terminal() -> bool:
+    """True where the process has a controlling terminal that is still there."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC))
+    except OSError:
+        return False
+    return True
 
 
 def canopen_of(loaded: Loaded) -> CanopenSetup:

@@ -4,9 +4,16 @@ import argparse
 import logging
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cli.common import Loaded, load_all, set_up_log, stopping_on_signals
+from kontronik_can_gw.cli.common import Loaded, assemble, fingerprint, load_all, logging_to_stderr, stopping_on_signals
+from kontronik_can_gw.cli.node_setup import parameter_folder
+from kontronik_can_gw.config import Config, load
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.telemetry import SECOND
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.runtime.loop import Loop
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -24,7 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="log a line about telemetry, CAN, NMT states and PDO traffic every so many seconds (default: changes only)",
     )
-    parser.epilog = "Ends by SIGTERM or SIGINT within half a second. The serial ports are only read; nothing is ever transmitted to an ESC."
+    parser.epilog = (
+        "Ends by SIGTERM or SIGINT within half a second. SIGHUP reads the configuration again: a faulty one is refused and the old "
+        "one stays. The serial ports are only read; nothing is ever transmitted to an ESC."
+    )
 
 
 def _seconds(text: str) -> float:
@@ -38,25 +48,104 @@ def _seconds(text: str) -> float:
 
 
 def main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.gateway import Gateway
-    from kontronik_can_gw.runtime.loop import Loop
-    from kontronik_can_gw.runtime.store import ParameterStore
+    with logging_to_stderr():
+        _Run(args).main()
+    return 0
 
-    loaded = load_all(args.config, ParameterStore)
-    config = loaded.config
-    set_up_log()
-    silent = config.dbc.on_loss == "silent"
-    gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns(), silent, loaded.canopen)
-    wait = args.wait or config.run.wait_for_devices
-    status_ns = int((args.status or 0) * SECOND)
-    loop = Loop(gateway, [esc.port for esc in config.esc], config.can, wait, loaded.store, status_ns)
-    with stopping_on_signals(loop.stop):
+
+class _Run:
+    """The gateway, over as many configurations as it is given one after the other."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        from kontronik_can_gw.runtime.reload import Reloader
+        from kontronik_can_gw.runtime.store import ParameterStore
+        from kontronik_can_gw.runtime.systemd import Notifier
+
+        self._file: Path = args.config
+        self._wait: bool = args.wait
+        self._status_ns = int((args.status or 0) * SECOND)
+        self._notifier = Notifier()
+        self._loaded = load_all(args.config, ParameterStore)
+        self._print = fingerprint(self._loaded.config)
+        self._reloader = Reloader(self._read_again)
+        self._loop: Loop | None = None
+        self._stopping = False
+
+    def main(self) -> None:
+        """Until a signal ends it."""
+        with stopping_on_signals(self._stop, self._reload):
+            self._open(self._loaded, self._wait or self._loaded.config.run.wait_for_devices)
+            while True:
+                assert self._loop is not None
+                self._loop.run()
+                if self._stopping or not isinstance(self._reloader.new, Config):
+                    break
+                self._change(self._reloader.new)
+                self._reloader.new = None
+        self._reloader.close()
+
+    def _stop(self) -> None:
+        self._stopping = True
+        self._notifier.stopping()
+        if self._loop is not None:
+            self._loop.stop()
+
+    def _reload(self) -> None:
+        if self._loop is not None:
+            self._loop.reload()
+
+    def _read_again(self) -> Config | None:
+        """In the reloader's thread: the configuration, checked, if it is another one."""
+        found = load(self._file)
+        loaded = assemble(found)
+        if fingerprint(found) == self._print:
+            return None
+        for warning in (*loaded.layout.warnings, *loaded.warnings):
+            log.warning("%s", warning)
+        return found
+
+    def _change(self, config: Config) -> None:
+        """Begin anew with another configuration; with the old one where it cannot be opened for a reason that waiting does not mend."""
+        old = self._loaded
+        try:
+            self._open(self._assembled(config), wait=True)
+        except UserError as error:
+            for problem in error.problems:
+                log.error("%s", problem)
+            log.error("the new configuration cannot be used: going on with the old one")
+            self._open(self._assembled(old.config), wait=True)
+
+    def _assembled(self, config: Config) -> Loaded:
+        from kontronik_can_gw.runtime.store import ParameterStore
+
+        return assemble(config, ParameterStore(parameter_folder(config)) if config.canopen.enabled else None)
+
+    def _open(self, loaded: Loaded, wait: bool) -> None:
+        from kontronik_can_gw.gateway import Gateway
+        from kontronik_can_gw.runtime.loop import Loop
+
+        config = loaded.config
+        silent = config.dbc.on_loss == "silent"
+        gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns(), silent, loaded.canopen)
+        if self._loop is not None:
+            gateway.take_over(self._loop.gateway)
+        loop = Loop(
+            gateway,
+            [esc.port for esc in config.esc],
+            config.can,
+            wait,
+            loaded.store,
+            self._status_ns,
+            notifier=self._notifier,
+            reloader=self._reloader,
+        )
         _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
         loop.open()
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
-        loop.run()
-    return 0
+        self._loaded, self._print, self._loop = loaded, fingerprint(config), loop
+        if self._stopping:  # a signal came while there was no loop
+            loop.stop()
 
 
 def _say_parameters(loaded: Loaded) -> None:

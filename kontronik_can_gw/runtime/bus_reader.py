@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import EXTENDED, CanFrame
 
 if TYPE_CHECKING:
     import can
@@ -75,7 +75,8 @@ class BusReader:
                 if len(self._frames) >= QUEUE_LENGTH:
                     self.dropped += 1
                 else:
-                    self._frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
+                    data, extended = bytes(message.data), message.is_extended_id
+                    self._frames.append(CanFrame(message.arbitration_id, data, extended, message.is_fd))
                     self._wake()
         except Exception as error:  # what a driver lets out when its adapter has gone: CanError, OSError, TypeError ...
             if not self._stopping:
@@ -84,12 +85,10 @@ class BusReader:
                 self._wake()
 
     def _wanted(self, message: "can.Message") -> bool:
-        """An 11-bit data frame of classic CAN with one of our ids, not sent by ourselves."""
+        """A data frame with one of our ids, not sent by ourselves."""
         return (
-            message.arbitration_id in self.ids
-            and not message.is_extended_id
+            message.arbitration_id | (EXTENDED if message.is_extended_id else 0) in self.ids
             and not message.is_remote_frame
             and not message.is_error_frame
-            and not message.is_fd
             and message.is_rx
         )

@@ -1,12 +1,14 @@
 """The CAN interface: any of python-can's; SocketCAN without waiting, by its own socket.
 
 ``send`` never blocks on SocketCAN and never raises: it says what became of the frame. ``receive`` never blocks and never raises. Data
-frames come only with ids that were asked for, so that foreign traffic does not wake the process.
+frames come only with ids that were asked for, so that foreign traffic does not wake the process. Ids here are as SocketCAN has them:
+bit 31 marks a 29-bit one.
 """
 
 import contextlib
 import difflib
 import errno
+import select
 import socket
 import struct
 from collections.abc import Collection
@@ -16,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
 from kontronik_can_gw.sources import CanState
@@ -29,14 +31,15 @@ RECEIVE_LIMIT = 64
 _DISCARD_LIMIT = 4096
 _RECEIVE_BUFFER = 1 << 20
 """Bytes asked for; the kernel grants what net.core.rmem_max allows, by default twice the usual 278 frames."""
+_SEND_BUFFER = 1
+"""Bytes asked for; the kernel gives its least, about six frames: what waits in there cannot be overtaken by newer values."""
 
 _CLASSIC = struct.Struct("=IB3x8s")
 _FD = struct.Struct("=IBB2x64s")
 _FD_BRS = 0x01
-_EXTENDED = 0x80000000
 _REMOTE = 0x40000000
 _ERROR_FLAG = 0x20000000
-_STANDARD_ID = 0x7FF
+_STANDARD_ID, _EXTENDED_ID = 0x7FF, 0x1FFFFFFF
 _FILTER = struct.Struct("=II")
 _MOST_FILTERS = 512
 """CAN_RAW_FILTER_MAX: the kernel takes no more for one socket."""
@@ -51,12 +54,14 @@ class Sent(Enum):
 
     OK = 1
     BUSY = 2
-    DOWN = 3
-    GONE = 4
+    FULL = 3
+    """Not now: our own share of the queue is full. The port becomes writable when it is not."""
+    DOWN = 4
+    GONE = 5
 
 
 class CanPort:
-    """An open interface. RunError with one clear line where it cannot be opened."""
+    """An open interface that is up. RunError with one clear line where it cannot be opened, or is down."""
 
     def __init__(self, config: CanConfig) -> None:
         self.config = config
@@ -78,6 +83,7 @@ class CanPort:
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 0)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
             self._socket.setblocking(False)
 
     def fileno(self) -> int | None:
@@ -96,13 +102,24 @@ class CanPort:
         """True when reception found that the interface was removed or its driver failed: close it and open it anew."""
         return self._removed or (self._reader is not None and self._reader.failed)
 
+    @property
+    def waits_to_be_read(self) -> bool:
+        """True while ``receive`` would find something."""
+        fd = self.fileno()
+        return fd is not None and _is_readable(fd)
+
+    def note_state(self, state: CanState) -> None:
+        """What else is known of the controller (rtnetlink)."""
+        self.bus_off_count += state is CanState.BUS_OFF and self.state is not CanState.BUS_OFF
+        self.state = state
+
     def set_receive_ids(self, ids: Collection[int]) -> None:
-        """From now on receive classic data frames with these 11-bit ids and no others. ValueError for a greater id.
+        """From now on receive data frames with these ids and no others. ValueError for what is no id.
 
         On SocketCAN by the kernel's filters; elsewhere by python-can's, with a thread that reads as soon as there is an id.
         """
-        if any(not 0 <= can_id <= _STANDARD_ID for can_id in ids):
-            raise ValueError(f"no 11-bit identifiers: {sorted(ids)}")
+        if any(not 0 <= can_id <= _STANDARD_ID and not EXTENDED <= can_id <= EXTENDED | _EXTENDED_ID for can_id in ids):
+            raise ValueError(f"no identifiers: {sorted(ids)}")
         self._ids = frozenset(ids)
         if self._socket is not None:
             packed = b"".join(_FILTER.pack(*each) for each in _kernel_filters(self._ids))
@@ -164,14 +181,17 @@ class CanPort:
                     self.state = CanState.DOWN
                     self._removed = self._removed or error.errno == errno.ENODEV
                 break
-            # a CAN FD frame is longer: no node of CiA 301 takes one (CANopen FD uses the same ids with other content)
-            if len(data) != _CLASSIC.size:
-                continue
-            can_id, size, content = _CLASSIC.unpack(data)
+            is_fd = len(data) != _CLASSIC.size
+            if is_fd:
+                if len(data) != _FD.size:
+                    continue
+                can_id, size, _, content = _FD.unpack(data)
+            else:
+                can_id, size, content = _CLASSIC.unpack(data)
             if can_id & _ERROR_FLAG:
                 self._follow(can_id, content[1])
-            elif can_id in self._ids:  # with a flag set, of a 29-bit or remote frame, it is none of ours
-                frames.append(CanFrame(can_id, content[:size]))
+            elif can_id in self._ids:  # with another flag set, of a remote frame, it is none of ours
+                frames.append(CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd))
         else:
             self._note_drops()  # there was more than we take at once: perhaps more than the kernel holds
         return frames
@@ -194,7 +214,12 @@ class CanPort:
 
     def _filter_bus(self) -> None:
         """Ask python-can's driver for our ids; one that cannot filter is left to the thread."""
-        filters = [{"can_id": each, "can_mask": _STANDARD_ID, "extended": False} for each in sorted(self._ids)]
+        filters = [
+            {"can_id": each & ~EXTENDED, "can_mask": _EXTENDED_ID, "extended": True}
+            if each & EXTENDED
+            else {"can_id": each, "can_mask": _STANDARD_ID, "extended": False}
+            for each in sorted(self._ids)
+        ]
         for wanted in (filters, None):
             with contextlib.suppress(Exception):  # each driver fails in its own way
                 self._bus.set_filters(wanted)  # type: ignore[arg-type]
@@ -221,7 +246,7 @@ class CanPort:
             return Sent.GONE
         if self._socket is None:
             return self._send_message(frame)
-        can_id = frame.can_id | (_EXTENDED if frame.extended else 0) | (_REMOTE if frame.remote else 0)
+        can_id = frame.can_id | (EXTENDED if frame.extended else 0) | (_REMOTE if frame.remote else 0)
         size = len(frame.data)
         if frame.fd:
             packet = _FD.pack(can_id, size, _FD_BRS, frame.data)
@@ -230,7 +255,9 @@ class CanPort:
         try:
             self._socket.send(packet)
         except OSError as error:
-            if error.errno in (errno.ENOBUFS, errno.EAGAIN, errno.ENOMEM):
+            if error.errno == errno.EAGAIN:
+                return Sent.FULL
+            if error.errno in (errno.ENOBUFS, errno.ENOMEM):
                 return Sent.BUSY
             return Sent.GONE if error.errno in (errno.ENXIO, errno.ENODEV, errno.EBADF) else Sent.DOWN
         return Sent.OK
@@ -256,15 +283,16 @@ class CanPort:
 
 
 def _kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:
-    """(id, mask) pairs that let these 11-bit data frames through; with too many ids blocks of 2, 4 ... of which one is wanted.
+    """(id, mask) pairs that let these data frames through; with too many ids blocks of 2, 4 ... of which one is wanted.
 
-    The flags are part of the mask, so that 29-bit and remote frames with the same number stay out.
+    The flags are part of the mask, so that remote frames, and those of the other length, with the same number stay out.
     """
     step = 1
     while len({can_id // step for can_id in ids}) > _MOST_FILTERS:
         step *= 2
-    mask = _EXTENDED | _REMOTE | _STANDARD_ID & ~(step - 1)
-    return [(block * step, mask) for block in sorted({can_id // step for can_id in ids})]
+    blocks = sorted({can_id // step * step for can_id in ids})
+    flags, low = EXTENDED | _REMOTE, step - 1
+    return [(first, flags | (_EXTENDED_ID if first & EXTENDED else _STANDARD_ID) & ~low) for first in blocks]
 
 
 def check_interface(config: CanConfig) -> None:
@@ -277,11 +305,27 @@ def check_interface(config: CanConfig) -> None:
         raise UserError(f"can.interface: {config.interface!r} is no interface of python-can.{hint}")
 
 
+def is_up(name: str) -> bool | None:
+    """Whether a network interface is up; None where there is none, or no way to know."""
+    try:
+        return bool(int(Path("/sys/class/net", name, "flags").read_text(), 16) & 1)
+    except (OSError, ValueError):
+        return None
+
+
+def _is_readable(fd: int) -> bool:
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
+    return bool(poll.poll(0))
+
+
 def _open(config: CanConfig) -> "can.BusABC":
     with without_asammdf():
         import can
 
     check_interface(config)
+    if config.interface == "socketcan" and is_up(config.channel) is False:
+        raise _socketcan_error(config, OSError(errno.ENETDOWN, ""))
     options: dict[str, Any] = {}
     mtu = Path("/sys/class/net", config.channel, "mtu")
     if config.interface == "socketcan" and config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:

@@ -11,7 +11,9 @@ import grp
 import os
 import struct
 import termios
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import serial
 
@@ -22,12 +24,22 @@ READ_SIZE = 4096
 
 _TIOCGICOUNT = 0x545D
 _COUNTS = struct.Struct("=20i")
-_FRAME_ERRORS, _PARITY_ERRORS, _BUFFER_OVERRUNS = 6, 8, 10
-"""In struct serial_icounter_struct; 7 are overruns."""
+_WAITING = struct.Struct("=i")
+_LINE_ERRORS = {"framing": 6, "overrun": 7, "parity": 8, "break": 9, "buffer_overrun": 10}
+"""Places in struct serial_icounter_struct (linux/serial.h)."""
 
 
 class PortLost(Exception):
     """The port was unplugged or hung up."""
+
+
+class Identity(NamedTuple):
+    """What tells a USB adapter from others, whatever its number is: vendor, product, serial number, or place where it has none."""
+
+    vendor: int
+    product: int
+    serial: str
+    place: str
 
 
 class SerialPort:
@@ -45,6 +57,7 @@ class SerialPort:
         finally:
             os.close(quiet)
         self._fd = self._serial.fileno()
+        self._real_path = os.path.realpath(path)
         if not is_pty:
             with contextlib.suppress(OSError):
                 fcntl.ioctl(self._fd, termios.TIOCEXCL)
@@ -66,13 +79,25 @@ class SerialPort:
             raise PortLost("hung up")
         return data
 
-    def line_errors(self) -> int:
-        """Parity, framing and overrun errors that the driver has counted; 0 where it counts none (pseudo terminals, some adapters)."""
+    def line_errors(self) -> dict[str, int]:
+        """What the driver has counted so far, by kind; empty where it counts nothing (pseudo terminals, some adapters)."""
         try:
             counts = _COUNTS.unpack(fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_COUNTS.size)))
         except OSError:
-            return 0
-        return int(sum(counts[_FRAME_ERRORS : _PARITY_ERRORS + 1]) + counts[_BUFFER_OVERRUNS])
+            return {}
+        return {kind: counts[place] for kind, place in _LINE_ERRORS.items()}
+
+    @property
+    def waits_to_be_read(self) -> bool:
+        """True while ``read`` would find bytes."""
+        try:
+            return bool(_WAITING.unpack(fcntl.ioctl(self._fd, termios.FIONREAD, bytes(_WAITING.size)))[0])
+        except OSError:
+            return False
+
+    def identity(self) -> Identity | None:
+        """Of the USB adapter behind the port; None for another kind of port."""
+        return next((found for device, found in _adapters() if device == self._real_path), None)
 
     def discard(self) -> None:
         """Throw away what waits to be read."""
@@ -82,6 +107,25 @@ class SerialPort:
     def close(self) -> None:
         with contextlib.suppress(OSError, termios.error):
             self._serial.close()
+
+
+def find_adapter(identity: Identity) -> str | None:
+    """The path of the adapter now, as /dev/ttyUSB1; None while it is not plugged in, or if two are alike."""
+    found = [device for device, other in _adapters() if other == identity]
+    return found[0] if len(found) == 1 else None
+
+
+def _adapters() -> Iterator[tuple[str, Identity]]:
+    """USB adapters that are plugged in: path and identity."""
+    from serial.tools.list_ports_linux import comports
+
+    with contextlib.suppress(OSError, ValueError):  # one is being unplugged
+        for port in comports():
+            if port.vid is not None and port.pid is not None:
+                # an adapter with several ports has one serial number for all
+                interface = (port.location or "").partition(":")[2]
+                place = interface if port.serial_number else port.location or ""
+                yield port.device, Identity(port.vid, port.pid, port.serial_number or "", place)
 
 
 def _in_use(path: str, users: str) -> RunError:

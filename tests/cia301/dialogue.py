@@ -119,6 +119,12 @@ class Bench:
         assert self.gateway.nodes is not None
         return self.gateway.nodes.nodes
 
+    @property
+    def listened_to(self) -> frozenset[int]:
+        """COB-IDs that the nodes take."""
+        assert self.gateway.nodes is not None
+        return self.gateway.nodes.receive_ids
+
     # --- step by step
 
     def pass_time(self, until: int) -> None:

@@ -1,8 +1,9 @@
 """Emergencies: every bit of the ESC's error word, the gateway's own findings, 1001h, 1003h, 1014h, 1015h, 1029h:2, 2100h:6."""
 
 import pytest
-from dialogue import MS, QUIET, Bench, default, info, live, play
+from dialogue import MS, NO_PDOS, QUIET, Bench, default, info, live, play
 
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.protocol.states import Device
 
 NOTHING = "081 00 00 00 FF 00 00 00 00"
@@ -423,9 +424,10 @@ def test_can_passive_and_bus_off() -> None:
         30 -> {NOTHING}
         40 do bench.can_state("BUS_OFF")
         50 do bench.can_state("ERROR_ACTIVE")
+        50 -> 701 00
         50 -> 081 40 81 11 FF 00 00 00 00
         50 -> {NOTHING}
-        51 read 1 1003:00 = 02
+        51 read 1 1003:00 = 01
     """)
 
 
@@ -434,11 +436,72 @@ def test_bus_off_left_by_way_of_a_restart_of_the_interface() -> None:
         10 do bench.can_state("BUS_OFF")
         20 do bench.can_state("DOWN")
         30 do bench.can_state("ERROR_ACTIVE")
+        30 -> 701 00
         30 -> 081 40 81 11 FF 00 00 00 00
         30 -> {NOTHING}
         40 do bench.can_state("DOWN")
         50 do bench.can_state("ERROR_ACTIVE")
+        50 -> 701 00
     """)
+
+
+@pytest.mark.parametrize(("behaviour", "after"), [(1, "05"), (2, "04")])
+def test_with_another_behaviour_a_node_says_its_state_at_once_behind_an_outage_and_does_not_boot(
+    behaviour: int, after: str
+) -> None:
+    told = f"1030 -> 081 40 81 11 FF 00 00 00 00\n        1030 -> {NOTHING}\n" if behaviour == 1 else ""
+    play(
+        f"""
+        10 <- 000 01 01
+        1000 -> 701 05
+        1010 do bench.can_state("BUS_OFF")
+        1030 do bench.can_state("ERROR_ACTIVE")
+        {told}        1030 -> 701 {after}
+    """,
+        Bench(changes={**default(0x1029, 1, behaviour), **NO_PDOS}),
+    )
+
+
+def test_a_self_starting_node_is_operational_again_behind_bus_off() -> None:
+    bench = Bench(changes={**QUIET, **default(0x1F80, 0, 0)}).start()
+    bench.can_state("BUS_OFF")
+    assert bench.nodes[0].state == 127
+    bench.can_state("ERROR_ACTIVE")
+    assert bench.nodes[0].state == 5
+
+
+def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_it_has_ceased() -> None:
+    bench = Bench(changes=QUIET)
+    bench.take()
+    for n in range(300):
+        bench.wait(20)
+        bench.gateway.receive_frame(CanFrame((0x701, 0x081, 0x581)[n % 3], bytes(8)), bench.now)
+        bench._collect()
+    assert [frame.data[:4] for frame in bench.take()] == [b"\x50\x81\x11\xff"]
+    assert bench.gateway.status.id_conflicts == 300
+    begun = bench.gateway.take_conflicts()
+    assert [(c.can_id, c.over) for c in begun] == [(0x701, False), (0x081, False), (0x581, False)]
+    assert begun[0].whose == "the heartbeat of CANopen node 1"
+    bench.wait(12_000)
+    assert [frame.data for frame in bench.take()] == [bytes((0, 0, 0, 0xFF, 0, 0, 0, 0))]
+    assert [(c.can_id, c.count, c.over) for c in bench.gateway.take_conflicts()] == [
+        (can_id, 100, True) for can_id in (0x701, 0x081, 0x581)
+    ]
+
+
+def test_what_only_looks_like_an_id_of_the_node_is_no_collision() -> None:
+    bench = Bench(changes=QUIET)
+    bench.take()
+    for frame in (
+        CanFrame(0x701, b"", remote=True),
+        CanFrame(0x701, b"", extended=True),
+        CanFrame(0x601, bytes(8)),
+        CanFrame(0x080, b""),
+        CanFrame(0x7E4, bytes(8)),
+    ):
+        bench.gateway.receive_frame(frame, bench.now)
+    assert bench.gateway.status.id_conflicts == 0
+    assert bench.gateway.take_conflicts() == []
 
 
 @pytest.mark.parametrize(("behaviour", "after"), [(0, 127), (1, 5), (2, 4)])

@@ -241,7 +241,7 @@ def test_a_stored_watch_survives_a_reset_and_is_of_this_node_only() -> None:
 
 
 def test_other_peoples_heartbeats_are_not_listened_to() -> None:
-    assert Bench(changes=NO_HEARTBEAT).gateway.receive_ids == {0, 0x80, 0x601, 0x7E5}
+    assert Bench(changes=NO_HEARTBEAT).listened_to == {0, 0x80, 0x601, 0x7E5}
 
 
 def test_a_node_may_watch_another_of_the_same_gateway() -> None:

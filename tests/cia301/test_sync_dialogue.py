@@ -50,7 +50,7 @@ def test_the_cob_id_of_1005h_is_listened_to_at_once() -> None:
         4 -> 701 00
         5 read 1 1005:00 = 80 00 00 00
     """)
-    assert bench.gateway.receive_ids == {0, 0x80, 0x601, 0x7E5}
+    assert bench.listened_to == {0, 0x80, 0x601, 0x7E5}
 
 
 @pytest.mark.parametrize(
@@ -266,4 +266,4 @@ def test_without_1005h_there_is_no_sync() -> None:
     without = type(eds)(
         eds.data, eds.name, tuple(e for e in eds.entries if e.index != 0x1005), eds.object_names, eds.device
     )
-    assert Bench(eds=without).gateway.receive_ids == {0, 0x601, 0x7E5}
+    assert Bench(eds=without).listened_to == {0, 0x601, 0x7E5}

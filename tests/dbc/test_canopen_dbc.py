@@ -294,6 +294,7 @@ def test_enumerations_name_every_value_that_can_be_sent() -> None:
             "CanPassive",
             "HeartbeatLost",
             "BusOffLeft",
+            "IdCollision",
             "SyncLength",
             "ParameterFile",
         )

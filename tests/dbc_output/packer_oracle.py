@@ -287,6 +287,7 @@ KNOWN: dict[str, Known] = {
     "received_frames": Known("", _of_gateway(lambda g, _: g.received_frames), rolls=True, gateway=True),
     "bus_off_count": Known("", _of_gateway(lambda g, _: g.bus_off_count), rolls=True, gateway=True),
     "dropped_frames": Known("", _of_gateway(lambda g, _: g.dropped_frames), rolls=True, gateway=True),
+    "id_conflicts": Known("", _of_gateway(lambda g, _: g.id_conflicts), rolls=True, gateway=True),
 }
 
 # unit -> other unit -> (text, factor, shift): value in other = value * factor + shift
@@ -745,4 +746,5 @@ def random_gateway(rng: random.Random, now: int) -> GatewayStatus:
         received_frames=rng.randrange(100000),
         bus_off_count=rng.randrange(100000),
         dropped_frames=rng.randrange(100000),
+        id_conflicts=rng.randrange(100000),
     )

@@ -19,6 +19,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.protocol import codec
 from kontronik_can_gw.protocol.fields import InfoData, LiveData
+from kontronik_can_gw.runtime import can_side
 from kontronik_can_gw.runtime.can_port import Sent
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.mailboxes import Mailboxes
@@ -263,7 +264,7 @@ class StoppedBusBase:
         return None
 
     def set_receive_ids(self, ids: Collection[int]) -> None:
-        assert not ids
+        """Nothing comes from it."""
 
     def discard(self) -> None:
         pass
@@ -391,12 +392,13 @@ def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(tmp_path: Path) -> None
         )
         loop.open()
         bus = ScriptedBus(clock)
-        loop._can = bus  # type: ignore[assignment]
+        loop.can._close_port()
+        loop.can.port = bus  # type: ignore[assignment]
         for n in range(500):
             clock[0] += 10 * MS
             for can_id in range(10):
-                loop._mailboxes.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
-            loop._transmit(clock[0])
+                loop.can.mailboxes.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
+            loop.can.transmit(clock[0])
         assert not bus.closed
         assert len(bus.sent) > 500
         loop.close()
@@ -436,7 +438,8 @@ def test_a_suspension_at_any_place_of_the_loop_makes_what_waits_old(tmp_path: Pa
         loop = Loop(gateway, [esc.path], CanConfig(interface="virtual", channel="suspended"), clock=now)
         loop.open()
         bus = StoppedBus(loop, esc, clock)
-        loop._can = bus  # type: ignore[assignment]
+        loop.can._close_port()
+        loop.can.port = bus  # type: ignore[assignment]
         loop.run()
     speeds = [int.from_bytes(frame.data[:4], "little") for frame in bus.sent]
     assert bus.stopped
@@ -464,7 +467,7 @@ def test_closed_standard_streams_never_lend_their_number_to_a_port(tmp_path: Pat
 
 
 class DownBus(StoppedBusBase):
-    """Down from 200 ms to 1 s."""
+    """Down from 200 ms to 1 s; opened and closed like an interface."""
 
     def __init__(self, clock: list[int]) -> None:
         self.clock = clock
@@ -477,7 +480,9 @@ class DownBus(StoppedBusBase):
         return Sent.OK
 
 
-def test_a_loss_during_an_outage_is_told_behind_it_though_nothing_else_is_sent(tmp_path: Path) -> None:
+def test_a_loss_during_an_outage_is_told_behind_it_though_nothing_else_is_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     message = 'BO_ 256 M: 8 Gw\n SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
     clock = [0]
     gateway = gateway_of(tmp_path, HEAD + message + TAIL)
@@ -485,7 +490,15 @@ def test_a_loss_during_an_outage_is_told_behind_it_though_nothing_else_is_sent(t
         loop = Loop(gateway, [esc.path], CanConfig(interface="virtual", channel="down"), clock=lambda: clock[0])
         loop.open()
         bus = DownBus(clock)
-        loop._can = bus  # type: ignore[assignment]
+
+        def open_bus(_config: CanConfig) -> DownBus:
+            if bus.send(CanFrame(0x7FF, b"")) is Sent.DOWN:
+                raise RunError("is down")
+            return bus
+
+        monkeypatch.setattr(can_side, "CanPort", open_bus)
+        loop.can._close_port()
+        loop.can.port = bus  # type: ignore[assignment]
         gateway.start(0)
         while clock[0] < 3 * SECOND:
             clock[0] += 10 * MS
@@ -493,7 +506,7 @@ def test_a_loss_during_an_outage_is_told_behind_it_though_nothing_else_is_sent(t
                 gateway.receive_bytes(0, frame_of(LiveData(electrical_speed=5000)), clock[0])
             loop._reopen(clock[0])
             gateway.advance(clock[0])
-            loop._transmit(clock[0])
+            loop.can.transmit(clock[0])
         loop.close()
     assert bus.sent[-1].data[:4] == b"\xff\xff\xff\xff"
-    assert loop._can_complaint == ""
+    assert loop.can.complaint == ""

@@ -18,6 +18,7 @@ class Port:
     """A SocketCAN port whose bus can be stopped."""
 
     tells_busy_from_gone = True
+    bus_off_count = 0
     state = CanState.ERROR_ACTIVE
     stopped = False
 
@@ -42,32 +43,32 @@ def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(caplog: pyt
     loaded = assemble(parse(tables, "test"))
     gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
     loop = Loop(gateway, ["p"], loaded.config.can)
-    port = loop._can = Port()  # type: ignore[assignment]
+    port = loop.can.port = Port()  # type: ignore[assignment]
     assert isinstance(port, Port)
     live = bytes.fromhex("4B4F444C 00000000 8A09" + "0000" * 5 + "581F E903 00 00 1D 20 00000200 0C 00 39234C14")
     try:
         with caplog.at_level(logging.INFO, "kontronik_can_gw"):
             gateway.start(0)
             gateway.receive_bytes(0, live, MS)
-            loop._transmit(MS)
+            loop.can.transmit(MS)
             assert CanFrame(0x701, b"\0", queued=True) in port.sent
             port.stopped = True
             for now in range(2 * MS, 60 * SECOND, 5 * MS):
                 gateway.advance(now)
-                loop._transmit(now)
-            assert len(loop._mailboxes) < 50
+                loop.can.transmit(now)
+            assert len(loop.can.mailboxes) < 50
             assert gateway.status.dropped_frames > 40
             port.stopped = False
             port.sent.clear()
             for now in range(60 * SECOND, 60 * SECOND + 50 * MS, 5 * MS):
                 gateway.advance(now)
-                loop._transmit(now)
+                loop.can.transmit(now)
     finally:
-        loop._can = None
+        loop.can.port = None
         loop.close()
     assert [frame.data for frame in port.sent if frame.can_id == 0x701] in ([], [b"\x7f"])
     emergencies = [frame.data[:2] for frame in port.sent if frame.can_id == 0x081]
     assert emergencies == [b"\x10\x75"]  # telemetry lost: told while nothing went, and told again
     said = [record.message for record in caplog.records if "no frame can be sent" in record.message]
     assert said == ["CAN can0: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."]
-    assert "CAN can0: frames are sent again" in caplog.messages
+    assert "CAN can0: frames are sent again, after 59.0 s" in caplog.messages

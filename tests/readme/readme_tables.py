@@ -26,6 +26,7 @@ _FOUND_BY_GATEWAY = {
     GatewayError.CAN_PASSIVE: "CAN controller error passive",
     GatewayError.HEARTBEAT_LOST: "a watched heartbeat stayed away; byte 4: the node-ID",
     GatewayError.BUS_OFF_LEFT: "back from bus-off",
+    GatewayError.ID_COLLISION: "somebody else sends with an id of this node: two nodes with one node-ID?",
     GatewayError.SYNC_LENGTH: "SYNC of a wrong length",
     GatewayError.PARAMETER_FILE: "the parameter file could not be read: defaults",
 }

@@ -23,9 +23,10 @@ from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.pty import PtyEsc
-from kontronik_can_gw.runtime import can_port
+from kontronik_can_gw.runtime import can_port, can_side
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, Sent
+from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
@@ -127,25 +128,47 @@ def test_any_set_of_ids_fits_into_the_kernels_filters(ids: set[int]) -> None:
     assert all(mask & (EXTENDED | REMOTE) == EXTENDED | REMOTE for _, mask in filters)
 
 
-@pytest.mark.parametrize("wrong", [-1, 0x800, 0x601 | EXTENDED])
-def test_an_id_of_more_than_11_bits_is_refused(socket_port: tuple[CanPort, FakeSocket], wrong: int) -> None:
-    with pytest.raises(ValueError, match="no 11-bit"):
+@settings(max_examples=50, deadline=None)
+@given(st.sets(st.integers(0, 0x1FFFFFFF), max_size=600), st.sets(st.integers(0, 0x7FF), max_size=300))
+def test_ids_of_both_lengths_fit_too_and_are_not_mixed_up(long_ids: set[int], short_ids: set[int]) -> None:
+    ids = frozenset({each | EXTENDED for each in long_ids} | short_ids)
+    filters = can_port._kernel_filters(ids)
+    assert len(filters) <= 512
+    for each in ids:
+        assert any(each & mask == wanted & mask for wanted, mask in filters)
+    if len(ids) <= 512:
+        for each in ids:
+            other = each ^ EXTENDED
+            if EXTENDED > other > 0x7FF:
+                continue
+            assert other in ids or not any(other & mask == wanted & mask for wanted, mask in filters)
+
+
+@pytest.mark.parametrize("wrong", [-1, 0x800, EXTENDED - 1, EXTENDED | 0x2000_0000, 1 << 32])
+def test_what_is_no_id_is_refused(socket_port: tuple[CanPort, FakeSocket], wrong: int) -> None:
+    with pytest.raises(ValueError, match="no identifiers"):
         socket_port[0].set_receive_ids([0x601, wrong])
 
 
-def test_only_classic_data_frames_with_the_wanted_ids_are_handed_on(socket_port: tuple[CanPort, FakeSocket]) -> None:
+def test_only_data_frames_with_the_wanted_ids_are_handed_on(socket_port: tuple[CanPort, FakeSocket]) -> None:
     port, fake = socket_port
-    port.set_receive_ids({0x601, 0})
+    port.set_receive_ids({0x601, 0, 0x602 | EXTENDED})
     fake.inbox = [
         packet(0x601, b"abc"),
         packet(0x602, b"waited when the filter changed"[:8]),
         packet(0x601 | EXTENDED, b"x"),
         packet(0x601 | REMOTE),
-        struct.pack("=IBB2x64s", 0x601, 8, 1, b"CAN FD"),
+        packet(0x602 | EXTENDED, b"y"),
+        struct.pack("=IBB2x64s", 0x601, 6, 1, b"CAN FD"),
         packet(ERROR | 0x40, bytes(8)),
         packet(0x000, bytes(2)),
     ]
-    assert port.receive() == [CanFrame(0x601, b"abc"), CanFrame(0x000, bytes(2))]
+    assert port.receive() == [
+        CanFrame(0x601, b"abc"),
+        CanFrame(0x602, b"y", extended=True),
+        CanFrame(0x601, b"CAN FD", fd=True),
+        CanFrame(0x000, bytes(2)),
+    ]
     assert port.receive() == []
     assert port.state is CanState.BUS_OFF
 
@@ -269,7 +292,6 @@ def test_one_thread_brings_the_wanted_frames_in_order() -> None:
             other.send(message(0x123, b"foreign"))
             other.send(message(0x601, is_extended_id=True))
             other.send(message(0x601, is_remote_frame=True))
-            other.send(message(0x601, is_fd=True))
             other.send(message(0x601, is_error_frame=True))
             other.send(message(0x601 + n % 2, bytes((n,))))
         assert receive(port, 100) == [CanFrame(0x601 + n % 2, bytes((n,))) for n in range(100)]
@@ -483,7 +505,7 @@ def test_the_loop_answers_requests_and_follows_ids_that_change() -> None:
         assert node.status.received_frames == 20
         node.ids = frozenset({0x602})
         os.write(loop._wake_write, b"\0")
-        port = loop._can
+        port = loop.can.port
         assert port is not None
         wait_for(lambda: port._ids == node.ids, "the new ids")
         other.send(message(0x601))
@@ -497,14 +519,14 @@ def test_the_loop_answers_requests_and_follows_ids_that_change() -> None:
 def test_the_loop_opens_an_adapter_anew_when_its_reader_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     node, channel = Node(0x601), f"anew-{os.getpid()}"
     with can.Bus(interface="virtual", channel=channel) as other, running(node, channel) as loop:
-        first = loop._can
+        first = loop.can.port
         assert first is not None
 
         def failing(timeout: float | None) -> None:
             raise can.CanOperationError("unplugged")
 
         monkeypatch.setattr(first._bus, "recv", failing)
-        wait_for(lambda: loop._can not in (None, first), "another port")
+        wait_for(lambda: loop.can.port not in (None, first), "another port")
         other.send(message(0x601, b"x"))
         answer = other.recv(5)
         assert answer is not None
@@ -536,6 +558,10 @@ class ScriptedPort:
         frames, self.inbox = self.inbox[:RECEIVE_LIMIT], self.inbox[RECEIVE_LIMIT:]
         return frames
 
+    def note_state(self, state: CanState) -> None:
+        self.bus_off_count += state is CanState.BUS_OFF
+        self.state = state
+
     def discard(self) -> None:
         self.discarded += len(self.inbox)
         self.inbox = []
@@ -557,8 +583,8 @@ def scripted() -> Iterator[tuple[Loop, Node, ScriptedPort]]:
     with PtyEsc() as esc:
         loop = Loop(node, [esc.path], CanConfig("virtual", f"scripted-{os.getpid()}"), clock=lambda: 0)
         loop.open()
-        loop._close_can()
-        loop._can = port  # type: ignore[assignment]
+        loop.can._close_port()
+        loop.can.port = port  # type: ignore[assignment]
         yield loop, node, port
         loop.close()
 
@@ -567,7 +593,7 @@ def test_bus_off_and_lost_frames_are_told_once(scripted: tuple[Loop, Node, Scrip
     loop, node, port = scripted
     port.bus_off_count, port.overruns, port.state = 2, 1, CanState.BUS_OFF
     for now in (MS, 2 * MS):
-        loop._receive(port, now)  # type: ignore[arg-type]
+        loop.can.serve(now)
     assert (node.status.bus_off_count, node.overruns, node.status.can_state) == (2, 1, CanState.BUS_OFF)
 
 
@@ -578,42 +604,74 @@ def test_answers_that_an_interface_that_is_down_does_not_take_are_dropped_and_co
     port.answer = Sent.DOWN
     for n in range(3):
         node.waiting.append(CanFrame(0x581, bytes((n,)), queued=True))
-    loop._transmit(MS)
+    loop.can.transmit(MS)
     assert (node.status.dropped_frames, node.status.can_state) == (3, CanState.DOWN)
     node.waiting.append(CanFrame(0x581, b"", queued=True))
-    loop._transmit(2 * MS)
+    loop.can.transmit(2 * MS)
     assert node.status.dropped_frames == 4
-    assert len(loop._mailboxes) == 0
+    assert len(loop.can.mailboxes) == 0
 
 
-def test_a_received_frame_ends_the_pause_after_an_outage(scripted: tuple[Loop, Node, ScriptedPort]) -> None:
+def test_what_the_kernel_tells_of_the_interface_ends_the_pause_after_an_outage(
+    scripted: tuple[Loop, Node, ScriptedPort], monkeypatch: pytest.MonkeyPatch
+) -> None:
     loop, node, port = scripted
     port.answer = Sent.DOWN
     node.waiting.append(CanFrame(0x581, b"", queued=True))
-    loop._transmit(0)
-    port.answer, port.state = Sent.OK, CanState.ERROR_ACTIVE
-    port.inbox = [CanFrame(0x601, b"x")]
-    loop._receive(port, MS)  # type: ignore[arg-type]
+    loop.can.transmit(0)
+    assert loop.can.port is None
+    back = ScriptedPort()
+    monkeypatch.setattr(can_side, "CanPort", lambda _config: back)
+    loop.can._follow(LinkFacts(exists=True, up=False), MS)
     loop._reopen(MS)
-    loop._transmit(MS)
-    assert port.sent == [CanFrame(0x581, b"x", queued=True)]
+    assert loop.can.port is None
+    loop.can._follow(LinkFacts(exists=True, up=True), 2 * MS)
+    loop._reopen(2 * MS)
+    node.waiting.append(CanFrame(0x581, b"x", queued=True))
+    loop.can.transmit(2 * MS)
+    assert back.sent == [CanFrame(0x581, b"x", queued=True)]
+
+
+def test_a_link_that_goes_down_or_away_is_an_outage_at_once(scripted: tuple[Loop, Node, ScriptedPort]) -> None:
+    loop, node, _port = scripted
+    loop.can._follow(LinkFacts(exists=True, up=True), 0)
+    assert loop.can.is_open
+    loop.can._follow(LinkFacts(exists=True, up=False), MS)
+    assert (loop.can.is_open, node.status.can_state) == (False, CanState.DOWN)
+    assert loop.can.complaint.endswith(": down. Trying again.")
+
+
+def test_in_bus_off_nothing_is_handed_to_the_controller_and_the_newest_goes_first_afterwards(
+    scripted: tuple[Loop, Node, ScriptedPort],
+) -> None:
+    loop, node, port = scripted
+    loop.can._follow(LinkFacts(exists=True, up=True, state=CanState.BUS_OFF, restart_ms=0), 0)
+    assert (node.status.can_state, node.status.bus_off_count) == (CanState.BUS_OFF, 1)
+    assert "restart-ms is 0" in loop.can.complaint
+    for n in range(5):
+        loop.can.mailboxes.put(CanFrame(0x100, bytes((n,))))
+        loop.can.transmit(n * MS)
+    assert port.sent == []
+    loop.can._follow(LinkFacts(exists=True, up=True, state=CanState.ERROR_ACTIVE, restart_ms=0), 9 * MS)
+    loop.can.mailboxes.put(CanFrame(0x100, b"new"))
+    loop.can.transmit(10 * MS)
+    assert [frame.data for frame in port.sent] == [b"new"]
+    assert (node.status.can_state, loop.can.complaint) == (CanState.ERROR_ACTIVE, "")
 
 
 def test_requests_from_before_a_suspension_are_thrown_away(scripted: tuple[Loop, Node, ScriptedPort]) -> None:
     loop, node, port = scripted
     port.inbox = [CanFrame(0x601, b"old")] * 200
-    loop._mailboxes.put(CanFrame(0x581, b"old", queued=True))
+    loop.can.mailboxes.put(CanFrame(0x581, b"old", queued=True))
     loop._discard_input(3 * SECOND, 4 * SECOND)
-    loop._receive(port, 4 * SECOND)  # type: ignore[arg-type]
+    loop.can.serve(4 * SECOND)
     assert (port.discarded, node.received) == (200, [])
     assert node.status.dropped_frames == 1
 
 
-def test_a_frame_of_a_port_that_was_closed_in_this_round_is_not_handed_on(
-    scripted: tuple[Loop, Node, ScriptedPort],
-) -> None:
-    loop, node, _port = scripted
-    closed = ScriptedPort()
-    closed.inbox = [CanFrame(0x601, b"")]
-    loop._receive(closed, MS)  # type: ignore[arg-type]
+def test_a_port_that_was_closed_in_this_round_is_not_served(scripted: tuple[Loop, Node, ScriptedPort]) -> None:
+    loop, node, port = scripted
+    port.inbox = [CanFrame(0x601, b"")]
+    loop.can._lost(Sent.GONE, 0)
+    loop.can.serve(MS)
     assert node.received == []

@@ -306,7 +306,7 @@ def test_a_node_hears_again_when_its_interface_was_down(vcan: str, run_node: Cal
     with Peer(vcan) as peer:
         for n in range(3):
             assert peer.ask(0x602, bytes((n,))) == (0x582, bytes((n,)))
-            port = running.loop._can
+            port = running.loop.can.port
             ip("link", "set", vcan, "down")
             wait_for(lambda: node.status.can_state is CanState.DOWN, 2, "down, though nothing was sent")
             node.waiting.append(CanFrame(0x582, b"lost", queued=True))
@@ -317,7 +317,7 @@ def test_a_node_hears_again_when_its_interface_was_down(vcan: str, run_node: Cal
                 peer.receive(0)
             assert peer.ask(0x602, b"again", 0.5) == (0x582, b"again")
             wait_for(lambda: node.status.can_state is CanState.ERROR_ACTIVE, 2, "error active")
-            assert running.loop._can is port
+            assert running.loop.can.port is port
 
 
 def test_a_node_hears_again_when_its_interface_was_removed(vcan: str, run_node: Callable[[Node], Running]) -> None:
@@ -326,13 +326,13 @@ def test_a_node_hears_again_when_its_interface_was_removed(vcan: str, run_node: 
     for n in range(2):
         with Peer(vcan) as peer:
             assert peer.ask(0x602, bytes((n,))) == (0x582, bytes((n,)))
-        port = running.loop._can
+        port = running.loop.can.port
         ip("link", "del", vcan)
-        wait_for(lambda port=port: running.loop._can is not port, 2, "gone, though nothing was sent")  # type: ignore[misc]
+        wait_for(lambda port=port: running.loop.can.port is not port, 2, "gone, though nothing was sent")  # type: ignore[misc]
         assert node.status.can_state is CanState.DOWN
         ip("link", "add", vcan, "type", "vcan")
         ip("link", "set", vcan, "up")
-        wait_for(lambda: running.loop._can is not None, 3, "open again")
+        wait_for(lambda: running.loop.can.port is not None, 3, "open again")
         with Peer(vcan) as peer:
             peer.send(0x603)
             assert peer.ask(0x602, b"again") == (0x582, b"again")

@@ -1,0 +1,395 @@
+"""The CAN interface as the loop has it: opened, lost, found again; what waits to be sent; what the kernel tells of it."""
+
+import contextlib
+import logging
+import selectors
+
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.gateway import Conflict, Gateway
+from kontronik_can_gw.runtime.can_port import CanPort, Sent
+from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
+from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
+from kontronik_can_gw.runtime.mailboxes import Mailboxes
+from kontronik_can_gw.runtime.retry import Retry
+from kontronik_can_gw.runtime.serial_port import device_of
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import MS, SECOND
+
+LONGEST_RETRY_NS = SECOND // 2
+BUSY_RETRY_NS = 2 * MS
+LASTING_BUSY_NS = SECOND
+ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
+"""How often the kernel is asked for the controller's state: as a rule, and in bus-off."""
+
+
+class CanSide:
+    """The interface of a gateway. ``esc_paths``: what must never be opened as a CAN adapter, which would send to an ESC."""
+
+    def __init__(
+        self,
+        config: CanConfig,
+        gateway: Gateway,
+        selector: selectors.BaseSelector,
+        conditions: Conditions,
+        esc_paths: tuple[str, ...] = (),
+    ) -> None:
+        self.config = config
+        self.port: CanPort | None = None
+        self.mailboxes = Mailboxes()
+        self.facts: LinkFacts | None = None
+        """What the kernel told last; None where it tells nothing of this interface."""
+        self._gateway = gateway
+        self._selector = selector
+        self._conditions = conditions
+        self._esc_paths = esc_paths
+        self._retry = Retry(LONGEST_RETRY_NS)
+        self._claims = Claims()
+        self._claimed: list[str] = []
+        self._receive_ids: frozenset[int] | None = None
+        """What the open port was told to receive."""
+        self._busy_until: int | None = None
+        self._busy_since: int | None = None
+        self._stalled = False
+        self._served = True
+        self._seen_waiting = False
+        self._monitor: LinkMonitor | None = None
+        self._ask_due: int | None = None
+        if config.interface == "socketcan" and (monitor := link_monitor(config.channel)) is not None:
+            self._monitor = monitor
+            self._ask_due = 0
+            selector.register(monitor.fileno(), selectors.EVENT_READ, self.hear)
+
+    @property
+    def due(self) -> int | None:
+        """When ``reopen``, ``ask`` or ``transmit`` has something to do."""
+        return min((d for d in (self._retry.due, self._busy_until, self._ask_due) if d is not None), default=None)
+
+    @property
+    def is_open(self) -> bool:
+        return self.port is not None
+
+    @property
+    def complaint(self) -> str:
+        """What is wrong with the bus; empty while frames are sent."""
+        for name in (self._interface_condition, self._sending_condition, self._controller_condition):
+            if reason := self._conditions.reason(name):
+                return reason
+        return ""
+
+    # --- life
+
+    def open(self, now: int, wait: bool) -> None:
+        """Open the interface. RunError where that fails, unless ``wait``: then it is tried again.
+
+        Where another gateway has one of our node-IDs or sends our messages it is a RunError in any case.
+        """
+        self._claim(at_start=True)
+        try:
+            self._open(now)
+        except RunError as error:
+            if not wait:
+                raise
+            self._failed(str(error), now)
+
+    def reopen(self, now: int) -> None:
+        """Try again what is due."""
+        if self._retry.due is None or now < self._retry.due or self.port is not None:
+            return
+        try:
+            self._open(now)
+        except RunError as error:
+            self._failed(str(error), now)
+            return
+        self._gateway.can_returned(now)
+
+    def close(self) -> None:
+        """Close everything."""
+        self._close_port()
+        self._claims.close()
+        if self._monitor is not None:
+            self._selector.unregister(self._monitor.fileno())
+            self._monitor.close()
+            self._monitor = None
+
+    def _open(self, now: int) -> None:
+        self._refuse_escs_as_channel()
+        port = CanPort(self.config)
+        self.port = port
+        self._retry.due = None
+        self._busy_until = self._busy_since = None
+        self._served, self._seen_waiting = True, False
+        if (fd := port.fileno()) is not None:
+            self._selector.register(fd, selectors.EVENT_READ, self.serve)
+        self._receive_ids = None
+        self.follow_ids()
+        self.ask(now)
+        if not self._conditions.is_on(self._interface_condition):  # otherwise it is said when a frame is sent
+            self._conditions.say(logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open")
+
+    def _claim(self, at_start: bool = False) -> None:
+        """Have what only one gateway may have on this interface."""
+        if self.config.interface == "virtual":  # is in this process only
+            return
+        channel = self.config.channel
+        names = [node_claim(channel, node) for node, _, _ in self._gateway.node_states() if node != UNCONFIGURED]
+        if (first := self._gateway.first_message_id) is not None:
+            names.append(messages_claim(channel, first))
+        if names == self._claimed:
+            return
+        self._claimed = names
+        for taken in self._claims.hold(names):
+            if at_start:
+                raise in_use(taken)
+            self._conditions.say(logging.ERROR, str(in_use(taken)))
+
+    def _refuse_escs_as_channel(self) -> None:
+        """Whatever its name is now: what leads to an ESC must not be opened as a CAN interface, which would send to it."""
+        device = device_of(self.config.channel)
+        for path in self._esc_paths:
+            if device is not None and device == device_of(path):
+                raise RunError(f"can.channel {self.config.channel} is the port {path}: nothing may be sent to an ESC.")
+
+    def _close_port(self) -> None:
+        if self.port is not None:
+            if (fd := self.port.fileno()) is not None:
+                with contextlib.suppress(KeyError, ValueError):
+                    self._selector.unregister(fd)
+            self.port.close()
+            self.port = None
+
+    def _failed(self, reason: str, now: int) -> None:
+        self._retry.failed(now)
+        self.clear()
+        self._gateway.set_can_state(CanState.DOWN, now)
+        self._conditions.begin(self._interface_condition, f"{reason} Trying again.", now)
+
+    def _lost(self, answer: Sent, now: int) -> None:
+        """The interface is down or gone: to be opened anew."""
+        self._close_port()
+        word = "down" if answer is Sent.DOWN else "gone"
+        self._failed(f"CAN interface {self.config.channel}: {word}.", now)
+        self.ask(now)  # it may be there again already
+
+    # --- what the kernel tells
+
+    def ask(self, now: int) -> None:
+        """Ask how the interface is."""
+        if self._monitor is not None:
+            self._monitor.ask()
+            self._ask_due = now + (ASK_OFF_NS if self._is_off else ASK_NS)
+
+    def ask_if_due(self, now: int) -> None:
+        if self._ask_due is not None and now >= self._ask_due:
+            self.ask(now)
+
+    def hear(self, now: int, _events: int = 0) -> None:
+        """The kernel has told something."""
+        for facts in self._monitor.take() if self._monitor is not None else ():
+            self._follow(facts, now)
+
+    def _follow(self, facts: LinkFacts, now: int) -> None:
+        self.facts = facts
+        if self.port is None:
+            if facts.up and self._retry.due is not None:
+                self._retry.due = now
+            return
+        if not facts.exists or not facts.up:
+            self._lost(Sent.DOWN if facts.exists else Sent.GONE, now)
+        elif facts.state is not None and facts.state is not self.port.state:
+            self.port.note_state(facts.state)
+            self._follow_state(now)
+
+    @property
+    def _is_off(self) -> bool:
+        """True where the kernel itself says bus-off: what is sent now is lost. (Error frames alone may be somebody's test.)"""
+        return self.facts is not None and self.facts.state is CanState.BUS_OFF
+
+    # --- frames
+
+    def follow_ids(self) -> None:
+        """Tell the open port what to receive, if that has changed."""
+        ids = self._gateway.receive_ids
+        if self.port is None or ids is self._receive_ids:
+            return
+        had_fd = self.port.fileno() is not None
+        self._receive_ids = ids
+        self.port.set_receive_ids(ids)
+        if not had_fd and (fd := self.port.fileno()) is not None:
+            self._selector.register(fd, selectors.EVENT_READ, self.serve)
+        self._claim()
+
+    def serve(self, now: int, events: int = selectors.EVENT_READ) -> None:
+        """The port is readable, or can be sent to again."""
+        self._served = True
+        if self.port is None:
+            return
+        if events & selectors.EVENT_WRITE:
+            self._busy_until = None
+            self._watch(selectors.EVENT_READ)
+        if events & selectors.EVENT_READ:
+            frames = self.port.receive()
+            self._gateway.status.received_frames += len(frames)
+            for frame in frames:
+                self._gateway.receive_frame(frame, now)
+            self._follow_reception(now)
+
+    def is_stuck(self) -> bool:
+        """True if frames have waited since the last call but one and none were read: the loop does not serve this port."""
+        waiting = self.port is not None and not self._served and self.port.waits_to_be_read
+        stuck = waiting and self._seen_waiting
+        self._served, self._seen_waiting = False, waiting
+        return stuck
+
+    def discard(self, now: int) -> None:
+        """Throw away what waits in both directions: it is old."""
+        lost = self.mailboxes.dropped
+        self.clear()
+        if self.port is not None:
+            self.port.discard()
+            self._follow_reception(now)
+        if self.mailboxes.dropped != lost:  # an answer is too late by now, but what is wrong has to be known
+            self._gateway.can_returned(now)
+
+    def clear(self) -> None:
+        """Throw away what waits to be sent."""
+        self.mailboxes.clear()
+        self._count_losses()
+
+    def transmit(self, now: int) -> None:
+        """Hand what is to be sent to the interface, as far as it takes it."""
+        status, waiting = self._gateway.status, self.mailboxes
+        for frame in self._gateway.take_frames():
+            waiting.put(frame)
+        if self.port is None or self._is_off:
+            self.clear()
+            return
+        self._count_losses()
+        if not len(waiting) or (self._busy_until is not None and now < self._busy_until):
+            return
+        self._busy_until = None
+        count, answer = waiting.flush(self.port.send)
+        status.sent_frames += count
+        if count:
+            self._busy_since = None
+        if answer is Sent.OK:
+            self._works(now)
+        else:
+            status.send_failures += 1
+            if answer in (Sent.BUSY, Sent.FULL):
+                answer = self._busy(answer, now)
+            if answer in (Sent.DOWN, Sent.GONE):
+                self._lost(answer, now)
+                return
+        if count and self._stalled:
+            self._stalled = False
+            self._conditions.end(self._sending_condition, f"CAN {self.config.channel}: frames are sent again", now)
+            self._gateway.can_returned(now)
+        self._follow_state(now)
+
+    def _busy(self, answer: Sent, now: int) -> Sent:
+        """The interface takes no more for now; GONE if it has not for so long that it must be."""
+        assert self.port is not None
+        self._busy_since = self._busy_since or now
+        if now - self._busy_since > LASTING_BUSY_NS:
+            if not self.port.tells_busy_from_gone:
+                return Sent.GONE
+            self._stall(now)
+        self._busy_until = now + BUSY_RETRY_NS
+        if answer is Sent.FULL:  # it tells when there is room
+            self._busy_until = now + LASTING_BUSY_NS
+            self._watch(selectors.EVENT_READ | selectors.EVENT_WRITE)
+        return answer
+
+    def _watch(self, events: int) -> None:
+        if self.port is not None and (fd := self.port.fileno()) is not None:
+            self._selector.modify(fd, events, self.serve)
+
+    def _stall(self, now: int) -> None:
+        """The bus has not taken a frame for long: what waits is too old to be of use."""
+        self.clear()
+        self._stalled = True
+        text = (
+            f"CAN {self.config.channel}: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."
+        )
+        self._conditions.begin(self._sending_condition, text, now)
+
+    def _works(self, now: int) -> None:
+        self._retry.succeeded()
+        self._conditions.end(self._interface_condition, f"CAN {self.config.channel}: frames are sent again", now)
+
+    def _count_losses(self) -> None:
+        status, waiting = self._gateway.status, self.mailboxes
+        status.replaced_frames, status.dropped_frames = waiting.replaced, waiting.dropped
+
+    def _follow_reception(self, now: int) -> None:
+        """What receiving told of the interface itself."""
+        port = self.port
+        assert port is not None
+        if port.overruns:
+            self._gateway.receive_overrun(now)
+        port.overruns = 0
+        if port.gone:
+            self._lost(Sent.GONE, now)
+        else:
+            self._follow_state(now)
+
+    def _follow_state(self, now: int) -> None:
+        port = self.port
+        assert port is not None
+        self._gateway.status.bus_off_count += port.bus_off_count
+        port.bus_off_count = 0
+        if port.state is self._gateway.status.can_state:
+            return
+        self._gateway.set_can_state(port.state, now)
+        name = f"CAN {self.config.channel}"
+        if port.state is CanState.BUS_OFF:
+            self._conditions.begin(self._controller_condition, f"{name}: bus-off.{self._restart_hint()}", now)
+            self.ask(now)
+        elif port.state is CanState.ERROR_PASSIVE:
+            text = f"{name}: error-passive: wrong bit rate, a cable or termination fault, or nobody acknowledges."
+            self._conditions.begin(self._controller_condition, text, now)
+        elif port.state is not CanState.UNKNOWN:
+            word = port.state.name.lower().replace("_", "-")
+            self._conditions.end(self._controller_condition, f"{name}: {word}", now)
+
+    def _restart_hint(self) -> str:
+        if self.facts is None or self.facts.restart_ms != 0:
+            return ""
+        name = self.config.channel
+        return (
+            f" restart-ms is 0, so it stays there until somebody restarts it: sudo ip link set {name} type can restart. "
+            f"For good: sudo ip link set {name} down; sudo ip link set {name} up type can restart-ms 100."
+        )
+
+    # --- words
+
+    def follow_conflicts(self, now: int) -> None:
+        """Others that send with our ids: say when it begins and when it is over."""
+        for conflict in self._gateway.take_conflicts():
+            self._tell(conflict, now)
+
+    def _tell(self, conflict: Conflict, now: int) -> None:
+        bits = "29-bit id" if conflict.is_extended else "id"
+        which = f"CAN {self.config.channel}: {bits} {conflict.can_id:X}h"
+        if conflict.over:
+            self._conditions.end(which, f"{which}: nobody else sends with it", now, f"; {conflict.count} frames")
+            return
+        remedy = "Two nodes with one node-ID?" if conflict.node is not None else "Change one, as by dbc.base_id."
+        self._conditions.begin(
+            which, f"{which}: somebody else sends with it too; here it is {conflict.whose}. {remedy}", now
+        )
+
+    @property
+    def _interface_condition(self) -> str:
+        return f"CAN {self.config.channel}: interface"
+
+    @property
+    def _sending_condition(self) -> str:
+        return f"CAN {self.config.channel}: sending"
+
+    @property
+    def _controller_condition(self) -> str:
+        return f"CAN {self.config.channel}: controller"

@@ -1,0 +1,130 @@
+"""One log line when a condition begins and one when it ends, and no flood of lines from one that comes and goes."""
+
+import logging
+from collections import deque
+
+from kontronik_can_gw.telemetry import SECOND
+
+log = logging.getLogger("kontronik_can_gw")
+
+FLAPPING = 6
+"""So many beginnings within a minute, and a condition is summed up once a minute."""
+MINUTE = 60 * SECOND
+REMEMBERED = 20
+
+
+class _Condition:
+    def __init__(self) -> None:
+        self.begun: int | None = None
+        self.reason = ""
+        self.begins: deque[int] = deque(maxlen=FLAPPING)
+        self.summing = False
+        self.due = 0
+        self.count = 0
+        self.total = 0
+
+
+class Conditions:
+    """The conditions of a gateway by name. ``recent``: the last lines, for the statistics."""
+
+    def __init__(self) -> None:
+        self.recent: deque[str] = deque(maxlen=REMEMBERED)
+        self._held: list[tuple[int, str]] | None = None
+        self._known: dict[str, _Condition] = {}
+        self._summing: set[str] = set()
+
+    def begin(self, name: str, text: str, now: int, quiet: bool = False) -> None:
+        """Something is wrong from now on. Said once, and once more when ``text`` becomes another one; ``quiet``: only its end is."""
+        condition = self._known.setdefault(name, _Condition())
+        if condition.begun is None:
+            condition.begun = now
+            condition.begins.append(now)
+            condition.count += 1
+        elif condition.reason == text:
+            return
+        condition.reason = text
+        if condition.summing or quiet:
+            return
+        often = len(condition.begins) == FLAPPING and now - condition.begins[0] < MINUTE
+        if often:
+            condition.summing, condition.due = True, now + MINUTE
+            condition.count = condition.total = 0
+            self._summing.add(name)
+            text += " This comes and goes: from now on it is summed up once a minute."
+        self.say(logging.WARNING, text)
+
+    def end(self, name: str, text: str, now: int, counts: str = "") -> None:
+        """It is over: ``text`` says what holds now; how long it lasted is added, and ``counts``. Nothing where it had not begun."""
+        condition = self._known.get(name)
+        if condition is None or condition.begun is None:
+            return
+        lasted = now - condition.begun
+        condition.begun = None
+        condition.total += lasted
+        if not condition.summing:
+            self.say(logging.INFO, f"{text}, after {duration(lasted)}{counts}")
+
+    def forget(self, name: str) -> None:
+        """It is over, and something else says so."""
+        if (condition := self._known.get(name)) is not None:
+            condition.begun = None
+
+    def is_on(self, name: str) -> bool:
+        """True while the condition lasts."""
+        condition = self._known.get(name)
+        return condition is not None and condition.begun is not None
+
+    def reason(self, name: str) -> str:
+        """What was said at its beginning; empty while it is off."""
+        return self._known[name].reason if self.is_on(name) else ""
+
+    @property
+    def due(self) -> int | None:
+        """When ``advance`` has something to say."""
+        return min((self._known[name].due for name in self._summing), default=None)
+
+    def advance(self, now: int) -> None:
+        """Say the sums that are due."""
+        for name in [name for name in self._summing if now >= self._known[name].due]:
+            condition = self._known[name]
+            total = condition.total + (0 if condition.begun is None else now - max(condition.begun, now - MINUTE))
+            if condition.count:
+                self.say(
+                    logging.WARNING,
+                    f"{name}: {condition.count} more times in the last minute, {duration(total)} in all: {condition.reason}",
+                )
+                condition.due = now + MINUTE
+                condition.count = condition.total = 0
+                continue
+            condition.summing = False
+            self._summing.discard(name)
+            state = f"it lasts: {condition.reason}" if condition.begun is not None else "it is over"
+            self.say(logging.INFO, f"{name}: no longer comes and goes, {state}")
+
+    def say(self, level: int, text: str) -> None:
+        """A line, remembered too."""
+        if self._held is not None:
+            self._held.append((level, text))
+            return
+        log.log(level, "%s", text)
+        self.recent.append(text)
+
+    def hold(self) -> None:
+        """Keep lines back until ``release``."""
+        self._held = []
+
+    def release(self) -> None:
+        """Say what was kept back."""
+        held, self._held = self._held, None
+        for level, text in held or ():
+            self.say(level, text)
+
+
+def duration(ns: int) -> str:
+    """A time span as people read it."""
+    seconds = ns / SECOND
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    if seconds < 6000:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"

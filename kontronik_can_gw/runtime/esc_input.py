@@ -1,0 +1,221 @@
+"""One ESC's serial port as the loop has it: opened, read, lost, found again, and talked about."""
+
+import logging
+import selectors
+from pathlib import Path
+
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.protocol.states import device_text
+from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.retry import Retry
+from kontronik_can_gw.runtime.serial_port import Identity, PortLost, SerialPort, find_adapter
+from kontronik_can_gw.telemetry import SECOND, LinkState
+
+LONGEST_RETRY_NS = SECOND
+DIAGNOSIS_NS = 3 * SECOND
+
+
+class EscInput:
+    """One ESC's port. ``reopened``: how often it came back; ``line_errors``: since the start, by kind."""
+
+    def __init__(
+        self,
+        index: int,
+        path: str,
+        gateway: Gateway,
+        selector: selectors.BaseSelector,
+        conditions: Conditions,
+    ) -> None:
+        self.path = path
+        self.port: SerialPort | None = None
+        self.identity: Identity | None = None
+        self.reopened = -1
+        self.line_errors: dict[str, int] = {}
+        self._index = index
+        self._gateway = gateway
+        self._selector = selector
+        self._conditions = conditions
+        self._retry = Retry(LONGEST_RETRY_NS)
+        self._diagnosis_due = 0
+        self._diagnosed: set[str] = set()
+        self._counted: dict[str, int] = {}
+        self._count_due = 0
+        self._served = True
+        self._seen_waiting = False
+        self._lost_counters = (0, 0)
+
+    @property
+    def name(self) -> str:
+        return self._gateway.escs[self._index].settings.name
+
+    @property
+    def due(self) -> int | None:
+        """When ``reopen`` has something to do."""
+        return self._retry.due
+
+    @property
+    def complaint(self) -> str:
+        """Why there is no telemetry, as far as it is known; empty while there is."""
+        for name in (self._port_condition, self._link_condition, self._diagnosis_condition):
+            if reason := self._conditions.reason(name):
+                return reason
+        return ""
+
+    def open(self, now: int, wait: bool, others: tuple[Identity | None, ...] = ()) -> None:
+        """Open the port. RunError where that fails, unless ``wait``: then it is tried again.
+
+        ``others``: adapters that are known to belong to other ESCs.
+        """
+        try:
+            port = SerialPort(self._path_now(others))
+        except RunError as error:
+            if not wait:
+                raise RunError(f"{self.name}: {error}") from None
+            self._failed(str(error), now)
+            return
+        port.discard()  # what came before we listened has no time
+        self.port = port
+        self.identity = port.identity()
+        self.reopened += 1
+        self._retry.succeeded()
+        self._diagnosis_due = now + DIAGNOSIS_NS
+        self._counted = port.line_errors()
+        self._served, self._seen_waiting = True, False
+        self._selector.register(port.fileno(), selectors.EVENT_READ, self.serve)
+        self._gateway.port_opened(self._index, now)
+        said = f"{self.name}: {port.path} is open"
+        if self._conditions.is_on(self._port_condition):
+            self._conditions.end(self._port_condition, said, now)
+        else:
+            self._conditions.say(logging.INFO, said)
+
+    def serve(self, now: int, _events: int = 0) -> None:
+        """The port is readable."""
+        self._served = True
+        if self.port is None:
+            return
+        try:
+            data = self.port.read()
+        except PortLost as error:
+            path = self.port.path
+            self.close()
+            self._failed(f"{path}: lost ({error}).", now)
+            return
+        if data:
+            self._gateway.receive_bytes(self._index, data, now)
+
+    def reopen(self, now: int, others: tuple[Identity | None, ...] = ()) -> None:
+        """Try again what is due."""
+        if self._retry.due is not None and now >= self._retry.due:
+            self.open(now, True, others)
+
+    def discard(self) -> None:
+        """Throw away what waits to be read."""
+        if self.port is not None:
+            self.port.discard()
+
+    def close(self) -> None:
+        """Close the port."""
+        if self.port is not None:
+            self._selector.unregister(self.port.fileno())
+            self.port.close()
+            self.port = None
+
+    def is_stuck(self) -> bool:
+        """True if bytes have waited since the last call but one and none were read: the loop does not serve this port."""
+        waiting = self.port is not None and not self._served and self.port.waits_to_be_read
+        stuck = waiting and self._seen_waiting
+        self._served, self._seen_waiting = False, waiting
+        return stuck
+
+    def follow_link(self, now: int) -> None:
+        """The link's state, layout or device changed: say so."""
+        esc, told, name = self._gateway.escs[self._index], self._conditions, self.name
+        self._diagnosis_due = now + DIAGNOSIS_NS
+        if esc.link in (LinkState.LOST, LinkState.PORT_ERROR):
+            self._lost_counters = (esc.counters.crc_errors, esc.counters.dropped_bytes)
+            quiet = esc.link is LinkState.PORT_ERROR  # which is said by itself
+            text = f"{name}: telemetry lost; its values are marked as not available"
+            told.begin(self._link_condition, text, now, quiet=quiet)
+            told.forget(self._quality_condition)
+        if esc.link not in (LinkState.OK, LinkState.DEGRADED):
+            return
+        self._diagnosed.clear()
+        told.forget(self._diagnosis_condition)
+        layout = ("unknown layout", "V4", "legacy")[esc.layout]
+        device = device_text(esc.info.device) if esc.info else None
+        said = f"{name}: telemetry {esc.link.name.lower()} ({layout}{f', {device}' if device else ''})"
+        if told.is_on(self._link_condition):
+            crc_errors = esc.counters.crc_errors - self._lost_counters[0]
+            dropped = esc.counters.dropped_bytes - self._lost_counters[1]
+            told.end(self._link_condition, said, now, f"; {crc_errors} CRC errors, {dropped} bytes dropped meanwhile")
+        elif esc.link is LinkState.DEGRADED:
+            told.begin(self._quality_condition, f"{said}: many CRC errors or dropped bytes", now)
+        elif told.is_on(self._quality_condition):
+            told.end(self._quality_condition, said, now)
+        else:
+            told.say(logging.INFO, said)
+
+    def report(self, now: int) -> None:
+        """Count line errors once a second; say why nothing comes."""
+        if self.port is None:
+            return
+        if now >= self._count_due:
+            self._count_due = now + SECOND
+            self._count(self.port.line_errors())
+        if self._diagnosis_due and now >= self._diagnosis_due:
+            self._diagnosis_due = now + DIAGNOSIS_NS
+            diagnosis = self._gateway.escs[self._index].diagnosis()
+            if diagnosis and diagnosis not in self._diagnosed:
+                self._diagnosed.add(diagnosis)
+                self._conditions.begin(
+                    self._diagnosis_condition, f"{self.name}: no telemetry: {diagnosis}{self._line_error_words()}", now
+                )
+
+    def _count(self, counts: dict[str, int]) -> None:
+        for kind, count in counts.items():
+            new = max(0, count - self._counted.get(kind, 0))  # the driver's own begin anew with each plugging in
+            self.line_errors[kind] = self.line_errors.get(kind, 0) + new
+            if kind != "break":  # a break is a framing error too
+                self._gateway.escs[self._index].line_errors += new
+        self._counted = counts
+
+    def _line_error_words(self) -> str:
+        counts = [f"{count} {kind} errors" for kind, count in self.line_errors.items() if count and kind != "break"]
+        return f" (the driver counts {', '.join(counts)})" if counts else ""
+
+    def _failed(self, reason: str, now: int) -> None:
+        self._retry.failed(now)
+        self._gateway.port_lost(self._index, now)
+        self._conditions.begin(self._port_condition, f"{self.name}: {reason} Trying again.", now)
+
+    def _path_now(self, others: tuple[Identity | None, ...]) -> str:
+        """Where the port is: an adapter that was unplugged may come back under another number.
+
+        RunError where the configured path is another ESC's adapter now: its values would be taken for this one's.
+        """
+        if self.identity is None or self.path.startswith("/dev/serial/"):
+            return self.path
+        found = find_adapter(self.identity)
+        if found is not None:
+            return self.path if Path(self.path).resolve() == Path(found) else found
+        if any(other is not None and find_adapter(other) == str(Path(self.path).resolve()) for other in others):
+            raise RunError(f"{self.path}: is another ESC's adapter now. Name ports by /dev/serial/by-id or by-path.")
+        return self.path
+
+    @property
+    def _port_condition(self) -> str:
+        return f"{self.name}: port"
+
+    @property
+    def _link_condition(self) -> str:
+        return f"{self.name}: telemetry"
+
+    @property
+    def _quality_condition(self) -> str:
+        return f"{self.name}: line quality"
+
+    @property
+    def _diagnosis_condition(self) -> str:
+        return f"{self.name}: diagnosis"

@@ -1,0 +1,73 @@
+"""Log lines written by a thread of their own: a slow disk or a journal that stands still must not hold a frame up.
+
+What may touch what: any thread may log; only the writer's thread writes. They share a bounded queue; what finds no room is counted and
+the count is written when there is room again.
+"""
+
+import contextlib
+import logging
+import signal
+import threading
+from collections import deque
+from typing import TextIO
+
+CAPACITY = 1000
+"""Lines that may wait to be written."""
+
+
+class BackgroundHandler(logging.Handler):
+    """Writes to a stream from a thread. ``close`` waits for what is queued, but not for ever."""
+
+    def __init__(self, stream: TextIO, longest_end_s: float = 0.3) -> None:
+        super().__init__()
+        self._stream = stream
+        self._longest_end_s = longest_end_s
+        self._ready = threading.Condition()
+        self._waiting: deque[str] = deque()
+        self._lost = 0
+        self._ending = False
+        self._thread: threading.Thread | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Let the line be written; never waits for the stream."""
+        try:
+            line = self.format(record) + "\n"
+        except Exception:  # a faulty message is no reason to end
+            line = f"{record.msg!r} cannot be formatted\n"
+        with self._ready:
+            if len(self._waiting) >= CAPACITY:
+                self._lost += 1
+                return
+            self._waiting.append(line)
+            if self._thread is None and not self._ending:
+                self._thread = threading.Thread(target=self._work, name="log-writer", daemon=True)
+                try:
+                    self._thread.start()
+                except RuntimeError:  # the system gives no thread now: with the next line
+                    self._thread = None
+            self._ready.notify()
+
+    def close(self) -> None:
+        """Write what is queued, for ``longest_end_s`` at most."""
+        with self._ready:
+            self._ending = True
+            self._ready.notify()
+        if self._thread is not None:
+            self._thread.join(self._longest_end_s)
+        super().close()
+
+    def _work(self) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are to wake the loop
+        while True:
+            with self._ready:
+                self._ready.wait_for(lambda: self._waiting or self._ending)
+                if not self._waiting:
+                    return
+                text = "".join(self._waiting)
+                self._waiting.clear()
+                lost, self._lost = self._lost, 0
+            if lost:
+                text += f"{lost} log lines were lost: they could not be written in time\n"
+            with contextlib.suppress(OSError, ValueError):  # nobody reads any more: there is no one to tell
+                self._stream.write(text)
+                self._stream.flush()

@@ -1,0 +1,143 @@
+"""What systemd and its journal are told: sd_notify's protocol and the priorities of log lines, without a library.
+
+Nothing here raises and nothing blocks: a supervisor that does not listen must not disturb the gateway.
+"""
+
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable, Mapping
+from typing import TextIO
+
+_MOST_CHARACTERS = 800
+"""Of a status line: systemd reads 4096 bytes of a datagram, and a character has up to 4."""
+
+
+class Notifier:
+    """The notify socket of the service manager; one thread uses it. Where there is none every call does nothing.
+
+    What the socket does not take now (its queue is full) goes with the next call, but for the sign of life: ``watchdog`` is called often.
+    """
+
+    def __init__(
+        self, environment: Mapping[str, str] | None = None, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        environment = os.environ if environment is None else environment
+        address = environment.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address if address.startswith("/") else ""
+        self._clock = clock
+        self._watchdog_ns = _watchdog_ns(environment)
+        self._socket: socket.socket | None = None
+        self._owed: dict[str, str] = {}
+        self._status = ""
+
+    @property
+    def present(self) -> bool:
+        """True where a service manager listens."""
+        return bool(self._address)
+
+    @property
+    def watchdog_ns(self) -> int | None:
+        """How often ``watchdog`` is to be called at the latest: half of what the manager allows. None: it does not watch this process."""
+        return self._watchdog_ns if self._address else None
+
+    def ready(self, status: str = "") -> None:
+        """Started, or done with a reload."""
+        self._forget("RELOADING", "MONOTONIC_USEC")
+        self._tell({"READY": "1"} | self._news(status))
+
+    def reloading(self) -> None:
+        """The configuration is read again: ``ready`` must follow, also where it was refused."""
+        self._forget("READY")
+        self._tell({"RELOADING": "1", "MONOTONIC_USEC": str(self._clock() // 1000)})
+
+    def status(self, text: str) -> None:
+        """Tell a line for people, if it is another one than before."""
+        if news := self._news(text):
+            self._tell(news)
+
+    def stopping(self, status: str = "") -> None:
+        """About to end."""
+        self._forget("READY", "RELOADING", "MONOTONIC_USEC")
+        self._tell({"STOPPING": "1"} | self._news(status))
+
+    def watchdog(self) -> None:
+        """Tell that all is well; nothing where nobody watches."""
+        if self.watchdog_ns is not None:
+            self._tell({"WATCHDOG": "1"})
+            self._forget("WATCHDOG")
+
+    def close(self) -> None:
+        """Give the socket back; a later call opens it again."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _news(self, text: str) -> dict[str, str]:
+        """The line, if it is new. It can hold nothing that would be read as a message of its own."""
+        line = " ".join("".join(c if c.isprintable() else " " for c in text).split())[:_MOST_CHARACTERS]
+        if not line or line == self._status:
+            return {}
+        self._status = line
+        return {"STATUS": line}
+
+    def _forget(self, *names: str) -> None:
+        for name in names:
+            self._owed.pop(name, None)
+
+    def _tell(self, what: dict[str, str]) -> None:
+        if not self._address:
+            return
+        self._owed |= what
+        message = "".join(f"{name}={value}\n" for name, value in self._owed.items())
+        try:
+            if self._socket is None:
+                self._socket = socket.socket(
+                    socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
+                )
+            self._socket.sendto(message.encode(errors="replace"), self._address)
+        except (OSError, ValueError):  # full, or nobody there: it is told next time
+            return
+        self._owed.clear()
+
+
+def _watchdog_ns(environment: Mapping[str, str]) -> int | None:
+    """Half of the time that the manager waits for this process, None where it does not."""
+    try:
+        microseconds = int(environment.get("WATCHDOG_USEC", "0"))
+        meant = int(environment.get("WATCHDOG_PID") or os.getpid()) == os.getpid()
+    except ValueError:
+        return None
+    return microseconds * 500 if meant and microseconds > 0 else None
+
+
+def is_journal(stream: TextIO, environment: Mapping[str, str] | None = None) -> bool:
+    """True where what is written to the stream goes to the journal itself, and not to a file or pipe that took its place."""
+    named = (os.environ if environment is None else environment).get("JOURNAL_STREAM", "")
+    try:
+        status = os.fstat(stream.fileno())
+    except (OSError, ValueError):  # closed, or none that has a descriptor
+        return False
+    return named == f"{status.st_dev}:{status.st_ino}"
+
+
+def log_formatter(stream: TextIO) -> logging.Formatter | None:
+    """Make the formatter for a stream to the journal: no time, which the journal has itself, and a priority. None for any other."""
+    return JournalFormatter("%(message)s") if is_journal(stream) else None
+
+
+class JournalFormatter(logging.Formatter):
+    """Each line begins with its priority, ``<3>`` for an error: the journal takes each as an entry of its own."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        mark = f"<{priority(record.levelno)}>"
+        return "\n".join(mark + line for line in super().format(record).split("\n"))
+
+
+def priority(level: int) -> int:
+    """Syslog's priority for a level of ``logging``: 2 critical, 3 error, 4 warning, 5 notice, 6 information, 7 debug."""
+    for least, number in ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO + 1, 5)):
+        if level >= least:
+            return number
+    return 6 if level >= logging.INFO else 7
