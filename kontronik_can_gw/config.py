@@ -13,6 +13,7 @@ from dataclasses import MISSING, Field, dataclass, field, fields
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
+from posixpath import normpath
 from typing import Any, TypeVar, cast
 
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
@@ -28,10 +29,13 @@ _OWN_OPTIONS = {"interface", "channel", "bitrate", "fd", "data_bitrate"}
 _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _NOT_BLANK = r"\S"
 _TEXT = r"^[^\x00]*[^\x00\s][^\x00]*$"
+_BYTE = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
+_PORT = "(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5][0-9]{4}|[1-9][0-9]{0,3})"
+_LOOPBACK = rf"(localhost|127(\.{_BYTE}){{3}}|\[::1\]):{_PORT}"
 
 
 def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
-    """A configuration key. ``kind``: string, integer, boolean, ratio, bindings, ids. ``limits``: low, high, choices, pattern."""
+    """A configuration key. ``kind``: string, integer, boolean, ratio, bindings, ids, loopback. ``limits``: low, high, choices, pattern."""
     metadata = {"doc": doc, "kind": kind} | limits
     if isinstance(default, dict):
         return field(default_factory=lambda: dict(default), metadata=metadata)
@@ -188,6 +192,31 @@ class RunConfig:
 
 
 @dataclass(frozen=True)
+class StatisticsConfig:
+    """Statistics for ``kontronik-can-gw status`` and for Prometheus."""
+
+    file: str | None = _key(
+        "JSON file that is replaced each second, relative to this configuration (default: status.json in the service's runtime folder; "
+        "without one none)",
+        "string",
+        None,
+    )
+    prometheus: str | None = _key(
+        "address and port on this machine, as 127.0.0.1:9123, where Prometheus may fetch /metrics (default: nothing listens)",
+        "loopback",
+        None,
+    )
+
+    @property
+    def address(self) -> tuple[str, int] | None:
+        """Where to listen for Prometheus."""
+        if self.prometheus is None:
+            return None
+        host, _, port = self.prometheus.rpartition(":")
+        return {"localhost": "127.0.0.1", "[::1]": "::1"}.get(host, host), int(port)
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole configuration; ``file`` is where it came from."""
 
@@ -197,6 +226,7 @@ class Config:
     run: RunConfig
     esc: tuple[EscConfig, ...]
     file: str = "(built-in)"
+    statistics: StatisticsConfig = StatisticsConfig()
 
     @cached_property
     def escs(self) -> list[EscSettings]:
@@ -222,6 +252,11 @@ class Config:
         return Path(self.file).parent / self.canopen.eds
 
     @property
+    def statistics_path(self) -> Path | None:
+        """The statistics file, relative to the configuration; None where it does not say."""
+        return None if self.statistics.file is None else Path(self.file).parent / self.statistics.file
+
+    @property
     def node_ids(self) -> list[int]:
         """CANopen node-IDs of the ESCs, in their order."""
         base = self.canopen.node_id
@@ -234,6 +269,7 @@ _TABLES: dict[str, type[Any]] = {
     "dbc": DbcConfig,
     "canopen": CanopenConfig,
     "run": RunConfig,
+    "statistics": StatisticsConfig,
     "esc": EscConfig,
 }
 
@@ -323,7 +359,7 @@ def schema() -> dict[str, Any]:
 def as_toml(config: Config) -> str:
     """The effective configuration as TOML, defaults included."""
     lines: list[str] = []
-    for name in ("can", "dbc", "canopen", "run"):
+    for name in ("can", "dbc", "canopen", "run", "statistics"):
         lines += _toml_table(f"[{name}]", getattr(config, name))
     for esc in config.esc:
         lines += _toml_table("[[esc]]", esc)
@@ -378,6 +414,10 @@ def _value(value: Any, f: Field[Any]) -> Any:
     choices = limits.get("choices")
     if choices and value not in choices:
         raise ValueError(f"{value!r} is none of {', '.join(choices)}.{_nearest(value, choices)}")
+    if limits["kind"] == "loopback" and not re.fullmatch(_LOOPBACK, value):
+        raise ValueError(
+            f"{value!r} is no port on this machine, as 127.0.0.1:9123 or [::1]:9123. The statistics are not for the network."
+        )
     pattern = limits.get("pattern")
     if pattern and not re.fullmatch(pattern, value):
         raise ValueError(
@@ -460,6 +500,11 @@ def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -
 
 def _check_outputs(config: Config, problems: list[str]) -> None:
     file, canopen = config.file, config.canopen
+    if (path := config.statistics_path) is not None:
+        read = {"the configuration": Path(file), "the DBC": config.dbc_path, "the EDS": config.eds_path}
+        for what, other in read.items():
+            if normpath(path) == normpath(other):
+                problems.append(f"{file}: statistics.file: {str(path)!r} is {what}, which would be overwritten")
     if not config.dbc.enabled and not canopen.enabled:
         problems.append(f"{file}: dbc.enabled, canopen.enabled: both are false, so nothing would be sent. Enable one.")
     if not canopen.enabled:
@@ -523,6 +568,8 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
         case "ids":
             number = {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
             entry |= {"type": "object", "additionalProperties": number}
+        case "loopback":
+            entry |= {"type": "string", "pattern": f"^{_LOOPBACK}$"}
         case kind:
             entry["type"] = kind
             if kind == "string":

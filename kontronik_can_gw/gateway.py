@@ -179,6 +179,8 @@ class Gateway:
                 self.nodes.on_can_state(state, now)
             if was_off and state is not CanState.DOWN:  # what was handed over meanwhile never reached the bus
                 self._output.start(now)
+        elif state is CanState.DOWN and self.nodes is not None:  # down again before a frame was sent
+            self.nodes.on_can_state(state, now)
 
     def advance(self, now: int) -> None:
         """Let time pass: time-outs, cyclic messages."""

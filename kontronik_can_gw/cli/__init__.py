@@ -18,7 +18,10 @@ from kontronik_can_gw.errors import UserError
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
     "run": "the gateway: ESC telemetry in, CAN frames out",
+    "status": "how a running gateway is",
     "check": "check a configuration and print what it will send",
+    "doctor": "look at machine, ports, CAN interface and configuration, and say what to do",
+    "service": "install the gateway as a systemd service, look at it, remove it",
     "init": "write a commented example configuration",
     "dbc": "write the DBC for several ESCs or for a configuration",
     "eds": "write the EDS, or the DCF of a CANopen node",

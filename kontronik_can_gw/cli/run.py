@@ -14,8 +14,12 @@ from kontronik_can_gw.telemetry import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.loop import Loop
+    from kontronik_can_gw.runtime.systemd import Notifier
 
 log = logging.getLogger("kontronik_can_gw")
+
+_PAUSE_S = 5
+"""Before the end of a service that cannot start; a signal ends it at once."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,26 +52,40 @@ def _seconds(text: str) -> float:
 
 
 def main(args: argparse.Namespace) -> int:
+    from kontronik_can_gw.runtime.systemd import Notifier
+
+    notifier = Notifier()
     with logging_to_stderr():
-        _Run(args).main()
+        try:
+            _Run(args, notifier).main()
+        except UserError as error:
+            if not notifier.present:
+                raise
+            # the service manager starts us again: not ten times a second, for what a person has to mend
+            for problem in error.problems:
+                log.error("%s", problem)
+            notifier.status(f"cannot start: {error.problems[0]}")
+            time.sleep(_PAUSE_S)
+            return error.exit_code
     return 0
 
 
 class _Run:
     """The gateway, over as many configurations as it is given one after the other."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
+    def __init__(self, args: argparse.Namespace, notifier: "Notifier") -> None:
         from kontronik_can_gw.runtime.reload import Reloader
+        from kontronik_can_gw.runtime.snapshot import program_facts
         from kontronik_can_gw.runtime.store import ParameterStore
-        from kontronik_can_gw.runtime.systemd import Notifier
 
         self._file: Path = args.config
         self._wait: bool = args.wait
         self._status_ns = int((args.status or 0) * SECOND)
-        self._notifier = Notifier()
+        self._notifier = notifier
         self._loaded = load_all(args.config, ParameterStore)
         self._print = fingerprint(self._loaded.config)
         self._reloader = Reloader(self._read_again)
+        self._program = program_facts(args.config)
         self._loop: Loop | None = None
         self._stopping = False
 
@@ -123,12 +141,14 @@ class _Run:
     def _open(self, loaded: Loaded, wait: bool) -> None:
         from kontronik_can_gw.gateway import Gateway
         from kontronik_can_gw.runtime.loop import Loop
+        from kontronik_can_gw.runtime.statistics import Statistics, default_file
 
         config = loaded.config
         silent = config.dbc.on_loss == "silent"
         gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns(), silent, loaded.canopen)
         if self._loop is not None:
             gateway.take_over(self._loop.gateway)
+        statistics = Statistics(config.statistics_path or default_file(), config.statistics.address)
         loop = Loop(
             gateway,
             [esc.port for esc in config.esc],
@@ -138,6 +158,8 @@ class _Run:
             self._status_ns,
             notifier=self._notifier,
             reloader=self._reloader,
+            statistics=statistics,
+            program=self._program,
         )
         _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
         loop.open()

@@ -11,6 +11,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.runtime.threads import start_beside_the_loop
 
 if TYPE_CHECKING:
     import can
@@ -36,7 +37,8 @@ class BusReader:
         self._lock = threading.Lock()
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._thread = threading.Thread(target=self._run, name="can-reader", daemon=True)
-        self._thread.start()
+        if not start_beside_the_loop(self._thread):
+            self.failed = True  # so that it is tried again with another one
 
     def fileno(self) -> int:
         return self._fd
@@ -55,7 +57,8 @@ class BusReader:
     def close(self) -> None:
         """End the thread; it takes as long as one wait of the driver. A thread that a driver holds is left behind, without effect."""
         self._stopping = True
-        self._thread.join(_LONGEST_END_S)
+        if self._thread.ident is not None:
+            self._thread.join(_LONGEST_END_S)
         with self._lock:
             if self._fd >= 0:
                 os.close(self._fd)

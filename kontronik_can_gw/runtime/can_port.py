@@ -324,8 +324,6 @@ def _open(config: CanConfig) -> "can.BusABC":
         import can
 
     check_interface(config)
-    if config.interface == "socketcan" and is_up(config.channel) is False:
-        raise _socketcan_error(config, OSError(errno.ENETDOWN, ""))
     options: dict[str, Any] = {}
     mtu = Path("/sys/class/net", config.channel, "mtu")
     if config.interface == "socketcan" and config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
@@ -334,6 +332,8 @@ def _open(config: CanConfig) -> "can.BusABC":
             f"CAN interface {name}: does not do CAN FD. Adapter: sudo ip link set {name} up type can bitrate {config.bitrate} "
             f"dbitrate {config.data_bitrate} fd on; vcan: sudo ip link set {name} mtu {_FD.size}; or set can.fd = false."
         )
+    if config.interface == "socketcan" and is_up(config.channel) is False:
+        raise _socketcan_error(config, OSError(errno.ENETDOWN, ""))
     if config.interface != "socketcan":
         options["bitrate"] = config.bitrate
     if config.fd:

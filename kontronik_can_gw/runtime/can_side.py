@@ -15,6 +15,7 @@ from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_m
 from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import device_of
+from kontronik_can_gw.runtime.snapshot import CanFacts
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND
 
@@ -78,6 +79,22 @@ class CanSide:
             if reason := self._conditions.reason(name):
                 return reason
         return ""
+
+    def facts_for_statistics(self) -> CanFacts:
+        """What the statistics show of the interface."""
+        told = self.facts or LinkFacts(exists=False)
+        bitrate = told.bitrate or (self.config.bitrate if self.config.interface != "socketcan" else None)
+        config = self.config
+        return CanFacts(
+            config.interface,
+            config.channel,
+            bitrate,
+            self.is_open,
+            self.complaint,
+            self._stalled,
+            told.restart_ms,
+            told.error_counters,
+        )
 
     # --- life
 

@@ -1,6 +1,7 @@
 """One log line when a condition begins and one when it ends, and no flood of lines from one that comes and goes."""
 
 import logging
+import time
 from collections import deque
 
 from kontronik_can_gw.telemetry import SECOND
@@ -53,6 +54,11 @@ class Conditions:
             text += " This comes and goes: from now on it is summed up once a minute."
         self.say(logging.WARNING, text)
 
+    def event(self, name: str, text: str, now: int) -> None:
+        """Something went wrong and is over already."""
+        self.begin(name, text, now)
+        self.forget(name)
+
     def end(self, name: str, text: str, now: int, counts: str = "") -> None:
         """It is over: ``text`` says what holds now; how long it lasted is added, and ``counts``. Nothing where it had not begun."""
         condition = self._known.get(name)
@@ -89,9 +95,10 @@ class Conditions:
             condition = self._known[name]
             total = condition.total + (0 if condition.begun is None else now - max(condition.begun, now - MINUTE))
             if condition.count:
+                in_all = f", {duration(total)} in all" if total else ""
                 self.say(
                     logging.WARNING,
-                    f"{name}: {condition.count} more times in the last minute, {duration(total)} in all: {condition.reason}",
+                    f"{name}: {condition.count} more times in the last minute{in_all}: {condition.reason}",
                 )
                 condition.due = now + MINUTE
                 condition.count = condition.total = 0
@@ -107,7 +114,7 @@ class Conditions:
             self._held.append((level, text))
             return
         log.log(level, "%s", text)
-        self.recent.append(text)
+        self.recent.append(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}")
 
     def hold(self) -> None:
         """Keep lines back until ``release``."""

@@ -10,6 +10,7 @@ from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import Identity, PortLost, SerialPort, find_adapter
+from kontronik_can_gw.runtime.snapshot import PortFacts
 from kontronik_can_gw.telemetry import SECOND, LinkState
 
 LONGEST_RETRY_NS = SECOND
@@ -44,6 +45,7 @@ class EscInput:
         self._served = True
         self._seen_waiting = False
         self._lost_counters = (0, 0)
+        self._lost_since: int | None = None
 
     @property
     def name(self) -> str:
@@ -62,6 +64,13 @@ class EscInput:
                 return reason
         return ""
 
+    def facts(self) -> PortFacts:
+        """For the statistics."""
+        is_open = self.port is not None
+        path = self.path if self.port is None else self.port.path
+        again = max(0, self.reopened)
+        return PortFacts(self.name, path, is_open, self.complaint, again, dict(self.line_errors), self._lost_since)
+
     def open(self, now: int, wait: bool, others: tuple[Identity | None, ...] = ()) -> None:
         """Open the port. RunError where that fails, unless ``wait``: then it is tried again.
 
@@ -78,6 +87,7 @@ class EscInput:
         self.port = port
         self.identity = port.identity()
         self.reopened += 1
+        self._lost_since = None
         self._retry.succeeded()
         self._diagnosis_due = now + DIAGNOSIS_NS
         self._counted = port.line_errors()
@@ -187,6 +197,7 @@ class EscInput:
 
     def _failed(self, reason: str, now: int) -> None:
         self._retry.failed(now)
+        self._lost_since = self._lost_since or now
         self._gateway.port_lost(self._index, now)
         self._conditions.begin(self._port_condition, f"{self.name}: {reason} Trying again.", now)
 

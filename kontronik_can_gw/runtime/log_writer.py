@@ -6,10 +6,11 @@ the count is written when there is room again.
 
 import contextlib
 import logging
-import signal
 import threading
 from collections import deque
 from typing import TextIO
+
+from kontronik_can_gw.runtime.threads import start_beside_the_loop
 
 CAPACITY = 1000
 """Lines that may wait to be written."""
@@ -40,11 +41,9 @@ class BackgroundHandler(logging.Handler):
                 return
             self._waiting.append(line)
             if self._thread is None and not self._ending:
-                self._thread = threading.Thread(target=self._work, name="log-writer", daemon=True)
-                try:
-                    self._thread.start()
-                except RuntimeError:  # the system gives no thread now: with the next line
-                    self._thread = None
+                thread = threading.Thread(target=self._work, name="log-writer", daemon=True)
+                if start_beside_the_loop(thread):  # otherwise with the next line
+                    self._thread = thread
             self._ready.notify()
 
     def close(self) -> None:
@@ -57,7 +56,6 @@ class BackgroundHandler(logging.Handler):
         super().close()
 
     def _work(self) -> None:
-        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are to wake the loop
         while True:
             with self._ready:
                 self._ready.wait_for(lambda: self._waiting or self._ending)

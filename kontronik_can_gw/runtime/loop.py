@@ -23,6 +23,8 @@ from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
 from kontronik_can_gw.runtime.reload import Reloader
+from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, process_facts, snapshot
+from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -51,6 +53,8 @@ class Loop:
         clock: Callable[[], int] = time.monotonic_ns,
         notifier: Notifier | None = None,
         reloader: Reloader | None = None,
+        statistics: Statistics | None = None,
+        program: ProgramFacts | None = None,
     ) -> None:
         self.gateway = gateway
         self.conditions = Conditions()
@@ -67,6 +71,9 @@ class Loop:
         self._notifier = notifier or Notifier({})
         self._alive_due = 0 if self._notifier.watchdog_ns is not None else None
         self._notify_due = 0
+        self._statistics = statistics or Statistics(None, None)
+        self._program = program or ProgramFacts("")
+        self._store_error = ""
         self._reloader = reloader
         self._reload_asked = False
         self._stopping = False
@@ -107,6 +114,7 @@ class Loop:
         if self.can.port is not None:
             self.can.port.discard()  # a node that has not booted yet hears nothing
         self.conditions.release()
+        self._publish(now)  # the first time takes the longest
 
     def run(self) -> None:
         """Until ``stop``, or until there is another configuration. Then a last status is sent and everything is closed."""
@@ -146,6 +154,7 @@ class Loop:
             esc.close()
         self.can.close()
         self._selector.close()
+        self._statistics.close()
         if self._store is not None:
             self._store.close(_LAST_SAVE_S)
         for fd in (self._wake_read, self._wake_write):
@@ -167,7 +176,7 @@ class Loop:
             return 0
         due = [self.gateway.next_deadline()]
         due += [esc.due for esc in self.escs if esc.due is not None]
-        others = (self.can.due, self._status_due, self._alive_due, self.conditions.due)
+        others = (self.can.due, self._status_due, self._alive_due, self.conditions.due, self._statistics.due)
         due += [each for each in others if each is not None]
         return min(due)
 
@@ -176,10 +185,8 @@ class Loop:
         return min([SUSPENDED_NS, *(esc.settings.timeout_ns for esc in self.gateway.escs)])
 
     def _discard_input(self, late: int, now: int) -> None:
-        self.conditions.say(
-            logging.WARNING,
-            f"the process was suspended for {late / SECOND:.1f} s: what waited on the serial ports and for CAN is thrown away",
-        )
+        text = f"the process was suspended for {late / SECOND:.1f} s: what waited on the serial ports and for CAN is thrown away"
+        self.conditions.event("suspended", text, now)
         self.can.discard(now)
         for esc in self.escs:
             esc.discard()
@@ -215,7 +222,32 @@ class Loop:
                 log.info("%s: parameters stored", name)
             else:
                 log.error("%s: parameters cannot be stored: %s", name, error)
+            self._store_error = "" if error is None else f"{name}: {error}"
             self.gateway.saved(index, error, now)
+
+    # --- statistics
+
+    def _publish(self, now: int) -> None:
+        """Let the statistics' thread tell how things are, if it is time."""
+        if self._statistics.wanted(now):
+            store = None if self._store is None else StoreFacts(len(self._to_keep) + self._keeping, self._store_error)
+            document = snapshot(
+                self.gateway,
+                now=now,
+                wall=time.time(),
+                program=self._program,
+                process=process_facts(),
+                ports=[esc.facts() for esc in self.escs],
+                can=self.can.facts_for_statistics(),
+                store=store,
+                log_lines=list(self.conditions.recent),
+            )
+            self._statistics.publish(document)
+        for begins, text in self._statistics.reports(now):
+            if begins:
+                self.conditions.begin("statistics", text, now)
+            else:
+                self.conditions.end("statistics", text, now)
 
     # --- another configuration
 
@@ -306,6 +338,7 @@ class Loop:
             esc.report(now)
         self.can.follow_conflicts(now)
         self.conditions.advance(now)
+        self._publish(now)
 
 
 def _words(name: str) -> str:

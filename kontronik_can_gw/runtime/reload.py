@@ -7,11 +7,11 @@ is taken when the descriptor says that it is there.
 import contextlib
 import logging
 import os
-import signal
 import threading
 from collections.abc import Callable
 
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.runtime.threads import start_beside_the_loop
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -38,9 +38,7 @@ class Reloader:
             return False
         log.info("reading the configuration again")
         thread = threading.Thread(target=self._work, name="reload", daemon=True)
-        try:
-            thread.start()
-        except RuntimeError:
+        if not start_beside_the_loop(thread):
             return False
         self._thread = thread
         return True
@@ -71,12 +69,11 @@ class Reloader:
         os.close(event)
 
     def _work(self) -> None:
-        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are to wake the loop
         try:
             self._result = self._read()
         except UserError as error:
             self._problems = list(error.problems)
         except Exception as error:  # a mistake of ours must not end the gateway that runs
             self._problems = [f"the configuration cannot be read: {error!r}"]
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError):  # closed meanwhile
             os.eventfd_write(self._event, 1)

@@ -199,16 +199,46 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
         return RunError(
             f"{path}: permission denied. Join its group: sudo usermod -aG {group} $USER, then log in again."
         )
+    if number == errno.EPERM:
+        return RunError(
+            f"{path}: the service is not allowed to use this device: sudo systemctl edit kontronik-can-gw, and there under "
+            f"[Service]: DeviceAllow={path} rw."
+        )
     if number in (errno.EAGAIN, errno.EBUSY):
         return _in_use(path, _users(path))
     return RunError(f"{path}: cannot be opened: {text}")
 
 
 def _users(path: str) -> str:
-    """Who else has the port open, as far as we may see."""
+    """Who else has the port open, as far as we may see: without root's rights only who has it as terminal (a getty), and the kernel."""
     device, found = device_of(path), set()
-    for link in Path("/proc").glob("[0-9]*/fd/*"):
-        with contextlib.suppress(OSError):
-            if link.stat().st_rdev == device and (pid := link.parts[2]) != str(os.getpid()):
-                found.add(f"{Path('/proc', pid, 'comm').read_text().strip()} (pid {pid})")
+    name = Path(os.path.realpath(path)).name
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/consoles").read_text().splitlines()
+        if any(line.split()[:1] == [name] for line in lines):
+            found.add(f"the kernel's console (take console={name} out of the kernel's command line)")
+    for process in Path("/proc").glob("[0-9]*"):
+        if process.name != str(os.getpid()) and _has_open(process, device):
+            with contextlib.suppress(OSError):
+                found.add(f"{(process / 'comm').read_text().strip()} (pid {process.name})")
     return ", ".join(sorted(found))
+
+
+def _has_open(process: Path, device: int | None) -> bool:
+    """True if a process has a device open, or as its controlling terminal (proc(5): field 7 of stat)."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        terminal = int((process / "stat").read_text().rpartition(")")[2].split()[4])
+        # the kernel packs numbers as minor 7..0, major 19..8, minor 31..20
+        if device is not None and terminal == _packed(device):
+            return True
+    with contextlib.suppress(OSError):
+        for link in (process / "fd").iterdir():
+            with contextlib.suppress(OSError):
+                if link.stat().st_rdev == device:
+                    return True
+    return False
+
+
+def _packed(device: int) -> int:
+    major, minor = os.major(device), os.minor(device)
+    return minor & 0xFF | major << 8 | (minor & ~0xFF) << 12

@@ -14,13 +14,13 @@ import errno
 import fcntl
 import os
 import re
-import signal
 import threading
 from collections import deque
 from pathlib import Path
 
 from kontronik_can_gw.cia301.storage import Stored, decode
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.runtime.threads import start_beside_the_loop
 
 CAPACITY = 32
 """Savings that may wait for the disk."""
@@ -147,15 +147,12 @@ class ParameterStore:
         if self._thread is not None:
             return True
         thread = threading.Thread(target=self._work, name="parameter-store", daemon=True)
-        try:
-            thread.start()
-        except RuntimeError:
+        if not start_beside_the_loop(thread):
             return False
         self._thread = thread
         return True
 
     def _work(self) -> None:
-        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are to wake the loop
         while True:
             with self._lock:
                 self._lock.wait_for(lambda: self._waiting or self._closed)

@@ -87,14 +87,20 @@ def test_an_unknown_command_is_told_with_those_there_are() -> None:
 
 @pytest.mark.parametrize("command", list(COMMANDS))
 def test_an_unknown_option_is_named(command: str) -> None:
-    needed = {"run": ["-c", "x"], "check": ["-c", "x"], "decode": ["-"]}.get(command, [])
+    needed = {
+        "run": ["-c", "x"],
+        "check": ["-c", "x"],
+        "doctor": ["-c", "x"],
+        "decode": ["-"],
+        "service": ["status"],
+    }.get(command, [])
     done = inside(command, *needed, "--no-such-option")
     assert (done.returncode, done.stdout) == (2, "")
     assert "Traceback" not in done.stderr
     assert "unrecognized arguments: --no-such-option" in done.stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize("command", ["run", "check"])
+@pytest.mark.parametrize("command", ["run", "check", "doctor"])
 def test_a_configuration_is_required(command: str) -> None:
     done = inside(command)
     assert (done.returncode, done.stdout) == (2, "")
@@ -118,6 +124,9 @@ OPTIONS = {
         *("--flip-bits", "--dropout", "--error", "--swap-device"),
     ],
     "schema": ["-h"],
+    "service": ["ACTION"],
+    "doctor": ["-c", "--config", "--json"],
+    "status": ["-c", "--config", "--file", "--json", "--once", "--interval"],
 }
 
 

@@ -28,6 +28,7 @@ TABLES: dict[str, tuple[str, ...]] = {
         *("enabled", "node_id", "eds", "vendor_id", "serial", "self_start", "read_only", "cia402_mirrors", "store"),
     ),
     "run": ("wait_for_devices",),
+    "statistics": ("file", "prometheus"),
     "esc": ("port", "name", "pole_pairs", "gear", "cell_count", "telemetry_timeout_ms", "node_id", "device"),
 }
 DEFAULTS: dict[str, dict[str, object]] = {
@@ -45,6 +46,7 @@ DEFAULTS: dict[str, dict[str, object]] = {
     "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
     "run": {"wait_for_devices": False},
+    "statistics": {"file": None, "prometheus": None},
     "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250}
     | {"node_id": None, "device": None},
 }
@@ -62,7 +64,7 @@ RANGES = {
     ("esc", "telemetry_timeout_ms"): (20, 60_000),
 }
 STRINGS = [("can", "interface"), ("can", "channel"), ("dbc", "file"), ("dbc", "node"), ("esc", "port")]
-STRINGS += [("canopen", "eds"), ("canopen", "store")]
+STRINGS += [("canopen", "eds"), ("canopen", "store"), ("statistics", "file")]
 BOOLEANS = [("can", "fd"), ("run", "wait_for_devices"), ("dbc", "enabled")]
 BOOLEANS += [("canopen", key) for key in ("enabled", "self_start", "read_only", "cia402_mirrors")]
 
@@ -182,6 +184,41 @@ def test_a_gateway_that_would_send_nothing_is_refused() -> None:
     assert "nothing would be sent" in said
 
 
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("127.0.0.1:9123", ("127.0.0.1", 9123)),
+        ("127.255.0.9:1", ("127.255.0.9", 1)),
+        ("localhost:65535", ("127.0.0.1", 65_535)),
+        ("[::1]:9123", ("::1", 9123)),
+    ],
+)
+def test_prometheus_may_ask_on_loopback(text: str, address: tuple[str, int]) -> None:
+    config = parse(tables("statistics", "prometheus", text), "a.toml")
+    assert config.statistics.address == address
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("0.0.0.0:9123", "192.168.1.5:9123", "[::]:9123", "::1:9123", ":9123", "9123", "127.0.0.1", "127.0.0.1:0"),
+        *("127.0.0.1:65536", "127.0.0.1:09123", "127.0.0.256:9123", "127.1:9123", "localhost.example:9123", "*:9123"),
+        *("127.0.0.1:9123\n", "127.0.0.1:9123 ", "http://127.0.0.1:9123", "128.0.0.1:9123", "[::1%lo]:9123"),
+    ],
+)
+def test_prometheus_on_any_other_address_is_refused(text: str) -> None:
+    assert "is no port on this machine" in refused("statistics", "prometheus", text)
+    assert "is not a text" in refused("statistics", "prometheus", 9123)
+
+
+def test_the_statistics_file_must_be_none_that_is_read() -> None:
+    for name, what in (("a.toml", "configuration"), ("./a.toml", "configuration"), ("my.dbc", "DBC")):
+        made = tables("statistics", "file", name) | {"dbc": {"file": "my.dbc"}}
+        (said,) = problems(made)
+        assert said.startswith("a.toml: statistics.file: ")
+        assert f"is the {what}, which would be overwritten" in said
+
+
 def test_an_unknown_device_is_refused_with_those_there_are() -> None:
     assert "KOSMIK" in refused("esc", "device", "KOSMIC")
 
@@ -289,7 +326,7 @@ def test_a_data_id_is_a_whole_number_of_16_bits_beside_a_message_name() -> None:
     ("given_tables", "said"),
     [
         ({"cann": {}}, "a.toml: cann: unknown table. Did you mean can?"),
-        ({"xyzzy": {}}, "a.toml: xyzzy: unknown table. Known: can, dbc, canopen, run, esc."),
+        ({"xyzzy": {}}, "a.toml: xyzzy: unknown table. Known: can, dbc, canopen, run, statistics, esc."),
         ({"can": {"bitrte": 1}}, "a.toml: can.bitrte: unknown key. Did you mean bitrate?"),
         ({"run": {"x": 1}}, "a.toml: run.x: unknown key. Known: wait_for_devices."),
         ({"can": 3}, "a.toml: can: is a table, written [can]"),
@@ -448,7 +485,7 @@ def test_the_shipped_example_is_valid_and_says_the_defaults() -> None:
     config = load(EXAMPLE)
     assert len(config.esc) == 1
     assert config.esc[0].pole_pairs == 7
-    for table in ("can", "dbc", "canopen", "run"):
+    for table in ("can", "dbc", "canopen", "run", "statistics"):
         for key, default in DEFAULTS[table].items():
             assert getattr(getattr(config, table), key) == default
 
@@ -477,11 +514,12 @@ def test_the_shipped_example_has_every_key_of_every_table() -> None:
 
 def test_what_the_example_shows_as_default_is_the_default() -> None:
     made = tomllib.loads(uncommented())
-    shown = {(table, key): value for table in ("can", "dbc", "canopen", "run") for key, value in made[table].items()}
+    shown = {(table, key): value for table in TABLES if table != "esc" for key, value in made[table].items()}
     shown |= {("esc", key): value for key, value in made["esc"][0].items()}
     examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
     examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options"), ("esc", "node_id"), ("esc", "device")}
     examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store")}
+    examples |= {("statistics", "file"), ("statistics", "prometheus")}
     for (table, key), value in shown.items():
         if (table, key) not in examples:
             assert value == DEFAULTS[table][key], f"{table}.{key}"
@@ -593,6 +631,11 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
         max_size=3,
     ),
     ("dbc", "e2e_data_ids"): st.dictionaries(_TEXT, st.integers(0, 0xFFFF), max_size=3),
+    ("statistics", "prometheus"): st.builds(
+        lambda host, port: f"{host}:{port}",
+        st.sampled_from(["127.0.0.1", "localhost", "[::1]", "127.255.3.200"]),
+        st.integers(1, 65_535),
+    ),
     ("esc", "name"): st.from_regex(r"\A[b-z][A-Za-z0-9_]{0,11}\Z"),
     ("esc", "gear"): st.one_of(
         st.floats(0.001, 1000).filter(lambda value: not value.is_integer()),
@@ -616,7 +659,7 @@ def configurations(draw: st.DrawFn, wrong: bool) -> dict[str, Any]:
             made[draw(_TEXT)] = 1
         return made
 
-    made: dict[str, Any] = {name: table(name) for name in ("can", "dbc", "canopen", "run") if draw(st.booleans())}
+    made: dict[str, Any] = {name: table(name) for name in TABLES if name != "esc" and draw(st.booleans())}
     return made | {"esc": [table("esc") for _ in range(draw(st.integers(1, 3)))]}
 
 
@@ -632,6 +675,7 @@ def only_the_parser_can_tell(made: dict[str, Any]) -> bool:
             "makes signal names ambiguous",
             "is outside 0.001..1000",
             "1 to 12 letters",
+            "which would be overwritten",
         )
         return all(any(sign in problem for sign in signs) for problem in error.problems)
     return False

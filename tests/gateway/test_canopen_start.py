@@ -9,6 +9,7 @@ from kontronik_can_gw.config import parse, shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import SECOND
 
 
@@ -34,6 +35,17 @@ def test_an_outage_later_on_does_not_boot_the_nodes_again() -> None:
     assert [f.can_id for f in made.take_frames()] == [0x701]
     made.can_returned(SECOND // 2)
     assert 0x701 not in [f.can_id for f in made.take_frames()]
+
+
+def test_an_interface_that_goes_down_again_before_a_frame_was_sent_makes_the_nodes_boot_when_it_is_up() -> None:
+    made = gateway()
+    made.start(0)
+    made.set_can_state(CanState.ERROR_ACTIVE, 0)
+    made.take_frames()
+    for now in (SECOND, 2 * SECOND, 3 * SECOND):
+        made.set_can_state(CanState.DOWN, now)
+        made.can_returned(now)
+        assert [(f.can_id, f.data) for f in made.take_frames()] == [(0x701, b"\0")]
 
 
 def refused(tmp_path: Path, eds: bytes = b"", dbc: str = "") -> str:

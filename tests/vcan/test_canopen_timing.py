@@ -218,7 +218,7 @@ def test_foreign_traffic_does_not_wake_the_nodes(vcan: str, start_gateway: Start
         gateway.wait_for_line("node 1 pre-operational")
         bus = Sdo(vcan)
         # neighbours of what the node listens to, the same numbers as 29-bit and as remote frames
-        ids = [0x001, 0x07F, 0x081, 0x181, 0x581, 0x600, 0x602, 0x67F, 0x701, 0x702, 0x7E4, 0x7E6]
+        ids = [0x001, 0x07F, 0x082, 0x182, 0x582, 0x600, 0x602, 0x67F, 0x702, 0x703, 0x7E4, 0x7E6]
         ids += [flag | can_id for flag in (0x80000000, 0x40000000) for can_id in (0x000, 0x080, 0x601, 0x7E5)]
         frames = [FRAME.pack(can_id, 8, bytes(8)) for can_id in ids]
 

@@ -1,0 +1,202 @@
+"""``doctor``: looks at the machine and the configuration, changes nothing, sends nothing, and says what to do."""
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.cli.common import Loaded, assemble
+from kontronik_can_gw.cli.node_setup import parameter_folder
+from kontronik_can_gw.config import SHIPPED, Config, load
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.runtime.can_port import check_interface
+from kontronik_can_gw.runtime.doctor.findings import Finding, Findings, Severity, count, document
+from kontronik_can_gw.runtime.store import parameter_file
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.runtime.doctor.service import Unit
+    from kontronik_can_gw.runtime.doctor.system import System
+
+_STYLES = {
+    Severity.OK: "green",
+    Severity.NOTE: "cyan",
+    Severity.WARNING: "bold yellow",
+    Severity.ERROR: "bold red",
+}
+_INDENT = " " * 11
+_WIDTHS = (40, 100)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration")
+    parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
+    parser.epilog = (
+        "Changes nothing and sends nothing, neither to the bus nor to an ESC; may be called while the gateway runs. "
+        "As root it sees more. Exit code: 0 no error (there may be warnings), 1 errors, 2 the configuration cannot be used."
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    from kontronik_can_gw.runtime.doctor.system import System
+
+    findings, code = examine(System(), args.config)
+    if args.json:
+        print(json.dumps(document(findings, __version__, str(args.config), code), indent=2, ensure_ascii=False))
+    else:
+        _show(findings)
+    return code
+
+
+def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
+    """All findings, and the exit code. What does not depend on a faulty part of the configuration is looked at all the same."""
+    from kontronik_can_gw.runtime.doctor.can_interface import Needs, check_can
+    from kontronik_can_gw.runtime.doctor.line import look
+    from kontronik_can_gw.runtime.doctor.machine import check_machine
+    from kontronik_can_gw.runtime.doctor.serial_ports import check_port
+    from kontronik_can_gw.runtime.doctor.service import unit_of
+
+    unit = unit_of(system, str(path.absolute()))
+    about = Findings("Configuration")
+    found: list[Finding] = []
+    code = 0
+    config, loaded, refused = _load(path, unit)
+    if refused is not None:
+        code = refused.exit_code
+        for problem in refused.problems:
+            about.error("config", problem, "", "" if config is None else f"kontronik-can-gw check -c {path}")
+    if config is not None:
+        _configuration(system, about, config, loaded, unit)
+        found += about.found
+        for esc in config.esc:
+            found += check_port(system, esc.name, esc.port, unit, look)
+        timeout_ms = min(esc.telemetry_timeout_ms for esc in config.esc)
+        found += check_can(system, Needs(config.can, _burst(loaded), timeout_ms))
+    else:
+        found += about.found
+    found += check_machine(system, unit)
+    return found, code or int(count(found, Severity.ERROR) > 0)
+
+
+def _load(path: Path, unit: "Unit | None") -> tuple[Config | None, Loaded | None, UserError | None]:
+    """As far as it goes: the configuration, what belongs to it, and why it went no further."""
+    config = None
+    try:
+        config = load(path)
+        if unit is not None and config.canopen.store is None:  # what systemd will tell it
+            config = replace(config, canopen=replace(config.canopen, store=unit.state_folder))
+        check_interface(config.can)
+        return config, assemble(config), None
+    except UserError as error:
+        return config, None, error
+
+
+def _configuration(
+    system: "System", findings: Findings, config: Config, loaded: Loaded | None, unit: "Unit | None"
+) -> None:
+    from kontronik_can_gw.runtime.doctor.folders import check_folder, check_readable
+
+    if loaded is not None:
+        _outputs(findings, config, loaded)
+    files = [Path(config.file)]
+    files += [config.dbc_path] if config.dbc.enabled and config.dbc.file != SHIPPED else []
+    files += [config.eds_path] if config.canopen.enabled and config.canopen.eds != SHIPPED else []
+    for file in files:
+        check_readable(system, findings, "config.readable", str(file.absolute()), unit)
+    if config.canopen.enabled:
+        folder = str(parameter_folder(config).absolute())
+        check_folder(system, findings, "config.store", "stored parameters", folder, unit)
+    if config.statistics_path is not None:
+        folder = str(config.statistics_path.absolute().parent)
+        check_folder(system, findings, "config.statistics", "statistics", folder, unit)
+
+
+def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
+    number = len(config.esc)
+    words = [f"{number} ESC{'s' * (number > 1)}"]
+    load = loaded.layout.bus_load(config.can.bitrate, config.can.data_bitrate)
+    if config.dbc.enabled:
+        words.append(f"{len(loaded.layout.messages)} messages of {config.dbc_path.name}")
+    if loaded.canopen is not None:
+        nodes = loaded.canopen.nodes(loaded.escs)
+        words.append(f"{len(nodes.nodes)} CANopen node{'s' * (number > 1)} of {config.eds_path.name}")
+        load += nodes.bits_per_second() / config.can.bitrate
+    findings.ok("config", f"{config.file}: {', '.join(words)}")
+    findings.ok("config.bus_load", f"needs {load:.1%} of {config.can.bitrate // 1000} kbit/s at most")
+    damaged = {f"{loaded.escs[esc].name}: stored parameters: {reason}": esc for esc, reason in loaded.damaged}
+    for warning in (*loaded.layout.warnings, *loaded.warnings):
+        if warning not in damaged:
+            findings.warning("config.warning", warning)
+    for text, esc in damaged.items():
+        if os.access(parameter_file(parameter_folder(config), loaded.escs[esc].name), os.R_OK):
+            remedy = "The gateway runs on defaults. Let the master store them anew, or restore the file"
+            findings.warning("config.parameters", text, remedy)
+        else:
+            findings.note("config.parameters", text, "Only the gateway's user and root can: run doctor with sudo")
+
+
+def _burst(loaded: Loaded | None) -> int:
+    """Frames that may become due at once: each message, each PDO and the heartbeats."""
+    if loaded is None:
+        return 0
+    frames = len(loaded.layout.messages)
+    if loaded.canopen is not None:
+        nodes = loaded.canopen.nodes(loaded.escs).nodes
+        frames += sum(1 + sum(tpdo.valid for tpdo in node.tpdos) for node in nodes)
+    return frames
+
+
+class _Piece(NamedTuple):
+    """A line of the screen: a word in a style, then text."""
+
+    word: str
+    style: str
+    text: str
+
+
+def _show(findings: list[Finding]) -> None:
+    lowest, highest = _WIDTHS
+    width = max(lowest, min(highest, shutil.get_terminal_size().columns))
+    if not sys.stdout.isatty():
+        for piece in _lines(findings, width):
+            print(piece.word + piece.text)
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(highlight=False, soft_wrap=True)
+    for piece in _lines(findings, width):
+        console.print(Text.assemble((piece.word, piece.style), piece.text))
+
+
+def _lines(findings: list[Finding], width: int) -> Iterator[_Piece]:
+    """The report. Commands are never broken, so that they can be copied."""
+    group = ""
+    for finding in findings:
+        if finding.group != group:
+            if group:
+                yield _Piece("", "", "")
+            group = finding.group
+            yield _Piece(group, "bold", "")
+        first, *more = textwrap.wrap(finding.text, width - len(_INDENT), break_on_hyphens=False) or [""]
+        yield _Piece(f"  {finding.severity:<9}", _STYLES[finding.severity], first)
+        for line in more:
+            yield _Piece("", "", _INDENT + line)
+        arrow = "-> "
+        for line in textwrap.wrap(finding.remedy, width - len(_INDENT) - 3, break_on_hyphens=False):
+            yield _Piece("", "", f"{_INDENT}{arrow}{line}")
+            arrow = "   "
+        if finding.command:
+            yield _Piece(_INDENT + arrow, "", finding.command)
+    yield _Piece("", "", "")
+    parts = []
+    for severity in (Severity.ERROR, Severity.WARNING, Severity.NOTE):
+        number = count(findings, severity)
+        parts.append(f"{number or 'no'} {severity}{'s' * (number != 1)}")
+    yield _Piece("", "", ", ".join(parts))

@@ -1,0 +1,219 @@
+"""``service``: the gateway as a systemd service: installed, looked at, removed.
+
+Without --root it works on this machine, as root, and calls systemd's tools; with it only files below that folder are touched.
+"""
+
+import argparse
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from kontronik_can_gw.cli import service_files as files
+from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.service_files import NAME, WANTS, Choices, State
+from kontronik_can_gw.cli.service_machine import (
+    call,
+    check_executable,
+    check_rights,
+    make_user,
+    own_executable,
+    reload_devices,
+    reload_network,
+)
+from kontronik_can_gw.cli.service_removal import uninstall
+from kontronik_can_gw.cli.service_status import status
+from kontronik_can_gw.errors import RunError, UserError
+
+_INSTANCE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}")
+_CHANNEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    install_parser = actions.add_parser(
+        "install", help="write units, udev rules, user and an example configuration; enable"
+    )
+    status_parser = actions.add_parser(
+        "status", help="state, configuration and last log lines; exit code 0 running, 3 not"
+    )
+    uninstall_parser = actions.add_parser("uninstall", help="stop, disable, and remove what install wrote")
+    for sub in (install_parser, status_parser, uninstall_parser):
+        sub.add_argument(
+            "--instance",
+            type=_instance,
+            metavar="NAME",
+            help="one of several gateways: NAME.toml, kontronik-can-gw@NAME",
+        )
+    for sub in (install_parser, uninstall_parser):
+        sub.add_argument("--root", type=Path, metavar="DIR", help="only write below DIR, as for an image; call nothing")
+        sub.add_argument("--dry-run", "--print", action="store_true", help="only show what would be done")
+    install_parser.add_argument("--now", action="store_true", help="start it too, or restart it")
+    install_parser.add_argument("--executable", metavar="PATH", help="the program (default: this one)")
+    install_parser.add_argument(
+        "--force", action="store_true", help="replace files that were changed by hand; they are kept as .bak"
+    )
+    install_parser.add_argument(
+        "--network", type=_bitrate, metavar="BITRATE", help="let systemd-networkd set up the CAN interface"
+    )
+    install_parser.add_argument(
+        "--channel", type=_channel, default="can0", metavar="NAME", help="the CAN interface (default can0)"
+    )
+    install_parser.add_argument(
+        "--prometheus", action="store_true", help="allow the service loopback IP, for statistics.prometheus"
+    )
+    uninstall_parser.add_argument(
+        "--purge", action="store_true", help="remove configurations, stored parameters and the user too"
+    )
+    status_parser.add_argument(
+        "-n", "--lines", type=_lines, default=10, metavar="N", help="lines of the log (default 10)"
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    actions = {"install": _install, "status": status, "uninstall": uninstall}
+    return actions[args.action](args)
+
+
+def _instance(text: str) -> str:
+    if not _INSTANCE.fullmatch(text) or text == "gateway":
+        reason = "is the plain service's configuration" if text == "gateway" else "is no name: letters, digits, _ . -"
+        raise argparse.ArgumentTypeError(f"{text!r} {reason}")
+    return text
+
+
+def _channel(text: str) -> str:
+    if not _CHANNEL.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not the name of an interface")
+    return text
+
+
+def _bitrate(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if not 5_000 <= value <= 1_000_000:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a bit rate in bit/s, 5000 to 1000000")
+    return value
+
+
+def _lines(text: str) -> int:
+    if not text.isdecimal() or int(text) > 10_000:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of lines, 0 to 10000")
+    return int(text)
+
+
+def _install(args: argparse.Namespace) -> int:
+    live = args.root is None
+    root = Path("/") if live else args.root
+    if not args.dry_run:
+        check_rights(live, root, "install")
+    executable = args.executable or own_executable()
+    choices = Choices(
+        executable,
+        check_executable(executable, root),
+        files.serial_group(root),
+        args.channel,
+        args.network,
+        args.prometheus,
+    )
+    plan = [(file, file.state(root)) for file in files.planned(choices, root)]
+    own = root / files.configuration(args.instance)
+    files.check_inside(root, [*(root / file.path for file, _ in plan), own, root / WANTS / "x"])
+    if args.dry_run:
+        return _show(plan, root, args)
+    changed = [root / file.path for file, state in plan if state is State.CHANGED]
+    if changed and not args.force:
+        raise UserError(
+            *(f"{path}: was changed by hand. --force replaces it and keeps it as {path.name}.bak." for path in changed)
+        )
+    for file, state in plan:
+        path = root / file.path
+        if state is State.CHANGED:
+            files.put_aside(path)
+        if state is not State.SAME:
+            files.write(path, file.text)
+        say(f"{path}: {state.value}")
+    if args.network is not None:
+        _remove_examples(root, args.channel)
+    if files.read(own) is None:
+        files.write(own, _example())
+        say(f"{own}: new, an example")
+    if live:
+        make_user(choices.group)
+        call("systemctl", "daemon-reload")
+        reload_devices()
+        if args.network is not None:
+            reload_network(args.channel)
+    return _enable(args, own, live, root)
+
+
+def _enable(args: argparse.Namespace, own: Path, live: bool, root: Path) -> int:
+    """Enable it, and start it if that is wanted, once its configuration can be used."""
+    unit = files.unit(args.instance)
+    if problems := _not_ready(own):
+        then = f" When it is right: sudo systemctl enable --now {unit}" if live else ""
+        text = [*problems, f"{unit} was not {'enabled and started' if args.now else 'enabled'}.{then}"]
+        if args.now:
+            raise RunError(*text)
+        for line in text:
+            say(line)
+        return 0
+    if not live:
+        link = root / WANTS / unit
+        target = f"/{files.UNITS}/{unit if args.instance is None else f'{NAME}@.service'}"
+        try:
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.unlink(missing_ok=True)
+            link.symlink_to(target)
+        except OSError as error:
+            raise RunError(f"{link}: cannot be made: {error.strerror}") from None
+        say(f"{unit} is enabled")
+        return 0
+    call("systemctl", "enable", unit)
+    if args.now:
+        call("systemctl", "restart", unit)
+        say(f"{unit} is enabled and runs. See: kontronik-can-gw service status")
+    else:
+        say(f"{unit} is enabled. Start it now: sudo systemctl restart {unit}")
+    return 0
+
+
+def _not_ready(own: Path) -> list[str]:
+    """Why the service must not send yet: its configuration is faulty, or the example that nobody has edited."""
+    import tomllib
+
+    from kontronik_can_gw.config import load, parse
+
+    try:
+        ports = {esc.port for esc in load(own).esc}
+    except UserError as error:
+        return list(error.problems)
+    if ports & {esc.port for esc in parse(tomllib.loads(_example()), "").esc}:
+        return [f"{own}: is the example. Set ports, bit rate and motors first."]
+    return []
+
+
+def _show(plan: Sequence[tuple[files.PlannedFile, State]], root: Path, args: argparse.Namespace) -> int:
+    for file, state in plan:
+        print(f"##### {root / file.path}: {state.value}")
+        print(file.text)
+    own = root / files.configuration(args.instance)
+    print(f"##### {own}: {'new, an example' if files.read(own) is None else 'kept'}")
+    if args.root is None:
+        print(f"##### user {NAME}; systemctl daemon-reload; systemctl enable {files.unit(args.instance)}", end="")
+        print(f"; systemctl restart {files.unit(args.instance)}" if args.now else "")
+    return 0
+
+
+def _example() -> str:
+    return (Path(__file__).parent.parent / "example.toml").read_text(encoding="utf-8")
+
+
+def _remove_examples(root: Path, channel: str) -> None:
+    """The active network file takes the place of its example."""
+    for path in files.installed(root):
+        if path.name.endswith(f"-{channel}.network.{files.EXAMPLE}") or path.name.endswith(
+            f"-{channel}.link.{files.EXAMPLE}"
+        ):
+            files.remove(path)

@@ -1,0 +1,222 @@
+"""The files that ``service`` installs: what is in them, where they go, and whether somebody changed them since.
+
+The first line of each holds a checksum of the rest, so that a file of ours can be told from one that was changed, without any record.
+"""
+
+import contextlib
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.errors import RunError
+
+NAME = "kontronik-can-gw"
+CONFIGURATIONS = f"etc/{NAME}"
+UNITS = "etc/systemd/system"
+SYSUSERS = f"etc/sysusers.d/{NAME}.conf"
+NETWORK = "etc/systemd/network"
+WANTS = f"{UNITS}/multi-user.target.wants"
+EXAMPLE = "example"
+_NETWORK_PREFIX = f"50-{NAME}-"
+_HEAD = re.compile(rf'# Written by "{NAME} service install" \S+, checksum ([0-9a-f]{{64}})\.')
+_PLACEHOLDER = re.compile(r"@[A-Z]+@")
+_SERIAL_GROUPS = ("dialout", "uucp")
+"""Debian's name of the group that owns serial ports, and Arch's."""
+
+
+class State(Enum):
+    """What is where a file goes."""
+
+    MISSING = "new"
+    SAME = "as it is"
+    OURS = "replaced: was written by another version or with other options"
+    CHANGED = "replaced: was changed by hand, kept as .bak"
+
+
+@dataclass(frozen=True)
+class PlannedFile:
+    """A file below the root, with its whole text."""
+
+    path: str
+    text: str
+
+    def state(self, root: Path) -> State:
+        """Compare with what is there. RunError where that cannot be read."""
+        found = read(root / self.path)
+        if found is None:
+            return State.MISSING
+        if found == self.text:
+            return State.SAME
+        return State.OURS if is_ours(found) else State.CHANGED
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What the files depend on."""
+
+    executable: str
+    home_visible: bool
+    """The program is below a home folder."""
+    group: str
+    """That owns serial ports."""
+    channel: str = "can0"
+    bitrate: int | None = None
+    """None: the network files are examples only."""
+    prometheus: bool = False
+
+
+def unit(instance: str | None) -> str:
+    """Name the service of an instance; of the plain one for None."""
+    return f"{NAME}.service" if instance is None else f"{NAME}@{instance}.service"
+
+
+def configuration(instance: str | None) -> str:
+    """The configuration's path below the root."""
+    return f"{CONFIGURATIONS}/{instance or 'gateway'}.toml"
+
+
+def planned(choices: Choices, root: Path) -> list[PlannedFile]:
+    """All files, in the order in which they are written. An active network file is not joined by an example."""
+    common = {"EXECUTABLE": choices.executable, "GROUP": choices.group, "HOME": _home(choices.home_visible)}
+    plain = common | {
+        "DESCRIPTION": "KONTRONIK ESC telemetry to CAN",
+        "CONFIGURATION": "gateway",
+        "FOLDER": NAME,
+    }
+    template = common | {
+        "DESCRIPTION": "KONTRONIK ESC telemetry to CAN, %i",
+        "CONFIGURATION": "%i",
+        "FOLDER": f"{NAME}-%i",
+    }
+    files = [
+        _made(SYSUSERS, "sysusers.conf", common),
+        _made(f"{UNITS}/{NAME}.service", "gateway.service", plain),
+        _made(f"{UNITS}/{NAME}@.service", "gateway.service", template),
+        _made(f"etc/udev/rules.d/70-{NAME}.rules", "udev.rules", {}),
+    ]
+    if choices.prometheus:
+        files += [_made(f"{UNITS}/{NAME}{kind}.service.d/prometheus.conf", "prometheus.conf", {}) for kind in ("", "@")]
+    for kind in ("network", "link"):
+        path = f"{NETWORK}/{_NETWORK_PREFIX}{choices.channel}.{kind}"
+        words = {"CHANNEL": choices.channel, "BITRATE": str(choices.bitrate or 500_000), "HOW": ""}
+        if choices.bitrate is not None:
+            files.append(_made(path, f"can.{kind}", words))
+        elif not (root / path).exists():
+            words["HOW"] = f" An example: set it right, then take .{EXAMPLE} off its name."
+            files.append(_made(f"{path}.{EXAMPLE}", f"can.{kind}", words))
+    return files
+
+
+def installed(root: Path) -> list[Path]:
+    """Every file that an install may have written and that is there."""
+    patterns = (
+        SYSUSERS,
+        f"{UNITS}/{NAME}.service",
+        f"{UNITS}/{NAME}@.service",
+        f"{UNITS}/{NAME}.service.d/prometheus.conf",
+        f"{UNITS}/{NAME}@.service.d/prometheus.conf",
+        f"etc/udev/rules.d/70-{NAME}.rules",
+        *(f"{NETWORK}/{_NETWORK_PREFIX}*.{kind}{end}" for kind in ("network", "link") for end in ("", f".{EXAMPLE}")),
+    )
+    return [path for pattern in patterns for path in sorted(root.glob(pattern))]
+
+
+def serial_group(root: Path) -> str:
+    """The group that owns serial ports on this system."""
+    text = read(root / "etc/group") or ""
+    groups = {line.split(":")[0] for line in text.splitlines()}
+    return next((group for group in _SERIAL_GROUPS if group in groups), _SERIAL_GROUPS[0])
+
+
+def template(name: str) -> str:
+    """A file that comes with the package."""
+    return (Path(__file__).parent.parent / "service" / name).read_text(encoding="utf-8")
+
+
+def is_ours(text: str) -> bool:
+    """True for a text that is as an install wrote it."""
+    head, _, body = text.partition("\n")
+    found = _HEAD.fullmatch(head)
+    return found is not None and found[1] == _checksum(body)
+
+
+def read(path: Path) -> str | None:
+    """The text of a file, None where there is none."""
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file that all may read, with the folders above it; all or nothing."""
+    beside: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
+        with tempfile.NamedTemporaryFile(
+            "w", dir=path.parent, prefix=f".{NAME}.", delete=False, encoding="utf-8"
+        ) as file:
+            beside = Path(file.name)
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.chmod(0o644)
+        beside.replace(path)
+    except OSError as error:
+        if beside is not None:
+            with contextlib.suppress(OSError):
+                beside.unlink()
+        raise RunError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def check_inside(root: Path, paths: Iterable[Path]) -> None:
+    """RunError where a symbolic link in an image leads out of it, as one to /etc does: the files would be written to this machine."""
+    top = root.resolve()
+    for path in paths:
+        if not path.parent.resolve().is_relative_to(top):
+            raise RunError(f"{path.parent}: leads out of {root}, to {path.parent.resolve()}")
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a symbolic link, and say so. RunError where that fails."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be removed: {error.strerror}") from None
+    say(f"{path}: removed")
+
+
+def put_aside(path: Path) -> Path:
+    """Keep a file as .bak, in place of an older one."""
+    kept = path.with_name(path.name + ".bak")
+    try:
+        path.replace(kept)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be renamed: {error.strerror}") from None
+    return kept
+
+
+def _home(visible: bool) -> str:
+    if visible:
+        return "# The program itself is in a home folder.\nProtectHome=read-only"
+    return "ProtectHome=yes"
+
+
+def _made(path: str, name: str, words: dict[str, str]) -> PlannedFile:
+    body = _PLACEHOLDER.sub(lambda found: words[found[0].strip("@")], template(name))
+    return PlannedFile(
+        path, f'# Written by "{NAME} service install" {__version__}, checksum {_checksum(body)}.\n{body}'
+    )
+
+
+def _checksum(body: str) -> str:
+    return hashlib.sha256(body.encode()).hexdigest()

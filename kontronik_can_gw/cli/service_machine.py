@@ -1,0 +1,166 @@
+"""The machine that ``service`` works on: systemd's tools, the service's user, and whether it could run the program."""
+
+import contextlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.service_files import NAME, SYSUSERS
+from kontronik_can_gw.errors import RunError, UserError
+
+_EXECUTABLE = re.compile(r"/[\w/.+@~=,:-]+")
+_HOMES = ("/home", "/root", "/run/user")
+_BOOTED = Path("/run/systemd/system")
+"""There where systemd runs (sd_booted)."""
+_HIDDEN = ("/tmp", "/var/tmp")  # noqa: S108  the service has its own, by PrivateTmp=
+
+
+def check_rights(live: bool, root: Path, action: str) -> None:
+    if not live:
+        if not root.is_dir():
+            raise UserError(f"{root}: is not a folder. --root names the top of an image.")
+        return
+    check_systemd()
+    if os.geteuid() != 0:
+        raise RunError(
+            f"only root may do that: sudo {own_executable()} service {action} ... (--dry-run shows what would be done)"
+        )
+
+
+def check_systemd() -> None:
+    if not _BOOTED.is_dir():
+        raise RunError("this system does not run systemd. Files for an image: --root DIR. Without systemd: run --wait")
+
+
+def run(*words: str) -> "subprocess.CompletedProcess[str]":
+    environment = os.environ | {"LC_ALL": "C.UTF-8", "SYSTEMD_PAGER": "", "SYSTEMD_COLORS": "0"}
+    try:
+        return subprocess.run(
+            words,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+            timeout=120,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+        )
+    except OSError as error:
+        raise RunError(f"{words[0]}: cannot be started: {error.strerror}") from None
+    except subprocess.TimeoutExpired:
+        raise RunError(f"`{' '.join(words)}` does not end. It was given up after two minutes.") from None
+
+
+def output(*words: str) -> str:
+    return run(*words).stdout
+
+
+def call(*words: str) -> None:
+    """Call a tool that must do its work. RunError with what it said."""
+    done = run(*words)
+    if done.returncode:
+        said = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [f"exit code {done.returncode}"]
+        raise RunError(f"`{' '.join(words)}` failed: {said[0]}")
+
+
+def make_user(group: str) -> None:
+    import pwd
+
+    if shutil.which("systemd-sysusers"):
+        call("systemd-sysusers", f"/{SYSUSERS}")
+    else:
+        with contextlib.suppress(KeyError):
+            pwd.getpwnam(NAME)
+            return
+        nowhere = ("--no-create-home", "--home-dir", "/", "--shell", "/usr/sbin/nologin")
+        call("useradd", "--system", "--user-group", *nowhere, "--groups", group, NAME)
+    try:
+        pwd.getpwnam(NAME)
+    except KeyError:
+        raise RunError(
+            f"user {NAME}: could not be made. By hand: sudo useradd --system --groups {group} {NAME}"
+        ) from None
+
+
+def reload_devices() -> None:
+    """Let the rules act on what is plugged in already."""
+    if shutil.which("udevadm") is None:
+        say("no udevadm here: the udev rules act after the next start")
+        return
+    call("udevadm", "control", "--reload")
+    call("udevadm", "trigger", "--action=change", "--subsystem-match=usb-serial", "--subsystem-match=tty")
+
+
+def reload_network(channel: str) -> None:
+    if output("systemctl", "is-active", "systemd-networkd.service").strip() == "active":
+        call("networkctl", "reload")
+    else:
+        say(f"systemd-networkd does not run here. For {channel}: sudo systemctl enable --now systemd-networkd")
+    say(
+        f"the queue length of {channel} holds from the next start of the machine; now: sudo ip link set {channel} txqueuelen 128"
+    )
+
+
+def own_executable() -> str:
+    """The installed program that belongs to this Python. UserError where there is none."""
+    import sysconfig
+
+    for folder in (
+        sysconfig.get_path("scripts"),
+        str(Path(sys.prefix) / "bin"),
+        str(Path(sys.argv[0]).absolute().parent),
+    ):
+        if os.access(Path(folder) / NAME, os.X_OK):
+            return str(Path(folder) / NAME)
+    raise UserError(f"no installed {NAME} belongs to this Python. Name it with --executable.")
+
+
+def check_executable(executable: str, root: Path) -> bool:
+    """True if it is below a home folder. UserError where the service could not run it."""
+    if not _EXECUTABLE.fullmatch(executable) or ".." in Path(executable).parts:
+        raise UserError(f"{executable}: must be an absolute path without spaces, quotes, % and the like: --executable")
+    program = root / executable.lstrip("/")
+    if root != Path("/") and not program.exists():
+        say(f"warning: {program}: is not there yet")
+        return executable.startswith(tuple(f"{home}/" for home in _HOMES))
+    if not os.access(program, os.X_OK) or not program.is_file():
+        raise UserError(f"{program}: is not a program. Name the installed one with --executable.")
+    if root != Path("/"):
+        return executable.startswith(tuple(f"{home}/" for home in _HOMES))
+    needed = _needed(Path(executable))
+    for path in needed:
+        if str(path).startswith(tuple(f"{folder}/" for folder in _HIDDEN)):
+            raise UserError(
+                f"{path}: the service has a /tmp of its own and does not see it. Install the program in /opt/{NAME}."
+            )
+        if (closed := closed_to_others(path)) is not None:
+            raise UserError(
+                f"{path}: the service's user cannot reach it: {closed} is closed to others. "
+                f"Install the program where all may read, as in /opt/{NAME}."
+            )
+    return any(str(path).startswith(tuple(f"{home}/" for home in _HOMES)) for path in needed)
+
+
+def _needed(program: Path) -> list[Path]:
+    """What is read to run it: the program, its interpreter, and the package if it is the one that runs now."""
+    needed = [program, program.resolve()]
+    with contextlib.suppress(OSError):
+        first = program.open("rb").readline(4096).decode(errors="replace")
+        if first.startswith("#!/") and (interpreter := Path(first[2:].split()[0])).name.startswith("python"):
+            needed += [interpreter, interpreter.resolve()]
+            if interpreter.parent == Path(sys.executable).parent:
+                needed.append(Path(__file__).resolve())
+    return list(dict.fromkeys(needed))
+
+
+def closed_to_others(path: Path) -> Path | None:
+    """The folder or file on the way that others may not pass or read."""
+    for part in reversed([path, *path.parents]):
+        with contextlib.suppress(OSError):
+            if part.stat().st_mode & (1 if part.is_dir() else 4) == 0:
+                return part
+    return None

@@ -1,0 +1,94 @@
+"""``service uninstall``: stop, disable, and remove what an install wrote. What people wrote is kept."""
+
+import argparse
+import contextlib
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from kontronik_can_gw.cli import service_files as files
+from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.service_files import NAME, WANTS
+from kontronik_can_gw.cli.service_machine import call, check_rights, output, run
+from kontronik_can_gw.cli.service_status import properties
+from kontronik_can_gw.errors import RunError, UserError
+
+
+def uninstall(args: argparse.Namespace) -> int:
+    live = args.root is None
+    root = Path("/") if live else args.root
+    if not args.dry_run:
+        check_rights(live, root, "uninstall")
+    links = sorted((root / WANTS).glob(f"{NAME}*.service"))
+    if args.instance:
+        if args.purge:
+            raise UserError("--purge removes everything: not with --instance")
+        return _disable(
+            args, [files.unit(args.instance)], [link for link in links if link.name == files.unit(args.instance)], live
+        )
+    found = files.installed(root)
+    doomed = _kept_data(root) if args.purge else []
+    if args.dry_run:
+        for path in (*links, *found, *doomed):
+            print(f"remove {path}")
+        return 0
+    if not found and not links and not doomed:
+        say("nothing is installed")
+        return 0
+    _disable(args, [*_running(), files.unit(None)] if live else [], links, live)
+    for path in found:
+        _remove_file(path)
+    for kind in ("", "@"):
+        with contextlib.suppress(OSError):  # not there, or others' drop-ins are in it
+            (root / files.UNITS / f"{NAME}{kind}.service.d").rmdir()
+    for path in doomed:
+        _remove_tree(path)
+    if live:
+        call("systemctl", "daemon-reload")
+        if shutil.which("udevadm"):
+            call("udevadm", "control", "--reload")
+        if args.purge:
+            run("userdel", NAME)
+    kept = [] if args.purge else _kept_data(root)
+    if kept:
+        say(f"kept: {', '.join(map(str, kept))} (--purge removes them)")
+    return 0
+
+
+def _disable(args: argparse.Namespace, units: Sequence[str], links: Sequence[Path], live: bool) -> int:
+    for unit in dict.fromkeys(units) if live else ():
+        if args.dry_run:
+            print(f"systemctl disable --now {unit}")
+        elif properties(unit).get("LoadState") == "loaded":
+            call("systemctl", "disable", "--now", unit)
+            run("systemctl", "reset-failed", unit)
+            say(f"{unit}: stopped and disabled")
+    for link in () if args.dry_run else links:
+        if link.is_symlink():
+            files.remove(link)
+    return 0
+
+
+def _running() -> list[str]:
+    listed = output("systemctl", "list-units", "--all", "--plain", "--no-legend", f"{NAME}@*.service")
+    return [line.split()[0] for line in listed.splitlines() if line.strip()]
+
+
+def _kept_data(root: Path) -> list[Path]:
+    states = (p for p in root.glob(f"var/lib/{NAME}*") if p.name == NAME or p.name.startswith(f"{NAME}-"))
+    return [path for path in (root / files.CONFIGURATIONS, *sorted(states)) if path.exists()]
+
+
+def _remove_file(path: Path) -> None:
+    if files.is_ours(files.read(path) or ""):
+        files.remove(path)
+    else:
+        say(f"{path}: was changed by hand, kept as {files.put_aside(path).name}")
+
+
+def _remove_tree(path: Path) -> None:
+    try:
+        shutil.rmtree(path)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be removed: {error.strerror or error}") from None
+    say(f"{path}: removed")

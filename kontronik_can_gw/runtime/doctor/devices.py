@@ -1,0 +1,77 @@
+"""What stands behind a serial port: driver, USB adapter, device tree, stable names. Read from /sys and /dev/serial only."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from kontronik_can_gw.runtime.doctor.system import System
+
+_MINI_UART = "brcm,bcm2835-aux-uart"
+_BUS_DRIVERS = ("port", "ctrl", "usb", "")
+"""Not the UART's own driver: newer kernels put two devices of the serial core in between."""
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """The hardware behind a tty. ``usb`` is the folder of the USB device in /sys, empty for others."""
+
+    driver: str = ""
+    usb: str = ""
+    product: str = ""
+    serial: str = ""
+    vendor_id: str = ""
+    mini_uart: bool = False
+
+    def __str__(self) -> str:
+        words = [self.product, f"driver {self.driver}" if self.driver else ""]
+        if self.usb:
+            words.append(f"serial number {self.serial}" if self.serial else "without a serial number")
+        return ", ".join(word for word in words if word)
+
+
+def adapter_of(system: System, tty: str) -> Adapter:
+    """The hardware behind a tty's name, as ttyUSB0."""
+    driver, mini_uart = "", False
+    for folder in _ancestors(system, f"/sys/class/tty/{tty}/device"):
+        if system.exists(f"{folder}/driver"):
+            name = system.real(f"{folder}/driver").rpartition("/")[2]
+            driver = driver or (name if name not in _BUS_DRIVERS else "")
+        compatible = system.text(f"{folder}/of_node/compatible") or ""
+        mini_uart = mini_uart or _MINI_UART in compatible.split("\0") or driver == "bcm2835-aux-uart"
+        if (vendor_id := system.text(f"{folder}/idVendor")) is not None:
+            product = system.text(f"{folder}/product") or ""
+            return Adapter(driver, folder, product, system.text(f"{folder}/serial") or "", vendor_id, mini_uart)
+    return Adapter(driver, mini_uart=mini_uart)
+
+
+def _ancestors(system: System, folder: str) -> Iterator[str]:
+    """A device's folder in /sys and those of the devices above it."""
+    if not system.exists(folder):
+        return
+    at = system.real(folder)
+    while at.count("/") > 2:
+        yield at
+        at = at.rpartition("/")[0]
+
+
+def stable_names(system: System, port: str) -> list[str]:
+    """Names of a port that do not change: by the adapter's serial number (only where it has one), else by the socket it is in."""
+    real = system.real(port)
+    tty = real.rpartition("/")[2]
+    kinds = ("by-id", "by-path") if adapter_of(system, tty).serial else ("by-path", "by-id")
+    found = []
+    for kind in kinds:
+        folder = f"/dev/serial/{kind}"
+        found += [f"{folder}/{name}" for name in system.names(folder) if system.real(f"{folder}/{name}") == real]
+    return found
+
+
+def ports_there(system: System) -> list[str]:
+    """Serial ports that an ESC could be on, by their best names."""
+    found = []
+    for tty in system.names("/sys/class/tty"):
+        if system.exists(f"/sys/class/tty/{tty}/device") and system.exists(f"/dev/{tty}"):
+            # Linux makes ttyS0..3 whether there is hardware or not: type 0 is none
+            if system.text(f"/sys/class/tty/{tty}/type") == "0":
+                continue
+            found.append(next(iter(stable_names(system, f"/dev/{tty}")), f"/dev/{tty}"))
+    return found

@@ -1,0 +1,101 @@
+"""A short look through an open serial port: can it do even parity, and what line errors has it counted.
+
+Nothing is written, and the settings of a port that somebody else may be using are not touched: the caller says whether nobody is. What is
+set, 115200 baud with even parity and without echo, is what the gateway sets too, and is left so: an echo would be sent to the ESC.
+"""
+
+import contextlib
+import errno
+import fcntl
+import os
+import struct
+import termios
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+_GET_COUNTS, _COUNTS = 0x545D, struct.Struct("=20i")
+_COUNTERS = {6: "framing", 8: "parity", 7: "overrun", 9: "break", 10: "buffer overrun"}
+"""Places in struct serial_icounter_struct."""
+_GET_SERIAL, _SERIAL_SIZE, _FLAGS_AT, _LOW_LATENCY = 0x541E, 128, 16, 1 << 13
+"""struct serial_struct: flags is its fifth integer."""
+_STICKY_PARITY = 0o10000000000
+
+
+@dataclass(frozen=True)
+class Line:
+    """What a port told. None: not known."""
+
+    trouble: str | None = None
+    """Why it could not be opened."""
+    busy: bool = False
+    """It could not be opened because somebody has it for himself."""
+    touched: bool = False
+    even_parity: bool | None = None
+    low_latency: bool | None = None
+    errors: Mapping[str, int] = field(default_factory=dict)
+    """Line errors since the driver began to count, by kind; empty where it does not count."""
+    counts: bool = False
+
+
+def look(path: str, alone: bool) -> Line:
+    """Open a port for a moment. ``alone``: nobody else has it open; otherwise only a port nobody has set up yet is tried."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        return Line(error.strerror or str(error), busy=error.errno == errno.EBUSY)
+    try:
+        parity = _try_even_parity(fd, alone)
+        errors = _line_errors(fd)
+        return Line(
+            touched=parity is not None,
+            even_parity=parity,
+            low_latency=_low_latency(fd),
+            errors=errors or {},
+            counts=errors is not None,
+        )
+    except termios.error as error:
+        return Line(f"is not a working serial port ({error.args[-1]})")
+    finally:
+        os.close(fd)
+
+
+def _try_even_parity(fd: int, alone: bool) -> bool | None:
+    """Set 115200 baud, 8E1, raw; say if the port took it. None: not tried."""
+    mode = termios.tcgetattr(fd)
+    if not alone and not mode[3] & termios.ICANON and not _is_ours(mode):
+        return None  # someone has set it up for himself
+    mode[0] = 0
+    mode[1] &= ~termios.OPOST
+    mode[2] &= ~(termios.CSIZE | termios.CSTOPB | termios.PARODD | termios.CRTSCTS | _STICKY_PARITY)
+    mode[2] |= termios.CS8 | termios.PARENB | termios.CREAD | termios.CLOCAL
+    mode[3] = 0
+    mode[4] = mode[5] = termios.B115200
+    with contextlib.suppress(termios.error):  # what it took is read back
+        termios.tcsetattr(fd, termios.TCSANOW, mode)
+    return _is_ours(termios.tcgetattr(fd))
+
+
+def _is_ours(mode: list[object]) -> bool:
+    flags, speed = mode[2], mode[4]
+    assert isinstance(flags, int)
+    asked = termios.CS8 | termios.PARENB
+    seen = flags & (termios.CSIZE | termios.PARENB | termios.PARODD | termios.CSTOPB)
+    return seen == asked and speed == termios.B115200
+
+
+def _line_errors(fd: int) -> dict[str, int] | None:
+    try:
+        counts = _COUNTS.unpack(fcntl.ioctl(fd, _GET_COUNTS, bytes(_COUNTS.size)))
+    except OSError:
+        return None
+    return {name: counts[place] for place, name in _COUNTERS.items() if counts[place]}
+
+
+def _low_latency(fd: int) -> bool | None:
+    """Is the driver's low-latency flag on? None where it has none."""
+    try:
+        found = fcntl.ioctl(fd, _GET_SERIAL, bytes(_SERIAL_SIZE))
+    except OSError:
+        return None
+    (flags,) = struct.unpack_from("=i", found, _FLAGS_AT)
+    return bool(flags & _LOW_LATENCY)

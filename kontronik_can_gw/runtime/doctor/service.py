@@ -1,0 +1,95 @@
+"""The installed systemd service: which unit runs a configuration, as whom, and how it fares."""
+
+from dataclasses import dataclass
+from pathlib import PurePath
+
+from kontronik_can_gw.runtime.doctor.findings import Findings
+from kontronik_can_gw.runtime.doctor.system import System, User
+
+NAME = "kontronik-can-gw"
+_FOLDER = f"/etc/{NAME}"
+_SHOWN = (
+    "LoadState,ActiveState,SubState,UnitFileState,NRestarts,Result,User,DynamicUser,SupplementaryGroups,"
+    "ProtectSystem,ProtectHome,ReadWritePaths,DevicePolicy,DeviceAllow"
+)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit that systemd knows."""
+
+    name: str
+    user: User | None
+    """None: unknown."""
+    state: str
+    """active, failed, inactive ..."""
+    detail: str
+    enabled: bool
+    restarts: int
+    strict: bool = False
+    """All folders but its own and ``writable`` are read-only for it."""
+    writable: tuple[str, ...] = ()
+    hides_homes: bool = False
+    devices: tuple[str, ...] | None = None
+    """Kinds of devices that it may use, as char-ttyUSB; None: all."""
+
+    @property
+    def state_folder(self) -> str:
+        """Where its parameters are kept if the configuration does not say."""
+        return f"/var/lib/{self.name.removesuffix('.service').replace('@', '-')}"
+
+
+def unit_of(system: System, config: str) -> Unit | None:
+    """The unit that runs a configuration file, or would if it were installed there; None where systemd has none."""
+    path = PurePath(config)
+    instance = path.stem if str(path.parent) == _FOLDER and path.stem != "gateway" else ""
+    name = f"{NAME}@{instance}.service" if instance else f"{NAME}.service"
+    if not system.has_systemd:
+        return None
+    lines = (system.run("systemctl", "show", name, f"--property={_SHOWN}") or "").splitlines()
+    shown: dict[str, str] = {}
+    for key, _, value in (line.partition("=") for line in lines):
+        shown[key] = f"{shown[key]} {value}" if key in shown else value  # DeviceAllow has a line for each
+    if shown.get("LoadState") != "loaded":
+        return None
+    groups, user = tuple(shown.get("SupplementaryGroups", "").split()), shown.get("User", "")
+    who = system.user_named(user or "root", groups)
+    if who is None and shown.get("DynamicUser") == "yes":
+        who = system.dynamic_user(user or NAME, groups)
+    restarts = shown.get("NRestarts", "0")
+    return Unit(
+        name,
+        who,
+        shown.get("ActiveState", ""),
+        f"{shown.get('SubState', '')}, result {shown.get('Result', '')}",
+        shown.get("UnitFileState", "").startswith("enabled"),
+        int(restarts) if restarts.isdigit() else 0,
+        shown.get("ProtectSystem") == "strict",
+        tuple(path.lstrip("-+") for path in shown.get("ReadWritePaths", "").split()),
+        shown.get("ProtectHome") in ("yes", "tmpfs"),
+        tuple(shown.get("DeviceAllow", "").split()[::2]) if shown.get("DevicePolicy") in ("closed", "strict") else None,
+    )
+
+
+def check_service(system: System, findings: Findings, unit: Unit | None) -> None:
+    """Installed, enabled, running, and how often it was restarted."""
+    if not system.has_systemd:
+        findings.note("machine.service", "systemd does not run here; the gateway must be started by other means")
+        return
+    if unit is None:
+        findings.note("machine.service", "not installed as a service", "", "sudo kontronik-can-gw service install")
+        return
+    log = f"journalctl -u {unit.name} -n 50"
+    if unit.state == "failed":
+        findings.error("machine.service", f"{unit.name} has failed ({unit.detail})", "Its log says why:", log)
+    elif unit.state not in ("active", "reloading"):
+        state = f"{unit.name} is {unit.state} ({unit.detail})"
+        findings.note("machine.service", state, "", f"sudo systemctl start {unit.name}")
+    elif unit.restarts:
+        text = f"{unit.name} is active; systemd has restarted it {unit.restarts} times"
+        findings.warning("machine.service", text, "Its log says why:", log)
+    else:
+        findings.ok("machine.service", f"{unit.name} is active")
+    if not unit.enabled:
+        text = f"{unit.name} does not start when the machine does"
+        findings.note("machine.service_enabled", text, "", f"sudo systemctl enable {unit.name}")

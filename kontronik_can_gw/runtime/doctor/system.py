@@ -1,0 +1,232 @@
+"""What the checks see of the machine: files below a root, programs that only show, processes. Nothing is changed.
+
+Names are absolute paths as the machine has them; tests give another root.
+"""
+
+import contextlib
+import grp
+import os
+import pwd
+import shutil
+import stat
+import subprocess
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+PROGRAM_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
+"""Where programs are looked for: `ip` is not on every user's path."""
+_PATIENCE_S = 5.0
+
+
+class Process(NamedTuple):
+    """A running program."""
+
+    pid: int
+    name: str
+    words: tuple[str, ...] = ()
+
+    @property
+    def is_gateway(self) -> bool:
+        """True for a gateway of ours: `kontronik-can-gw run`, or `python -m kontronik_can_gw run`."""
+        names = [word.rpartition("/")[2] for word in self.words[:4]]
+        return "run" in self.words[1:] and bool({"kontronik-can-gw", "kontronik_can_gw"} & set(names))
+
+    def __str__(self) -> str:
+        return f"{'kontronik-can-gw' if self.is_gateway else self.name} (pid {self.pid})"
+
+
+@dataclass(frozen=True)
+class User:
+    """Someone who opens files: a name, a user-ID and the IDs of all groups."""
+
+    name: str
+    uid: int
+    groups: frozenset[int] = field(default_factory=frozenset)
+
+    def may(self, status: os.stat_result, bits: int) -> bool:
+        """True if the mode allows all of ``bits`` (4 read, 2 write, 1 enter or run)."""
+        if self.uid == 0:
+            return True
+        shift = 6 if status.st_uid == self.uid else 3 if status.st_gid in self.groups else 0
+        return status.st_mode >> shift & bits == bits
+
+
+class FileSystem(NamedTuple):
+    """What a folder's file system has left."""
+
+    read_only: bool
+    free_bytes: int
+    free_files: int | None
+    """None where the file system has no such limit."""
+
+
+class System:
+    """The machine below ``root``."""
+
+    def __init__(self, root: Path = Path("/")) -> None:
+        self.root = root
+
+    # --- files
+
+    def path(self, name: str) -> Path:
+        return self.root / name.lstrip("/")
+
+    def text(self, name: str) -> str | None:
+        """A small file's text; None where it cannot be read. Device trees end theirs with NUL."""
+        try:
+            return self.path(name).read_bytes().decode("utf-8", "replace").strip("\0\n ")
+        except OSError:
+            return None
+
+    def number(self, name: str) -> int | None:
+        """A file with one number in it."""
+        try:
+            return int(self.text(name) or "", 0)
+        except ValueError:
+            return None
+
+    def names(self, folder: str) -> list[str]:
+        """What is in a folder; nothing where it cannot be read."""
+        try:
+            return sorted(each.name for each in self.path(folder).iterdir())
+        except OSError:
+            return []
+
+    def exists(self, name: str) -> bool:
+        return self.status(name) is not None
+
+    def real(self, name: str) -> str:
+        """The path without symbolic links."""
+        found = os.path.realpath(self.path(name))
+        root = os.path.realpath(self.root)
+        return found if root == "/" else found.removeprefix(root) or "/"
+
+    def status(self, name: str) -> os.stat_result | None:
+        try:
+            return self.path(name).stat()
+        except OSError:
+            return None
+
+    def file_system(self, name: str) -> FileSystem | None:
+        try:
+            found = os.statvfs(self.path(name))
+        except OSError:
+            return None
+        files = found.f_favail if found.f_files else None
+        return FileSystem(bool(found.f_flag & os.ST_RDONLY), found.f_bavail * found.f_frsize, files)
+
+    def may_open(self, name: str) -> bool:
+        """True if this process may read and write a file, access lists included."""
+        return os.access(self.path(name), os.R_OK | os.W_OK)
+
+    def may_fill(self, name: str) -> bool:
+        """True if this process may make files in a folder."""
+        return os.access(self.path(name), os.W_OK | os.X_OK)
+
+    # --- programs
+
+    def run(self, *command: str) -> str | None:
+        """What a program prints; None where it is missing or takes too long. Its exit code says nothing here."""
+        program = shutil.which(command[0], path=PROGRAM_PATH)
+        if program is None:
+            return None
+        try:
+            done = subprocess.run(
+                [program, *command[1:]],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=_PATIENCE_S,
+                check=False,
+                env={**os.environ, "LC_ALL": "C"},
+            )
+        except (OSError, subprocess.SubprocessError):
+            return None
+        return done.stdout
+
+    @property
+    def has_systemd(self) -> bool:
+        return self.exists("/run/systemd/system")
+
+    # --- users
+
+    @cached_property
+    def user(self) -> User:
+        """Who we are."""
+        uid = os.geteuid()
+        name = str(uid)
+        with contextlib.suppress(KeyError):
+            name = pwd.getpwuid(uid).pw_name
+        return User(name, uid, frozenset((*os.getgroups(), os.getegid())))
+
+    def user_named(self, name: str, more_groups: tuple[str, ...] = ()) -> User | None:
+        """Another user, with the groups that the system gives him and ``more_groups``; None where there is none."""
+        for line in (self.text("/etc/passwd") or "").splitlines():
+            words = line.split(":")
+            if words[0] == name and len(words) > 3 and words[2].isdigit() and words[3].isdigit():
+                return User(name, int(words[2]), frozenset({int(words[3]), *self._groups(name, more_groups)}))
+        return None
+
+    def dynamic_user(self, name: str, groups: tuple[str, ...]) -> User:
+        """A user that systemd makes up when the service starts."""
+        return User(name, -1, frozenset(self._groups(name, groups)))
+
+    def _groups(self, user: str, more: tuple[str, ...]) -> list[int]:
+        found = []
+        for line in (self.text("/etc/group") or "").splitlines():
+            words = line.split(":")
+            if len(words) > 3 and words[2].isdigit() and (words[0] in more or user in words[3].split(",")):
+                found.append(int(words[2]))
+        return found
+
+    def group_name(self, gid: int) -> str:
+        try:
+            return grp.getgrgid(gid).gr_name
+        except KeyError:
+            return str(gid)
+
+    # --- processes
+
+    @cached_property
+    def processes(self) -> list[Process]:
+        """All programs that we may see, but ourselves."""
+        found = []
+        for pid in self.names("/proc"):
+            if not pid.isdigit() or int(pid) == os.getpid():
+                continue
+            name = self.text(f"/proc/{pid}/comm")
+            if name is not None:
+                words = (self.text(f"/proc/{pid}/cmdline") or "").split("\0")
+                found.append(Process(int(pid), name, tuple(words)))
+        return found
+
+    def openers(self, device: os.stat_result) -> tuple[list[Process], bool]:
+        """Who has a character device open or locked; False if there may be others that we may not see."""
+        found: dict[int, Process] = {}
+        complete = bool(self.processes) and self.exists("/proc/1/comm")
+        for process in self.processes:
+            folder = f"/proc/{process.pid}/fd"
+            try:
+                numbers = [each.name for each in self.path(folder).iterdir()]
+            except PermissionError:
+                complete = False
+                continue
+            except OSError:  # it has ended
+                continue
+            for number in numbers:
+                status = self.status(f"{folder}/{number}")
+                if status and stat.S_ISCHR(status.st_mode) and status.st_rdev == device.st_rdev:
+                    found[process.pid] = process
+        for pid in self._lockers(device) - set(found) - {os.getpid()}:
+            known = next((process for process in self.processes if process.pid == pid), None)
+            found[pid] = known or Process(pid, "a program that we may not see")
+        return [found[pid] for pid in sorted(found)], complete
+
+    def _lockers(self, file: os.stat_result) -> set[int]:
+        """Who has locked a file, which everybody may see."""
+        where = f"{os.major(file.st_dev):02x}:{os.minor(file.st_dev):02x}:{file.st_ino}"
+        lines = [line.split() for line in (self.text("/proc/locks") or "").splitlines()]
+        return {int(words[4]) for words in lines if len(words) > 5 and words[5] == where and words[4].isdigit()}

@@ -1,0 +1,356 @@
+"""What the gateway knows of itself, as one JSON document for people and programs.
+
+A snapshot is made by the loop's thread from the gateway and from facts about what the loop owns. Every value in it was fresh when it was
+made, or is null.
+"""
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.protocol.states import (
+    ErrorBit,
+    OperatingError,
+    SelfTestError,
+    Severity,
+    bit_texts,
+    device_text,
+    peak_current_of,
+    state_text,
+)
+from kontronik_can_gw.sources import GatewayStatus, Group, Source, sources
+from kontronik_can_gw.telemetry import INFO_TIMEOUT_NS, SECOND, EscSettings, EscTelemetry
+
+FORMAT = 1
+"""Of the document; another number for a change that readers must know of. New keys may come without one."""
+PROGRAM = "kontronik-can-gw"
+STALE_NS = 3 * SECOND
+"""A document older than this says nothing of now."""
+LOG_LINES = 20
+_LAYOUTS = (None, "V4", "legacy")
+_OTHERWISE = ("variant", "device_raw", "firmware_main", "firmware_sub")
+"""Sources that stand beside the values, not among them."""
+
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class PortFacts:
+    """What the loop knows of one ESC's port. ``lost_since_ns``: monotonic, None while it is open."""
+
+    name: str
+    path: str
+    open: bool
+    complaint: str = ""
+    reopened: int = 0
+    line_errors: Mapping[str, int] = field(default_factory=dict)
+    lost_since_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class CanFacts:
+    """What the loop knows of the CAN interface; its state and its counters are in GatewayStatus."""
+
+    interface: str
+    channel: str
+    bitrate: int | None
+    open: bool
+    complaint: str = ""
+    stalled: bool = False
+    restart_ms: int | None = None
+    error_counters: tuple[int, int] | None = None
+    """Transmit and receive error counter of the controller, where known."""
+
+
+@dataclass(frozen=True)
+class StoreFacts:
+    """Parameters that wait for the disk, and why the last saving failed ('' where it did not)."""
+
+    waiting: int = 0
+    last_error: str = ""
+
+
+@dataclass(frozen=True)
+class ProgramFacts:
+    """What stays the same while the process runs. ``started``: wall clock at start, UTC; ``ticks``: start time in /proc."""
+
+    configuration: str
+    version: str = __version__
+    pid: int = 0
+    ticks: int = 0
+    pid_namespace: str = ""
+    started: str = ""
+
+
+@dataclass(frozen=True)
+class ProcessFacts:
+    """What the process uses. 0 where the system does not tell."""
+
+    rss_bytes: int = 0
+    open_fds: int = 0
+    threads: int = 0
+
+
+def program_facts(configuration: Path | str) -> ProgramFacts:
+    """About this process."""
+    pid = os.getpid()
+    return ProgramFacts(
+        str(Path(configuration).absolute()),
+        pid=pid,
+        ticks=start_ticks(pid),
+        pid_namespace=pid_namespace(),
+        started=utc(time.time()),
+    )
+
+
+def process_facts() -> ProcessFacts:
+    """About this process, now: two looks into /proc."""
+    threads = rss = fds = 0
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        found = _stat_fields("self")
+        threads, rss = int(found[17]), int(found[21]) * os.sysconf("SC_PAGE_SIZE")
+    with contextlib.suppress(OSError):
+        fds = len(os.listdir("/proc/self/fd")) - 1  # noqa: PTH208  names are enough; one is that of the listing itself
+    return ProcessFacts(rss, fds, threads)
+
+
+def start_ticks(pid: int) -> int:
+    """When a process started, in clock ticks since boot: with the pid it is one and no other.
+
+    0 where the system does not tell, -1 for a process that has ended and only waits for its parent.
+    """
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        found = _stat_fields(str(pid))
+        return -1 if found[0] in (b"Z", b"X") else int(found[19])
+    return 0
+
+
+def pid_namespace() -> str:
+    """What pids of this process mean something to; '' where the system does not tell."""
+    with contextlib.suppress(OSError):
+        return str(Path("/proc/self/ns/pid").readlink())
+    return ""
+
+
+def utc(wall: float) -> str:
+    """Wall clock seconds as text."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall))
+
+
+def snapshot(
+    gateway: Gateway,
+    *,
+    now: int,
+    wall: float,
+    program: ProgramFacts,
+    process: ProcessFacts,
+    ports: Sequence[PortFacts],
+    can: CanFacts,
+    store: StoreFacts | None = None,
+    log_lines: Sequence[str] = (),
+) -> Document:
+    """The document: plain dictionaries, lists, texts and numbers. ``now`` monotonic nanoseconds, ``wall`` seconds of the wall clock."""
+    status, nodes = gateway.status, gateway.node_states()
+    names = [port.name for port in ports]
+    return {
+        "format": FORMAT,
+        "program": PROGRAM,
+        "version": program.version,
+        "configuration": program.configuration,
+        "monotonic_ns": now,
+        "time": utc(wall),
+        "process": {
+            "pid": program.pid,
+            "start_ticks": program.ticks,
+            "pid_namespace": program.pid_namespace,
+            "started": program.started,
+            "uptime_s": _seconds(now - status.started_ns),
+            "rss_bytes": process.rss_bytes,
+            "open_fds": process.open_fds,
+            "threads": process.threads,
+        },
+        "gateway": {"state": _words(status.state.name), "esc_count": status.esc_count, "escs_ok": status.escs_ok},
+        "can": {
+            "interface": can.interface,
+            "channel": can.channel,
+            "bitrate": can.bitrate,
+            "state": _words(status.can_state.name),
+            "open": can.open,
+            "stalled": can.stalled,
+            "complaint": can.complaint or None,
+            "restart_ms": can.restart_ms,
+            "error_counters": None if can.error_counters is None else list(can.error_counters),
+            "counters": {name: getattr(status, name) for name in _STATUS_COUNTERS},
+        },
+        "units": _UNITS,
+        "escs": [_esc(esc, port, now) for esc, port in zip(gateway.escs, ports, strict=True)],
+        "nodes": [
+            {
+                "esc": name,
+                "node_id": None if node_id == UNCONFIGURED else node_id,
+                "state": _words(state.name),
+                "pdos_sent": sent,
+            }
+            for name, (node_id, state, sent) in zip(names, nodes, strict=False)
+        ],
+        "store": None if store is None else {"waiting": store.waiting, "last_error": store.last_error or None},
+        "log": list(log_lines)[-LOG_LINES:],
+    }
+
+
+def with_rates(document: Document, before: Document | None) -> Document:
+    """The document with what happens in a second since ``before``: frames on the bus, PDOs of each node. None without a ``before``."""
+    seconds = 0.0 if before is None else (document["monotonic_ns"] - before["monotonic_ns"]) / SECOND
+    if before is None or seconds <= 0:
+        return document | {"rates": None}
+    new, old = document["can"]["counters"], before["can"]["counters"]
+    pdos = zip(document["nodes"], before["nodes"], strict=False)
+    rates: Document = {
+        f"{name}_per_s": round((new[name] - old[name]) / seconds, 1) for name in ("sent_frames", "received_frames")
+    }
+    rates["pdos_per_s"] = [round((now["pdos_sent"] - then["pdos_sent"]) / seconds, 1) for now, then in pdos]
+    return document | {"rates": {"seconds": round(seconds, 3)} | rates}
+
+
+def _stat_fields(pid: str) -> list[bytes]:
+    """The fields of /proc/PID/stat behind the program's name, which may hold anything."""
+    return Path("/proc", pid, "stat").read_bytes().rpartition(b")")[2].split()
+
+
+def _seconds(ns: int) -> float:
+    return round(ns / SECOND, 3)
+
+
+def _words(name: str) -> str:
+    """A constant's name as people read it."""
+    return name.lower().replace("_", "-")
+
+
+def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
+    """One ESC. What is not fresh at ``now`` is None, whatever the last call of ``advance`` knew."""
+    live, info = esc.live, esc.info
+    if live is not None and (esc.live_ns is None or now - esc.live_ns > esc.settings.timeout_ns):
+        live = None
+    if info is not None and (esc.info_ns is None or now - esc.info_ns > INFO_TIMEOUT_NS):
+        info = None
+    readers = _readers(esc.settings.pole_pairs, esc.settings.gear)
+    alarms = None if live is None else _alarms(live.operating_errors)
+    return {
+        "name": esc.settings.name,
+        "port": {
+            "path": port.path,
+            "open": port.open,
+            "complaint": port.complaint or None,
+            "reopened": max(0, port.reopened),
+            "lost_for_s": None if port.lost_since_ns is None else _seconds(now - port.lost_since_ns),
+            "line_errors": dict(port.line_errors),
+        },
+        "link": _words(esc.link.name),
+        "fresh": live is not None,
+        "diagnosis": esc.diagnosis() if live is None and port.open else None,
+        "layout": _LAYOUTS[esc.layout],
+        "device": None if info is None else device_text(info.device) or str(info.device),
+        "variant": None if info is None else info.variant,
+        "firmware": None if info is None else info.firmware,
+        "peak_current_of": None if info is None else peak_current_of(info.device),
+        "frame_rate_hz": None if esc.frame_rate is None else esc.frame_rate / 10,
+        "data_age_ms": esc.age_ms(now),
+        "losses": esc.losses,
+        "counters": esc.counters.as_dict()
+        | {"suspect_frames": esc.suspect_frames, "late_frames": esc.late_frames, "line_errors": esc.line_errors},
+        "operating_state": None if live is None else state_text(live.operating_state) or str(live.operating_state),
+        "errors": None if alarms is None else alarms[Severity.ERROR],
+        "warnings": None if alarms is None else alarms[Severity.WARNING],
+        "statuses": None if alarms is None else alarms[Severity.STATUS],
+        "selftest_errors": None if info is None else _selftest(info.selftest_errors),
+        "values": {
+            **(readers.nothing_live if live is None else readers.live(esc, live, info)),
+            **(readers.nothing_known if info is None else readers.info(esc, live, info)),
+            **readers.link(esc, live, info),
+        },
+    }
+
+
+@lru_cache(maxsize=256)
+def _alarms(word: int) -> dict[Severity, list[str]]:
+    """The bits of the error word by their class; one without a name counts as an error."""
+    found: dict[Severity, list[str]] = {severity: [] for severity in Severity}
+    for text in bit_texts(word, OperatingError):
+        found[_SEVERITIES.get(text, Severity.ERROR)].append(text)
+    return found
+
+
+@lru_cache(maxsize=256)
+def _selftest(word: int) -> list[str]:
+    return bit_texts(word, SelfTestError)
+
+
+Reader = Callable[[EscTelemetry, object, object], dict[str, float | None]]
+
+
+class _Readers(NamedTuple):
+    live: Reader
+    info: Reader
+    link: Reader
+    nothing_live: Mapping[str, None]
+    nothing_known: Mapping[str, None]
+
+
+@lru_cache(maxsize=64)
+def _readers(pole_pairs: int, gear: Fraction) -> _Readers:
+    """How the values of an ESC with this drive train are read: the sources' own expressions, compiled."""
+    settings = EscSettings(pole_pairs=pole_pairs, gear=gear)
+    groups = {group: [s for s in _values(settings) if s.group is group] for group in Group}
+    live, info, link = (_compiled(groups[group]) for group in (Group.LIVE, Group.INFO, Group.LINK))
+    nothing_live, nothing_known = (dict.fromkeys(s.name for s in groups[group]) for group in (Group.LIVE, Group.INFO))
+    return _Readers(live, info, link, nothing_live, nothing_known)
+
+
+def _values(settings: EscSettings) -> list[Source]:
+    """The sources whose values are numbers of the ESC: no flags, no names, no counters of the link."""
+    return [
+        source
+        for source in sources(settings).values()
+        if source.bit is None
+        and not source.names
+        and source.name not in _OTHERWISE
+        and (source.group in (Group.LIVE, Group.INFO) or source.pace is Group.LIVE)
+    ]
+
+
+def _compiled(listed: Sequence[Source]) -> Reader:
+    lines = []
+    for source in listed:
+        steps = source.per_unit
+        value = f"({source.expression})"
+        if steps != 1:
+            value = f"round({value} * {steps.denominator} / {steps.numerator}, 6)"
+        if source.supplied is not None:
+            value = f"({value} if {source.supplied} else None)"
+        lines.append(f"{source.name!r}: {value},")
+    names: dict[str, Any] = {}
+    exec("def read(esc, live, info):\n return {" + "\n".join(lines) + "}", names)  # noqa: S102  text made by us, from sources of ours
+    reader: Reader = names["read"]
+    return reader
+
+
+def _severities(bits: type[ErrorBit]) -> dict[str, Severity]:
+    return {bit.text: bit.severity for bit in bits}
+
+
+_SEVERITIES = _severities(OperatingError)
+_UNITS = {source.name: source.unit for source in _values(EscSettings())}
+_STATUS_COUNTERS = tuple(
+    f.name
+    for f in fields(GatewayStatus)
+    if f.type in (int, "int") and f.name not in ("esc_count", "escs_ok", "started_ns")
+)

@@ -1,0 +1,159 @@
+"""A machine made of files in a folder: /sys, /proc, /dev and what programs print, for the checks of `doctor`."""
+
+import os
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+
+from kontronik_can_gw.runtime.doctor.findings import Finding, Severity
+from kontronik_can_gw.runtime.doctor.system import FileSystem, System, User
+
+DIALOUT = 20
+ME = User("anna", 1000, frozenset({1000, DIALOUT}))
+_DEVICE_FOLDER = 6
+_ROOM = FileSystem(False, 1 << 30, 100_000)
+
+
+class Tree(System):
+    """A machine below a folder. What it is not told of is not there."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.programs: dict[tuple[str, ...], str] = {}
+        self.devices: dict[str, os.stat_result] = {}
+        self.full: dict[str, FileSystem] = {}
+        self.closed: set[str] = set()
+        """Files and folders that we may not open or fill."""
+        self.me = ME
+        root.chmod(0o755)  # pytest's own is closed
+        self.file("/proc/1/comm", "systemd\n")
+        self.file("/proc/cmdline", "root=/dev/mmcblk0p2 rw quiet\n")
+        self.folder("/dev")
+
+    # --- making it
+
+    def folder(self, name: str, mode: int = 0o755) -> None:
+        """A folder with this mode, whatever the umask; those above it too, which everybody may enter."""
+        path = self.path(name)
+        if not path.parent.exists():
+            self.folder(os.path.dirname(name))
+        path.mkdir(exist_ok=True)
+        path.chmod(mode)
+
+    def file(self, name: str, text: str) -> None:
+        if not self.path(name).parent.exists():
+            self.folder(os.path.dirname(name))
+        self.path(name).write_text(text)
+        self.path(name).chmod(0o644)
+
+    def link(self, name: str, target: str) -> None:
+        """A symbolic link to an absolute name of this machine."""
+        if not self.path(name).parent.exists():
+            self.folder(os.path.dirname(name))
+        self.path(name).symlink_to(self.path(target))
+
+    def device(self, name: str, number: tuple[int, int], mode: int = 0o660, group: int = DIALOUT) -> None:
+        """A character device of root's."""
+        self.file(name, "")
+        inode = 100 + len(self.devices)
+        values = (stat.S_IFCHR | mode, inode, os.makedev(0, _DEVICE_FOLDER), 1, 0, group, 0, 0, 0, 0)
+        self.devices[name] = os.stat_result(values, {"st_rdev": os.makedev(*number)})
+
+    def process(self, pid: int, *words: str, opens: Sequence[str] = ()) -> None:
+        self.file(f"/proc/{pid}/comm", words[0].rpartition("/")[2][:15] + "\n")
+        self.file(f"/proc/{pid}/cmdline", "\0".join(words) + "\0")
+        self.folder(f"/proc/{pid}/fd")
+        for number, name in enumerate(opens, 3):
+            self.link(f"/proc/{pid}/fd/{number}", name)
+
+    def ftdi(self, tty: str = "ttyUSB0", serial: str = "A1234", latency: int = 1, minor: int = 0) -> None:
+        """An FTDI adapter with its device node and udev's names."""
+        usb = f"/sys/devices/pci0/usb1/1-{minor + 1}"
+        port = f"{usb}/1-{minor + 1}:1.0/{tty}"
+        self.file(f"{usb}/idVendor", "0403\n")
+        self.file(f"{usb}/product", "FT232R USB UART\n")
+        self.file(f"{usb}/power/control", "on\n")
+        if serial:
+            self.file(f"{usb}/serial", f"{serial}\n")
+        self.file(f"{port}/latency_timer", f"{latency}\n")
+        self.folder("/sys/bus/usb-serial/drivers/ftdi_sio")
+        self.link(f"{port}/driver", "/sys/bus/usb-serial/drivers/ftdi_sio")
+        self.folder(f"{port}/tty/{tty}")
+        self.link(f"/sys/class/tty/{tty}", f"{port}/tty/{tty}")
+        self.link(f"{port}/tty/{tty}/device", port)
+        self.device(f"/dev/{tty}", (188, minor))
+        self.link(f"/dev/serial/by-id/usb-FTDI_{serial or 'none'}-port0", f"/dev/{tty}")
+        self.link(f"/dev/serial/by-path/pci-usb-0:{minor + 1}", f"/dev/{tty}")
+
+    def uart(self, tty: str, driver: str, compatible: str = "", number: tuple[int, int] = (4, 64)) -> None:
+        """A UART on the board, as kernels since 6.6 show it: two devices of the serial core between it and the tty."""
+        board = f"/sys/devices/platform/soc/{tty}.serial"
+        core = f"{board}/{tty}:0/{tty}:0.0"
+        self.folder(f"{core}/tty/{tty}")
+        self.folder("/sys/bus/serial-base/drivers/port")
+        self.link(f"{core}/driver", "/sys/bus/serial-base/drivers/port")
+        self.folder(f"/sys/bus/platform/drivers/{driver}")
+        self.link(f"{board}/driver", f"/sys/bus/platform/drivers/{driver}")
+        if compatible:
+            self.file(f"{board}/of_node/compatible", compatible + "\0")
+        self.link(f"/sys/class/tty/{tty}", f"{core}/tty/{tty}")
+        self.link(f"{core}/tty/{tty}/device", core)
+        self.device(f"/dev/{tty}", number)
+
+    def systemd(self, **shown: str) -> None:
+        """systemd with our unit, which shows these properties besides the usual ones."""
+        self.folder("/run/systemd/system")
+        self.file("/etc/passwd", "root:x:0:0::/:/bin/sh\nkontronik-can-gw:x:990:990::/:/bin/false\n")
+        usual = {
+            "LoadState": "loaded",
+            "ActiveState": "active",
+            "SubState": "running",
+            "UnitFileState": "enabled",
+            "NRestarts": "0",
+            "Result": "success",
+            "User": "kontronik-can-gw",
+            "SupplementaryGroups": "dialout",
+        }
+        self.file("/etc/group", f"root:x:0:\ndialout:x:{DIALOUT}:anna\n")
+        text = "".join(f"{name}={value}\n" for name, value in {**usual, **shown}.items())
+        self.programs["systemctl", "show"] = text
+
+    # --- what the checks see
+
+    @property
+    def user(self) -> User:
+        return self.me
+
+    def group_name(self, gid: int) -> str:
+        return {0: "root", DIALOUT: "dialout"}.get(gid, str(gid))
+
+    def status(self, name: str) -> os.stat_result | None:
+        return self.devices.get(self.real(name)) or super().status(name)
+
+    def run(self, *command: str) -> str | None:
+        """What was put down for the longest beginning of this command."""
+        for length in range(len(command), 0, -1):
+            if (found := self.programs.get(command[:length])) is not None:
+                return found
+        return None
+
+    def file_system(self, name: str) -> FileSystem | None:
+        return self.full.get(name, _ROOM)
+
+    def may_open(self, name: str) -> bool:
+        return name not in self.closed
+
+    def may_fill(self, name: str) -> bool:
+        return name not in self.closed
+
+
+def only(findings: Sequence[Finding], check: str) -> Finding:
+    """The one finding of a check."""
+    found = [finding for finding in findings if finding.check == check]
+    assert len(found) == 1, f"{check}: {found}"
+    return found[0]
+
+
+def grave(findings: Sequence[Finding]) -> dict[str, Severity]:
+    """What is not as it should be, by check."""
+    return {finding.check: finding.severity for finding in findings if finding.severity is not Severity.OK}

@@ -1,0 +1,124 @@
+"""Conditions: a line at the beginning, a line at the end, and no flood in between. Time is passed in."""
+
+import logging
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kontronik_can_gw.runtime.conditions import FLAPPING, MINUTE, REMEMBERED, Conditions, duration
+from kontronik_can_gw.telemetry import SECOND
+
+NAME = "kontronik_can_gw"
+
+
+@pytest.fixture
+def told(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level(logging.INFO, NAME)
+    return caplog
+
+
+def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(told: pytest.LogCaptureFixture) -> None:
+    conditions = Conditions()
+    for now in range(10):
+        conditions.begin("port", "gone", now * SECOND)
+    assert conditions.is_on("port")
+    assert conditions.reason("port") == "gone"
+    conditions.end("port", "back", 75 * SECOND, "; 3 errors")
+    conditions.end("port", "back", 76 * SECOND)
+    assert told.messages == ["gone", "back, after 75.0 s; 3 errors"]
+    assert [record.levelname for record in told.records] == ["WARNING", "INFO"]
+    assert not conditions.is_on("port")
+    assert conditions.reason("port") == ""
+
+
+def test_another_reason_is_said_and_the_time_runs_on(told: pytest.LogCaptureFixture) -> None:
+    conditions = Conditions()
+    conditions.begin("port", "gone", 0)
+    conditions.begin("port", "no permission", 5 * SECOND)
+    conditions.end("port", "back", 10 * SECOND)
+    assert told.messages == ["gone", "no permission", "back, after 10.0 s"]
+
+
+def test_an_end_without_a_beginning_and_a_quiet_beginning_say_nothing(told: pytest.LogCaptureFixture) -> None:
+    conditions = Conditions()
+    conditions.end("a", "over", 0)
+    conditions.begin("b", "because of a", 0, quiet=True)
+    assert told.messages == []
+    conditions.end("b", "good again", SECOND)
+    assert told.messages == ["good again, after 1.0 s"]
+
+
+def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(told: pytest.LogCaptureFixture) -> None:
+    conditions = Conditions()
+    now = 0
+    for _ in range(300):  # ten minutes, each second lost and found
+        conditions.begin("esc1: telemetry", "lost", now)
+        now += SECOND
+        conditions.end("esc1: telemetry", "ok", now)
+        now += SECOND
+        conditions.advance(now)
+    assert len(told.messages) == 2 * FLAPPING - 1 + 9
+    assert "summed up" in told.messages[2 * FLAPPING - 2]
+    sums = [message for message in told.messages if "more times" in message]
+    assert sums[3] == "esc1: telemetry: 30 more times in the last minute, 30.0 s in all: lost"
+    while conditions.due is not None:
+        now = conditions.due
+        conditions.advance(now)
+    assert told.messages[-1] == "esc1: telemetry: no longer comes and goes, it is over"
+    conditions.begin("esc1: telemetry", "lost", now + MINUTE)
+    assert told.messages[-1] == "lost"
+
+
+def test_a_condition_that_lasts_while_it_is_summed_up_is_said_to_last(told: pytest.LogCaptureFixture) -> None:
+    conditions = Conditions()
+    for n in range(FLAPPING):
+        conditions.begin("x", "bad", n * SECOND)
+        if n < FLAPPING - 1:
+            conditions.end("x", "good", n * SECOND + 1)
+    conditions.advance(2 * MINUTE)
+    assert told.messages[-1] == "x: no longer comes and goes, it lasts: bad"
+
+
+def test_events_are_said_one_by_one_and_then_summed_up(told: pytest.LogCaptureFixture) -> None:
+    conditions = Conditions()
+    for n in range(20):
+        conditions.event("suspended", f"suspended for {n} s", n * SECOND)
+    assert len(told.messages) == FLAPPING
+    conditions.advance(MINUTE + 20 * SECOND)
+    assert told.messages[-1] == "suspended: 14 more times in the last minute: suspended for 19 s"
+
+
+def test_lines_can_be_held_back_and_the_last_ones_are_remembered(told: pytest.LogCaptureFixture) -> None:
+    conditions = Conditions()
+    conditions.hold()
+    conditions.say(logging.INFO, "open")
+    assert told.messages == []
+    conditions.release()
+    assert told.messages == ["open"]
+    for n in range(50):
+        conditions.say(logging.INFO, str(n))
+    assert [line.split(" ", 2)[2] for line in conditions.recent] == [str(n) for n in range(50 - REMEMBERED, 50)]
+
+
+@given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))
+def test_however_it_flaps_the_lines_are_few(happenings: list[tuple[str, bool, int]]) -> None:
+    conditions, now, lines = Conditions(), 0, 0
+    conditions.hold()
+    for name, begins, seconds in happenings:
+        now += seconds * SECOND
+        if begins:
+            conditions.begin(name, "bad", now)
+        else:
+            conditions.end(name, "good", now)
+        conditions.advance(now)
+    assert conditions._held is not None
+    lines = len(conditions._held)
+    assert lines <= 2 * (now // MINUTE + 1) * (2 * FLAPPING + 1)
+
+
+@pytest.mark.parametrize(
+    ("ns", "text"), [(0, "0.0 s"), (99_940_000_000, "99.9 s"), (120 * SECOND, "2 min"), (7200 * SECOND, "2.0 h")]
+)
+def test_durations_read_well(ns: int, text: str) -> None:
+    assert duration(ns) == text

@@ -1,0 +1,241 @@
+"""The whole program under a stand-in of the service manager: ready, alive, reloaded, frozen, begun anew, ended."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.protocol.codec import Layout, encode
+from kontronik_can_gw.protocol.fields import LiveData
+
+LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), Layout.V4)
+WATCHDOG_S = 1.0
+
+
+class Manager:
+    """What systemd does with a unit of Type=notify, WatchdogSec= and Restart=always, as far as it goes without systemd."""
+
+    def __init__(self, folder: Path, config: Path) -> None:
+        self.config = config
+        self.path = folder / "notify"
+        self.messages: list[dict[str, str]] = []
+        self.restarts = 0
+        self.lines: list[str] = []
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(self.path))
+        self._socket.settimeout(0.05)
+        self._folder = folder
+        self._fed = time.monotonic()
+        self._ending = False
+        self.process = self._start()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def _start(self) -> subprocess.Popen[str]:
+        environment = {
+            **os.environ,
+            "NOTIFY_SOCKET": str(self.path),
+            "WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6)),
+            "RUNTIME_DIRECTORY": str(self._folder),
+        }
+        environment.pop("WATCHDOG_PID", None)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(self.config), "--wait"],
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        threading.Thread(target=self._read, args=(process,), daemon=True).start()
+        self._fed = time.monotonic() + 20  # TimeoutStartSec: until it is ready
+        return process
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr is not None
+        with process.stderr:
+            for line in process.stderr:
+                self.lines.append(line.rstrip())
+
+    def _watch(self) -> None:
+        while not self._ending:
+            try:
+                message = dict(line.split("=", 1) for line in self._socket.recv(4096).decode().splitlines())
+                self.messages.append(message)
+                if "WATCHDOG" in message or "READY" in message:
+                    self._fed = time.monotonic()
+            except TimeoutError:
+                pass
+            if time.monotonic() - self._fed > WATCHDOG_S and self.process.poll() is None:
+                self.process.send_signal(signal.SIGABRT)  # which a stopped process does not take before SIGKILL
+                self.process.kill()
+                self.process.wait()
+                self.restarts += 1
+                self.process = self._start()
+
+    def said(self, key: str) -> list[str]:
+        return [message[key] for message in list(self.messages) if key in message]
+
+    def wait(self, condition: Callable[[], bool], what: str, seconds: float = 20) -> float:
+        begin = time.monotonic()
+        while not condition():
+            assert time.monotonic() - begin < seconds, f"{what}: not within {seconds} s\n" + "\n".join(self.lines)
+            time.sleep(0.01)
+        return time.monotonic() - begin
+
+    def logged(self, text: str, seconds: float = 20) -> None:
+        self.wait(lambda: any(text in line for line in list(self.lines)), text, seconds)
+
+    def close(self) -> None:
+        self._ending = True
+        self._thread.join(5)
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self._socket.close()
+
+
+def configuration(port: str, channel: str, more: str = "") -> str:
+    return f'[can]\ninterface = "virtual"\nchannel = "{channel}"\n{more}\n[[esc]]\nport = "{port}"\npole_pairs = 7\n'
+
+
+@pytest.fixture
+def esc() -> Iterator[PtyEsc]:
+    with PtyEsc() as made:
+        yield made
+        assert made.received == 0, "the gateway wrote to the ESC"
+
+
+@pytest.fixture
+def manager(tmp_path: Path, esc: PtyEsc) -> Iterator[Manager]:
+    config = tmp_path / "gateway.toml"
+    config.write_text(configuration(esc.path, "life"))
+    made = Manager(tmp_path, config)
+    try:
+        made.wait(lambda: made.said("READY") == ["1"], "READY")
+        yield made
+    finally:
+        made.close()
+
+
+def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(manager: Manager, esc: PtyEsc) -> None:
+    manager.wait(lambda: len(manager.said("WATCHDOG")) > 4, "signs of life")
+    assert "esc1: telemetry never-seen" in manager.said("STATUS")[0]
+    stop = threading.Event()
+
+    def talk() -> None:
+        while not stop.wait(0.02):
+            esc.write(LIVE)
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        manager.wait(lambda: "esc1: telemetry ok" in manager.said("STATUS")[-1], "telemetry in the status")
+        document = json.loads((manager.path.parent / "status.json").read_text())
+        assert document["escs"][0]["name"] == "esc1"
+    finally:
+        stop.set()
+        thread.join()
+    manager.process.send_signal(signal.SIGTERM)
+    assert manager.process.wait(5) == 0
+    manager.wait(lambda: manager.said("STOPPING") == ["1"], "STOPPING")
+    assert manager.restarts == 0
+    assert not (manager.path.parent / "status.json").exists()
+
+
+def test_a_loop_that_is_frozen_is_begun_anew(manager: Manager) -> None:
+    """The manager's rule: no sign of life for WatchdogSec, so it is killed and started again."""
+    first = manager.process.pid
+    manager.process.send_signal(signal.SIGSTOP)
+    manager.wait(lambda: manager.restarts == 1, "the restart")
+    manager.wait(lambda: len(manager.said("READY")) == 2, "READY again")
+    assert manager.process.pid != first
+    signs = len(manager.said("WATCHDOG"))
+    manager.wait(lambda: len(manager.said("WATCHDOG")) > signs + 3, "signs of life")
+    assert manager.restarts == 1
+
+
+def test_a_hang_up_reads_the_configuration_again(manager: Manager, esc: PtyEsc) -> None:
+    process = manager.process
+    process.send_signal(signal.SIGHUP)
+    manager.logged("the configuration is unchanged")
+
+    manager.config.write_text(configuration(esc.path, "life", "[can_bus]\nx = 1"))
+    process.send_signal(signal.SIGHUP)
+    manager.logged("the new configuration is refused: the old one stays")
+    manager.logged("can_bus: unknown table")
+
+    manager.config.write_text(configuration(esc.path, "life").replace("[[esc]]", '[[esc]]\nname = "left"'))
+    process.send_signal(signal.SIGHUP)
+    manager.logged(f"left: {esc.path} is open")
+    esc.write(LIVE)
+    manager.logged("left: telemetry ok")
+    manager.wait(lambda: len(manager.said("RELOADING")) == 3, "RELOADING")
+    manager.wait(lambda: len(manager.said("READY")) == 4, "READY after each")
+
+    manager.config.write_text(configuration("/dev/no-such-port", "life"))
+    process.send_signal(signal.SIGHUP)
+    manager.logged("esc1: /dev/no-such-port: no such serial port")
+    manager.config.write_text(configuration(esc.path, "life"))
+    process.send_signal(signal.SIGHUP)
+    manager.logged(f"esc1: {esc.path} is open")
+    assert process.poll() is None
+    assert manager.restarts == 0
+
+
+def test_a_configuration_that_another_gateway_stands_against_is_given_up_for_the_old_one(
+    manager: Manager, esc: PtyEsc
+) -> None:
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 0))
+        busy.listen()
+        number = busy.getsockname()[1]
+        more = f'[statistics]\nprometheus = "127.0.0.1:{number}"'
+        manager.config.write_text(configuration(esc.path, "life", more))
+        manager.process.send_signal(signal.SIGHUP)
+        manager.logged("going on with the old one")
+        opened = f"esc1: {esc.path} is open"
+        manager.wait(lambda: sum(opened in line for line in list(manager.lines)) == 2, "opened again")
+    esc.write(LIVE)
+    manager.logged("telemetry ok")
+    assert manager.process.poll() is None
+
+
+def test_a_second_gateway_on_the_same_port_is_refused_with_a_line(manager: Manager, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(manager.config)],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "is in use by another program" in line
+
+
+def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path: Path) -> None:
+    config = tmp_path / "gateway.toml"
+    config.write_text("nonsense")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(str(tmp_path / "notify"))
+        listening.settimeout(20)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)],
+            stderr=subprocess.PIPE,
+            env={**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")},
+        )
+        said = listening.recv(4096).decode()
+        assert said.startswith("STATUS=cannot start: ")
+        assert process.poll() is None
+        process.terminate()
+        _, errors = process.communicate(timeout=10)
+    assert b"is not valid TOML" in errors
+    assert b"Traceback" not in errors

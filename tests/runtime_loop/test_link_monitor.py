@@ -1,0 +1,139 @@
+"""rtnetlink messages: built here byte by byte, and the real kernel's about the loopback interface."""
+
+import os
+import select
+import struct
+import subprocess
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kontronik_can_gw.runtime import link_monitor
+from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor
+from kontronik_can_gw.sources import CanState
+
+
+def attribute(kind: int, value: bytes) -> bytes:
+    return struct.pack("=HH", 4 + len(value), kind) + value + bytes(-len(value) % 4)
+
+
+def link_message(kind: int = 16, name: str = "can0", flags: int = 1, can: bytes | None = b"") -> bytes:
+    info = b"" if can is None else attribute(18, attribute(1, b"can\0") + attribute(2, can))
+    body = struct.pack("=BxHiII", 0, 280, 3, flags, 0) + attribute(3, name.encode() + b"\0") + info
+    return struct.pack("=IHHII", 16 + len(body), kind, 0, 0, 0) + body
+
+
+def can_data(
+    state: int = 0, bitrate: int = 250_000, restart_ms: int = 100, counters: tuple[int, int] = (0, 0)
+) -> bytes:
+    timing = struct.pack("=8I", bitrate, 875, *range(6))
+    parts = attribute(1, timing) + attribute(4, struct.pack("=I", state)) + attribute(6, struct.pack("=I", restart_ms))
+    return parts + attribute(8, struct.pack("=HH", *counters))
+
+
+class FakeSocket:
+    def __init__(self, *datagrams: bytes | int) -> None:
+        self.datagrams = list(datagrams)
+        self.sent: list[bytes] = []
+
+    def recv(self, _size: int) -> bytes:
+        if not self.datagrams:
+            raise BlockingIOError
+        first = self.datagrams.pop(0)
+        if isinstance(first, int):
+            raise OSError(first, os.strerror(first))
+        return first
+
+    def send(self, data: bytes) -> None:
+        self.sent.append(data)
+
+    def close(self) -> None:
+        pass
+
+
+def heard(*datagrams: bytes | int, name: str = "can0") -> list[LinkFacts]:
+    monitor = LinkMonitor.__new__(LinkMonitor)
+    monitor._name = name.encode()
+    monitor._socket = FakeSocket(*datagrams)  # type: ignore[assignment]
+    return monitor.take()
+
+
+def test_state_bit_rate_restart_time_and_error_counters_of_a_controller() -> None:
+    data = can_data(state=2, bitrate=125_000, restart_ms=0, counters=(130, 7))
+    (facts,) = heard(link_message(can=data))
+    assert facts == LinkFacts(True, True, "can", CanState.ERROR_PASSIVE, 125_000, 0, (130, 7))
+
+
+@pytest.mark.parametrize(
+    ("number", "state"),
+    [
+        (0, CanState.ERROR_ACTIVE),
+        (1, CanState.ERROR_WARNING),
+        (3, CanState.BUS_OFF),
+        (4, None),  # stopped
+        (5, None),  # sleeping
+        (77, None),
+    ],
+)
+def test_the_states_of_a_controller(number: int, state: CanState | None) -> None:
+    assert heard(link_message(can=can_data(state=number)))[0].state is state
+
+
+def test_a_virtual_interface_has_no_controller() -> None:
+    assert heard(link_message(can=None, flags=0)) == [LinkFacts(True, False)]
+
+
+def test_other_interfaces_are_none_of_ours_and_a_removed_one_is_gone() -> None:
+    datagram = link_message(name="can1") + link_message() + link_message(kind=17, name="eth0") + link_message(kind=17)
+    assert [facts.exists for facts in heard(datagram)] == [True, False]
+
+
+def test_the_answer_that_there_is_no_such_interface() -> None:
+    error = struct.pack("=i", -19) + bytes(16)
+    assert heard(struct.pack("=IHHII", 16 + len(error), 2, 0, 0, 0) + error) == [LinkFacts(False)]
+
+
+def test_after_an_overrun_the_kernel_is_asked_anew() -> None:
+    monitor = LinkMonitor.__new__(LinkMonitor)
+    monitor._name = b"can0"
+    fake = FakeSocket(105, link_message())
+    monitor._socket = fake  # type: ignore[assignment]
+    assert len(monitor.take()) == 1
+    assert len(fake.sent) == 1
+
+
+@given(st.lists(st.one_of(st.binary(max_size=200), st.just(link_message(can=can_data())).map(bytes)), max_size=5))
+def test_rubbish_raises_nothing(datagrams: list[bytes]) -> None:
+    heard(*(datagram for datagram in datagrams if datagram))
+
+
+@given(st.integers(0, len(link_message(can=can_data()))), st.integers(0, 255), st.integers(0, 200))
+def test_a_damaged_message_raises_nothing(end: int, value: int, place: int) -> None:
+    message = bytearray(link_message(can=can_data()))
+    message[min(place, len(message) - 1)] = value
+    if end:
+        heard(bytes(message[:end]))
+
+
+def test_the_real_kernel_tells_of_the_loopback_interface() -> None:
+    monitor = link_monitor.link_monitor("lo")
+    assert monitor is not None
+    try:
+        monitor.ask()
+        assert select.select([monitor.fileno()], [], [], 2)[0]
+        facts = monitor.take()[-1]
+        shown = subprocess.run(["ip", "-o", "link", "show", "lo"], capture_output=True, text=True, check=True).stdout
+        assert (facts.exists, facts.up, facts.state) == (True, ",UP" in shown, None)
+    finally:
+        monitor.close()
+
+
+def test_the_real_kernel_tells_that_there_is_no_such_interface() -> None:
+    monitor = LinkMonitor("nocan77")
+    try:
+        monitor.ask()
+        assert select.select([monitor.fileno()], [], [], 2)[0]
+        assert monitor.take() == [LinkFacts(False)]
+    finally:
+        monitor.close()

@@ -1,0 +1,70 @@
+"""Reading another configuration while the gateway runs."""
+
+import logging
+import select
+import threading
+
+import pytest
+
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.runtime.reload import Reloader
+
+
+def taken(reloader: Reloader) -> bool:
+    assert select.select([reloader], [], [], 5)[0]
+    return reloader.take()
+
+
+def test_a_faulty_configuration_is_refused_with_its_lines_and_the_next_one_taken(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    answers: list[object] = [UserError("a.toml: pole_pairs: too many", "a.toml: x: unknown"), None, KeyError("oops"), 7]
+
+    def read() -> object | None:
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    reloader = Reloader(read)
+    try:
+        with caplog.at_level(logging.INFO, "kontronik_can_gw"):
+            results = []
+            for _ in range(4):
+                assert reloader.begin()
+                results.append(taken(reloader))
+        assert results == [False, False, False, True]
+        assert reloader.new == 7
+        said = "\n".join(caplog.messages)
+        assert "a.toml: pole_pairs: too many\na.toml: x: unknown\nthe new configuration is refused" in said
+        assert "the configuration is unchanged" in said
+        assert "KeyError('oops')" in said
+    finally:
+        reloader.close()
+
+
+def test_a_second_request_while_it_is_being_read_is_none() -> None:
+    gate = threading.Event()
+
+    def read() -> object | None:
+        gate.wait(10)
+        return 1
+
+    reloader = Reloader(read)
+    assert reloader.begin()
+    assert not reloader.begin()
+    assert not select.select([reloader], [], [], 0)[0]
+    gate.set()
+    assert taken(reloader)
+    reloader.close()
+
+
+def test_a_reading_that_ends_behind_the_gateway_does_no_harm() -> None:
+    gate = threading.Event()
+    reloader = Reloader(lambda: int(gate.wait(10)))
+    assert reloader.begin()
+    reloader.close()
+    gate.set()
+    assert reloader._thread is not None
+    reloader._thread.join(5)
+    assert not reloader._thread.is_alive()

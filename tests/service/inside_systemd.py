@@ -1,0 +1,239 @@
+"""Run by systemd in a VM (boot_systemd.sh): installs the service, makes it suffer, removes it, and writes what it saw as JSON.
+
+inside_systemd.py FOLDER        writes FOLDER/facts.json
+inside_systemd.py --probe       what a process in the service's cage can do, as JSON
+"""
+
+import contextlib
+import json
+import mmap
+import os
+import shutil
+import socket
+import stat
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+PROGRAM = str(Path(sys.prefix, "bin", "kontronik-can-gw"))
+CONFIGURATION = Path("/etc/kontronik-can-gw/gateway.toml")
+UNIT = "kontronik-can-gw.service"
+LINK = "/run/esc"
+VALUES = 0x698
+FORBIDDEN = "/dev/not_a_serial_port"
+Facts = dict[str, Any]
+
+
+def run(*words: str) -> dict[str, Any]:
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=100)
+    return {"code": done.returncode, "out": done.stdout, "talk": done.stderr}
+
+
+def service(*words: str) -> dict[str, Any]:
+    return run(PROGRAM, "service", *words)
+
+
+def shown(unit: str = UNIT) -> dict[str, str]:
+    names = "ActiveState,SubState,MainPID,NRestarts,StatusText,UnitFileState,Result,Type"
+    lines = run("systemctl", "show", "-p", names, unit)["out"].splitlines()
+    return dict(line.partition("=")[::2] for line in lines)
+
+
+def until(condition: Callable[[], bool], seconds: float) -> float:
+    """How long it took; -1: it did not come."""
+    start = time.monotonic()
+    while time.monotonic() - start < seconds:
+        if condition():
+            return time.monotonic() - start
+        time.sleep(0.05)
+    return -1.0
+
+
+def fresh(seconds: float) -> float:
+    """How long it took until a value of the ESC was on the bus: until then the bytes of the shipped DBC's message say "not available"."""
+    start = time.monotonic()
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
+        bus.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", VALUES, 0x7FF))
+        bus.bind(("vcan0",))
+        bus.settimeout(0.2)
+        while time.monotonic() - start < seconds:
+            with contextlib.suppress(TimeoutError):
+                if bus.recv(16)[8:12] != b"\xff" * 4:
+                    return time.monotonic() - start
+    return -1.0
+
+
+def write_configuration(file: Path, channel: str, port: str) -> None:
+    file.write_text(f'[can]\nchannel = "{channel}"\n[[esc]]\nport = "{port}"\n')
+
+
+def entries() -> list[dict[str, Any]]:
+    return [json.loads(line) for line in run("journalctl", "-u", UNIT, "-o", "json", "--no-pager")["out"].splitlines()]
+
+
+def main(folder: Path) -> None:
+    facts: Facts = {}
+    try:
+        trial(facts)
+    finally:
+        (folder / "facts.json").write_text(json.dumps(facts, indent=1))
+
+
+def trial(facts: Facts) -> None:
+    for name in ("vcan0", "vcan1"):
+        for words in (("add", name, "type", "vcan"), ("set", name, "up")):
+            facts[f"link {name} {words[0]}"] = run("ip", "link", *words)
+    facts["install"] = service("install")
+    facts["after install"] = shown()
+
+    simulator = subprocess.Popen(
+        [PROGRAM, "simulate", "--link", LINK], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    until(Path(LINK).exists, 20)
+    shutil.chown(LINK, "root", "dialout")
+    Path(LINK).chmod(0o660)
+    write_configuration(CONFIGURATION, "vcan0", LINK)
+    facts["install now"] = service("install", "--now")
+    facts["fresh after"] = fresh(20)
+    facts["running"] = shown()
+    facts["status"] = service("status")
+    pid = facts["running"]["MainPID"]
+    facts["process"] = Path(f"/proc/{pid}/status").read_text()
+    facts["nice"] = os.getpriority(os.PRIO_PROCESS, int(pid))
+    facts["oom"] = Path(f"/proc/{pid}/oom_score_adj").read_text().strip()
+    facts["folders"] = {
+        path: [oct(Path(path).stat().st_mode & 0o777), Path(path).owner()]
+        for path in ("/run/kontronik-can-gw", "/var/lib/kontronik-can-gw")
+        if Path(path).exists()
+    }
+
+    os.kill(int(pid), 9)
+    facts["running again after kill"] = until(
+        lambda: shown()["MainPID"] not in ("0", pid) and shown()["ActiveState"] == "active", 20
+    )
+    facts["fresh after kill"] = fresh(20)
+    facts["killed"] = shown()
+
+    pid = facts["killed"]["MainPID"]
+    os.kill(int(pid), 19)  # SIGSTOP: nothing in it goes on
+    facts["running again after freeze"] = until(
+        lambda: shown()["MainPID"] not in ("0", pid) and shown()["ActiveState"] == "active", 40
+    )
+    facts["frozen"] = shown()
+    pid = facts["frozen"]["MainPID"]
+
+    good = CONFIGURATION.read_text()
+    CONFIGURATION.write_text(good + "nonsense = 1\n")
+    facts["reload"] = run("systemctl", "reload", UNIT)
+    until(lambda: any("nonsense" in str(entry.get("MESSAGE")) for entry in entries()), 10)
+    facts["after faulty reload"] = shown()
+    facts["install with faulty configuration"] = service("install", "--now")
+    CONFIGURATION.write_text(good)
+    facts["same process"] = shown()["MainPID"] == pid
+
+    write_configuration(CONFIGURATION.with_name("left.toml"), "vcan1", "/dev/ttyUSB7")
+    facts["install left"] = service("install", "--instance", "left", "--now")
+    facts["status of both"] = service("status", "-n", "1")
+    facts["uninstall left"] = service("uninstall", "--instance", "left")
+    facts["left"] = shown("kontronik-can-gw@left.service")
+
+    os.mknod(FORBIDDEN, 0o666 | stat.S_IFCHR, os.makedev(1, 11))  # all may open it, but the service
+    os.chmod(FORBIDDEN, 0o666)
+    facts["probe"] = probed()
+    facts["probe with prometheus"] = service("install", "--prometheus"), probed()
+    facts["log"] = [[entry.get("PRIORITY"), entry.get("MESSAGE")] for entry in entries()]
+    facts["as nobody"] = run("setpriv", "--reuid=65534", "--clear-groups", PROGRAM, "service", "uninstall")
+    facts["network"] = service("install", "--network", "500000", "--channel", "vcan1"), networkd()
+
+    facts["uninstall"] = service("uninstall")
+    facts["after uninstall"] = [shown(), left_over()]
+    facts["install again"] = service("install", "--now")
+    facts["running in the end"] = shown()
+    facts["purge"] = service("uninstall", "--purge")
+    facts["after purge"] = [shown(), left_over(), run("id", "kontronik-can-gw")["code"]]
+    facts["status in the end"] = service("status")
+    simulator.terminate()
+
+
+def left_over() -> list[str]:
+    found = [*Path("/etc").rglob("*kontronik*"), *Path("/var/lib").glob("kontronik*"), *Path("/run").glob("kontronik*")]
+    return sorted(str(path) for path in found)
+
+
+def networkd() -> str:
+    """What systemd-networkd says of the file; on a vcan it cannot set a bit rate, but it reads it."""
+    daemon = shutil.which("systemd-networkd", path="/lib/systemd:/usr/lib/systemd")
+    if daemon is None:
+        return "missing"
+    Path("/etc/systemd/network/60-wrong.network").write_text("[Match]\nName=x\n[CAN]\nBitrat=5\n")
+    return str(run("env", "SYSTEMD_LOG_LEVEL=debug", "timeout", "4", daemon)["talk"])
+
+
+def probed() -> Facts:
+    """The probe as an instance of the template unit, with its cage."""
+    folder = Path("/run/systemd/system/kontronik-can-gw@probe.service.d")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "probe.conf").write_text(
+        f"[Service]\nType=oneshot\nRestart=no\nWatchdogSec=0\nExecStart=\nExecStart={sys.executable} -B {__file__} --probe\n"
+        "StandardOutput=truncate:/run/probe.json\n"
+    )
+    run("systemctl", "daemon-reload")
+    done = run("systemctl", "start", "kontronik-can-gw@probe.service")
+    try:
+        found: Facts = json.loads(Path("/run/probe.json").read_text())
+    except ValueError:
+        return done
+    return found
+
+
+def probe() -> None:
+    """What must work and what must not."""
+    tries: dict[str, Callable[[], object]] = {
+        "CAN socket": lambda: socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW),
+        "netlink": lambda: socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0),
+        "abstract socket": lambda: socket.socket(socket.AF_UNIX).bind("\0kontronik-can-gw/probe"),
+        "state folder": lambda: Path(os.environ["STATE_DIRECTORY"], "x").write_text("x"),
+        "runtime folder": lambda: Path(os.environ["RUNTIME_DIRECTORY"], "x").write_text("x"),
+        "other processes": lambda: Path("/proc/1/stat").read_text(),
+        "machine-id": lambda: Path("/etc/machine-id").read_text(),
+        "ctypes": lambda: __import__("ctypes").CFUNCTYPE(None)(print),
+        "terminal": lambda: os.open("/dev/ptmx", os.O_RDWR),
+        "internet": lambda: socket.socket(socket.AF_INET, socket.SOCK_STREAM),
+        "packet": lambda: socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0),
+        "write /etc": lambda: Path("/etc/kontronik-can-gw/x").write_text("x"),
+        "write and execute": lambda: mmap.mmap(-1, 4096, prot=mmap.PROT_WRITE | mmap.PROT_EXEC),
+        "another device": lambda: os.open(FORBIDDEN, os.O_RDONLY),
+        "set kernel": lambda: Path("/proc/sys/kernel/panic").write_text("1"),
+        "namespace": unshared,
+        "priority": lambda: os.setpriority(os.PRIO_PROCESS, 0, 5),
+        "another user": lambda: os.setuid(0),
+    }
+    found = {}
+    for name, attempt in tries.items():
+        try:
+            attempt()
+            found[name] = "works"
+        except Exception as error:
+            found[name] = f"{type(error).__name__}: {error}"
+    print(json.dumps(found))
+
+
+def unshared() -> None:
+    """unshare(2) of user name spaces, which Python 3.11 does not know."""
+    import ctypes
+
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.unshare(0x10000000) != 0:
+        raise OSError(ctypes.get_errno(), "unshare")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["--probe"]:
+        with contextlib.suppress(BrokenPipeError):
+            probe()
+    else:
+        main(Path(sys.argv[1]))

@@ -1,0 +1,224 @@
+"""What the gateway tells systemd, read from a socket that stands in for systemd's; and how its log lines look to the journal."""
+
+import contextlib
+import logging
+import os
+import secrets
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.runtime.systemd import Notifier, is_journal, log_formatter, priority
+
+
+class Manager:
+    """The end that systemd has."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self.socket.bind("\0" + address[1:] if address.startswith("@") else address)
+
+    def environment(self, **more: object) -> dict[str, str]:
+        return {"NOTIFY_SOCKET": self.address} | {name: str(value) for name, value in more.items()}
+
+    def told(self) -> list[list[str]]:
+        """The messages since the last call, each as its lines."""
+        found = []
+        while True:
+            try:
+                found.append(self.socket.recv(65536).decode().splitlines())
+            except BlockingIOError:
+                return found
+
+
+@pytest.fixture(params=["path", "abstract"])
+def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]:
+    found = Manager(str(tmp_path / "notify") if request.param == "path" else f"@kcg-test-{secrets.token_hex(8)}")
+    with found.socket:
+        yield found
+
+
+def test_a_life_is_told_in_systemds_words(manager: Manager) -> None:
+    notifier = Notifier(manager.environment(WATCHDOG_USEC=10_000_000, WATCHDOG_PID=os.getpid()), lambda: 5_000_001_999)
+    notifier.ready("two ESCs")
+    notifier.status("one ESC")
+    notifier.watchdog()
+    notifier.reloading()
+    notifier.ready("two ESCs")
+    notifier.stopping("going")
+    notifier.close()
+    assert manager.told() == [
+        ["READY=1", "STATUS=two ESCs"],
+        ["STATUS=one ESC"],
+        ["WATCHDOG=1"],
+        ["RELOADING=1", "MONOTONIC_USEC=5000001"],
+        ["READY=1", "STATUS=two ESCs"],
+        ["STOPPING=1", "STATUS=going"],
+    ]
+
+
+def test_a_status_is_told_only_when_it_changes(manager: Manager) -> None:
+    notifier = Notifier(manager.environment())
+    for text in ("a", "a", "b", "b", "a", "a ", ""):
+        notifier.status(text)
+    assert manager.told() == [["STATUS=a"], ["STATUS=b"], ["STATUS=a"]]
+
+
+def test_a_status_cannot_carry_a_message_of_its_own(manager: Manager) -> None:
+    notifier = Notifier(manager.environment())
+    notifier.status("bus-off\nSTOPPING=1\r\0\x85\u2028MAINPID=1\udcff")
+    assert manager.told() == [["STATUS=bus-off STOPPING=1 MAINPID=1"]]
+
+
+def test_a_long_status_fits_what_systemd_reads(manager: Manager) -> None:
+    Notifier(manager.environment()).status("\N{GRINNING FACE}" * 5000)
+    [[line]] = manager.told()
+    assert 3000 < len(line.encode()) <= 4096
+
+
+def test_without_a_manager_nothing_happens() -> None:
+    for address in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}, {"NOTIFY_SOCKET": "@"}):
+        notifier = Notifier(address | {"WATCHDOG_USEC": "1000"})
+        notifier.ready("x")
+        notifier.watchdog()
+        notifier.stopping()
+        notifier.close()
+    assert not Notifier({}).present
+    assert Notifier({"WATCHDOG_USEC": "1000"}).watchdog_ns is None
+
+
+@pytest.mark.parametrize("address", ["/no/such/folder/notify", "/" + "x" * 300, "/with\0null"])
+def test_a_socket_that_cannot_be_reached_does_no_harm(address: str) -> None:
+    notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000"})
+    for _ in range(3):
+        notifier.ready("x")
+        notifier.watchdog()
+    assert notifier.present
+
+
+def test_a_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None:
+    notifier = Notifier(manager.environment(WATCHDOG_USEC=10_000_000))
+    for _ in range(5000):  # more than any queue holds
+        notifier.watchdog()
+    notifier.ready("up")
+    notifier.status("lost")
+    earlier = manager.told()
+    assert len(earlier) < 5000
+    assert ["READY=1", "STATUS=up"] not in earlier
+    notifier.watchdog()
+    assert manager.told() == [["READY=1", "STATUS=lost", "WATCHDOG=1"]]
+    notifier.watchdog()
+    assert manager.told() == [["WATCHDOG=1"]]
+
+
+def test_what_a_full_socket_did_not_take_is_dropped_when_it_holds_no_more(manager: Manager) -> None:
+    notifier = Notifier(manager.environment(WATCHDOG_USEC=10_000_000))
+    for _ in range(5000):
+        notifier.watchdog()
+    notifier.reloading()
+    notifier.ready()
+    notifier.stopping()
+    manager.told()
+    notifier.stopping()
+    assert manager.told() == [["STOPPING=1"]]
+
+
+def test_a_manager_that_comes_back_is_told_again(tmp_path: Path) -> None:
+    path = tmp_path / "notify"
+    first = Manager(str(path))
+    notifier = Notifier(first.environment())
+    notifier.status("one")
+    assert first.told() == [["STATUS=one"]]
+    first.socket.close()
+    path.unlink()
+    notifier.status("two")
+    second = Manager(str(path))
+    with second.socket:
+        notifier.status("two")
+        assert second.told() == []
+        notifier.status("three")
+        assert second.told() == [["STATUS=three"]]
+    notifier.close()
+
+
+@pytest.mark.parametrize(
+    ("variables", "half"),
+    [
+        ({"WATCHDOG_USEC": "10000000"}, 5_000_000_000),
+        ({"WATCHDOG_USEC": "3", "WATCHDOG_PID": str(os.getpid())}, 1_500),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),
+        ({"WATCHDOG_PID": str(os.getpid())}, None),
+        ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "-5"}, None),
+        ({"WATCHDOG_USEC": "soon"}, None),
+        ({"WATCHDOG_USEC": "5", "WATCHDOG_PID": "me"}, None),
+    ],
+)
+def test_the_watchdog_is_for_the_process_that_is_meant(
+    variables: dict[str, str], half: int | None, tmp_path: Path
+) -> None:
+    manager = Manager(str(tmp_path / "notify"))
+    with manager.socket:
+        notifier = Notifier(manager.environment() | variables)
+        assert notifier.watchdog_ns == half
+        notifier.watchdog()
+        assert manager.told() == ([["WATCHDOG=1"]] if half else [])
+
+
+def sockets() -> set[int]:
+    """The descriptors of this process that are sockets."""
+    found = set()
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            if str(link.readlink()).startswith("socket:"):
+                found.add(int(link.name))
+    return found
+
+
+def test_one_socket_is_opened_that_no_child_inherits(manager: Manager) -> None:
+    notifier = Notifier(manager.environment())
+    before = sockets()
+    for text in "abc":
+        notifier.status(text)
+    [opened] = sockets() - before
+    assert not os.get_inheritable(opened)
+    notifier.close()
+    assert sockets() == before
+
+
+# --- the log
+
+
+def record(level: int, text: str) -> logging.LogRecord:
+    return logging.LogRecord("kontronik_can_gw", level, __file__, 1, text, (), None)
+
+
+def test_standard_error_is_the_journal_only_where_its_inode_is_named(tmp_path: Path) -> None:
+    with (tmp_path / "log").open("w") as stream:
+        status = os.fstat(stream.fileno())
+        assert is_journal(stream, {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"})
+        assert not is_journal(stream, {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino + 1}"})
+        assert not is_journal(stream, {"JOURNAL_STREAM": "rubbish"})
+        assert not is_journal(stream, {})
+    assert not is_journal(stream, {"JOURNAL_STREAM": "1:2"})
+
+
+def test_each_line_carries_its_priority(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with (tmp_path / "log").open("w") as stream:
+        assert log_formatter(stream) is None
+        status = os.fstat(stream.fileno())
+        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
+        formatter = log_formatter(stream)
+    assert formatter is not None
+    assert formatter.format(record(logging.ERROR, "lost\nfor good")) == "<3>lost\n<3>for good"
+    assert formatter.format(record(logging.INFO, "back")) == "<6>back"
+
+
+@pytest.mark.parametrize(
+    ("level", "number"), [(60, 2), (50, 2), (40, 3), (30, 4), (25, 5), (20, 6), (15, 7), (10, 7), (0, 7)]
+)
+def test_priorities_are_those_of_syslog(level: int, number: int) -> None:
+    assert priority(level) == number

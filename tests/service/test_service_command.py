@@ -1,0 +1,438 @@
+"""``service`` as a command: staged files, round trips, what people changed, wrong uses; status with stand-ins for systemd's tools."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.cli import main, service_machine
+from kontronik_can_gw.cli.service_files import is_ours
+
+UNITS = "etc/systemd/system"
+CONFIGURATION = "etc/kontronik-can-gw/gateway.toml"
+FILES = [
+    CONFIGURATION,
+    "etc/sysusers.d/kontronik-can-gw.conf",
+    "etc/systemd/network/50-kontronik-can-gw-can0.link.example",
+    "etc/systemd/network/50-kontronik-can-gw-can0.network.example",
+    f"{UNITS}/kontronik-can-gw.service",
+    f"{UNITS}/kontronik-can-gw@.service",
+    "etc/udev/rules.d/70-kontronik-can-gw.rules",
+]
+EXECUTABLE = "/opt/kontronik-can-gw/bin/kontronik-can-gw"
+Done = subprocess.CompletedProcess[str]
+
+
+def service(*words: object) -> Done:
+    out, talk = io.StringIO(), io.StringIO()
+    code: object
+    with redirect_stdout(out), redirect_stderr(talk):
+        try:
+            code = main(["service", *map(str, words)])
+        except SystemExit as end:
+            code = end.code
+    return Done([], code if isinstance(code, int) else 0, out.getvalue(), talk.getvalue())
+
+
+def install(root: Path, *words: object) -> Done:
+    return service("install", "--root", root, "--executable", EXECUTABLE, *words)
+
+
+def one_line(done: Done, code: int) -> str:
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (code, "", 1), done
+    return done.stderr.strip()
+
+
+def tree(root: Path) -> list[str]:
+    return sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_symlink() or path.is_file())
+
+
+def edit(root: Path, name: str = CONFIGURATION) -> None:
+    (root / name).write_text('[[esc]]\nport = "/dev/esc_left"\n')
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """An image with the program in it."""
+    program = tmp_path / "image" / EXECUTABLE.lstrip("/")
+    program.parent.mkdir(parents=True)
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    return tmp_path / "image"
+
+
+def added(root: Path) -> list[str]:
+    return [name for name in tree(root) if name != EXECUTABLE.lstrip("/")]
+
+
+# --- install and uninstall below a folder
+
+
+def test_a_staged_install_writes_files_that_all_may_read(root: Path) -> None:
+    done = install(root)
+    assert done.returncode == 0
+    assert added(root) == sorted(FILES)
+    assert {(root / name).stat().st_mode & 0o777 for name in FILES} == {0o644}
+    assert f"ExecStart={EXECUTABLE} run --wait" in (root / UNITS / "kontronik-can-gw.service").read_text()
+    assert "is the example. Set ports, bit rate and motors first." in done.stderr
+    assert done.stderr.endswith("kontronik-can-gw.service was not enabled.\n")
+
+
+def test_uninstall_removes_what_install_wrote_and_keeps_the_configuration(root: Path) -> None:
+    install(root, "--prometheus", "--network", 500_000)
+    edit(root)
+    install(root)
+    assert service("uninstall", "--root", root).returncode == 0
+    assert added(root) == [CONFIGURATION]
+    assert not (root / UNITS / "kontronik-can-gw.service.d").exists()
+    assert "nothing is installed" in service("uninstall", "--root", root).stderr
+
+
+def test_purge_removes_configurations_and_parameters_and_nothing_of_others(root: Path) -> None:
+    install(root)
+    for name in ("kontronik-can-gw", "kontronik-can-gw-left", "kontronik-can-gwen"):
+        (root / "var/lib" / name).mkdir(parents=True)
+        (root / "var/lib" / name / "esc1.params").write_text("x")
+    assert service("uninstall", "--root", root, "--purge").returncode == 0
+    assert added(root) == ["var/lib/kontronik-can-gwen/esc1.params"]
+    assert not (root / "var/lib/kontronik-can-gw").exists()
+
+
+def test_an_edited_configuration_is_kept_and_enabled(root: Path) -> None:
+    install(root)
+    edit(root)
+    before = (root / CONFIGURATION).read_text()
+    assert install(root).stderr.endswith("kontronik-can-gw.service is enabled\n")
+    link = root / UNITS / "multi-user.target.wants/kontronik-can-gw.service"
+    assert str(link.readlink()) == "/etc/systemd/system/kontronik-can-gw.service"
+    assert (root / CONFIGURATION).read_text() == before
+    assert install(root).returncode == 0
+    service("uninstall", "--root", root)
+    assert not link.is_symlink()
+
+
+def test_an_instance_has_its_own_configuration_and_goes_alone(root: Path) -> None:
+    for name in ("left", "right"):
+        install(root, "--instance", name)
+        edit(root, f"etc/kontronik-can-gw/{name}.toml")
+        install(root, "--instance", name)
+    wants = root / UNITS / "multi-user.target.wants"
+    assert sorted(link.name for link in wants.iterdir()) == [
+        "kontronik-can-gw@left.service",
+        "kontronik-can-gw@right.service",
+    ]
+    assert str((wants / "kontronik-can-gw@left.service").readlink()) == f"/{UNITS}/kontronik-can-gw@.service"
+    assert not (root / CONFIGURATION).exists()
+    service("uninstall", "--root", root, "--instance", "left")
+    assert [link.name for link in wants.iterdir()] == ["kontronik-can-gw@right.service"]
+    assert (root / UNITS / "kontronik-can-gw@.service").exists()
+    service("uninstall", "--root", root)
+    assert list(wants.iterdir()) == []
+
+
+def test_a_faulty_configuration_is_told_and_not_enabled(root: Path) -> None:
+    install(root)
+    (root / CONFIGURATION).write_text("[can]\nbitrat = 5\n")
+    done = install(root)
+    assert done.returncode == 0
+    assert "can.bitrat: unknown key" in done.stderr
+    assert not (root / UNITS / "multi-user.target.wants").exists()
+    assert install(root, "--now").returncode == 1
+
+
+def test_a_second_install_changes_nothing(root: Path) -> None:
+    install(root)
+    before = {name: (root / name).stat().st_ino for name in FILES}
+    done = install(root)
+    assert {name: (root / name).stat().st_ino for name in FILES} == before
+    assert done.stderr.count(": as it is\n") == len(FILES) - 1
+
+
+def test_an_older_file_of_ours_is_replaced_without_a_word_of_force(root: Path) -> None:
+    install(root, "--network", 250_000)
+    network = root / "etc/systemd/network/50-kontronik-can-gw-can0.network"
+    assert "BitRate=250000" in network.read_text()
+    assert "was written by another version or with other options" in install(root, "--network", 500_000).stderr
+    assert "BitRate=500000" in network.read_text()
+    assert not list(network.parent.glob("*.bak"))
+
+
+def test_what_was_changed_by_hand_is_refused_then_kept_aside(root: Path) -> None:
+    install(root)
+    unit = root / UNITS / "kontronik-can-gw.service"
+    unit.write_text(unit.read_text().replace("Nice=-10", "Nice=0"))
+    mine = unit.read_text()
+    assert "kontronik-can-gw.service: was changed by hand. --force replaces it" in one_line(install(root), 2)
+    assert unit.read_text() == mine
+    assert install(root, "--force").returncode == 0
+    assert unit.with_name("kontronik-can-gw.service.bak").read_text() == mine
+    assert is_ours(unit.read_text())
+
+
+def test_a_foreign_file_is_never_taken_for_ours(root: Path) -> None:
+    unit = root / UNITS / "kontronik-can-gw.service"
+    unit.parent.mkdir(parents=True)
+    unit.write_text("[Service]\nExecStart=/bin/true\n")
+    assert "--force replaces it" in one_line(install(root), 2)
+    assert added(root) == [f"{UNITS}/kontronik-can-gw.service"]
+
+
+def test_uninstall_keeps_what_was_changed_by_hand_aside(root: Path) -> None:
+    install(root)
+    rules = root / "etc/udev/rules.d/70-kontronik-can-gw.rules"
+    rules.write_text(rules.read_text() + 'SUBSYSTEM=="tty", ENV{ID_SERIAL_SHORT}=="A1", SYMLINK+="esc_left"\n')
+    mine = rules.read_text()
+    done = service("uninstall", "--root", root)
+    assert "70-kontronik-can-gw.rules: was changed by hand, kept as 70-kontronik-can-gw.rules.bak" in done.stderr
+    assert rules.with_name("70-kontronik-can-gw.rules.bak").read_text() == mine
+    assert not rules.exists()
+
+
+def test_an_active_network_file_takes_the_place_of_its_example(root: Path) -> None:
+    install(root)
+    install(root, "--network", 500_000)
+    network = root / "etc/systemd/network"
+    active = ["50-kontronik-can-gw-can0.link", "50-kontronik-can-gw-can0.network"]
+    assert sorted(path.name for path in network.iterdir()) == active
+    install(root)
+    assert sorted(path.name for path in network.iterdir()) == active
+
+
+def test_the_group_of_serial_ports_comes_from_the_image(root: Path) -> None:
+    (root / "etc").mkdir()
+    (root / "etc/group").write_text("root:x:0:\nuucp:x:986:\n")
+    install(root)
+    assert "\nSupplementaryGroups=uucp\n" in (root / UNITS / "kontronik-can-gw.service").read_text()
+
+
+def test_a_program_in_a_home_folder_is_made_visible(root: Path) -> None:
+    service("install", "--root", root, "--executable", "/home/pi/.venv/bin/kontronik-can-gw")
+    assert "\nProtectHome=read-only\n" in (root / UNITS / "kontronik-can-gw.service").read_text()
+
+
+def test_a_link_that_leads_out_of_an_image_is_not_followed(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (root / "etc").symlink_to(tmp_path / "elsewhere")
+    assert "leads out of" in one_line(install(root), 1)
+    assert tree(tmp_path / "elsewhere") == []
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(root: Path) -> None:
+    (root / "etc").write_text("a file")
+    assert "cannot be" in one_line(install(root), 1)
+
+
+@pytest.mark.parametrize("option", ["--dry-run", "--print"])
+def test_a_dry_run_shows_everything_and_does_nothing(root: Path, option: str) -> None:
+    done = install(root, option)
+    assert (done.returncode, added(root)) == (0, [])
+    assert [line.split(":")[0].split("image/")[1] for line in done.stdout.splitlines() if line.startswith("#####")] == [
+        "etc/sysusers.d/kontronik-can-gw.conf",
+        f"{UNITS}/kontronik-can-gw.service",
+        f"{UNITS}/kontronik-can-gw@.service",
+        "etc/udev/rules.d/70-kontronik-can-gw.rules",
+        "etc/systemd/network/50-kontronik-can-gw-can0.network.example",
+        "etc/systemd/network/50-kontronik-can-gw-can0.link.example",
+        CONFIGURATION,
+    ]
+    assert "\nCapabilityBoundingSet=\n" in done.stdout
+    install(root)
+    before = added(root)
+    gone = service("uninstall", "--root", root, "--dry-run", "--purge").stdout.splitlines()
+    assert len(gone) == len(FILES)
+    assert added(root) == before
+
+
+# --- wrong uses
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "the following arguments are required: ACTION"),
+        (["instal"], "invalid choice: 'instal'"),
+        (["install", "--instance", "../x"], "'../x' is no name: letters, digits, _ . -"),
+        (["install", "--instance", "gateway"], "'gateway' is the plain service's configuration"),
+        (["install", "--network", "fast"], "'fast' is not a bit rate in bit/s"),
+        (["install", "--network", "5000000"], "'5000000' is not a bit rate in bit/s"),
+        (["install", "--channel", "can 0"], "'can 0' is not the name of an interface"),
+        (["status", "-n", "many"], "'many' is not a number of lines"),
+        (["uninstall", "--force"], "unrecognized arguments: --force"),
+    ],
+)
+def test_a_wrong_use_is_told_in_the_last_line(words: list[str], said: str) -> None:
+    done = service(*words)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert said in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("executable", ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExecStartPre=/x"])
+def test_a_program_that_a_unit_cannot_hold_is_refused(root: Path, executable: str) -> None:
+    done = service("install", "--root", root, "--executable", executable)
+    assert (done.returncode, added(root)) == (2, [])
+    assert "must be an absolute path without spaces" in done.stderr
+
+
+def test_what_is_no_program_is_refused(root: Path) -> None:
+    (root / "opt/notes").write_text("x")
+    done = service("install", "--root", root, "--executable", "/opt/notes")
+    assert "is not a program" in one_line(done, 2)
+
+
+def test_a_root_that_is_no_folder_is_refused(tmp_path: Path) -> None:
+    assert "is not a folder" in one_line(install(tmp_path / "none"), 2)
+    assert "is not a folder" in one_line(service("uninstall", "--root", tmp_path / "none"), 2)
+
+
+def test_purge_of_an_instance_is_refused(root: Path) -> None:
+    assert "not with --instance" in one_line(service("uninstall", "--root", root, "--instance", "left", "--purge"), 2)
+
+
+@pytest.mark.parametrize("action", ["install", "status", "uninstall"])
+def test_without_systemd_it_is_refused(action: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(service_machine, "_BOOTED", tmp_path / "none")
+    assert "this system does not run systemd." in one_line(service(action), 1)
+
+
+@pytest.mark.parametrize("action", ["install", "uninstall"])
+def test_without_root_it_is_refused(action: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(service_machine, "_BOOTED", tmp_path)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    said = one_line(service(action), 1)
+    assert said.startswith("kontronik-can-gw service: only root may do that: sudo /")
+    assert f" service {action} " in said
+
+
+def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path) -> None:
+    """Only shown: a dry run on this machine, with a program in a closed folder."""
+    program = tmp_path / "closed" / "kontronik-can-gw"
+    program.parent.mkdir(mode=0o700)
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    done = service("install", "--dry-run", "--executable", program)
+    said = one_line(done, 2)
+    assert "the service has a /tmp of its own" in said or "is closed to others" in said
+
+
+def test_closed_folders_on_the_way_are_found(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    (tmp_path / "a").mkdir(mode=0o755)
+    (tmp_path / "a/b").mkdir(mode=0o750)
+    (tmp_path / "a/b/x").write_text("x")
+    found = service_machine.closed_to_others(tmp_path / "a/b/x")
+    assert found is not None
+    (tmp_path / "a/b").chmod(0o711)
+    (tmp_path / "a/b/x").chmod(0o640)
+    below = [service_machine.closed_to_others(tmp_path / name) for name in ("a/b/x", "a/b")]
+    outside = service_machine.closed_to_others(tmp_path.parent)
+    assert below == ([tmp_path / "a/b/x", None] if outside is None else [outside, outside])
+
+
+# --- status, with stand-ins for systemctl and journalctl
+
+
+SYSTEMCTL = """#!{python}
+import json, sys
+said = json.load(open({file!r}))
+words = sys.argv[1:]
+if words[0] == "show":
+    for name, value in said["units"].get(words[-1], {{"LoadState": "not-found", "ActiveState": "inactive"}}).items():
+        print(f"{{name}}={{value}}")
+elif words[0] == "list-units":
+    for name in said["units"]:
+        if "@" in name:
+            print(name, "loaded active running x")
+"""
+JOURNALCTL = """#!{python}
+import json
+for entry in json.load(open({file!r}))["log"]:
+    print(entry if isinstance(entry, str) else json.dumps(entry))
+"""
+RUNNING = {
+    "LoadState": "loaded",
+    "ActiveState": "active",
+    "SubState": "running",
+    "StateChangeTimestamp": "Sat 2026-11-21 15:52:40 UTC",
+    "UnitFileState": "enabled",
+    "StatusText": "esc1: telemetry ok",
+    "MainPID": "107",
+    "NRestarts": "0",
+    "MemoryCurrent": "28311552",
+    "Result": "success",
+    "ExecMainStatus": "0",
+}
+FAILED = RUNNING | {
+    "ActiveState": "activating",
+    "SubState": "auto-restart",
+    "UnitFileState": "disabled",
+    "StatusText": "",
+    "MainPID": "0",
+    "NRestarts": "12",
+    "MemoryCurrent": "18446744073709551615",
+    "Result": "exit-code",
+    "ExecMainStatus": "2",
+}
+
+
+def status(folder: Path, monkeypatch: pytest.MonkeyPatch, units: object, log: object, *words: object) -> Done:
+    file = folder / "said.json"
+    file.write_text(json.dumps({"units": units, "log": log}))
+    for name, text in (("systemctl", SYSTEMCTL), ("journalctl", JOURNALCTL)):
+        (folder / name).write_text(text.format(python=sys.executable, file=str(file)))
+        (folder / name).chmod(0o755)
+    monkeypatch.setattr(service_machine, "_BOOTED", folder)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("TZ", "UTC")
+    return service("status", *words)
+
+
+def test_status_shows_state_configuration_and_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = [
+        {"__REALTIME_TIMESTAMP": "1795276360000000", "PRIORITY": "4", "MESSAGE": "esc1: lost\u001b[31m"},
+        "no JSON",
+        {"__REALTIME_TIMESTAMP": "1795276361000000", "PRIORITY": "6", "MESSAGE": [101, 115, 99, 255]},
+        {"MESSAGE": "without time"},
+    ]
+    done = status(tmp_path, monkeypatch, {"kontronik-can-gw.service": RUNNING}, log)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert lines[:3] == [
+        "kontronik-can-gw.service: active (running) since Sat 2026-11-21 15:52:40 UTC; starts with the machine",
+        "  says           esc1: telemetry ok",
+        "  process        pid 107, restarted 0 times, 27 MB",
+    ]
+    assert lines[3].startswith("  configuration  /etc/kontronik-can-gw/gateway.toml")
+    assert [line[17:].split("  ", 1)[1] for line in lines[-2:]] == ["warning: esc1: lost [31m", "esc\ufffd"]
+
+
+def test_status_of_a_service_that_cannot_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = status(tmp_path, monkeypatch, {"kontronik-can-gw.service": FAILED}, [], "-n", 0)
+    assert done.returncode == 3
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("kontronik-can-gw.service: activating (auto-restart) since ")
+    assert lines[0].endswith("; does not start with the machine")
+    assert lines[1] == "  process        restarted 12 times, last ended by exit-code, status 2"
+
+
+def test_status_of_instances_names_each_and_fails_if_one_is_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left, right = "kontronik-can-gw@left.service", "kontronik-can-gw@right.service"
+    idle = RUNNING | {"ActiveState": "inactive", "UnitFileState": "disabled"}
+    units = {"kontronik-can-gw.service": idle, left: RUNNING, right: FAILED}
+    done = status(tmp_path, monkeypatch, units, [])
+    heads = [line.split(":")[0] for line in done.stdout.splitlines() if not line.startswith(" ")]
+    assert (done.returncode, heads) == (3, [left, right])
+    assert "configuration  /etc/kontronik-can-gw/left.toml" in done.stdout
+    assert status(tmp_path, monkeypatch, units, [], "--instance", "left").returncode == 0
+
+
+def test_status_of_what_is_not_installed_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = status(tmp_path, monkeypatch, {}, [])
+    assert (done.returncode, done.stdout.count("\n")) == (3, 1)
+    assert "not installed" in done.stdout

@@ -1,0 +1,221 @@
+"""The installed service under a real systemd, in a virtual machine: it starts, is caged, comes back, and goes without a trace.
+
+One run of inside_systemd.py gathers the facts, which takes a minute or two; the tests look at them.
+"""
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).resolve().parent
+PROJECT = HERE.parents[1]
+INSTALLED = Path(sys.prefix, "bin", "kontronik-can-gw")
+TIMEOUT_S = 500
+Facts = dict[str, Any]
+
+
+def obstacle() -> str | None:
+    """Why it cannot be run here, and the remedy."""
+    search = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
+    if shutil.which("linux.uml", path=search) is None:
+        return "no User Mode Linux: sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
+    if not Path("/lib/systemd/systemd").exists() or shutil.which("systemd-sysusers") is None:
+        return "no systemd on this machine: sudo apt-get install systemd"
+    if not INSTALLED.exists():
+        return f"{INSTALLED} is missing: python -m pip install -e '.[test]'"
+    if str(PROJECT).startswith(("/tmp/", "/var/tmp/")):
+        return "the checkout is below /tmp, which a service does not see: move it"
+    return None
+
+
+def hidden_folders() -> list[str]:
+    """What the unprivileged user of the service needs and cannot reach."""
+    found: list[str] = []
+    for folder in dict.fromkeys(str(Path(name).resolve()) for name in (sys.base_prefix, sys.prefix, str(PROJECT))):
+        closed = [part for part in Path(folder).parents if not part.stat().st_mode & stat.S_IXOTH]
+        if closed and not any(folder.startswith(f"{other}/") for other in found):
+            found.append(folder)
+    return found
+
+
+@pytest.fixture(scope="module")
+def facts(tmp_path_factory: pytest.TempPathFactory) -> Facts:
+    if reason := obstacle():
+        pytest.skip(reason)
+    folder = tmp_path_factory.mktemp("systemd")
+    folder.chmod(0o755)
+    words = ["--backend", "uml", "--timeout", str(TIMEOUT_S), "--rw", str(folder), "--"]
+    inside = ["sh", str(HERE / "boot_systemd.sh"), sys.executable, str(HERE / "inside_systemd.py"), str(folder)]
+    done = subprocess.run(
+        [sys.executable, "-B", str(PROJECT / "tests" / "vm" / "vm_run.py"), *words, *inside, *hidden_folders()],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=TIMEOUT_S + 60,
+    )
+    file, said = folder / "facts.json", folder / "said"
+    talk = done.stdout + done.stderr + (said.read_text() if said.exists() else "")
+    assert file.exists(), talk
+    found: Facts = json.loads(file.read_text())
+    assert "status in the end" in found, talk
+    return found
+
+
+def talk(facts: Facts, name: str, code: int = 0) -> str:
+    """What an action said; it had this exit code."""
+    done = facts[name]
+    assert done["code"] == code, done
+    return str(done["talk"])
+
+
+def test_an_example_that_nobody_edited_is_not_started(facts: Facts) -> None:
+    assert "gateway.toml: is the example. Set ports, bit rate and motors first." in talk(facts, "install")
+    assert facts["after install"]["ActiveState"] == "inactive"
+    assert facts["after install"]["UnitFileState"] == "disabled"
+
+
+def test_it_runs_as_its_own_user_without_any_right(facts: Facts) -> None:
+    assert talk(facts, "install now").endswith("is enabled and runs. See: kontronik-can-gw service status\n")
+    assert facts["running"]["ActiveState"] == "active"
+    assert facts["running"]["UnitFileState"] == "enabled"
+    process = dict(line.split(":\t", 1) for line in facts["process"].splitlines() if ":\t" in line)
+    assert "0" not in process["Uid"].split() + process["Gid"].split()
+    assert len(process["Groups"].split()) == 2  # its own and that of serial ports
+    assert {process[f"Cap{kind}"] for kind in ("Inh", "Prm", "Eff", "Bnd", "Amb")} == {"0" * 16}
+    assert process["NoNewPrivs"] == "1"
+    assert process["Seccomp"] == "2"
+    assert facts["nice"] == -10
+    assert facts["oom"] == "-500"
+
+
+def test_telemetry_of_a_port_of_its_group_reaches_the_bus(facts: Facts) -> None:
+    assert 0 <= facts["fresh after"] < 20
+    assert "telemetry ok" in facts["running"]["StatusText"]
+
+
+def test_its_folders_are_its_own(facts: Facts) -> None:
+    assert facts["folders"] == {
+        "/run/kontronik-can-gw": ["0o755", "kontronik-can-gw"],
+        "/var/lib/kontronik-can-gw": ["0o700", "kontronik-can-gw"],
+    }
+
+
+def test_a_killed_process_is_started_again(facts: Facts) -> None:
+    assert 0 <= facts["running again after kill"] < 20
+    assert 0 <= facts["fresh after kill"] < 20
+    assert facts["killed"]["NRestarts"] == "1"
+
+
+def test_a_frozen_process_is_replaced_and_tells_where_it_was(facts: Facts) -> None:
+    assert 5 <= facts["running again after freeze"] < 40
+    assert facts["frozen"]["NRestarts"] == "2"
+    assert any("most recent call first" in str(message) for _, message in facts["log"])
+
+
+def test_a_faulty_configuration_is_refused_at_reload_and_the_process_goes_on(facts: Facts) -> None:
+    talk(facts, "reload")
+    assert facts["after faulty reload"]["ActiveState"] == "active"
+    assert facts["same process"]
+    assert [priority for priority, message in facts["log"] if "nonsense" in str(message)] == ["3"]
+
+
+def test_a_faulty_configuration_is_not_started_by_install(facts: Facts) -> None:
+    said = talk(facts, "install with faulty configuration", 1)
+    assert "gateway.toml: esc[1].nonsense: unknown key." in said
+    assert "kontronik-can-gw.service was not enabled and started." in said
+
+
+def test_status_is_readable(facts: Facts) -> None:
+    done = facts["status"]
+    assert (done["code"], done["talk"]) == (0, "")
+    lines = done["out"].splitlines()
+    assert lines[0].startswith("kontronik-can-gw.service: active (running) since ")
+    assert lines[0].endswith("; starts with the machine")
+    assert "esc1: telemetry ok" in lines[1]
+    assert "restarted 0 times" in lines[2]
+    assert lines[3] == "  configuration  /etc/kontronik-can-gw/gateway.toml"
+    assert lines[4].startswith("  log ")
+
+
+def test_several_gateways_run_side_by_side(facts: Facts) -> None:
+    talk(facts, "install left")
+    done = facts["status of both"]
+    assert done["code"] == 0
+    heads = [line for line in done["out"].splitlines() if not line.startswith(" ")]
+    assert [head.split(" (")[0] for head in heads] == [
+        "kontronik-can-gw.service: active",
+        "kontronik-can-gw@left.service: active",
+    ]
+    assert "kontronik-can-gw@left.service: stopped and disabled" in talk(facts, "uninstall left")
+    assert facts["left"]["ActiveState"] == "inactive"
+    assert facts["left"]["UnitFileState"] == "disabled"
+
+
+def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> None:
+    needed = [
+        *("CAN socket", "netlink", "abstract socket", "state folder", "runtime folder", "terminal"),
+        *("ctypes", "other processes", "machine-id"),
+    ]
+    refused = {
+        "internet": "Errno 97",
+        "packet": "Errno 97",
+        "write /etc": "Errno 30",
+        "set kernel": "Errno 30",
+        "write and execute": "Errno 1]",
+        "another device": "Errno 1]",
+        "namespace": "Errno 1]",
+        "priority": "Errno 1]",
+        "another user": "Errno 1]",
+    }
+    probe = facts["probe"]
+    assert set(probe) == {*needed, *refused}
+    assert [name for name in needed if probe[name] != "works"] == []
+    assert [name for name, error in refused.items() if error not in probe[name]] == []
+
+
+def test_loopback_ip_is_allowed_on_request(facts: Facts) -> None:
+    done, probe = facts["probe with prometheus"]
+    assert done["code"] == 0
+    assert probe == facts["probe"] | {"internet": "works"}
+
+
+def test_networkd_understands_the_network_file(facts: Facts) -> None:
+    done, said = facts["network"]
+    assert done["code"] == 0
+    if said == "missing":
+        pytest.skip("systemd-networkd is missing: sudo apt-get install systemd (or systemd-networkd)")
+    assert "60-wrong.network:4: Unknown key name 'Bitrat'" in said or "60-wrong.network:4: Unknown key 'Bitrat'" in said
+    assert "50-kontronik-can-gw-vcan1.network:" not in said
+
+
+def test_only_root_removes_it(facts: Facts) -> None:
+    assert talk(facts, "as nobody", 1).count("\n") == 1
+    assert "only root may do that: sudo " in talk(facts, "as nobody", 1)
+
+
+def test_uninstall_keeps_what_people_wrote(facts: Facts) -> None:
+    assert "(--purge removes them)" in talk(facts, "uninstall")
+    state, left = facts["after uninstall"]
+    assert state["ActiveState"] == "inactive"
+    assert left == [
+        "/etc/kontronik-can-gw",
+        "/var/lib/kontronik-can-gw",
+        "/var/lib/kontronik-can-gw-left",
+        "/var/lib/kontronik-can-gw-probe",
+    ]
+    assert facts["running in the end"]["ActiveState"] == "active"
+
+
+def test_purge_leaves_nothing(facts: Facts) -> None:
+    talk(facts, "purge")
+    state, left, user = facts["after purge"]
+    assert (state["ActiveState"], left, user) == ("inactive", [], 1)
+    assert facts["status in the end"]["code"] == 3
+    assert facts["status in the end"]["out"].startswith("kontronik-can-gw.service: not installed.")

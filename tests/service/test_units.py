@@ -1,0 +1,204 @@
+"""The files as they are installed: judged by systemd's own tools where those are, and read line by line everywhere."""
+
+import os
+import re
+import shutil
+import subprocess
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kontronik_can_gw.cli.service_files import Choices, PlannedFile, planned
+
+NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
+ENABLE = "no systemd-analyze on this machine: sudo apt-get install systemd"
+MOST_EXPOSED = 2.0
+
+
+def files(root: Path, **more: Any) -> dict[str, PlannedFile]:
+    """All files by their names."""
+    usual: dict[str, Any] = {"executable": "/bin/true", "home_visible": False, "group": "dialout"}
+    return {Path(file.path).name: file for file in planned(Choices(**(usual | more)), root)}
+
+
+def units(folder: Path, prometheus: bool = False) -> list[Path]:
+    """The units with their drop-ins in a folder, the template as an instance."""
+    for file in planned(Choices("/bin/true", False, "dialout", prometheus=prometheus), folder):
+        if "/system/" in file.path:
+            path = folder / file.path.partition("/system/")[2].replace("gw@.service", "gw@left.service")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(file.text)
+    return [folder / name.replace("@", "@left") for name in NAMES]
+
+
+def settings(text: str) -> dict[str, list[str]]:
+    found: defaultdict[str, list[str]] = defaultdict(list)
+    for line in text.splitlines():
+        if line and line[0] not in "#[":
+            name, _, value = line.partition("=")
+            found[name].append(value)
+    return found
+
+
+def analyze(*words: str) -> "subprocess.CompletedProcess[str]":
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip(ENABLE)
+    environment = os.environ | {"SYSTEMD_COLORS": "0", "LC_ALL": "C.UTF-8"}
+    return subprocess.run(
+        ["systemd-analyze", *words], capture_output=True, text=True, check=False, timeout=60, env=environment
+    )
+
+
+# --- by systemd's tools
+
+
+@pytest.mark.parametrize("prometheus", [False, True])
+def test_systemd_finds_nothing_to_complain_about(tmp_path: Path, prometheus: bool) -> None:
+    for unit in units(tmp_path, prometheus):
+        done = analyze("verify", "--man=no", str(unit))
+        ours = [
+            line for line in (done.stdout + done.stderr).splitlines() if "kontronik" in line or str(tmp_path) in line
+        ]
+        assert (done.returncode, ours) == (0, []), done.stderr
+
+
+def test_verify_would_have_found_a_mistake(tmp_path: Path) -> None:
+    unit = units(tmp_path)[0]
+    unit.write_text(unit.read_text().replace("RestartSec=", "RestartSecs="))
+    assert "RestartSecs" in analyze("verify", "--man=no", str(unit)).stderr
+
+
+@pytest.mark.parametrize("prometheus", [False, True])
+def test_the_service_is_hardly_exposed(tmp_path: Path, prometheus: bool) -> None:
+    for unit in units(tmp_path, prometheus):
+        done = analyze("security", "--offline=true", "--no-pager", str(unit))
+        found = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
+        assert found, done.stdout + done.stderr
+        assert float(found[1]) <= MOST_EXPOSED
+
+
+# --- line by line
+
+
+def test_both_units_differ_only_in_their_names(tmp_path: Path) -> None:
+    made = files(tmp_path)
+    plain, template = (settings(made[name].text) for name in NAMES)
+    assert {name for name in plain if plain[name] != template[name]} == {
+        "Description",
+        "ExecStart",
+        "StateDirectory",
+        "RuntimeDirectory",
+    }
+    assert plain["ExecStart"] == ["/bin/true run --wait -c /etc/kontronik-can-gw/gateway.toml"]
+    assert template["ExecStart"] == ["/bin/true run --wait -c /etc/kontronik-can-gw/%i.toml"]
+    assert template["StateDirectory"] == template["RuntimeDirectory"] == ["kontronik-can-gw-%i"]
+
+
+def test_it_never_gives_up_and_is_watched(tmp_path: Path) -> None:
+    unit = settings(files(tmp_path)[NAMES[0]].text)
+    assert unit["Type"] == ["notify"]
+    assert unit["Restart"] == ["always"]
+    assert unit["StartLimitIntervalSec"] == ["0"]
+    assert unit["WatchdogSec"] == ["10s"]
+    assert unit["ExecReload"] == ["/bin/kill -HUP $MAINPID"]
+    assert not [
+        name for name in unit if name.startswith(("ExecStartPre", "RestartPrevent", "ExecCondition", "Condition"))
+    ]
+
+
+def test_it_may_open_serial_ports_and_nothing_else(tmp_path: Path) -> None:
+    unit = settings(files(tmp_path)[NAMES[0]].text)
+    assert unit["DevicePolicy"] == ["closed"]
+    assert {"char-ttyUSB rw", "char-ttyACM rw", "char-ttyS rw", "char-ttyAMA rw"} <= set(unit["DeviceAllow"])
+    assert all(re.fullmatch(r"char-tty[A-Za-z]+ rw", line) for line in unit["DeviceAllow"])
+    # an adapter may be plugged in when the service runs already: its driver has to be loaded before
+    for module in ("usbserial", "cdc_acm"):
+        assert all(f"modprobe@{module}.service" in unit[name][0].split() for name in ("Wants", "After"))
+    assert "PrivateDevices" not in unit
+
+
+def test_it_speaks_can_and_nothing_of_the_internet(tmp_path: Path) -> None:
+    made = files(tmp_path)
+    unit = settings(made[NAMES[0]].text)
+    assert unit["RestrictAddressFamilies"] == ["AF_CAN AF_UNIX AF_NETLINK"]
+    assert unit["IPAddressDeny"] == ["any"]
+    assert unit["CapabilityBoundingSet"] == unit["AmbientCapabilities"] == [""]
+    assert "prometheus.conf" not in made
+    loopback = settings(files(tmp_path, prometheus=True)["prometheus.conf"].text)
+    assert loopback == {"RestrictAddressFamilies": ["AF_INET AF_INET6"], "IPAddressAllow": ["localhost"]}
+
+
+def test_a_program_in_a_home_folder_is_seen_but_not_written(tmp_path: Path) -> None:
+    for visible, value in ((False, "yes"), (True, "read-only")):
+        assert settings(files(tmp_path, home_visible=visible)[NAMES[0]].text)["ProtectHome"] == [value]
+
+
+def test_the_group_of_serial_ports_is_the_systems(tmp_path: Path) -> None:
+    made = files(tmp_path, group="uucp")
+    assert settings(made[NAMES[0]].text)["SupplementaryGroups"] == ["uucp"]
+    assert "m kontronik-can-gw uucp\n" in made["kontronik-can-gw.conf"].text
+
+
+def test_nothing_is_left_to_be_filled_in(tmp_path: Path) -> None:
+    for bitrate in (None, 250_000):
+        for file in files(tmp_path, bitrate=bitrate, prometheus=True).values():
+            assert not re.search(r"@[A-Z]+@", file.text)
+
+
+# --- network and udev
+
+
+def test_the_network_file_has_what_the_bus_needs(tmp_path: Path) -> None:
+    made = files(tmp_path, bitrate=250_000, channel="can1")
+    network = settings(made["50-kontronik-can-gw-can1.network"].text)
+    assert network == {
+        "Name": ["can1"],
+        "RequiredForOnline": ["no"],
+        "BitRate": ["250000"],
+        "SamplePoint": ["87.5%"],
+        "RestartSec": ["100ms"],
+    }
+    link = settings(made["50-kontronik-can-gw-can1.link"].text)
+    assert link == {"OriginalName": ["can1"], "TransmitQueueLength": ["128"]}
+
+
+def test_without_a_bit_rate_the_network_files_are_examples(tmp_path: Path) -> None:
+    made = files(tmp_path)
+    assert [name for name in made if "can0" in name] == [
+        "50-kontronik-can-gw-can0.network.example",
+        "50-kontronik-can-gw-can0.link.example",
+    ]
+    assert "BitRate=500000" in made["50-kontronik-can-gw-can0.network.example"].text
+    assert "then take .example off its name" in made["50-kontronik-can-gw-can0.network.example"].text
+
+
+RULE = re.compile(
+    r"(ACTION|SUBSYSTEMS?|DRIVER|ENV\{\w+\}|ATTRS?\{\w+\})==\"[^\"]*\"|(ENV|ATTR)\{\w+\}=\"[^\"]*\"|SYMLINK\+=\"[^\"]+\"|(GOTO|LABEL)=\"\w+\""
+)
+
+
+def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
+    """By the grammar of the keys in use, and by udev itself where it can (udevadm verify, systemd 254)."""
+    text = files(tmp_path)["70-kontronik-can-gw.rules"].text
+    lines = [line.removeprefix("#") for line in text.splitlines() if re.match("#?[A-Z]+(==|=)", line)]
+    assert len(lines) == 7
+    for line in lines:
+        for part in line.split(", "):
+            assert RULE.fullmatch(part), part
+    assert text.count('GOTO="kontronik_can_gw_end"') == text.count('LABEL="kontronik_can_gw_end"') == 1
+    udevadm = shutil.which("udevadm", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/bin")
+    if udevadm and "verify" in subprocess.run([udevadm, "--help"], capture_output=True, text=True, check=False).stdout:
+        rules = tmp_path / "70-kontronik-can-gw.rules"
+        rules.write_text(text)
+        done = subprocess.run([udevadm, "verify", str(rules)], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr + done.stdout
+
+
+def test_udev_rules_make_adapters_quick_and_keep_modem_manager_away(tmp_path: Path) -> None:
+    text = files(tmp_path)["70-kontronik-can-gw.rules"].text
+    assert 'SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"\n' in text
+    ignored = [line for line in text.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
+    assert [line.split(",")[0] for line in ignored] == ['SUBSYSTEM=="usb"', 'SUBSYSTEM=="tty"']
+    assert all("0403" in line for line in ignored)

@@ -1,0 +1,92 @@
+"""A gateway with simulated ESCs whose time is passed in, and documents of it."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.protocol.fields import InfoData, LiveData
+from kontronik_can_gw.runtime.snapshot import (
+    CanFacts,
+    PortFacts,
+    ProcessFacts,
+    ProgramFacts,
+    StoreFacts,
+    snapshot,
+)
+from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
+
+START = 1000 * SECOND
+PROGRAM = ProgramFacts("/etc/kontronik-can-gw/gateway.toml", "1.2.3", 4711, 99, "pid:[1]", "2026-01-02T03:04:05Z")
+
+
+@dataclass
+class Bench:
+    """``escs`` simulated ESCs that are heard from START on."""
+
+    escs: int = 2
+    settings: EscSettings = field(default_factory=lambda: EscSettings("esc", 7, Fraction(98, 10)))
+    options: EscOptions | None = None
+
+    def __post_init__(self) -> None:
+        self.now = START
+        names = [f"esc{number + 1}" for number in range(self.escs)]
+        made = [EscSettings(name, self.settings.pole_pairs, self.settings.gear) for name in names]
+        self.gateway = Gateway(made, Layout("", "", ()), START)
+        self.gateway.start(START)
+        self.simulated = [SimulatedEsc(self.options, seed=n, start_ns=START) for n in range(self.escs)]
+        self.sent: list[list[LiveData | InfoData]] = [[] for _ in names]
+        self.silent: set[int] = set()
+
+    def run(self, seconds: float) -> None:
+        """Let time pass in steps of 10 ms; ``silent`` ESCs are not heard."""
+        end = self.now + round(seconds * SECOND)
+        while self.now < end:
+            self.now += 10 * MS
+            for number, simulated in enumerate(self.simulated):
+                for frame in simulated.frames_until(self.now):
+                    if number not in self.silent:
+                        self.gateway.receive_bytes(number, frame.wire, self.now)
+                        self.sent[number].append(frame.data)
+            self.gateway.advance(self.now)
+
+    def newest(self, esc: int, kind: type[LiveData] | type[InfoData]) -> Any:
+        return next(data for data in reversed(self.sent[esc]) if isinstance(data, kind))
+
+    def document(
+        self,
+        *,
+        at: int | None = None,
+        ports: Sequence[PortFacts] | None = None,
+        can: CanFacts | None = None,
+        store: StoreFacts | None = None,
+        log_lines: Sequence[str] = (),
+        program: ProgramFacts = PROGRAM,
+    ) -> dict[str, Any]:
+        """The document now, as a reader of the file gets it."""
+        names = [esc.settings.name for esc in self.gateway.escs]
+        document = snapshot(
+            self.gateway,
+            now=self.now if at is None else at,
+            wall=1_700_000_000.5,
+            program=program,
+            process=ProcessFacts(20_000_000, 12, 3),
+            ports=ports or [PortFacts(name, f"/dev/{name}", True) for name in names],
+            can=can or CanFacts("socketcan", "can0", 500_000, True),
+            store=store,
+            log_lines=log_lines,
+        )
+        read: dict[str, Any] = json.loads(json.dumps(document, allow_nan=False))
+        return read
+
+
+def with_nodes(document: Mapping[str, Any], count: int = 2, sent: int = 0) -> dict[str, Any]:
+    """The document of a gateway with CANopen nodes."""
+    nodes = [
+        {"esc": f"esc{n + 1}", "node_id": n + 1, "state": "operational", "pdos_sent": sent + n} for n in range(count)
+    ]
+    return {**document, "nodes": nodes}

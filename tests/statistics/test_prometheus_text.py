@@ -1,0 +1,185 @@
+"""The text for Prometheus, read back by another's parser: names, types, base units, and nothing that is not available."""
+
+import re
+from typing import Any
+
+import pytest
+from prometheus_client import Metric
+from prometheus_client.parser import text_string_to_metric_families
+from statistics_bench import Bench, with_nodes
+
+from kontronik_can_gw.protocol.fields import LiveData
+from kontronik_can_gw.protocol.states import OperatingError, SelfTestError
+from kontronik_can_gw.runtime.prometheus import metrics
+from kontronik_can_gw.runtime.snapshot import CanFacts, PortFacts, StoreFacts
+
+UNITS: tuple[str, ...] = (
+    "volts",
+    "amperes",
+    "watts",
+    "joules",
+    "coulombs",
+    "celsius",
+    "ratio",
+    "seconds",
+    "bytes",
+    "hertz",
+)
+UNITS += ("revolutions_per_second", "bits_per_second")
+
+
+def families(document: dict[str, Any]) -> dict[str, Metric]:
+    """By name as it is written, ``_total`` included."""
+    text = metrics(document)
+    found = list(text_string_to_metric_families(text))
+    names = [family.name + ("_total" if family.type == "counter" else "") for family in found]
+    assert len(set(names)) == len(names)
+    return dict(zip(names, found, strict=True))
+
+
+def value(document: dict[str, Any], name: str, **labels: str) -> float | None:
+    family = families(document).get(name)
+    if family is None:
+        return None
+    found = [s.value for s in family.samples if s.labels == labels]
+    assert len(found) <= 1
+    return found[0] if found else None
+
+
+@pytest.fixture(scope="module")
+def document() -> dict[str, Any]:
+    bench = Bench(2)
+    bench.run(6)
+    ports = [PortFacts(f"esc{n}", f"/dev/{n}", True, line_errors={"parity": n, "framing": 0}) for n in (1, 2)]
+    can = CanFacts("socketcan", "can0", 500_000, True, error_counters=(8, 0))
+    return with_nodes(bench.document(ports=ports, can=can, store=StoreFacts(1, "disk full")))
+
+
+def test_every_line_is_a_sample_or_the_help_or_type_of_the_family_that_follows(document: dict[str, Any]) -> None:
+    lines = metrics(document).split("\n")
+    assert lines.pop() == ""
+    name = kind = ""
+    for line in lines:
+        if line.startswith("# HELP "):
+            name = line.split()[2]
+            assert re.fullmatch(r"# HELP \S+ \S.*\.", line), line
+        elif line.startswith("# TYPE "):
+            assert line.split()[2] == name
+            kind = line.split()[3]
+        else:
+            assert re.fullmatch(rf'{name}(\{{([a-z_]+="[^"]*",?)+\}})? -?[0-9][0-9.e+-]*', line), line
+            assert kind in ("gauge", "counter")
+
+
+def test_names_have_the_prefix_counters_end_in_total_and_a_unit_stands_behind_the_name(
+    document: dict[str, Any],
+) -> None:
+    units = dict.fromkeys(UNITS, 0)
+    for name, family in families(document).items():
+        assert re.fullmatch(r"kontronik_[a-z][a-z0-9_]*", name)
+        assert (family.type == "counter") == name.endswith("_total")
+        assert family.documentation
+        for unit in UNITS:
+            units[unit] += name.removesuffix("_total").endswith(f"_{unit}")
+        assert not re.search(r"_(v|a|w|wh|mah|ms|us|percent|rpm|millis|degrees|kbit)(_|$)", name), name
+    assert all(units.values()), units
+
+
+def test_values_are_in_base_units(document: dict[str, Any]) -> None:
+    values = document["escs"][0]["values"]
+    assert values["electrical_speed"] > 0
+    expected = {
+        "battery_voltage_volts": values["battery_voltage"],
+        "battery_current_amperes": values["battery_current"],
+        "battery_power_watts": values["battery_power"],
+        "consumed_charge_coulombs": values["consumed_charge"] * 3.6,
+        "energy_used_joules_total": values["energy_used"] * 3600,
+        "motor_run_time_seconds_total": values["motor_run_time"],
+        "power_stage_temperature_celsius": values["power_stage_temperature"],
+        "throttle_ratio": values["throttle"] / 100,
+        "pwm_input_seconds": values["pwm_input"] * 1e-6,
+        "electrical_speed_revolutions_per_second": values["electrical_speed"] / 60,
+        "cell_count": values["cell_count"],
+        "operating_state_raw": values["operating_state_raw"],
+        "esc_data_age_seconds": document["escs"][0]["data_age_ms"] / 1000,
+        "esc_frame_rate_hertz": document["escs"][0]["frame_rate_hz"],
+        "esc_live_frames_total": document["escs"][0]["counters"]["live"],
+        "esc_received_bytes_total": document["escs"][0]["counters"]["bytes"],
+    }
+    for name, number in expected.items():
+        assert value(document, f"kontronik_{name}", esc="esc1") == pytest.approx(number, rel=1e-12), name
+    assert value(document, "kontronik_can_bitrate_bits_per_second") == 500_000
+    assert value(document, "kontronik_can_transmit_error_counter") == 8
+    assert value(document, "kontronik_uptime_seconds") == 6
+    assert value(document, "kontronik_esc_port_line_errors_total", esc="esc2", kind="parity") == 2
+    assert value(document, "kontronik_store_failed") == 1
+
+
+def test_every_value_of_the_document_has_its_metric_for_each_esc(document: dict[str, Any]) -> None:
+    found = families(document)
+    for name in document["units"]:
+        (family,) = [f for full, f in found.items() if re.match(rf"kontronik_{name}(_(?!error)|$)", full)]
+        assert [sample.labels for sample in family.samples] == [{"esc": "esc1"}, {"esc": "esc2"}]
+    for name in document["can"]["counters"]:
+        assert f"kontronik_can_{name.removesuffix('_count')}_total" in found
+
+
+def test_what_is_not_available_is_left_out() -> None:
+    bench = Bench(2)
+    bench.run(2)
+    bench.silent.add(0)
+    bench.run(1)
+    document = bench.document()
+    values = [v for k, v in document["escs"][0]["values"].items() if k not in ("energy_used", "motor_run_time")]
+    assert set(values) == {None}
+    text = metrics(document)
+    assert value(document, "kontronik_battery_voltage_volts", esc="esc1") is None
+    assert value(document, "kontronik_battery_voltage_volts", esc="esc2") is not None
+    assert value(document, "kontronik_esc_fresh", esc="esc1") == 0
+    assert 'kontronik_operating_error{esc="esc1"' not in text
+    assert 'kontronik_esc_info{esc="esc1"' not in text
+    assert not re.search("nan|none|null", text, re.IGNORECASE)
+    assert value(document, "kontronik_esc_losses_total", esc="esc1") == 1
+    assert "kontronik_canopen_node_state" not in text  # there are no nodes
+    assert "kontronik_store" not in text
+
+
+def test_without_any_esc_heard_no_family_of_values_is_begun() -> None:
+    text = metrics(Bench(1).document())
+    assert "battery_voltage" not in text
+    assert 'kontronik_esc_link_state{esc="esc1",state="never-seen"} 1' in text
+
+
+def test_a_state_is_one_of_its_names(document: dict[str, Any]) -> None:
+    for name, now in (("can_state", "unknown"), ("gateway_state", "running")):
+        family = families(document)[f"kontronik_{name}"]
+        assert [s.labels["state"] for s in family.samples if s.value == 1] == [now]
+        assert len(family.samples) > 3
+    states = families(document)["kontronik_canopen_node_state"].samples
+    assert [s.labels for s in states if s.value == 1] == [
+        {"esc": f"esc{n}", "node_id": str(n), "state": "operational"} for n in (1, 2)
+    ]
+    links = families(document)["kontronik_esc_link_state"].samples
+    assert [(s.labels["esc"], s.labels["state"]) for s in links if s.value == 1] == [("esc1", "ok"), ("esc2", "ok")]
+
+
+def test_each_error_bit_is_a_flag_with_its_severity_and_an_unknown_one_shows_when_it_is_set() -> None:
+    bench = Bench(1)
+    bench.run(3)
+    esc = bench.gateway.escs[0]
+    assert isinstance(esc.live, LiveData)
+    esc.live = esc.live._replace(operating_errors=1 << OperatingError.OVERVOLTAGE | 1 << 30)
+    samples = families(bench.document())["kontronik_operating_error"].samples
+    assert len(samples) == len(OperatingError) + 1
+    known = {s.labels["error"]: s.labels["severity"] for s in samples}
+    assert {bit.text: bit.severity.value for bit in OperatingError} | {"bit30": "error"} == known
+    assert {s.labels["error"] for s in samples if s.value == 1} == {"overvoltage", "bit30"}
+    assert len(families(bench.document())["kontronik_selftest_error"].samples) == len(SelfTestError)
+
+
+def test_texts_with_quotes_backslashes_and_line_ends_are_read_back(document: dict[str, Any]) -> None:
+    channel = 'a"b\\c\nd\\n µ'
+    made = document | {"can": document["can"] | {"channel": channel}, "version": "\udcff"}
+    (sample,) = families(made)["kontronik_can_info"].samples
+    assert sample.labels == {"interface": "socketcan", "channel": channel}
+    metrics(made).encode()

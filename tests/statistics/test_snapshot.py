@@ -1,0 +1,245 @@
+"""The document: every value true and fresh or null, every counter there, and figures that come from /proc."""
+
+import os
+import time
+from dataclasses import fields, replace
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+from statistics_bench import START, Bench, with_nodes
+
+from kontronik_can_gw.protocol.deframer import Counters
+from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
+from kontronik_can_gw.protocol.states import Device, OperatingError, state_text
+from kontronik_can_gw.runtime.snapshot import (
+    LOG_LINES,
+    CanFacts,
+    PortFacts,
+    StoreFacts,
+    process_facts,
+    program_facts,
+    start_ticks,
+    with_rates,
+)
+from kontronik_can_gw.runtime.statistics import default_file
+from kontronik_can_gw.simulator import EscOptions, Faults
+from kontronik_can_gw.sources import CanState, GatewayStatus
+from kontronik_can_gw.telemetry import MS, SECOND
+
+
+def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
+    bench = Bench()
+    bench.run(6)
+    document = bench.document()
+    for number, esc in enumerate(document["escs"]):
+        for kind in (LiveData, InfoData):
+            sent = bench.newest(number, kind)
+            for (name, row), raw in zip(rows(kind).items(), sent, strict=True):
+                if name in ("operating_state", "device_and_variant", "firmware_word"):
+                    continue
+                assert esc["values"][name] == row.physical(raw), name
+                assert document["units"][name] == row.unit
+        live, info = bench.newest(number, LiveData), bench.newest(number, InfoData)
+        assert esc["operating_state"] == state_text(live.operating_state)
+        assert (esc["device"], esc["firmware"]) == ("KOSMIK", info.firmware)
+        assert esc["values"]["motor_speed"] == pytest.approx(live.electrical_speed / 7, abs=1e-6)
+        assert esc["values"]["output_speed"] == pytest.approx(live.electrical_speed / 7 / 9.8, abs=1e-6)
+        assert esc["values"]["battery_power"] == pytest.approx(live.battery_voltage * live.battery_current / 1000)
+        assert set(esc["values"]) == set(document["units"])
+        assert (esc["link"], esc["fresh"], esc["layout"]) == ("ok", True, "V4")
+
+
+def test_pole_pairs_that_come_over_the_bus_hold_from_the_next_document_on() -> None:
+    bench = Bench(1)
+    bench.run(6)
+    before = bench.document()["escs"][0]["values"]
+    esc = bench.gateway.escs[0]
+    esc.apply(replace(esc.settings, pole_pairs=14, gear=Fraction(1)))
+    after = bench.document()["escs"][0]["values"]
+    assert after["motor_speed"] == pytest.approx(before["motor_speed"] / 2, abs=1e-5)
+    assert after["output_speed"] == after["motor_speed"] > 0
+
+
+def test_values_are_null_as_soon_as_they_are_older_than_the_time_out_whatever_the_gateway_was_told() -> None:
+    bench = Bench(1)
+    bench.run(1)
+    heard = bench.gateway.escs[0].live_ns
+    assert heard is not None
+    last = bench.document(at=heard + 250 * MS)["escs"][0]
+    late = bench.document(at=heard + 250 * MS + 1)["escs"][0]
+    assert last["fresh"] and last["values"]["battery_voltage"] is not None
+    assert not late["fresh"]
+    assert late["values"]["battery_voltage"] is late["values"]["motor_speed"] is None
+    assert late["operating_state"] is late["errors"] is late["warnings"] is late["statuses"] is None
+    assert late["data_age_ms"] == 250
+    assert bench.document(at=heard + 20 * SECOND)["escs"][0]["device"] is None
+
+
+def test_a_lost_esc_has_no_values_but_its_counters_and_its_age() -> None:
+    bench = Bench(2)
+    bench.run(2)
+    bench.silent.add(1)
+    bench.run(2)
+    heard, lost = bench.document()["escs"]
+    assert heard["fresh"] and not lost["fresh"]
+    measured = {name: value for name, value in lost["values"].items() if name not in ("energy_used", "motor_run_time")}
+    assert set(measured.values()) == {None}
+    assert (lost["link"], lost["losses"], lost["device"], lost["selftest_errors"]) == ("lost", 1, None, None)
+    assert 1900 <= lost["data_age_ms"] <= 2100
+    assert lost["counters"]["live"] > 190
+    assert lost["diagnosis"].startswith("no bytes")
+    assert lost["frame_rate_hz"] == 0
+
+
+def test_what_a_jivepro_does_not_supply_is_null() -> None:
+    bench = Bench(1, options=EscOptions(device=Device.JIVEPRO))
+    bench.run(3)
+    (esc,) = bench.document()["escs"]
+    assert esc["device"] == "JIVEPro"
+    assert esc["values"]["bec_current"] is None
+    assert esc["values"]["bec_voltage"] is not None
+    assert esc["peak_current_of"] == "battery"
+
+
+def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> None:
+    bench = Bench(1, options=EscOptions(faults=Faults(noise=0.5, flipped_bits=1e-4)))
+    bench.run(3)
+    document = bench.document()
+    counters = document["escs"][0]["counters"]
+    assert {f.name for f in fields(Counters)} <= set(counters)
+    assert counters["dropped_bytes"] > 0
+    assert counters == {**bench.gateway.escs[0].counters.as_dict(), "suspect_frames": 0, "late_frames": 0} | {
+        "line_errors": 0
+    }
+    others = {"state", "can_state", "esc_count", "escs_ok", "started_ns"}
+    assert set(document["can"]["counters"]) == {f.name for f in fields(GatewayStatus)} - others
+
+
+def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_error() -> None:
+    bench = Bench(1)
+    bench.run(1)
+    esc = bench.gateway.escs[0]
+    assert esc.live is not None
+    word = 1 << OperatingError.UNDERVOLTAGE | 1 << OperatingError.POWER_STAGE_OVERTEMP_WARNING | 1 << 31
+    esc.live = esc.live._replace(operating_errors=word | 1 << OperatingError.PROGRAMMING_ALLOWED)
+    (shown,) = bench.document()["escs"]
+    assert shown["errors"] == ["undervoltage", "bit31"]
+    assert shown["warnings"] == ["power_stage_overtemp_warning"]
+    assert shown["statuses"] == ["programming_allowed"]
+
+
+def test_ports_interface_store_and_log_are_told_as_the_loop_gave_them() -> None:
+    bench = Bench(2)
+    bench.run(1)
+    bench.gateway.port_lost(1, bench.now)
+    bench.gateway.set_can_state(CanState.BUS_OFF, bench.now)
+    ports = [
+        PortFacts("esc1", "/dev/a", True, reopened=3, line_errors={"parity": 2, "framing": 0}),
+        PortFacts("esc2", "/dev/b", False, "gone", lost_since_ns=bench.now - 5 * SECOND),
+    ]
+    can = CanFacts("socketcan", "can7", None, True, "bus-off", True, 100, (255, 3))
+    lines = [f"line {n}" for n in range(30)]
+    document = bench.document(ports=ports, can=can, store=StoreFacts(2, "disk full"), log_lines=lines)
+    first, second = document["escs"]
+    assert first["port"] | {"path": "/dev/a"} == {
+        "path": "/dev/a",
+        "open": True,
+        "complaint": None,
+        "reopened": 3,
+        "lost_for_s": None,
+        "line_errors": {"parity": 2, "framing": 0},
+    }
+    assert (second["port"]["open"], second["port"]["complaint"], second["port"]["lost_for_s"]) == (False, "gone", 5.0)
+    assert (second["link"], second["diagnosis"]) == ("port-error", None)
+    shown = document["can"]
+    assert (shown["channel"], shown["state"], shown["bitrate"], shown["stalled"]) == ("can7", "bus-off", None, True)
+    assert (shown["complaint"], shown["restart_ms"], shown["error_counters"]) == ("bus-off", 100, [255, 3])
+    assert document["store"] == {"waiting": 2, "last_error": "disk full"}
+    assert document["log"] == lines[-LOG_LINES:]
+    assert bench.document()["store"] is None
+
+
+def test_the_head_says_format_clocks_and_process() -> None:
+    bench = Bench(1)
+    bench.run(1)
+    document = bench.document()
+    assert (document["format"], document["program"], document["version"]) == (1, "kontronik-can-gw", "1.2.3")
+    assert document["monotonic_ns"] == START + SECOND
+    assert document["time"] == "2023-11-14T22:13:20Z"
+    assert document["process"] == {
+        "pid": 4711,
+        "start_ticks": 99,
+        "pid_namespace": "pid:[1]",
+        "started": "2026-01-02T03:04:05Z",
+        "uptime_s": 1.0,
+        "rss_bytes": 20_000_000,
+        "open_fds": 12,
+        "threads": 3,
+    }
+    assert document["gateway"] == {"state": "running", "esc_count": 1, "escs_ok": 1}
+
+
+def test_rates_are_per_second_between_two_documents() -> None:
+    bench = Bench(2)
+    before = with_nodes(bench.document(), sent=100)
+    bench.run(2)
+    bench.gateway.status.sent_frames += 300
+    bench.gateway.status.received_frames += 5
+    after = with_rates(with_nodes(bench.document(), sent=150), before)
+    assert after["rates"] == {
+        "seconds": 2.0,
+        "sent_frames_per_s": 150.0,
+        "received_frames_per_s": 2.5,
+        "pdos_per_s": [25.0, 25.0],
+    }
+    assert with_rates(before, None)["rates"] is None
+    assert with_rates(before, before)["rates"] is None
+
+
+def test_the_figures_of_the_process_are_those_of_proc(tmp_path: Path) -> None:
+    before = process_facts()
+    opened = [(tmp_path / f"{n}").open("w") for n in range(5)]
+    after = process_facts()
+    for file in opened:
+        file.close()
+    assert after.open_fds == before.open_fds + 5
+    assert after.threads == len(list(Path("/proc/self/task").iterdir()))
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    resident = next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmRSS"))
+    assert abs(after.rss_bytes - resident) < 0.2 * resident
+
+
+def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> None:
+    facts = program_facts("gateway.toml")
+    assert facts.pid == os.getpid()
+    assert facts.ticks == start_ticks(os.getpid()) > 0
+    assert Path(facts.configuration).is_absolute()
+    child = os.posix_spawn("/bin/true", ["true"], {})
+    deadline = time.monotonic() + 10
+    while start_ticks(child) > 0 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert start_ticks(child) == -1  # ended, and nobody has asked for its exit code
+    os.waitpid(child, 0)
+    assert start_ticks(child) == 0
+
+
+def test_the_default_file_is_in_the_services_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    assert default_file() is None
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/kontronik-can-gw:/run/other")
+    assert default_file() == Path("/run/kontronik-can-gw/status.json")
+
+
+def test_a_document_of_eight_escs_is_made_in_a_few_milliseconds() -> None:
+    bench = Bench(8)
+    bench.run(1)
+    bench.document()
+    best = min(_seconds(bench) for _ in range(20))
+    assert best < 0.02  # about 0.7 ms on an idle PC
+
+
+def _seconds(bench: Bench) -> float:
+    begin = time.perf_counter()
+    bench.document()
+    return time.perf_counter() - begin

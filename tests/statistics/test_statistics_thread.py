@@ -1,0 +1,368 @@
+"""The thread that writes the file: never in the loop's way, always a whole document, faults told once, gone when closed."""
+
+import errno
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kontronik_can_gw.runtime.snapshot import STALE_NS
+from kontronik_can_gw.runtime.statistics import PERIOD_NS, Report, Statistics
+from kontronik_can_gw.telemetry import MS, SECOND
+
+PATIENCE = 30.0
+"""Seconds that something may take on a busy machine before a test fails."""
+
+
+def numbered(number: int, size: int = 0) -> dict[str, Any]:
+    """A document as far as the thread looks into it."""
+    counters = {"sent_frames": number, "received_frames": 0}
+    return {"monotonic_ns": number * SECOND, "can": {"counters": counters}, "nodes": [], "pad": [number] * size}
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "it did not come about"
+        time.sleep(0.002)
+
+
+def number_in(file: Path) -> int:
+    """The number of the document in a file, 0 without one."""
+    try:
+        return int(json.loads(file.read_bytes())["monotonic_ns"]) // SECOND
+    except FileNotFoundError:
+        return 0
+
+
+def put(statistics: Statistics, file: Path, number: int) -> None:
+    statistics.publish(numbered(number))
+    until(lambda: number_in(file) == number)
+
+
+def reports(statistics: Statistics, count: int) -> list[Report]:
+    found: list[Report] = []
+
+    def come() -> bool:
+        found.extend(statistics.reports(0))
+        return len(found) >= count
+
+    until(come)
+    return found
+
+
+class StuckDisk:
+    """``os.write`` of the statistics' thread waits until it is let go; everybody else's works."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.free = threading.Event()
+        self.stuck = threading.Event()
+        real = os.write
+
+        def write(fd: int, data: bytes) -> int:
+            if threading.current_thread().name == "statistics" and not self.free.is_set():
+                self.stuck.set()
+                assert self.free.wait(PATIENCE)
+            return real(fd, data)
+
+        monkeypatch.setattr(os, "write", write)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "status.json"
+
+
+@pytest.fixture
+def statistics(file: Path) -> Iterator[Statistics]:
+    made = Statistics(file, None)
+    yield made
+    made.close()
+
+
+def test_without_file_and_address_there_is_no_thread_and_nothing_is_wanted() -> None:
+    before = threading.active_count()
+    statistics = Statistics(None, None)
+    assert not statistics.wanted(10**18)
+    assert (statistics.due, statistics.address, statistics.reports(0)) == (None, None, [])
+    statistics.publish(numbered(1))
+    assert threading.active_count() == before
+    statistics.close()
+
+
+def test_a_document_is_wanted_at_once_and_then_once_a_second(file: Path, statistics: Statistics) -> None:
+    assert statistics.wanted(0)
+    statistics.publish(numbered(5))
+    assert not statistics.wanted(5 * SECOND + PERIOD_NS - 1)
+    assert statistics.wanted(5 * SECOND + PERIOD_NS)
+    assert statistics.due == 6 * SECOND
+
+
+def test_the_file_is_readable_for_all_whole_and_alone(file: Path, statistics: Statistics) -> None:
+    put(statistics, file, 1)
+    put(statistics, file, 3)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o644
+    assert os.listdir(file.parent) == ["status.json"]
+    assert file.read_bytes().endswith(b"\n")
+    assert json.loads(file.read_text(encoding="utf-8"))["rates"]["sent_frames_per_s"] == 1.0
+
+
+def test_the_mode_does_not_depend_on_the_umask(file: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        statistics = Statistics(file, None)
+        put(statistics, file, 1)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o644
+    statistics.close()
+
+
+def test_who_reads_while_it_is_written_always_reads_a_whole_document(file: Path, statistics: Statistics) -> None:
+    put(statistics, file, 1)
+    ended = threading.Event()
+    torn: list[bytes] = []
+    read = [0, 0, 0]
+
+    def reader(which: int) -> None:
+        newest = 0
+        while not ended.is_set():
+            data = file.read_bytes()
+            try:
+                document = json.loads(data)
+            except ValueError:
+                torn.append(data)
+                return
+            number = document["monotonic_ns"] // SECOND
+            if set(document["pad"]) - {number} or number < newest:
+                torn.append(data)
+            newest = number
+            read[which] += 1
+
+    readers = [threading.Thread(target=reader, args=(n,)) for n in range(3)]
+    for thread in readers:
+        thread.start()
+    for number in range(2, 202):
+        statistics.publish(numbered(number, size=number * 37 % 3000))
+        time.sleep(0.002)
+    until(lambda: number_in(file) == 201)
+    ended.set()
+    for thread in readers:
+        thread.join(PATIENCE)
+    assert torn == []
+    assert min(read) > 10
+
+
+def test_publishing_never_waits_while_the_disk_is_stuck(
+    file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = StuckDisk(monkeypatch)
+    statistics.publish(numbered(1))
+    assert disk.stuck.wait(PATIENCE)
+    times = []
+    for number in range(2, 502):
+        begin = time.perf_counter()
+        statistics.publish(numbered(number))
+        statistics.reports(number)
+        times.append(time.perf_counter() - begin)
+    # one of them may be interrupted by the machine itself; a disk would hold up each
+    assert sorted(times)[-5] < 0.005
+    assert number_in(file) == 0
+    disk.free.set()
+    until(lambda: number_in(file) == 501)  # the newest, and none of those between
+
+
+def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
+    file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = StuckDisk(monkeypatch)
+    statistics.publish(numbered(1))
+    assert disk.stuck.wait(PATIENCE)
+    now = time.monotonic_ns()
+    assert statistics.reports(now) == []
+    (report,) = statistics.reports(now + STALE_NS)
+    assert report.begins and str(file) in report.text and "disk does not answer" in report.text
+    assert statistics.reports(now + 2 * STALE_NS) == []
+    disk.free.set()
+    (report,) = reports(statistics, 1)
+    assert not report.begins and "answers again" in report.text
+
+
+def test_a_stuck_disk_does_not_hold_up_the_end_and_leaves_no_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    statistics = Statistics(file, None)
+    put(statistics, file, 1)
+    disk = StuckDisk(monkeypatch)
+    statistics.publish(numbered(2))
+    assert disk.stuck.wait(PATIENCE)
+    begin = time.monotonic()
+    statistics.close()
+    assert 0.15 < time.monotonic() - begin < 1.0
+    disk.free.set()
+    until(lambda: os.listdir(file.parent) == [])
+    until(lambda: "statistics" not in [thread.name for thread in threading.enumerate()])
+
+
+def test_the_end_removes_the_file_ends_the_thread_and_closes_what_was_opened(file: Path) -> None:
+    def descriptors() -> set[str]:
+        return set(os.listdir("/proc/self/fd"))
+
+    before, threads = descriptors(), threading.active_count()
+    for _ in range(20):
+        statistics = Statistics(file, ("127.0.0.1", 0))
+        put(statistics, file, 1)
+        begin = time.monotonic()
+        statistics.close()
+        assert time.monotonic() - begin < 0.2
+        assert os.listdir(file.parent) == []
+        statistics.close()
+        statistics.publish(numbered(2))  # too late, and nothing happens
+    assert descriptors() == before
+    assert threading.active_count() == threads
+    assert os.listdir(file.parent) == []
+
+
+def test_a_file_that_became_another_gateways_is_left_alone(file: Path) -> None:
+    first, second = Statistics(file, None), Statistics(file, None)
+    put(first, file, 1)
+    until(lambda: first.reports(0) == [])
+    put(second, file, 2)
+    first.close()
+    assert number_in(file) == 2
+    second.close()
+    assert not file.exists()
+
+
+def test_a_folder_that_is_missing_is_told_once_and_the_file_comes_with_it(tmp_path: Path) -> None:
+    file = tmp_path / "run" / "status.json"
+    statistics = Statistics(file, None)
+    for number in (1, 2, 3):
+        statistics.publish(numbered(number))
+        time.sleep(0.02)
+    (report,) = reports(statistics, 1)
+    assert report == Report(
+        True, f"statistics file {file}: cannot be written: No such file or directory. Trying again."
+    )
+    file.parent.mkdir()
+    put(statistics, file, 4)
+    (report,) = reports(statistics, 1)
+    assert not report.begins
+    assert report.text.startswith(f"statistics file {file}: is written again (")
+    statistics.close()
+
+
+def test_a_full_disk_leaves_the_old_document_and_no_half_one(
+    file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(statistics, file, 1)
+    real = os.write
+
+    def full(fd: int, data: bytes) -> int:
+        if threading.current_thread().name == "statistics":
+            if len(data) > 10:
+                return real(fd, data[:10])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(fd, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        statistics.publish(numbered(2))
+        (report,) = reports(statistics, 1)
+        assert report.begins and "No space left on device" in report.text
+        assert number_in(file) == 1
+        assert os.listdir(file.parent) == ["status.json"]
+    put(statistics, file, 3)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="a full file system is mounted: needs root")
+def test_on_a_file_system_that_is_full_it_is_told_and_heals(tmp_path: Path) -> None:
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(tmp_path)], capture_output=True, check=False
+    )
+    if done.returncode:
+        pytest.skip(f"no tmpfs can be mounted here: {done.stderr.decode().strip()}")
+    try:
+        statistics = Statistics(tmp_path / "status.json", None)
+        put(statistics, tmp_path / "status.json", 1)
+        ballast = tmp_path / "ballast"
+        with pytest.raises(OSError, match="No space"):
+            ballast.write_bytes(bytes(1 << 17))
+        statistics.publish(numbered(2))
+        assert reports(statistics, 1)[0].begins
+        assert number_in(tmp_path / "status.json") == 1
+        ballast.unlink()
+        put(statistics, tmp_path / "status.json", 3)
+        statistics.close()
+        assert os.listdir(tmp_path) == []
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=False)
+
+
+def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "device"
+    os.mkfifo(target)
+    statistics = Statistics(target, None)
+    statistics.publish(numbered(1))
+    (report,) = reports(statistics, 1)
+    assert report.begins and "no plain file" in report.text
+    statistics.close()
+    assert stat.S_ISFIFO(target.stat().st_mode)
+
+
+def test_a_text_that_is_no_unicode_is_no_obstacle(file: Path, statistics: Statistics) -> None:
+    statistics.publish(numbered(1) | {"path": "/dev/\udcff\ud800 µ"})
+    until(lambda: number_in(file) == 1)
+    assert json.loads(file.read_text(encoding="utf-8"))["path"].endswith(" µ")
+
+
+def test_all_signals_are_blocked_in_the_thread_and_in_no_other(file: Path) -> None:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    statistics = Statistics(file, None)
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
+    thread = next(thread for thread in threading.enumerate() if thread.name == "statistics")
+    status = Path(f"/proc/self/task/{thread.native_id}/status").read_text(encoding="ascii")
+    blocked = int(next(line.split()[1] for line in status.splitlines() if line.startswith("SigBlk")), 16)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
+        assert blocked >> number - 1 & 1
+    statistics.close()
+
+
+def test_a_killed_process_leaves_a_whole_document_and_the_next_one_takes_its_place(tmp_path: Path) -> None:
+    file = tmp_path / "status.json"
+    code = (
+        "import sys, itertools; from pathlib import Path; sys.path.insert(0, sys.argv[2]);"
+        "from test_statistics_thread import numbered; from kontronik_can_gw.runtime.statistics import Statistics;"
+        "s = Statistics(Path(sys.argv[1]), None)\n"
+        "for n in itertools.count(1): s.publish(numbered(n, 2000))"
+    )
+    for _ in range(5):
+        folder = str(Path(__file__).parent)
+        process = subprocess.Popen([sys.executable, "-c", code, str(file), folder], cwd=Path(__file__).parents[2])
+        old = number_in(file)
+        until(lambda old=old: number_in(file) not in (0, old))  # type: ignore[misc]
+        process.kill()
+        process.wait()
+        assert number_in(file) > 0
+    (tmp_path / ".status.json.4711.tmp").write_text('{"half')
+    statistics = Statistics(file, None)
+    put(statistics, file, 1)
+    assert os.listdir(tmp_path) == ["status.json"]  # nor what the killed ones left half
+    statistics.close()
+
+
+def test_the_loop_is_delayed_by_less_than_a_millisecond_a_second(file: Path, statistics: Statistics) -> None:
+    """Publishing is an assignment and a wake-up."""
+    times = []
+    for number in range(1, 200):
+        begin = time.perf_counter()
+        statistics.publish(numbered(number, 1000))
+        times.append(time.perf_counter() - begin)
+    assert sorted(times)[len(times) // 2] < MS / SECOND

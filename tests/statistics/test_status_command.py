@@ -1,0 +1,488 @@
+"""``status``: which file it reads, what it says of the gateway, its exit codes, and that no content of a file harms it."""
+
+import contextlib
+import fcntl
+import io
+import json
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from statistics_bench import Bench, with_nodes
+
+from kontronik_can_gw.cli import main, status
+from kontronik_can_gw.cli.status import HEALTHY, NOT_RUNNING, TROUBLE, Node, Seen, judge, look_at, screen
+from kontronik_can_gw.runtime.snapshot import (
+    STALE_NS,
+    CanFacts,
+    PortFacts,
+    ProgramFacts,
+    StoreFacts,
+    program_facts,
+    with_rates,
+)
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import SECOND
+
+Document = dict[str, Any]
+
+
+def heard(escs: int = 2, seconds: float = 2, change: Callable[[Bench], None] | None = None) -> Bench:
+    """A healthy gateway that runs."""
+    bench = Bench(escs)
+    bench.run(seconds)
+    bench.gateway.set_can_state(CanState.ERROR_ACTIVE, bench.now)
+    if change is not None:
+        change(bench)
+    return bench
+
+
+def judged(document: Document, later: int = 0, alive: bool = True) -> Seen:
+    return judge(Path("status.json"), Node(document), document["monotonic_ns"] + later, alive)
+
+
+def words(seen: Seen, size: tuple[int, int] | None = None) -> str:
+    return "\n".join("".join(piece.text for piece in line) for line in screen(seen, size))
+
+
+def shell(*arguments: object) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of the command."""
+    out, talk = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(talk):
+        code = main(["status", *map(str, arguments)])
+    return code, out.getvalue(), talk.getvalue()
+
+
+def written(file: Path, bench: Bench, program: ProgramFacts | None = None, **changes: Any) -> Document:
+    """A file of this process and this instant."""
+    document = bench.document(program=program or program_facts("gateway.toml"))
+    document |= {"monotonic_ns": time.monotonic_ns()} | changes
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(document), encoding="utf-8")
+    return document
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "run"
+    monkeypatch.setattr(status, "RUN_FOLDER", folder)
+    return folder
+
+
+# --- the judgement
+
+
+def test_a_gateway_that_hears_all_is_healthy() -> None:
+    seen = judged(heard().document())
+    assert (seen.code, seen.sentence, seen.troubles) == (HEALTHY, "running", ())
+
+
+def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
+    bench = heard()
+    bench.silent.add(1)
+    bench.run(2)
+    seen = judged(bench.document())
+    assert (seen.code, seen.sentence) == (TROUBLE, "running, 1 fault")
+    assert seen.troubles[0].startswith("esc2: no bytes: ESC off")
+
+
+def test_a_port_that_is_lost_is_told_with_its_complaint_and_for_how_long() -> None:
+    bench = heard()
+    bench.gateway.port_lost(0, bench.now)
+    ports = [
+        PortFacts("esc1", "/dev/a", False, "esc1: /dev/a: lost (hung up).", lost_since_ns=bench.now - 70 * SECOND),
+        PortFacts("esc2", "/dev/b", True),
+    ]
+    seen = judged(bench.document(ports=ports))
+    assert (seen.code, seen.troubles) == (TROUBLE, ("esc1: port not open for 70 s: /dev/a: lost (hung up).",))
+
+
+@pytest.mark.parametrize(
+    ("state", "facts", "code", "said"),
+    [
+        (CanState.ERROR_ACTIVE, CanFacts("socketcan", "can0", None, True), HEALTHY, None),
+        (CanState.ERROR_WARNING, CanFacts("socketcan", "can0", None, True), HEALTHY, None),
+        (CanState.ERROR_PASSIVE, CanFacts("socketcan", "can0", None, True), HEALTHY, None),
+        (CanState.UNKNOWN, CanFacts("slcan", "x", None, True), HEALTHY, None),
+        (CanState.BUS_OFF, CanFacts("socketcan", "can0", None, True), TROUBLE, "CAN can0 is bus-off"),
+        (CanState.DOWN, CanFacts("socketcan", "can0", None, True), TROUBLE, "CAN can0 is down"),
+        (CanState.UNKNOWN, CanFacts("socketcan", "can0", None, False, "can0: gone"), TROUBLE, "can0: gone"),
+        (
+            CanState.ERROR_ACTIVE,
+            CanFacts("socketcan", "can0", None, True, stalled=True),
+            TROUBLE,
+            "CAN can0: no frame can be sent",
+        ),
+    ],
+)
+def test_a_bus_that_takes_nothing_is_a_fault(state: CanState, facts: CanFacts, code: int, said: str | None) -> None:
+    bench = heard()
+    bench.gateway.set_can_state(state, bench.now)
+    seen = judged(bench.document(can=facts))
+    assert (seen.code, list(seen.troubles)) == (code, [said] if said else [])
+
+
+def test_parameters_that_cannot_be_stored_are_a_fault() -> None:
+    seen = judged(heard().document(store=StoreFacts(0, "disk full")))
+    assert (seen.code, seen.troubles) == (TROUBLE, ("parameters cannot be stored: disk full",))
+
+
+def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> None:
+    document = heard().document()
+    assert judged(document, STALE_NS).code == HEALTHY
+    seen = judged(document, 12 * SECOND)
+    assert (seen.code, seen.sentence) == (NOT_RUNNING, "does not answer since 12 s")
+    shown = words(seen)
+    assert "does not answer since 12 s" in shown and "journalctl" in shown
+    assert "25." not in shown and "esc1" not in shown
+
+
+def test_a_document_of_a_dead_process_or_from_before_the_last_start_of_the_machine_is_of_none_that_runs() -> None:
+    document = heard().document()
+    for seen in (judged(document, alive=False), judged(document, -STALE_NS - 1)):
+        assert (seen.code, seen.sentence) == (NOT_RUNNING, "not running")
+
+
+# --- files
+
+
+def test_a_living_writer_is_told_from_a_dead_one_and_from_another_with_its_pid(tmp_path: Path) -> None:
+    file, bench, own = tmp_path / "status.json", heard(), program_facts("x")
+    written(file, bench)
+    assert look_at(file, time.monotonic_ns()).code == HEALTHY
+    other = ProgramFacts("x", pid=own.pid, ticks=own.ticks + 1, pid_namespace=own.pid_namespace)
+    written(file, bench, other)
+    assert look_at(file, time.monotonic_ns()).sentence == "not running"
+    child = subprocess.Popen(["sleep", "100"])
+    dead = ProgramFacts("x", pid=child.pid, ticks=0, pid_namespace=own.pid_namespace)
+    written(file, bench, dead)
+    assert look_at(file, time.monotonic_ns()).code == HEALTHY
+    child.kill()
+    time.sleep(0.2)  # it has ended, and is not reaped
+    assert look_at(file, time.monotonic_ns()).sentence == "not running"
+    child.wait()
+    assert look_at(file, time.monotonic_ns()).sentence == "not running"
+    elsewhere = ProgramFacts("x", pid=child.pid, ticks=5, pid_namespace="pid:[7]")  # in a container
+    written(file, bench, elsewhere)
+    assert look_at(file, time.monotonic_ns()).code == HEALTHY
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b"7", b'"x"', b"{}", b"\xff\xfe", b'{"format": 1}', b"[" * 100_000, b"1" * 5000]
+)
+def test_what_is_no_statistics_file_is_told_in_one_line(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "status.json"
+    file.write_bytes(content)
+    code, out, talk = shell("--file", file)
+    assert (code, out) == (NOT_RUNNING, "")
+    assert talk == (
+        f"kontronik-can-gw status: {file}: is not a statistics file of kontronik-can-gw. Look at statistics.file.\n"
+    )
+
+
+def test_a_missing_file_a_folder_a_pipe_and_another_version_are_told_in_one_line(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    written(tmp_path / "newer", heard(), format=2)
+    for name, said in (
+        ("none", "not running: there is no such file"),
+        (".", "is no plain file"),
+        ("pipe", "is no plain file"),
+        ("newer", "is of another version"),
+    ):
+        code, out, talk = shell("--file", tmp_path / name)
+        assert (code, out, talk.count("\n")) == (NOT_RUNNING, "", 1)
+        assert said in talk
+
+
+def test_the_configuration_says_where_the_file_is(tmp_path: Path) -> None:
+    configuration = tmp_path / "gateway.toml"
+    configuration.write_text('[statistics]\nfile = "s/status.json"\n[[esc]]\nport = "x"\n', encoding="utf-8")
+    written(tmp_path / "s" / "status.json", heard())
+    code, out, _ = shell("-c", configuration)
+    assert code == HEALTHY and out.startswith("kontronik-can-gw")
+
+
+def test_a_configuration_that_says_nothing_is_looked_for_among_the_services(tmp_path: Path, run_folder: Path) -> None:
+    configuration = tmp_path / "front.toml"
+    configuration.write_text('[[esc]]\nport = "x"\n', encoding="utf-8")
+    code, _, talk = shell("-c", configuration)
+    assert code == NOT_RUNNING and "no gateway with this configuration runs as a service" in talk
+    written(run_folder / "kontronik-can-gw-rear" / "status.json", heard(), program_facts(tmp_path / "rear.toml"))
+    written(run_folder / "kontronik-can-gw-front" / "status.json", heard(), program_facts(configuration))
+    code, out, _ = shell("-c", configuration)
+    assert code == HEALTHY
+    assert str(configuration) in out and "rear.toml" not in out
+
+
+def test_without_words_all_services_are_shown_and_the_worst_is_the_exit_code(run_folder: Path) -> None:
+    code, out, talk = shell()
+    assert (code, out) == (NOT_RUNNING, "")
+    assert "sudo systemctl start kontronik-can-gw" in talk and talk.count("\n") == 1
+    written(run_folder / "kontronik-can-gw" / "status.json", heard())
+    code, out, _ = shell()
+    assert (code, out.count("kontronik-can-gw ")) == (HEALTHY, 1)
+    troubled = heard(change=lambda bench: bench.gateway.set_can_state(CanState.BUS_OFF, bench.now))
+    written(run_folder / "kontronik-can-gw-a" / "status.json", troubled)
+    assert shell()[0] == TROUBLE
+    written(run_folder / "kontronik-can-gw-b" / "status.json", heard(), monotonic_ns=1)
+    code, out, _ = shell("--once")
+    assert code == NOT_RUNNING
+    assert out.count("kontronik-can-gw ") == 3
+
+
+def test_a_faulty_configuration_and_two_sources_are_wrong_usage(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text("[xyz]\n", encoding="utf-8")
+    assert shell("-c", tmp_path / "a.toml")[0] == 2
+    for wrong in (("-c", "a", "--file", "b"), ("--interval", "0"), ("--interval", "nan"), ("--interval", "x")):
+        with pytest.raises(SystemExit) as caught:
+            shell(*wrong)
+        assert caught.value.code == 2
+
+
+def test_json_is_one_document_with_the_judgement_and_what_the_file_held(tmp_path: Path) -> None:
+    file = tmp_path / "status.json"
+    document = written(file, heard(change=lambda bench: bench.silent.add(0)))
+    code, out, talk = shell("--file", file, "--json")
+    (gateway,) = json.loads(out)["gateways"]
+    assert (code, talk) == (HEALTHY, "")
+    assert gateway["document"] == document
+    assert (gateway["file"], gateway["exit_code"], gateway["status"]) == (str(file), 0, "running")
+    assert 0 <= gateway["age_s"] < 3
+    code, out, talk = shell("--file", tmp_path / "none", "--json")
+    (gateway,) = json.loads(out)["gateways"]
+    assert (code, talk, gateway["document"]) == (NOT_RUNNING, "", None)
+
+
+# --- the screen
+
+
+def crowded() -> Document:
+    """Eight ESCs with long names and great numbers, all nodes, faults and a long log."""
+    bench = heard(8)
+    for number, esc in enumerate(bench.gateway.escs):
+        esc.losses = 99_999
+        esc.counters.crc_errors = 123_456_789
+        assert esc.live is not None
+        esc.live = esc.live._replace(
+            electrical_speed=2_100_000, battery_voltage=10_000, battery_current=-10_000, power_stage_temperature=-100
+        )
+        if number == 3:
+            esc.live = esc.live._replace(operating_errors=0xFFFFFF)
+    bench.gateway.port_lost(6, bench.now)
+    complaint = "/dev/serial/by-id/usb-FTDI_FT232R_USB_UART_A50285BI-if00-port0: no such serial port. Is it plugged in?"
+    ports = [
+        PortFacts(f"esc{n}", f"/dev/{n}", n != 7, complaint if n == 7 else "", line_errors={"parity": 10**7})
+        for n in range(1, 9)
+    ]
+    log_lines = [f"14:03:{n:02} esc{n}: telemetry lost; its values are marked as not available" for n in range(20)]
+    document = bench.document(ports=ports, log_lines=log_lines, can=CanFacts("socketcan", "can0", 1_000_000, True))
+    for number, esc in enumerate(document["escs"]):
+        esc["name"] = f"tailrotor_{number:02}"
+    before = with_nodes(document, 8)
+    later = with_nodes(document, 8, 400) | {"monotonic_ns": document["monotonic_ns"] + SECOND}
+    return with_rates(later, before)
+
+
+def test_eight_escs_with_faults_fit_into_80_columns_and_24_lines() -> None:
+    seen = judged(crowded())
+    shown = words(seen, (80, 22)).split("\n")
+    assert len(shown) == 22
+    too_long = [line for line in shown if len(line) > 80]
+    assert too_long == []
+    assert sum(line.startswith("tailrotor_0") and " ok " in line for line in shown) == 7
+    assert any(re.match(r"tailrotor_06 +port error", line) for line in shown)
+    assert any("port not open: /dev/serial/by-id" in line for line in shown)
+    assert re.fullmatch(r"\.\.\. and \d+ lines more: --once shows them", shown[-1])
+
+
+def test_at_once_everything_is_shown() -> None:
+    shown = words(judged(crowded()))
+    assert "14:03:00" in shown and "14:03:19" in shown
+    assert "esc8: node 8 operational, 400/s" in shown
+    assert "battery voltage too low; battery voltage too high" in shown
+    assert "error was found" not in shown  # a mere summary of the others
+
+
+def test_values_are_in_their_columns_and_a_dash_where_there_is_none() -> None:
+    bench = heard(2, 6)
+    bench.silent.add(1)
+    bench.run(1)
+    lines = words(judged(bench.document())).split("\n")
+    head = next(line.split() for line in lines if line.startswith("ESC"))
+    assert head == ["ESC", "link", "Hz", "age", "ms", "V", "A", "1/min", "°C", "CRC", "line", "lost"]
+    values = bench.document()["escs"][0]["values"]
+    ok = next(line.split() for line in lines if line.startswith("esc1"))
+    assert ok[1:3] == ["ok", "100"]
+    assert ok[4:8] == [
+        f"{values['battery_voltage']:.2f}",
+        f"{values['battery_current']:.1f}",
+        f"{values['motor_speed']:.0f}",
+        f"{values['power_stage_temperature']:.0f}",
+    ]
+    lost = next(line.split() for line in lines if line.startswith("esc2"))
+    assert lost[1] == "lost" and lost[4:8] == ["-", "-", "-", "-"] and lost[-1] == "1"
+
+
+def test_the_last_events_fill_what_room_there_is() -> None:
+    document = heard(1).document(log_lines=[f"event {n}" for n in range(20)])
+    for height in range(8, 40):
+        shown = words(judged(document), (80, height)).split("\n")
+        assert len(shown) <= height
+        if len(shown) > 8:
+            assert shown[-1].strip() == "event 19"
+
+
+def test_nothing_that_a_terminal_might_obey_comes_from_a_file(tmp_path: Path) -> None:
+    evil = "\x1b[2J\x1b]0;x\x07\r\n\x9b[31m\u202e"
+    document = heard().document(log_lines=[evil])
+    document |= {"configuration": evil, "version": evil}
+    document["can"] |= {"channel": evil, "state": evil, "complaint": evil}
+    document["escs"][0] |= {"name": evil, "link": evil, "errors": [evil], "fresh": False, "diagnosis": evil}
+    shown = words(judged(document))
+    assert all(char.isprintable() or char == "\n" for char in shown)
+    document["process"]["pid_namespace"] = ""
+    (tmp_path / "s").write_text(json.dumps(document | {"monotonic_ns": time.monotonic_ns()}), encoding="utf-8")
+    _, out, _ = shell("--file", tmp_path / "s")
+    assert all(char.isprintable() or char == "\n" for char in out)
+
+
+def places(value: object, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The paths of everything in a document."""
+    found = [path]
+    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in children:
+        found += places(child, (*path, key))
+    return found
+
+
+WHOLE = crowded()
+PLACES = [place for place in places(WHOLE) if place]
+_ODD = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(10**30), 10**30),
+    st.sampled_from([float("nan"), float("inf"), 1e308, -1e308, 10**400, [], {}, [[]], [None, {}], {"a": {}}]),
+    st.text(max_size=20),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(PLACES), _ODD), min_size=1, max_size=5), st.booleans())
+def test_no_document_makes_anything_but_lines(changes: list[tuple[tuple[Any, ...], Any]], alive: bool) -> None:
+    document: Any = json.loads(json.dumps(WHOLE))
+    for place, value in changes:
+        at = document
+        with contextlib.suppress(KeyError, IndexError, TypeError):
+            for key in place[:-1]:
+                at = at[key]
+            at[place[-1]] = value
+    seen = judge(Path("x"), Node(document), WHOLE["monotonic_ns"], alive)
+    assert seen.code in (HEALTHY, TROUBLE, NOT_RUNNING)
+    for size in (None, (80, 22), (20, 5)):
+        screen(seen, size)
+
+
+# --- the process
+
+
+def program(*arguments: object, **more: Any) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "kontronik_can_gw", "status", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **more)
+
+
+def test_in_a_pipe_it_is_shown_once_without_colour(tmp_path: Path) -> None:
+    file = tmp_path / "status.json"
+    written(file, heard())
+    done = program("--file", file)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\x1b" not in done.stdout
+    assert "esc1" in done.stdout and "esc2" in done.stdout
+
+
+class Terminal:
+    """The command on a terminal of 80 columns and 24 lines."""
+
+    def __init__(self, *arguments: object, **environment: str) -> None:
+        self.master, slave = pty.openpty()
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        environment = {"TERM": "xterm-256color", **environment}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "kontronik_can_gw", "status", *map(str, arguments)],
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            env=os.environ | environment,
+            start_new_session=True,
+        )
+        os.close(slave)
+        self.text = ""
+
+    def until(self, text: str) -> None:
+        end = time.monotonic() + 30
+        while text not in self.text:
+            assert time.monotonic() < end, self.text
+            if select.select([self.master], [], [], 0.1)[0]:
+                self.text += os.read(self.master, 65536).decode("utf-8", "replace")
+
+    def end(self, number: int) -> int:
+        self.process.send_signal(number)
+        code = self.process.wait(30)
+        with contextlib.suppress(OSError):
+            while select.select([self.master], [], [], 0.1)[0]:
+                self.text += os.read(self.master, 65536).decode("utf-8", "replace")
+        os.close(self.master)
+        return code
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_on_a_terminal_it_is_live_and_ends_by_a_signal_with_0_and_the_cursor_shown(tmp_path: Path, number: int) -> None:
+    file = tmp_path / "status.json"
+    written(file, heard())
+    terminal = Terminal("--file", file, "--interval", "0.1")
+    terminal.until("Ctrl-C ends.")
+    written(file, heard(change=lambda bench: bench.gateway.set_can_state(CanState.BUS_OFF, bench.now)))
+    terminal.until("CAN can0 is bus-off")
+    file.unlink()
+    terminal.until("there is no such file")
+    assert terminal.end(number) == 0
+    assert "Traceback" not in terminal.text
+    assert terminal.text.rindex("\x1b[?25h") > terminal.text.rindex("\x1b[?25l")
+
+
+def test_on_a_terminal_without_colour_no_colour_is_set(tmp_path: Path) -> None:
+    file = tmp_path / "status.json"
+    written(file, heard())
+    terminal = Terminal("--file", file, NO_COLOR="1")
+    terminal.until("Ctrl-C ends.")
+    assert terminal.end(signal.SIGINT) == 0
+    assert not re.search(r"\x1b\[[0-9;]*3[0-7]m", terminal.text)
+
+
+def test_on_a_terminal_that_can_do_nothing_it_is_shown_once(tmp_path: Path) -> None:
+    file = tmp_path / "status.json"
+    written(file, heard())
+    terminal = Terminal("--file", file, TERM="dumb")
+    terminal.until("esc2")
+    assert terminal.process.wait(30) == 0
+    os.close(terminal.master)
+
+
+def test_on_a_terminal_a_missing_file_ends_it_with_one_line(tmp_path: Path) -> None:
+    terminal = Terminal("--file", tmp_path / "none")
+    terminal.until("not running: there is no such file")
+    assert terminal.process.wait(30) == NOT_RUNNING
+    os.close(terminal.master)
