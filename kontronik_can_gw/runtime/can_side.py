@@ -209,6 +209,7 @@ class CanSide:
 
     def _follow(self, facts: LinkFacts, now: int) -> None:
         self.facts = facts
+        self._follow_bitrate(facts.bitrate, now)
         if self.port is None:
             if facts.up and self._retry.due is not None:
                 self._retry.due = now
@@ -372,13 +373,21 @@ class CanSide:
             word = port.state.name.lower().replace("_", "-")
             self._conditions.end(self._controller_condition, f"{name}: {word}", now)
 
+    def _follow_bitrate(self, bitrate: int | None, now: int) -> None:
+        name, wanted = self.config.channel, self.config.bitrate
+        if bitrate and bitrate != wanted:
+            text = f"CAN {name} runs at {bitrate} bit/s, can.bitrate says {wanted}: make them the same."
+            self._conditions.begin(f"CAN {name}: bit rate", text, now)
+        elif bitrate:
+            self._conditions.end(f"CAN {name}: bit rate", f"CAN {name} runs at {bitrate} bit/s", now)
+
     def _restart_hint(self) -> str:
         if self.facts is None or self.facts.restart_ms != 0:
             return ""
         name = self.config.channel
         return (
-            f" restart-ms is 0, so it stays there until somebody restarts it: sudo ip link set {name} type can restart. "
-            f"For good: sudo ip link set {name} down; sudo ip link set {name} up type can restart-ms 100."
+            f" restart-ms is 0, so it stays there until somebody restarts it: sudo ip link set {name} down && sudo ip link set {name} "
+            "up. For good: the same with up type can restart-ms 100."
         )
 
     # --- words

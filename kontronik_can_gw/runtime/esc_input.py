@@ -9,7 +9,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.retry import Retry
-from kontronik_can_gw.runtime.serial_port import Identity, PortLost, SerialPort, find_adapter
+from kontronik_can_gw.runtime.serial_port import Identity, PortLost, SerialPort, find_adapter, is_mini_uart
 from kontronik_can_gw.runtime.snapshot import PortFacts
 from kontronik_can_gw.telemetry import SECOND, LinkState
 
@@ -99,6 +99,12 @@ class EscInput:
             self._conditions.end(self._port_condition, said, now)
         else:
             self._conditions.say(logging.INFO, said)
+        if is_mini_uart(port.path):
+            self._conditions.say(
+                logging.WARNING,
+                f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which cannot do even parity: frames may be lost or never "
+                "come. Use ttyAMA0.",
+            )
 
     def serve(self, now: int, _events: int = 0) -> None:
         """The port is readable."""

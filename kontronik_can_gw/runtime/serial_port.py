@@ -23,10 +23,16 @@ BAUD_RATE = 115_200
 READ_SIZE = 4096
 
 _TIOCGICOUNT = 0x545D
+MINI_UART = "brcm,bcm2835-aux-uart"
+"""A Raspberry Pi's second UART, by its name in the device tree: it has no parity, and its driver does not say so."""
+
 _COUNTS = struct.Struct("=20i")
 _WAITING = struct.Struct("=i")
 _LINE_ERRORS = {"framing": 6, "overrun": 7, "parity": 8, "break": 9, "buffer_overrun": 10}
 """Places in struct serial_icounter_struct (linux/serial.h)."""
+
+
+_NO_PARITY = "A Raspberry Pi's mini-UART (ttyS0) cannot do even parity: use ttyAMA0."
 
 
 class PortLost(Exception):
@@ -109,6 +115,17 @@ class SerialPort:
             self._serial.close()
 
 
+def is_mini_uart(path: str, root: Path = Path("/")) -> bool:
+    """True for a Raspberry Pi's mini-UART, which cannot do even parity."""
+    device = root / "sys/class/tty" / Path(os.path.realpath(path)).name / "device"
+    with contextlib.suppress(OSError):
+        for folder in [device.resolve(), *device.resolve().parents][:4]:
+            names = folder / "of_node" / "compatible"
+            if names.is_file() and MINI_UART in names.read_text(errors="replace").split("\0"):
+                return True
+    return False
+
+
 def find_adapter(identity: Identity) -> str | None:
     """The path of the adapter now, as /dev/ttyUSB1; None while it is not plugged in, or if two are alike."""
     found = [device for device, other in _adapters() if other == identity]
@@ -173,9 +190,7 @@ def _open(path: str, parity: str, is_pty: bool) -> serial.Serial:
         if number == errno.EINVAL and parity == serial.PARITY_EVEN:
             if is_pty:  # a pseudo terminal has no parity and may say so
                 return _open(path, serial.PARITY_NONE, is_pty)
-            raise RunError(
-                f"{path}: cannot do 115200 baud with even parity. A Raspberry Pi's mini-UART (ttyS0) cannot: use ttyAMA0."
-            ) from None
+            raise RunError(f"{path}: cannot do 115200 baud with even parity. {_NO_PARITY}") from None
         raise _explained(path, number, str(error)) from None
 
 

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from kontronik_can_gw.runtime.doctor.system import System
+from kontronik_can_gw.runtime.serial_port import MINI_UART
 
-_MINI_UART = "brcm,bcm2835-aux-uart"
 _BUS_DRIVERS = ("port", "ctrl", "usb", "")
 """Not the UART's own driver: newer kernels put two devices of the serial core in between."""
 
@@ -36,7 +36,7 @@ def adapter_of(system: System, tty: str) -> Adapter:
             name = system.real(f"{folder}/driver").rpartition("/")[2]
             driver = driver or (name if name not in _BUS_DRIVERS else "")
         compatible = system.text(f"{folder}/of_node/compatible") or ""
-        mini_uart = mini_uart or _MINI_UART in compatible.split("\0") or driver == "bcm2835-aux-uart"
+        mini_uart = mini_uart or MINI_UART in compatible.split("\0") or driver == "bcm2835-aux-uart"
         if (vendor_id := system.text(f"{folder}/idVendor")) is not None:
             product = system.text(f"{folder}/product") or ""
             return Adapter(driver, folder, product, system.text(f"{folder}/serial") or "", vendor_id, mini_uart)

@@ -1,0 +1,260 @@
+"""One ESC's port in the loop: which adapter is opened, what is counted, what is said. Time is passed in, ports are scripted."""
+
+import logging
+import selectors
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.protocol import codec
+from kontronik_can_gw.protocol.fields import LiveData
+from kontronik_can_gw.runtime import esc_input, serial_port
+from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.esc_input import EscInput
+from kontronik_can_gw.runtime.serial_port import Identity, PortLost, find_adapter, is_mini_uart
+from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
+
+LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2", "1.0")
+LIVE = codec.encode(LiveData(battery_voltage=2442), codec.Layout.V4)
+
+
+class Port:
+    """A serial port that is told what to read. ``there``: path to adapter."""
+
+    there: dict[str, Identity | None]
+
+    def __init__(self, path: str) -> None:
+        if path not in self.there:
+            raise RunError(f"{path}: no such serial port.")
+        self.path = path
+        self.reads: list[bytes | Exception] = []
+        self.counts: dict[str, int] = {"parity": 5}
+        self.waits_to_be_read = False
+        self.pipe = PtyEsc()
+
+    def fileno(self) -> int:
+        return self.pipe.fileno()
+
+    def identity(self) -> Identity | None:
+        return self.there[self.path]
+
+    def read(self) -> bytes:
+        found = self.reads.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def line_errors(self) -> dict[str, int]:
+        return dict(self.counts)
+
+    def discard(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.pipe.close()
+
+
+class Bench:
+    def __init__(self, *paths: str) -> None:
+        escs = [EscSettings(name) for name in ("left", "right")[: len(paths)]]
+        self.gateway = Gateway(escs, Layout("x", "Gw", ()), 0)
+        self.conditions = Conditions()
+        self.selector = selectors.DefaultSelector()
+        self.escs = [EscInput(n, path, self.gateway, self.selector, self.conditions) for n, path in enumerate(paths)]
+
+    def port(self, number: int = 0) -> Port:
+        port = self.escs[number].port
+        assert isinstance(port, Port)
+        return port
+
+    def lose(self, number: int, now: int) -> None:
+        self.port(number).reads = [PortLost("hung up")]
+        self.escs[number].serve(now)
+
+    def reopen(self, now: int) -> None:
+        for esc in self.escs:
+            esc.reopen(now, tuple(other.identity for other in self.escs if other is not esc))
+
+    def close(self) -> None:
+        for esc in self.escs:
+            esc.close()
+        self.selector.close()
+
+
+@pytest.fixture
+def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
+    ports: dict[str, Identity | None] = {}
+    Port.there = ports
+    monkeypatch.setattr(esc_input, "SerialPort", Port)
+    monkeypatch.setattr(serial_port, "_adapters", lambda: [(p, i) for p, i in ports.items() if i is not None])
+    return ports
+
+
+def test_an_adapter_that_comes_back_under_another_number_is_found(
+    there: dict[str, Identity | None], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    there |= {"/dev/ttyUSB0": LEFT}
+    bench = Bench("/dev/ttyUSB0")
+    bench.escs[0].open(0, wait=False)
+    del there["/dev/ttyUSB0"]
+    bench.lose(0, SECOND)
+    bench.reopen(2 * SECOND)
+    assert bench.escs[0].port is None
+    there["/dev/ttyUSB3"] = LEFT
+    bench.reopen(3 * SECOND)
+    assert bench.port().path == "/dev/ttyUSB3"
+    assert bench.escs[0].reopened == 1
+    assert caplog.messages[-1] == "left: /dev/ttyUSB3 is open, after 2.0 s"
+    bench.close()
+
+
+def test_two_adapters_that_change_their_numbers_stay_with_their_escs(there: dict[str, Identity | None]) -> None:
+    there |= {"/dev/ttyUSB0": LEFT, "/dev/ttyUSB1": RIGHT}
+    bench = Bench("/dev/ttyUSB0", "/dev/ttyUSB1")
+    for esc in bench.escs:
+        esc.open(0, wait=False)
+    there.clear()
+    bench.lose(0, SECOND)
+    bench.lose(1, SECOND)
+    there["/dev/ttyUSB0"] = RIGHT  # plugged in again in the other order
+    bench.reopen(2 * SECOND)
+    assert bench.escs[0].port is None, "left must not show the values of right"
+    assert "another ESC's adapter" in bench.escs[0].complaint
+    assert bench.port(1).path == "/dev/ttyUSB0"
+    there["/dev/ttyUSB1"] = LEFT
+    bench.reopen(4 * SECOND)
+    assert bench.port(0).path == "/dev/ttyUSB1"
+    bench.close()
+
+
+def test_another_adapter_on_the_configured_path_is_taken_as_a_replacement(there: dict[str, Identity | None]) -> None:
+    there["/dev/ttyUSB0"] = LEFT
+    bench = Bench("/dev/ttyUSB0")
+    bench.escs[0].open(0, wait=False)
+    there["/dev/ttyUSB0"] = RIGHT
+    bench.lose(0, SECOND)
+    bench.reopen(2 * SECOND)
+    assert bench.escs[0].identity == RIGHT
+    bench.close()
+
+
+@pytest.mark.parametrize("path", ["/dev/serial/by-id/usb-FTDI", "/dev/serial/by-path/usb-0:1"])
+def test_a_stable_name_is_followed_as_it_is(there: dict[str, Identity | None], path: str) -> None:
+    there[path] = LEFT
+    bench = Bench(path)
+    bench.escs[0].open(0, wait=False)
+    there.pop(path)
+    there["/dev/ttyUSB0"] = LEFT
+    bench.lose(0, SECOND)
+    bench.reopen(2 * SECOND)
+    assert bench.escs[0].port is None
+    bench.close()
+
+
+def test_of_two_adapters_that_cannot_be_told_apart_none_is_guessed(there: dict[str, Identity | None]) -> None:
+    there |= {"/dev/ttyUSB1": LEFT, "/dev/ttyUSB2": LEFT}
+    assert find_adapter(LEFT) is None
+
+
+def test_a_port_that_is_away_for_a_day_is_tried_once_a_second_and_said_once(
+    there: dict[str, Identity | None], caplog: pytest.LogCaptureFixture
+) -> None:
+    there["/dev/ttyUSB0"] = None
+    bench = Bench("/dev/ttyUSB0")
+    bench.escs[0].open(0, wait=False)
+    there.clear()
+    bench.lose(0, 0)
+    tries, now = 0, 0
+    while now < 3600 * SECOND:
+        due = bench.escs[0].due
+        assert due is not None
+        assert due - now <= SECOND
+        now = due
+        bench.reopen(now)
+        tries += 1
+    assert 3600 <= tries < 3610
+    assert len(caplog.messages) == 2, "lost, and no such port"
+    bench.close()
+
+
+def test_line_errors_are_counted_by_kind_from_the_opening_on_and_over_every_plugging_in(
+    there: dict[str, Identity | None],
+) -> None:
+    there["/dev/ttyUSB0"] = LEFT
+    bench = Bench("/dev/ttyUSB0")
+    esc = bench.escs[0]
+    esc.open(0, wait=False)
+    bench.port().counts = {"parity": 8, "framing": 2, "break": 2, "overrun": 0, "buffer_overrun": 0}
+    esc.report(SECOND)
+    assert esc.line_errors == {"parity": 3, "framing": 2, "break": 2, "overrun": 0, "buffer_overrun": 0}
+    assert bench.gateway.escs[0].line_errors == 5, "a break is a framing error already"
+    bench.lose(0, 2 * SECOND)
+    bench.reopen(3 * SECOND)
+    bench.port().counts = {"parity": 1}
+    esc.report(4 * SECOND)
+    assert esc.line_errors["parity"] == 3, "of a new driver's count"
+    bench.port().counts = {"parity": 9}
+    esc.report(5 * SECOND)
+    assert bench.gateway.escs[0].line_errors == 13
+    bench.close()
+
+
+def test_a_diagnosis_is_said_once_and_names_the_drivers_counts(
+    there: dict[str, Identity | None], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    there["/dev/ttyUSB0"] = None
+    bench = Bench("/dev/ttyUSB0")
+    esc = bench.escs[0]
+    esc.open(0, wait=False)
+    for n in range(1, 400):
+        now = n * 50 * MS
+        bench.port().counts = {"parity": 5 + n}
+        bench.port().reads = [bytes((0x55, 0x10 + n % 7)) * 20]
+        esc.serve(now)
+        bench.gateway.advance(now)
+        esc.report(now)
+    said = [message for message in caplog.messages if "no telemetry" in message]
+    assert len(said) == 1
+    assert "bytes but never KOD: wrong parity (8E1 is needed)" in said[0]
+    assert "parity errors)" in said[0]
+    bench.port().reads = [LIVE]
+    esc.serve(21 * SECOND)
+    esc.follow_link(21 * SECOND)
+    assert caplog.messages[-1] == "left: telemetry ok (V4)"
+    assert esc.complaint == ""
+    bench.close()
+
+
+def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(
+    there: dict[str, Identity | None],
+) -> None:
+    there["/dev/ttyUSB0"] = None
+    bench = Bench("/dev/ttyUSB0")
+    esc = bench.escs[0]
+    assert not esc.is_stuck(), "not open: known to be lost"
+    esc.open(0, wait=False)
+    assert [esc.is_stuck() for _ in range(3)] == [False] * 3
+    bench.port().waits_to_be_read = True
+    assert [esc.is_stuck() for _ in range(3)] == [False, True, True]
+    bench.port().reads = [LIVE]
+    esc.serve(SECOND)
+    assert not esc.is_stuck()
+    bench.close()
+
+
+def test_the_mini_uart_of_a_raspberry_pi_is_known_by_its_device_tree(tmp_path: Path) -> None:
+    device = tmp_path / "sys/devices/platform/soc/3f215040.serial"
+    (device / "of_node").mkdir(parents=True)
+    (device / "of_node/compatible").write_bytes(b"brcm,bcm2835-aux-uart\0")
+    (tmp_path / "sys/class/tty/ttyS0").mkdir(parents=True)
+    (tmp_path / "sys/class/tty/ttyS0/device").symlink_to(device)
+    assert is_mini_uart("/dev/ttyS0", tmp_path)
+    assert not is_mini_uart("/dev/ttyAMA0", tmp_path)
+    (device / "of_node/compatible").write_bytes(b"arm,pl011\0arm,primecell\0")
+    assert not is_mini_uart("/dev/ttyS0", tmp_path)
