@@ -65,8 +65,10 @@ class CanSide:
 
     @property
     def due(self) -> int | None:
-        """When ``reopen``, ``ask`` or ``transmit`` has something to do."""
-        return min((d for d in (self._retry.due, self._busy_until, self._ask_due) if d is not None), default=None)
+        """When ``reopen``, ``ask_if_due`` or ``transmit`` has something to do."""
+        if self._retry.due is None and self._busy_until is None:
+            return self._ask_due
+        return min(d for d in (self._retry.due, self._busy_until, self._ask_due) if d is not None)
 
     @property
     def is_open(self) -> bool:

@@ -18,7 +18,10 @@ DIAGNOSIS_NS = 3 * SECOND
 
 
 class EscInput:
-    """One ESC's port. ``reopened``: how often it came back; ``line_errors``: since the start, by kind."""
+    """One ESC's port. ``reopened``: how often it came back; ``line_errors``: since the start, by kind.
+
+    While the port is lost it is in ``lost``, so that nobody need look at each.
+    """
 
     def __init__(
         self,
@@ -27,13 +30,17 @@ class EscInput:
         gateway: Gateway,
         selector: selectors.BaseSelector,
         conditions: Conditions,
+        lost: "set[EscInput]",
     ) -> None:
         self.path = path
         self.port: SerialPort | None = None
         self.identity: Identity | None = None
         self.reopened = -1
+        self.due = 0
+        """While it is lost: when ``reopen`` has something to do."""
         self.line_errors: dict[str, int] = {}
         self._index = index
+        self._lost = lost
         self._gateway = gateway
         self._selector = selector
         self._conditions = conditions
@@ -50,11 +57,6 @@ class EscInput:
     @property
     def name(self) -> str:
         return self._gateway.escs[self._index].settings.name
-
-    @property
-    def due(self) -> int | None:
-        """When ``reopen`` has something to do."""
-        return self._retry.due
 
     @property
     def complaint(self) -> str:
@@ -89,6 +91,7 @@ class EscInput:
         self.reopened += 1
         self._lost_since = None
         self._retry.succeeded()
+        self._lost.discard(self)
         self._diagnosis_due = now + DIAGNOSIS_NS
         self._counted = port.line_errors()
         self._served, self._seen_waiting = True, False
@@ -123,7 +126,7 @@ class EscInput:
 
     def reopen(self, now: int, others: tuple[Identity | None, ...] = ()) -> None:
         """Try again what is due."""
-        if self._retry.due is not None and now >= self._retry.due:
+        if self in self._lost and now >= self.due:
             self.open(now, True, others)
 
     def discard(self) -> None:
@@ -202,7 +205,8 @@ class EscInput:
         return f" (the driver counts {', '.join(counts)})" if counts else ""
 
     def _failed(self, reason: str, now: int) -> None:
-        self._retry.failed(now)
+        self.due = self._retry.failed(now)
+        self._lost.add(self)
         self._lost_since = self._lost_since or now
         self._gateway.port_lost(self._index, now)
         self._conditions.begin(self._port_condition, f"{self.name}: {reason} Trying again.", now)

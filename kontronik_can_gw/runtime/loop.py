@@ -35,7 +35,8 @@ LEAST_SUSPENDED_NS, SUSPENDED_NS = 20 * MS, 250 * MS
 """A loop that comes round this much too late was held up or suspended: what waits on the ports is old."""
 STATUS_NS = SECOND
 """The service manager is told a line at most this often."""
-STUCK_RETRY_NS = 100 * MS
+LOOK_NS = 100 * MS
+"""How often there is a look round: statistics, line errors, log sums, signs of life."""
 _LAST_SAVE_S = 0.2
 
 
@@ -69,6 +70,7 @@ class Loop:
         self._status_due = 0 if status_ns else None
         self._status_before: tuple[int, list[int]] = (0, [])
         self._notifier = notifier or Notifier({})
+        self._look_due = 0
         self._alive_due = 0 if self._notifier.watchdog_ns is not None else None
         self._notify_due = 0
         self._statistics = statistics or Statistics(None, None)
@@ -78,7 +80,10 @@ class Loop:
         self._reload_asked = False
         self._stopping = False
         self._selector = selectors.DefaultSelector()
-        self.escs = [EscInput(i, path, gateway, self._selector, self.conditions) for i, path in enumerate(ports)]
+        self._lost: set[EscInput] = set()
+        self.escs = [
+            EscInput(i, path, gateway, self._selector, self.conditions, self._lost) for i, path in enumerate(ports)
+        ]
         self.can = CanSide(can_config, gateway, self._selector, self.conditions, tuple(ports))
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
@@ -95,6 +100,7 @@ class Loop:
     def reload(self) -> None:
         """Read the configuration again; safe in a signal handler. ``run`` ends if it is another one."""
         self._reload_asked = True
+        self._look_due = 0
         self._wake()
 
     def open(self) -> None:
@@ -141,7 +147,8 @@ class Loop:
                 self.can.follow_ids()
                 self.can.transmit(now)
                 self._report(now)
-                self._tell_manager(now)
+                if now >= self._look_due:
+                    self._look_round(now)
         finally:
             now = clock()
             gateway.stop(now)
@@ -174,10 +181,10 @@ class Loop:
     def _next_deadline(self) -> int:
         if self.gateway.frames_wait:  # of a change that sending itself brought about
             return 0
-        due = [self.gateway.next_deadline()]
-        due += [esc.due for esc in self.escs if esc.due is not None]
-        others = (self.can.due, self._status_due, self._alive_due, self.conditions.due, self._statistics.due)
-        due += [each for each in others if each is not None]
+        due = [self.gateway.next_deadline(), self._look_due]
+        due += [esc.due for esc in self._lost]
+        if (can_due := self.can.due) is not None:
+            due.append(can_due)
         return min(due)
 
     def _suspended_ns(self) -> int:
@@ -192,9 +199,8 @@ class Loop:
             esc.discard()
 
     def _reopen(self, now: int) -> None:
-        for esc in self.escs:
-            if esc.due is not None and now >= esc.due:
-                esc.reopen(now, tuple(other.identity for other in self.escs if other is not esc))
+        for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
+            esc.reopen(now, tuple(other.identity for other in self.escs if other is not esc))
         self.can.reopen(now)
         self.can.ask_if_due(now)
 
@@ -270,16 +276,13 @@ class Loop:
     # --- the service manager
 
     def _tell_manager(self, now: int) -> None:
-        if self._reload_asked:
-            self._begin_reload()
         if now >= self._notify_due and self._notifier.present:
             self._notify_due = now + STATUS_NS
             self._notifier.status(self._status_words())
         if self._alive_due is None or now < self._alive_due:
             return
         if any([*(esc.is_stuck() for esc in self.escs), self.can.is_stuck()]):
-            self._alive_due = now + STUCK_RETRY_NS  # not fed: what is not served in time is a reason to begin anew
-            return
+            return  # not fed: what is not served in time is a reason to begin anew
         self._alive_due = now + (self._notifier.watchdog_ns or SECOND)
         self._notifier.watchdog()
 
@@ -330,15 +333,22 @@ class Loop:
 
     def _report(self, now: int) -> None:
         self._report_nodes()
-        if self._status_due is not None and now >= self._status_due:
-            self._tell_status(now)
         for index in dict.fromkeys(self.gateway.take_link_changes()):
             self.escs[index].follow_link(now)
+
+    def _look_round(self, now: int) -> None:
+        """What need not be done each time the loop comes round."""
+        self._look_due = now + LOOK_NS
+        if self._reload_asked:
+            self._begin_reload()
         for esc in self.escs:
             esc.report(now)
         self.can.follow_conflicts(now)
         self.conditions.advance(now)
+        if self._status_due is not None and now >= self._status_due:
+            self._tell_status(now)
         self._publish(now)
+        self._tell_manager(now)
 
 
 def _words(name: str) -> str:

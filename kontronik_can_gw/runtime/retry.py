@@ -13,10 +13,11 @@ class Retry:
         self._longest = longest_ns
         self._pause = FIRST_NS
 
-    def failed(self, now: int) -> None:
-        """Try later: each time twice as late."""
-        self.due = now + self._pause
+    def failed(self, now: int) -> int:
+        """Try later, at the time that is returned: each time twice as late."""
+        self.due = due = now + self._pause
         self._pause = min(self._pause * 2, self._longest)
+        return due
 
     def succeeded(self) -> None:
         """Nothing is to be tried; the next failure begins with the shortest pause."""
