@@ -56,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
 
 def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
     """All findings, and the exit code. What does not depend on a faulty part of the configuration is looked at all the same."""
-    from kontronik_can_gw.runtime.doctor.can_interface import Needs, check_can
+    from kontronik_can_gw.runtime.doctor.can_interface import check_can
     from kontronik_can_gw.runtime.doctor.line import look
     from kontronik_can_gw.runtime.doctor.machine import check_machine
     from kontronik_can_gw.runtime.doctor.serial_ports import check_port
@@ -76,8 +76,7 @@ def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
         found += about.found
         for esc in config.esc:
             found += check_port(system, esc.name, esc.port, unit, look)
-        timeout_ms = min(esc.telemetry_timeout_ms for esc in config.esc)
-        found += check_can(system, Needs(config.can, _burst(loaded), timeout_ms))
+        found += check_can(system, config.can)
     else:
         found += about.found
     found += check_machine(system, unit)
@@ -139,17 +138,6 @@ def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
             findings.warning("config.parameters", text, remedy)
         else:
             findings.note("config.parameters", text, "Only the gateway's user and root can: run doctor with sudo")
-
-
-def _burst(loaded: Loaded | None) -> int:
-    """Frames that may become due at once: each message, each PDO and the heartbeats."""
-    if loaded is None:
-        return 0
-    frames = len(loaded.layout.messages)
-    if loaded.canopen is not None:
-        nodes = loaded.canopen.nodes(loaded.escs).nodes
-        frames += sum(1 + sum(tpdo.valid for tpdo in node.tpdos) for node in nodes)
-    return frames
 
 
 class _Piece(NamedTuple):

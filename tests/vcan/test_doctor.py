@@ -145,6 +145,9 @@ def test_bit_rate_and_state_of_a_real_driver_are_seen(adapter: SlcanAdapter, tmp
     assert code == 0
     assert found["can.bitrate"]["severity"] == found["can.state"]["severity"] == "ok"
     assert found["can.restart"]["severity"] == "note"
+    assert found["can.queue"]["severity"] == "ok"
+    ip("link", "set", adapter.name, "txqueuelen", "4")
+    found, _ = doctor(file)
     assert found["can.queue"]["severity"] == "warning"
     subprocess.run(found["can.queue"]["command"].replace("sudo ", ""), shell=True, check=True)
     assert doctor(file)[0]["can.queue"]["severity"] == "ok"

@@ -2,17 +2,15 @@
 
 import platform
 from importlib import import_module
-from typing import NamedTuple
 
 from kontronik_can_gw.config import CanConfig
-from kontronik_can_gw.dbc_output.layout import classic_bits
 from kontronik_can_gw.runtime.claims import PREFIX
 from kontronik_can_gw.runtime.doctor.can_link import Link, can_interfaces, link_of
 from kontronik_can_gw.runtime.doctor.findings import Finding, Findings
 from kontronik_can_gw.runtime.doctor.system import System
 
-SHORTEST_QUEUE = 16
-"""Frames. The gateway tries again 2 ms after a full queue; 10 frames, the usual length, last less than that at 1 Mbit/s."""
+SHORTEST_QUEUE = 8
+"""Frames: more than the gateway's own share, which is all that it ever has in there."""
 GOOD_QUEUE = 128
 _FD_MTU = 72
 _VIRTUAL = ("vcan", "vxcan")
@@ -21,17 +19,8 @@ _RESTART_MS = 100
 _LONG_RESTART_MS = 1000
 
 
-class Needs(NamedTuple):
-    """What a configuration wants of the interface. ``burst``: frames that may become due at once; the shortest ESC time-out in ms."""
-
-    can: CanConfig
-    burst: int
-    timeout_ms: int
-
-
-def check_can(system: System, needs: Needs) -> list[Finding]:
+def check_can(system: System, can: CanConfig) -> list[Finding]:
     """Everything about the CAN interface."""
-    can = needs.can
     findings = Findings(f"CAN {can.channel}")
     if can.interface != "socketcan":
         _driver(findings, can)
@@ -45,7 +34,7 @@ def check_can(system: System, needs: Needs) -> list[Finding]:
         there = ", ".join(can_interfaces(system)) or "none"
         findings.error("can.exists", f"{can.channel} is no CAN interface", f"Set can.channel; CAN interfaces: {there}")
     else:
-        _link(findings, link, needs)
+        _link(findings, link, can)
     _other_gateways(system, findings, can.channel)
     return findings.found
 
@@ -103,8 +92,7 @@ def _missing(system: System, findings: Findings, can: CanConfig) -> None:
     findings.error("can.exists", f"there is no interface {can.channel}, nor any other CAN interface", remedy, command)
 
 
-def _link(findings: Findings, link: Link, needs: Needs) -> None:
-    can = needs.can
+def _link(findings: Findings, link: Link, can: CanConfig) -> None:
     kind = {None: "CAN", "can": "CAN controller"}.get(link.kind, str(link.kind))
     virtual = link.kind in _VIRTUAL
     if virtual:
@@ -132,7 +120,7 @@ def _link(findings: Findings, link: Link, needs: Needs) -> None:
             _bit_timing(findings, link, can)
             _restart(findings, link, can)
         _controller(findings, link, can)
-    _queue(findings, link, needs, virtual)
+    _queue(findings, link, can, virtual)
     _statistics(findings, link)
 
 
@@ -225,31 +213,20 @@ def _controller(findings: Findings, link: Link, can: CanConfig) -> None:
         )
 
 
-def _queue(findings: Findings, link: Link, needs: Needs, virtual: bool) -> None:
-    """Short: the bus idles while the gateway waits for room. Long: a blocked bus gets old values first afterwards."""
+def _queue(findings: Findings, link: Link, can: CanConfig, virtual: bool) -> None:
+    """The gateway keeps at most about six frames in there, and is told when there is room again; other programs share it."""
     length = link.queue_length
     if length is None or virtual:
         return
-    least = max(SHORTEST_QUEUE, needs.burst)
-    good = max(GOOD_QUEUE, least)
-    held_ms = length * classic_bits(8) * 1000 // (link.bitrate or needs.can.bitrate)
-    command = f"sudo ip link set {needs.can.channel} txqueuelen {good}"
-    if length < least:
+    if length < SHORTEST_QUEUE:
         findings.warning(
             "can.queue",
-            f"transmit queue of {length} frames; {needs.burst} may be due at once",
-            f"At least {least}. For good by TransmitQueueLength={good} in a systemd .link file:",
-            command,
-        )
-    elif held_ms > needs.timeout_ms and length > good:
-        findings.warning(
-            "can.queue",
-            f"transmit queue of {length} frames: after a blocked bus {held_ms} ms of old values go first",
-            "",
-            command,
+            f"transmit queue of {length} frames: too short to keep the bus busy",
+            f"For good by TransmitQueueLength={GOOD_QUEUE} in a systemd .link file:",
+            f"sudo ip link set {can.channel} txqueuelen {GOOD_QUEUE}",
         )
     else:
-        findings.ok("can.queue", f"transmit queue of {length} frames, {held_ms} ms of bus time")
+        findings.ok("can.queue", f"transmit queue of {length} frames")
 
 
 def _statistics(findings: Findings, link: Link) -> None:
