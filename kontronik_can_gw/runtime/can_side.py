@@ -287,9 +287,12 @@ class CanSide:
             self.clear()
             return
         self._count_losses()
-        if not len(waiting) or (self._busy_until is not None and now < self._busy_until):
+        if self._busy_until is not None:
+            if now < self._busy_until:
+                return
+            self._busy_until = None
+        if not len(waiting):
             return
-        self._busy_until = None
         count, answer = waiting.flush(self.port.send)
         status.sent_frames += count
         if count:

@@ -52,7 +52,10 @@ if [ -z "$version" ]; then
     echo "setup.sh: no linux-image-amd64 in this distribution; the QEMU part is for Debian on amd64" >&2
     exit 1
 fi
-[ -e "$cache/$version/initrd.cpio" ] && exit 0
+# Besides vcan and slcan: the CAN controllers, the serial adapter, and USB devices played by a test (vhci_hcd).
+modules="virtio_pci virtio_console 9pnet_virtio 9p can can_raw can_bcm can_gw can_isotp can_j1939 vcan vxcan slcan sch_tbf
+sch_netem kvaser_pci xhci_pci ftdi_sio vhci_hcd usb_8dev"
+[ -e "$cache/$version/initrd.cpio" ] && [ "$(cat "$cache/$version/modules" 2>/dev/null)" = "$modules" ] && exit 0
 
 mkdir -p "$cache"
 work=$(mktemp -d "$cache/work.XXXXXX")
@@ -84,8 +87,7 @@ root=$work/root
 mkdir -p "$root/bin" "$root/proc" "$root/sys" "$root/dev" "$root/modules" "$root/new"
 cp "$(command -v busybox)" "$root/bin/busybox"
 : >"$root/modules/order"
-for module in virtio_pci virtio_console 9pnet_virtio 9p \
-    can can_raw can_bcm can_gw can_isotp can_j1939 vcan vxcan slcan sch_tbf sch_netem kvaser_pci xhci_pci ftdi_sio; do
+for module in $modules; do
     modprobe -d "$work" -S "$version" --show-depends "$module" | while read -r word file _; do
         [ "$word" = insmod ] || continue
         name=$(basename "$file" .xz)
@@ -110,5 +112,6 @@ exec $b switch_root /new "$GUEST_INIT"
 INIT
 chmod +x "$root/init"
 (cd "$root" && find . | cpio -o -H newc --quiet) >"$work/out/initrd.cpio"
+echo "$modules" >"$work/out/modules"
 rm -rf "${cache:?}/$version"
 mv "$work/out" "$cache/$version"
