@@ -221,6 +221,11 @@ class Gateway:
         """Grows with each change of a node's NMT state or node-ID."""
         return 0 if self.nodes is None else self.nodes.state_changes
 
+    @property
+    def node_ids(self) -> list[int]:
+        """Node-IDs of the CANopen nodes; before the start those that they will have."""
+        return [] if self.nodes is None else [node.claimed_node_id for node in self.nodes.nodes]
+
     def node_states(self) -> list[tuple[int, NmtState, int]]:
         """Of each ESC's CANopen node: node-ID, NMT state, PDOs sent so far. Empty without nodes."""
         if self.nodes is None:

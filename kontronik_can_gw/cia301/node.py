@@ -384,6 +384,11 @@ class Node:
         return number(0x1018, 1), number(0x1018, 2), number(0x1018, 3), number(0x1018, 4)
 
     @property
+    def claimed_node_id(self) -> int:
+        """The node-ID it has; before it is powered on the one it will have."""
+        return self.pending_node_id if self.state is NmtState.INITIALISING else self.node_id
+
+    @property
     def active_node_id(self) -> int:
         return self.node_id
 

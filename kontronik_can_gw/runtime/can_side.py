@@ -153,7 +153,7 @@ class CanSide:
         if self.config.interface == "virtual":  # is in this process only
             return
         channel = self.config.channel
-        names = [node_claim(channel, node) for node, _, _ in self._gateway.node_states() if node != UNCONFIGURED]
+        names = [node_claim(channel, node_id) for node_id in self._gateway.node_ids if node_id != UNCONFIGURED]
         if (first := self._gateway.first_message_id) is not None:
             names.append(messages_claim(channel, first))
         if names == self._claimed:

@@ -34,7 +34,7 @@ class Conditions:
         self._known: dict[str, _Condition] = {}
         self._summing: set[str] = set()
 
-    def begin(self, name: str, text: str, now: int, quiet: bool = False) -> None:
+    def begin(self, name: str, text: str, now: int, quiet: bool = False, level: int = logging.WARNING) -> None:
         """Something is wrong from now on. Said once, and once more when ``text`` becomes another one; ``quiet``: only its end is."""
         condition = self._known.setdefault(name, _Condition())
         if condition.begun is None:
@@ -52,11 +52,11 @@ class Conditions:
             condition.count = condition.total = 0
             self._summing.add(name)
             text += " This comes and goes: from now on it is summed up once a minute."
-        self.say(logging.WARNING, text)
+        self.say(level, text)
 
-    def event(self, name: str, text: str, now: int) -> None:
-        """Something went wrong and is over already."""
-        self.begin(name, text, now)
+    def event(self, name: str, text: str, now: int, level: int = logging.WARNING) -> None:
+        """Something happened and is over already."""
+        self.begin(name, text, now, level=level)
         self.forget(name)
 
     def end(self, name: str, text: str, now: int, counts: str = "") -> None:
@@ -98,7 +98,7 @@ class Conditions:
                 in_all = f", {duration(total)} in all" if total else ""
                 self.say(
                     logging.WARNING,
-                    f"{name}: {condition.count} more times in the last minute{in_all}: {condition.reason}",
+                    f"{name}: {condition.count} more times in the last minute{in_all}; the last: {condition.reason}",
                 )
                 condition.due = now + MINUTE
                 condition.count = condition.total = 0

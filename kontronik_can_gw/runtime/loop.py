@@ -294,7 +294,7 @@ class Loop:
 
     # --- words
 
-    def _report_nodes(self) -> None:
+    def _report_nodes(self, now: int) -> None:
         if self.gateway.node_changes == self._node_changes:
             return
         self._node_changes = self.gateway.node_changes
@@ -309,7 +309,8 @@ class Loop:
             if before and before[index] == (node_id, state):
                 continue
             words = "waits for LSS" if node_id == UNCONFIGURED else f"{node_id} {_words(state.name)}"
-            log.info("%s: CANopen node %s", self.escs[index].name, words)
+            name = f"{self.escs[index].name}: CANopen node"
+            self.conditions.event(name, f"{name} {words}", now, logging.INFO)
 
     def _tell_status(self, now: int) -> None:
         """One line about everything, for who wants it every so often."""
@@ -332,7 +333,7 @@ class Loop:
         log.info("%s", "; ".join(words))
 
     def _report(self, now: int) -> None:
-        self._report_nodes()
+        self._report_nodes(now)
         for index in dict.fromkeys(self.gateway.take_link_changes()):
             self.escs[index].follow_link(now)
 

@@ -147,10 +147,9 @@ def _adapters() -> Iterator[tuple[str, Identity]]:
 
 def _in_use(path: str, users: str) -> RunError:
     who = f": {users}" if users else " (another gateway? a getty?)"
-    name = Path(path).name
-    return RunError(
-        f"{path}: is in use by another program{who}. End it; if it is a getty: sudo systemctl disable --now serial-getty@{name}."
-    )
+    name = Path(os.path.realpath(path)).name
+    getty = f"; if it is a getty: sudo systemctl disable --now serial-getty@{name}" if name.startswith("tty") else ""
+    return RunError(f"{path}: is in use by another program{who}. End it{getty}.")
 
 
 def device_of(path: str) -> int | None:

@@ -9,7 +9,15 @@ import cantools.database
 
 from kontronik_can_gw.cia301.eds import ARRAY, RECORD, Eds, load
 from kontronik_can_gw.cia301.emergency import GatewayError, code_of_bit
-from kontronik_can_gw.config import CanConfig, CanopenConfig, DbcConfig, EscConfig, RunConfig, shipped
+from kontronik_can_gw.config import (
+    CanConfig,
+    CanopenConfig,
+    DbcConfig,
+    EscConfig,
+    RunConfig,
+    StatisticsConfig,
+    shipped,
+)
 from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.sources import Group, sources
 from kontronik_can_gw.telemetry import EscSettings
@@ -45,6 +53,7 @@ def configuration() -> str:
         ("dbc", DbcConfig),
         ("canopen", CanopenConfig),
         ("run", RunConfig),
+        ("statistics", StatisticsConfig),
         ("[esc]", EscConfig),
     ):
         for f in fields(table):

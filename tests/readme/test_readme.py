@@ -10,10 +10,10 @@ from pathlib import Path
 
 import cantools.database
 import pytest
-from readme_tables import README, with_tables
+from readme_tables import README, configuration, with_tables
 
 from kontronik_can_gw.cli import COMMANDS
-from kontronik_can_gw.config import parse, shipped
+from kontronik_can_gw.config import parse, schema, shipped
 
 TEXT = README.read_text(encoding="utf-8")
 PROJECT = README.parent
@@ -21,6 +21,21 @@ PROJECT = README.parent
 
 def test_its_tables_are_those_of_the_sources() -> None:
     assert with_tables(TEXT) == TEXT, "run: python tests/readme/readme_tables.py"
+
+
+def test_its_configuration_table_has_every_key_of_every_table() -> None:
+    rows = set(re.findall(r"^\| `([^`]+)` \|", configuration(), re.MULTILINE))
+    keys = set()
+    for name, table in schema()["properties"].items():
+        head, table = (f"[{name}]", table["items"]) if table["type"] == "array" else (name, table)
+        keys |= {f"{head}.{key}" for key in table["properties"]}
+    assert rows == keys
+
+
+def test_its_links_lead_to_its_headings() -> None:
+    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", TEXT, flags=re.DOTALL), re.MULTILINE)
+    anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    assert set(re.findall(r"\]\(#([^)]+)\)", TEXT)) <= anchors
 
 
 def test_its_configuration_is_valid() -> None:

@@ -61,7 +61,7 @@ def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(told: p
     assert len(told.messages) == 2 * FLAPPING - 1 + 9
     assert "summed up" in told.messages[2 * FLAPPING - 2]
     sums = [message for message in told.messages if "more times" in message]
-    assert sums[3] == "esc1: telemetry: 30 more times in the last minute, 30.0 s in all: lost"
+    assert sums[3] == "esc1: telemetry: 30 more times in the last minute, 30.0 s in all; the last: lost"
     while conditions.due is not None:
         now = conditions.due
         conditions.advance(now)
@@ -86,7 +86,7 @@ def test_events_are_said_one_by_one_and_then_summed_up(told: pytest.LogCaptureFi
         conditions.event("suspended", f"suspended for {n} s", n * SECOND)
     assert len(told.messages) == FLAPPING
     conditions.advance(MINUTE + 20 * SECOND)
-    assert told.messages[-1] == "suspended: 14 more times in the last minute: suspended for 19 s"
+    assert told.messages[-1] == "suspended: 14 more times in the last minute; the last: suspended for 19 s"
 
 
 def test_lines_can_be_held_back_and_the_last_ones_are_remembered(told: pytest.LogCaptureFixture) -> None:

@@ -5,11 +5,12 @@ import platform
 import time
 from importlib.metadata import PackageNotFoundError, version
 
+from kontronik_can_gw import __version__
 from kontronik_can_gw.runtime.doctor.findings import Finding, Findings
 from kontronik_can_gw.runtime.doctor.service import Unit, check_service
 from kontronik_can_gw.runtime.doctor.system import System
 
-_PACKAGES = ("kontronik-can-gw", "python-can", "canopen", "pyserial", "cantools", "rich")
+_PACKAGES = ("python-can", "canopen", "pyserial", "cantools", "rich")
 _FIRST_YEAR = 2024
 _LEAST_MEMORY_KB = 64 * 1024
 _SLOW_CLOCKS = ("acpi_pm", "hpet", "jiffies", "pit")
@@ -104,5 +105,5 @@ def _versions(findings: Findings) -> None:
             found.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
-    text = f"Python {platform.python_version()}, kernel {platform.release()}, {', '.join(found)}"
+    text = f"kontronik-can-gw {__version__}, Python {platform.python_version()}, kernel {platform.release()}, {', '.join(found)}"
     findings.ok("machine.versions", text)
