@@ -16,6 +16,7 @@ from kontronik_can_gw.telemetry import SECOND, EscSettings, EscTelemetry, Event
 
 _CONFLICT_NS = 10 * SECOND
 """So long without a further one, and a conflict of ids is over."""
+_ECHO_NS = SECOND // 5
 
 
 class Conflict:
@@ -63,6 +64,7 @@ class Gateway:
         self._receive_ids: frozenset[int] = frozenset()
         self._routed: frozenset[int] | None = None
         self._conflicts: dict[int, Conflict] = {}
+        self._echoes_until = 0
         self._conflict_news: list[Conflict] = []
         self._follow_ids()
         self._link_changes: list[int] = []
@@ -113,6 +115,10 @@ class Gateway:
         if self.nodes is not None:
             self._expire(now)
             self.nodes.receive(frame, now)
+
+    def can_opened(self, now: int) -> None:
+        """The interface was opened (again): what we sent before may still come back, and is no conflict."""
+        self._echoes_until = now + _ECHO_NS
 
     @property
     def first_message_id(self) -> int | None:
@@ -270,6 +276,8 @@ class Gateway:
         self._receive_ids = routed | frozenset(own)
 
     def _collide(self, key: int, own: tuple[int | None, str], now: int) -> None:
+        if now < self._echoes_until:
+            return
         self.status.id_conflicts += 1
         conflict = self._conflicts.get(key)
         if conflict is None:

@@ -191,6 +191,7 @@ class Node:
 
     def power_on(self, now: int) -> None:
         """The gateway starts. A node without a node-ID stays silent until LSS gives it one."""
+        self._off_bus = self._outage = False  # what was before is nobody's concern
         self.reset_node(now)
 
     def reset_node(self, now: int) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.cli.node_setup import (
     check_cob_ids,
     load_of_stored,
@@ -108,6 +109,22 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
         warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
     damaged = () if kept is None else tuple(kept.damaged)
     return Loaded(config, escs, database, layout, canopen, damaged, store, tuple(w for w in warnings if w))
+
+
+def with_store(loaded: Loaded, store: ParameterStore | None) -> Loaded:
+    """The same configuration as it is in memory, with a store of its own and what is in there now."""
+    if loaded.canopen is None:
+        return replace(loaded, store=store)
+    config = loaded.config
+    kept = read_stored(config, store)
+    plain = replace(loaded.canopen, stored=(Stored(),) * len(config.esc))
+    escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
+    foreign = {message.can_id: message.name for message in loaded.layout.messages if not message.extended}
+    canopen, given_way = with_stored(plain, kept.stored, config, escs, foreign)
+    warnings = (*given_way, *kept.warnings)
+    return replace(
+        loaded, escs=escs, canopen=canopen, store=store, damaged=tuple(kept.damaged), warnings=tuple(warnings)
+    )
 
 
 @contextmanager

@@ -6,14 +6,26 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cli.common import Loaded, assemble, fingerprint, load_all, logging_to_stderr, stopping_on_signals
+from kontronik_can_gw.cli.common import (
+    Loaded,
+    assemble,
+    fingerprint,
+    load_all,
+    logging_to_stderr,
+    stopping_on_signals,
+    with_store,
+)
 from kontronik_can_gw.cli.node_setup import parameter_folder
 from kontronik_can_gw.config import Config, load
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.runtime.can_port import check_interface
 from kontronik_can_gw.telemetry import SECOND
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from kontronik_can_gw.runtime.loop import Loop
+    from kontronik_can_gw.runtime.store import ParameterStore
     from kontronik_can_gw.runtime.systemd import Notifier
 
 log = logging.getLogger("kontronik_can_gw")
@@ -76,30 +88,32 @@ class _Run:
     def __init__(self, args: argparse.Namespace, notifier: "Notifier") -> None:
         from kontronik_can_gw.runtime.reload import Reloader
         from kontronik_can_gw.runtime.snapshot import program_facts
-        from kontronik_can_gw.runtime.store import ParameterStore
 
         self._file: Path = args.config
         self._wait: bool = args.wait
         self._status_ns = int((args.status or 0) * SECOND)
         self._notifier = notifier
-        self._loaded = load_all(args.config, ParameterStore)
-        self._print = fingerprint(self._loaded.config)
-        self._reloader = Reloader(self._read_again)
         self._program = program_facts(args.config)
+        self._reloader = Reloader(self._read_again)
+        self._loaded: Loaded | None = None
+        self._print = b""
         self._loop: Loop | None = None
-        self._stopping = False
+        self._stopping = self._reload_asked = False
 
     def main(self) -> None:
         """Until a signal ends it."""
+        from kontronik_can_gw.runtime.store import ParameterStore
+
         with stopping_on_signals(self._stop, self._reload):
-            self._open(self._loaded, self._wait or self._loaded.config.run.wait_for_devices)
+            loaded = load_all(self._file, ParameterStore)
+            self._open(loaded, self._wait or loaded.config.run.wait_for_devices)
             while True:
                 assert self._loop is not None
                 self._loop.run()
-                if self._stopping or not isinstance(self._reloader.new, Config):
+                new, self._reloader.new = self._reloader.new, None
+                if self._stopping or not isinstance(new, Config):
                     break
-                self._change(self._reloader.new)
-                self._reloader.new = None
+                self._change(new)
         self._reloader.close()
 
     def _stop(self) -> None:
@@ -109,12 +123,15 @@ class _Run:
             self._loop.stop()
 
     def _reload(self) -> None:
+        self._reload_asked = True
         if self._loop is not None:
             self._loop.reload()
 
     def _read_again(self) -> Config | None:
         """In the reloader's thread: the configuration, checked, if it is another one."""
+        self._reload_asked = False
         found = load(self._file)
+        check_interface(found.can)
         loaded = assemble(found)
         if fingerprint(found) == self._print:
             return None
@@ -125,18 +142,27 @@ class _Run:
     def _change(self, config: Config) -> None:
         """Begin anew with another configuration; with the old one where it cannot be opened for a reason that waiting does not mend."""
         old = self._loaded
+        assert old is not None
         try:
-            self._open(self._assembled(config), wait=True)
+            self._open(self._with_store(config, assemble), wait=True)
         except UserError as error:
             for problem in error.problems:
                 log.error("%s", problem)
             log.error("the new configuration cannot be used: going on with the old one")
-            self._open(self._assembled(old.config), wait=True)
+            # by what is in memory: its DBC and EDS may be others by now
+            self._open(self._with_store(old.config, lambda _config, store: with_store(old, store)), wait=True)
 
-    def _assembled(self, config: Config) -> Loaded:
+    def _with_store(self, config: Config, make: "Callable[[Config, ParameterStore | None], Loaded]") -> Loaded:
+        """What ``make`` makes of a configuration and the store for it; where it fails the store is free again."""
         from kontronik_can_gw.runtime.store import ParameterStore
 
-        return assemble(config, ParameterStore(parameter_folder(config)) if config.canopen.enabled else None)
+        store = ParameterStore(parameter_folder(config)) if config.canopen.enabled else None
+        try:
+            return make(config, store)
+        except UserError:
+            if store is not None:
+                store.close(0)
+            raise
 
     def _open(self, loaded: Loaded, wait: bool) -> None:
         from kontronik_can_gw.gateway import Gateway
@@ -146,9 +172,12 @@ class _Run:
         config = loaded.config
         silent = config.dbc.on_loss == "silent"
         gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns(), silent, loaded.canopen)
-        if self._loop is not None:
-            gateway.take_over(self._loop.gateway)
-        statistics = Statistics(config.statistics_path or default_file(), config.statistics.address)
+        try:
+            statistics = Statistics(config.statistics_path or default_file(), config.statistics.address)
+        except UserError:
+            if loaded.store is not None:
+                loaded.store.close(0)
+            raise
         loop = Loop(
             gateway,
             [esc.port for esc in config.esc],
@@ -161,6 +190,9 @@ class _Run:
             statistics=statistics,
             program=self._program,
         )
+        if self._loop is not None:
+            gateway.take_over(self._loop.gateway)
+            loop.take_over(self._loop)
         _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
         loop.open()
         for esc, _ in loaded.damaged:
@@ -168,6 +200,8 @@ class _Run:
         self._loaded, self._print, self._loop = loaded, fingerprint(config), loop
         if self._stopping:  # a signal came while there was no loop
             loop.stop()
+        if self._reload_asked:
+            loop.reload()
 
 
 def _say_parameters(loaded: Loaded) -> None:

@@ -58,6 +58,8 @@ class Sent(Enum):
     """Not now: our own share of the queue is full. The port becomes writable when it is not."""
     DOWN = 4
     GONE = 5
+    LATE = 6
+    """Not sent: it has become old while it was to be handed over."""
 
 
 class CanPort:
@@ -333,7 +335,7 @@ def _open(config: CanConfig) -> "can.BusABC":
             f"dbitrate {config.data_bitrate} fd on; vcan: sudo ip link set {name} mtu {_FD.size}; or set can.fd = false."
         )
     if config.interface == "socketcan" and is_up(config.channel) is False:
-        raise _socketcan_error(config, OSError(errno.ENETDOWN, ""))
+        raise socketcan_error(config, errno.ENETDOWN)
     if config.interface != "socketcan":
         options["bitrate"] = config.bitrate
     if config.fd:
@@ -345,7 +347,7 @@ def _open(config: CanConfig) -> "can.BusABC":
         return can.Bus(interface=config.interface, channel=config.channel, **options)
     except OSError as error:
         if config.interface == "socketcan":
-            raise _socketcan_error(config, error) from None
+            raise socketcan_error(config, error.errno or 0, error.strerror or str(error)) from None
         raise RunError(f"CAN {config.interface} {config.channel}: cannot be opened: {error}") from None
     except (
         Exception
@@ -353,16 +355,17 @@ def _open(config: CanConfig) -> "can.BusABC":
         raise RunError(f"CAN {config.interface} {config.channel}: cannot be opened: {error}") from None
 
 
-def _socketcan_error(config: CanConfig, error: OSError) -> RunError:
+def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
+    """What is said of an interface that cannot be used, with the remedy. ``number`` as in errno."""
     name = config.channel
     make = f"sudo ip link set {name} up type can bitrate {config.bitrate} restart-ms 100"
-    if error.errno in (errno.ENODEV, errno.ENXIO):
+    if number in (errno.ENODEV, errno.ENXIO):
         virtual = f"sudo ip link add {name} type vcan && sudo ip link set {name} up"
         return RunError(
             f"CAN interface {name}: there is none. With an adapter plugged in: {make}. For a virtual one: {virtual}."
         )
-    if error.errno in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
+    if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
         return RunError(f"CAN interface {name}: this kernel has no SocketCAN. Try: sudo modprobe can_raw vcan.")
-    if error.errno == errno.ENETDOWN:
+    if number == errno.ENETDOWN:
         return RunError(f"CAN interface {name}: is down. Start it: {make}.")
-    return RunError(f"CAN interface {name}: cannot be opened: {error.strerror or error}")
+    return RunError(f"CAN interface {name}: cannot be opened: {text}")

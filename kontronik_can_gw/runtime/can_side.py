@@ -1,20 +1,23 @@
 """The CAN interface as the loop has it: opened, lost, found again; what waits to be sent; what the kernel tells of it."""
 
 import contextlib
+import errno
 import logging
 import selectors
+import time
+from collections.abc import Callable
 
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Conflict, Gateway
-from kontronik_can_gw.runtime.can_port import CanPort, Sent
+from kontronik_can_gw.runtime.can_port import CanPort, Sent, socketcan_error
 from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.runtime.retry import Retry
-from kontronik_can_gw.runtime.serial_port import device_of
 from kontronik_can_gw.runtime.snapshot import CanFacts
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -24,10 +27,12 @@ BUSY_RETRY_NS = 2 * MS
 LASTING_BUSY_NS = SECOND
 ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
 """How often the kernel is asked for the controller's state: as a rule, and in bus-off."""
+RESTARTED_NS = SECOND
+"""So long behind a restart a driver may go on telling of bus-off."""
 
 
 class CanSide:
-    """The interface of a gateway. ``esc_paths``: what must never be opened as a CAN adapter, which would send to an ESC."""
+    """The interface of a gateway. ``esc_at`` names the ESC that a path leads to: it must never be opened as a CAN adapter."""
 
     def __init__(
         self,
@@ -35,7 +40,8 @@ class CanSide:
         gateway: Gateway,
         selector: selectors.BaseSelector,
         conditions: Conditions,
-        esc_paths: tuple[str, ...] = (),
+        esc_at: Callable[[str], str | None] = lambda _path: None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.config = config
         self.port: CanPort | None = None
@@ -45,7 +51,11 @@ class CanSide:
         self._gateway = gateway
         self._selector = selector
         self._conditions = conditions
-        self._esc_paths = esc_paths
+        self._esc_at = esc_at
+        self._clock = clock
+        self.longest_turn_ns = SECOND // 4
+        """A frame that is to go out so long after its turn began is old by now."""
+        self._turn_ns = 0
         self._retry = Retry(LONGEST_RETRY_NS)
         self._claims = Claims()
         self._claimed: list[str] = []
@@ -54,6 +64,8 @@ class CanSide:
         self._busy_until: int | None = None
         self._busy_since: int | None = None
         self._stalled = False
+        self._off = False
+        self._restarted_ns = -RESTARTED_NS
         self._served = True
         self._seen_waiting = False
         self._monitor: LinkMonitor | None = None
@@ -135,16 +147,21 @@ class CanSide:
 
     def _open(self, now: int) -> None:
         self._refuse_escs_as_channel()
-        port = CanPort(self.config)
+        try:
+            port = CanPort(self.config)
+        except OSError as error:  # it went away a moment ago
+            raise RunError(f"CAN interface {self.config.channel}: {error.strerror or error}.") from None
         self.port = port
         self._retry.due = None
         self._busy_until = self._busy_since = None
+        self._off = False
         self._served, self._seen_waiting = True, False
         if (fd := port.fileno()) is not None:
             self._selector.register(fd, selectors.EVENT_READ, self.serve)
         self._receive_ids = None
         self.follow_ids()
-        self.ask(now)
+        self._gateway.can_opened(now)
+        self._refresh_facts(now)  # what was told before, as that it was down, is past
         if not self._conditions.is_on(self._interface_condition):  # otherwise it is said when a frame is sent
             self._conditions.say(logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open")
 
@@ -159,19 +176,21 @@ class CanSide:
         if names == self._claimed:
             return
         self._claimed = names
-        for taken in self._claims.hold(names):
+        all_taken = self._claims.hold(names)
+        if all_taken:
+            self._claimed = []  # to be tried again
+        for taken in all_taken:
             if at_start:
                 raise in_use(taken)
             self._conditions.say(logging.ERROR, str(in_use(taken)))
 
     def _refuse_escs_as_channel(self) -> None:
         """Whatever its name is now: what leads to an ESC must not be opened as a CAN interface, which would send to it."""
-        device = device_of(self.config.channel)
-        for path in self._esc_paths:
-            if device is not None and device == device_of(path):
-                raise RunError(f"can.channel {self.config.channel} is the port {path}: nothing may be sent to an ESC.")
+        if (esc := self._esc_at(self.config.channel)) is not None:
+            raise RunError(f"can.channel {self.config.channel} is the port of {esc}: nothing may be sent to an ESC.")
 
     def _close_port(self) -> None:
+        self._busy_until = self._busy_since = None
         if self.port is not None:
             if (fd := self.port.fileno()) is not None:
                 with contextlib.suppress(KeyError, ValueError):
@@ -188,8 +207,11 @@ class CanSide:
     def _lost(self, answer: Sent, now: int) -> None:
         """The interface is down or gone: to be opened anew."""
         self._close_port()
-        word = "down" if answer is Sent.DOWN else "gone"
-        self._failed(f"CAN interface {self.config.channel}: {word}.", now)
+        number = errno.ENETDOWN if answer is Sent.DOWN else errno.ENODEV
+        if self.config.interface == "socketcan":
+            self._failed(str(socketcan_error(self.config, number)), now)
+        else:
+            self._failed(f"CAN {self.config.interface} {self.config.channel}: the adapter has failed.", now)
         self.ask(now)  # it may be there again already
 
     # --- what the kernel tells
@@ -198,7 +220,7 @@ class CanSide:
         """Ask how the interface is."""
         if self._monitor is not None:
             self._monitor.ask()
-            self._ask_due = now + (ASK_OFF_NS if self._is_off else ASK_NS)
+            self._ask_due = now + (ASK_OFF_NS if self._off else ASK_NS)
 
     def ask_if_due(self, now: int) -> None:
         if self._ask_due is not None and now >= self._ask_due:
@@ -218,14 +240,29 @@ class CanSide:
             return
         if not facts.exists or not facts.up:
             self._lost(Sent.DOWN if facts.exists else Sent.GONE, now)
-        elif facts.state is not None and facts.state is not self.port.state:
+            return
+        behind = facts.state is CanState.BUS_OFF and now - self._restarted_ns < RESTARTED_NS
+        if facts.state is not None and facts.state is not self.port.state and not behind:
             self.port.note_state(facts.state)
-            self._follow_state(now)
+        self._follow_state(now)
 
     @property
-    def _is_off(self) -> bool:
-        """True where the kernel itself says bus-off: what is sent now is lost. (Error frames alone may be somebody's test.)"""
-        return self.facts is not None and self.facts.state is CanState.BUS_OFF
+    def _sends_in_vain(self) -> bool:
+        """True in the bus-off of a real controller: what is sent now is lost. (On a vcan error frames are somebody's test.)"""
+        return self._off and self.facts is not None and self.facts.state is not None
+
+    def _has_restarted(self, now: int) -> bool:
+        """Whether the queue of a controller that left bus-off runs again; before that the kernel drops frames without a word."""
+        self._refresh_facts(now)
+        return self.facts is None or (self.facts.up and self.facts.running)
+
+    def _refresh_facts(self, now: int) -> None:
+        """How the interface is now; what waits of older news is passed over."""
+        self.ask(now)
+        told = self._monitor.take() if self._monitor is not None else []
+        if told:
+            self.facts = told[-1]
+            self._follow_bitrate(self.facts.bitrate, now)
 
     # --- frames
 
@@ -265,12 +302,12 @@ class CanSide:
 
     def discard(self, now: int) -> None:
         """Throw away what waits in both directions: it is old."""
-        lost = self.mailboxes.dropped
+        waited = len(self.mailboxes)
         self.clear()
         if self.port is not None:
             self.port.discard()
             self._follow_reception(now)
-        if self.mailboxes.dropped != lost:  # an answer is too late by now, but what is wrong has to be known
+        if waited:  # an answer is too late by now, but what is wrong has to be known
             self._gateway.can_returned(now)
 
     def clear(self) -> None:
@@ -283,8 +320,9 @@ class CanSide:
         status, waiting = self._gateway.status, self.mailboxes
         for frame in self._gateway.take_frames():
             waiting.put(frame)
-        if self.port is None or self._is_off:
+        if self.port is None or self._sends_in_vain:
             self.clear()
+            self._busy_until = self._busy_since = None
             return
         self._count_losses()
         if self._busy_until is not None:
@@ -292,11 +330,16 @@ class CanSide:
                 return
             self._busy_until = None
         if not len(waiting):
+            if not self._stalled:
+                self._busy_since = None
             return
-        count, answer = waiting.flush(self.port.send)
+        self._turn_ns = now
+        count, answer = waiting.flush(self._send)
         status.sent_frames += count
         if count:
             self._busy_since = None
+        if answer is Sent.LATE:
+            return  # the next turn throws it away
         if answer is Sent.OK:
             self._works(now)
         else:
@@ -311,6 +354,12 @@ class CanSide:
             self._conditions.end(self._sending_condition, f"CAN {self.config.channel}: frames are sent again", now)
             self._gateway.can_returned(now)
         self._follow_state(now)
+
+    def _send(self, frame: CanFrame) -> Sent:
+        if self._clock() - self._turn_ns > self.longest_turn_ns:  # the process was stopped in the middle of its turn
+            return Sent.LATE
+        assert self.port is not None
+        return self.port.send(frame)
 
     def _busy(self, answer: Sent, now: int) -> Sent:
         """The interface takes no more for now; GONE if it has not for so long that it must be."""
@@ -366,6 +415,11 @@ class CanSide:
         port.bus_off_count = 0
         if port.state is self._gateway.status.can_state:
             return
+        if self._off and port.state is not CanState.BUS_OFF:
+            if not self._has_restarted(now):
+                return
+            self._restarted_ns = now
+        self._off = port.state is CanState.BUS_OFF
         self._gateway.set_can_state(port.state, now)
         name = f"CAN {self.config.channel}"
         if port.state is CanState.BUS_OFF:

@@ -8,6 +8,7 @@ import contextlib
 import errno
 import socket
 from collections.abc import Iterable
+from hashlib import sha256
 
 from kontronik_can_gw.errors import RunError
 
@@ -42,7 +43,7 @@ class Claims:
                 continue
             claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
             try:
-                claim.bind("\0" + (PREFIX + name)[: _LONGEST_NAME - 1])
+                claim.bind("\0" + PREFIX + _short(name))
             except OSError as error:
                 claim.close()
                 if error.errno == errno.EADDRINUSE:
@@ -59,6 +60,14 @@ class Claims:
         for claim in self._held.values():
             claim.close()
         self._held = {}
+
+
+def _short(name: str) -> str:
+    """A name that fits into an address: the channel of a long one in short."""
+    if len(PREFIX + name) < _LONGEST_NAME:
+        return name
+    channel, what, number = name.rsplit("/", 2)
+    return f"{sha256(channel.encode()).hexdigest()[:32]}/{what}/{number}"
 
 
 def in_use(name: str) -> RunError:

@@ -37,14 +37,16 @@ class Conditions:
     def begin(self, name: str, text: str, now: int, quiet: bool = False, level: int = logging.WARNING) -> None:
         """Something is wrong from now on. Said once, and once more when ``text`` becomes another one; ``quiet``: only its end is."""
         condition = self._known.setdefault(name, _Condition())
+        if condition.begun is not None and condition.reason == text:
+            return
         if condition.begun is None:
             condition.begun = now
-            condition.begins.append(now)
-            condition.count += 1
-        elif condition.reason == text:
-            return
         condition.reason = text
-        if condition.summing or quiet:
+        if quiet:
+            return
+        condition.begins.append(now)
+        condition.count += 1
+        if condition.summing:
             return
         often = len(condition.begins) == FLAPPING and now - condition.begins[0] < MINUTE
         if often:

@@ -9,7 +9,16 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.retry import Retry
-from kontronik_can_gw.runtime.serial_port import Identity, PortLost, SerialPort, find_adapter, is_mini_uart
+from kontronik_can_gw.runtime.serial_port import (
+    Identity,
+    NoPort,
+    PortLost,
+    SerialPort,
+    device_of,
+    find_adapter,
+    identity_at,
+    is_mini_uart,
+)
 from kontronik_can_gw.runtime.snapshot import PortFacts
 from kontronik_can_gw.telemetry import SECOND, LinkState
 
@@ -53,6 +62,7 @@ class EscInput:
         self._seen_waiting = False
         self._lost_counters = (0, 0)
         self._lost_since: int | None = None
+        self._proven = False
 
     @property
     def name(self) -> str:
@@ -83,14 +93,15 @@ class EscInput:
         except RunError as error:
             if not wait:
                 raise RunError(f"{self.name}: {error}") from None
-            self._failed(str(error), now)
+            unplugged = isinstance(error, NoPort) and self.reopened >= 0  # which was said when it was lost
+            self._failed(str(error), now, quiet=unplugged)
             return
         port.discard()  # what came before we listened has no time
         self.port = port
         self.identity = port.identity()
         self.reopened += 1
         self._lost_since = None
-        self._retry.succeeded()
+        self._proven = False
         self._lost.discard(self)
         self._diagnosis_due = now + DIAGNOSIS_NS
         self._counted = port.line_errors()
@@ -109,6 +120,15 @@ class EscInput:
                 "come. Use ttyAMA0.",
             )
 
+    def is_at(self, path: str) -> bool:
+        """True if a path leads to this ESC, whatever its name is now."""
+        device = device_of(path)
+        if device is not None and device == device_of(self.path):
+            return True
+        if device is not None and self.port is not None and device == device_of(self.port.path):
+            return True
+        return self.identity is not None and identity_at(path) == self.identity
+
     def serve(self, now: int, _events: int = 0) -> None:
         """The port is readable."""
         self._served = True
@@ -122,6 +142,9 @@ class EscInput:
             self._failed(f"{path}: lost ({error}).", now)
             return
         if data:
+            if not self._proven:  # a port that goes as soon as it has come is tried more and more seldom
+                self._proven = True
+                self._retry.succeeded()
             self._gateway.receive_bytes(self._index, data, now)
 
     def reopen(self, now: int, others: tuple[Identity | None, ...] = ()) -> None:
@@ -183,6 +206,9 @@ class EscInput:
         if now >= self._count_due:
             self._count_due = now + SECOND
             self._count(self.port.line_errors())
+            if not self.port.settings_hold():
+                text = f"{self.name}: another program changed the settings of {self.port.path}: set to 115200 8E1 again"
+                self._conditions.event(f"{self.name}: settings", text, now)
         if self._diagnosis_due and now >= self._diagnosis_due:
             self._diagnosis_due = now + DIAGNOSIS_NS
             diagnosis = self._gateway.escs[self._index].diagnosis()
@@ -204,20 +230,20 @@ class EscInput:
         counts = [f"{count} {kind} errors" for kind, count in self.line_errors.items() if count and kind != "break"]
         return f" (the driver counts {', '.join(counts)})" if counts else ""
 
-    def _failed(self, reason: str, now: int) -> None:
+    def _failed(self, reason: str, now: int, quiet: bool = False) -> None:
         self.due = self._retry.failed(now)
         self._lost.add(self)
         self._lost_since = self._lost_since or now
         self._gateway.port_lost(self._index, now)
-        self._conditions.begin(self._port_condition, f"{self.name}: {reason} Trying again.", now)
+        self._conditions.begin(self._port_condition, f"{self.name}: {reason} Trying again.", now, quiet=quiet)
 
     def _path_now(self, others: tuple[Identity | None, ...]) -> str:
         """Where the port is: an adapter that was unplugged may come back under another number.
 
         RunError where the configured path is another ESC's adapter now: its values would be taken for this one's.
         """
-        if self.identity is None or self.path.startswith("/dev/serial/"):
-            return self.path
+        if self.identity is None or self.path.startswith("/dev/serial/") or self.identity in others:
+            return self.path  # adapters with one serial number for all cannot be told apart
         found = find_adapter(self.identity)
         if found is not None:
             return self.path if Path(self.path).resolve() == Path(found) else found

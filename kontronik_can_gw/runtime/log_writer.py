@@ -19,7 +19,7 @@ CAPACITY = 1000
 class BackgroundHandler(logging.Handler):
     """Writes to a stream from a thread. ``close`` waits for what is queued, but not for ever."""
 
-    def __init__(self, stream: TextIO, longest_end_s: float = 0.3) -> None:
+    def __init__(self, stream: TextIO, longest_end_s: float = 0.1) -> None:
         super().__init__()
         self._stream = stream
         self._longest_end_s = longest_end_s

@@ -23,6 +23,7 @@ from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
 from kontronik_can_gw.runtime.reload import Reloader
+from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, process_facts, snapshot
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.store import ParameterStore
@@ -84,7 +85,7 @@ class Loop:
         self.escs = [
             EscInput(i, path, gateway, self._selector, self.conditions, self._lost) for i, path in enumerate(ports)
         ]
-        self.can = CanSide(can_config, gateway, self._selector, self.conditions, tuple(ports))
+        self.can = CanSide(can_config, gateway, self._selector, self.conditions, self._esc_at, clock)
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
         if store is not None:
@@ -103,6 +104,17 @@ class Loop:
         self._look_due = 0
         self._wake()
 
+    @property
+    def reload_asked(self) -> bool:
+        """True while a request to read the configuration again has not been followed."""
+        return self._reload_asked
+
+    def take_over(self, old: "Loop") -> None:
+        """Know what an earlier loop learnt: which adapter is which ESC's."""
+        known = {(esc.name, esc.path): esc.identity for esc in old.escs}
+        for esc in self.escs:
+            esc.identity = known.get((esc.name, esc.path))
+
     def open(self) -> None:
         """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
         now = self._clock()
@@ -110,7 +122,7 @@ class Loop:
         try:
             # ports first, and locked: so that nothing else, a CAN adapter's driver included, opens them
             for esc in self.escs:
-                esc.open(now, self._wait)
+                esc.open(now, self._wait, self._others(esc))
             self.can.open(now, self._wait)
         except UserError:
             self.close()
@@ -187,6 +199,13 @@ class Loop:
             due.append(can_due)
         return min(due)
 
+    def _others(self, esc: EscInput) -> tuple[Identity | None, ...]:
+        return tuple(other.identity for other in self.escs if other is not esc)
+
+    def _esc_at(self, path: str) -> str | None:
+        """The name of the ESC that a path leads to."""
+        return next((esc.name for esc in self.escs if esc.is_at(path)), None)
+
     def _suspended_ns(self) -> int:
         """Held up for longer, what waits on the ports is old: a master may change the ESCs' time-outs."""
         return min([SUSPENDED_NS, *(esc.settings.timeout_ns for esc in self.gateway.escs)])
@@ -200,7 +219,7 @@ class Loop:
 
     def _reopen(self, now: int) -> None:
         for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
-            esc.reopen(now, tuple(other.identity for other in self.escs if other is not esc))
+            esc.reopen(now, self._others(esc))
         self.can.reopen(now)
         self.can.ask_if_due(now)
 
@@ -258,13 +277,11 @@ class Loop:
     # --- another configuration
 
     def _begin_reload(self) -> None:
-        self._reload_asked = False
         if self._reloader is None:
-            return
-        if not self._reloader.begin():
-            log.warning("the configuration is being read already")
-            return
-        self._notifier.reloading()
+            self._reload_asked = False
+        elif self._reloader.begin():  # otherwise it is being read: once more when that is done
+            self._reload_asked = False
+            self._notifier.reloading()
 
     def _take_reloaded(self, _now: int, _events: int) -> None:
         assert self._reloader is not None
@@ -340,6 +357,7 @@ class Loop:
     def _look_round(self, now: int) -> None:
         """What need not be done each time the loop comes round."""
         self._look_due = now + LOOK_NS
+        self.can.longest_turn_ns = self._suspended_ns()
         if self._reload_asked:
             self._begin_reload()
         for esc in self.escs:

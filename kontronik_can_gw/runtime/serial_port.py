@@ -11,6 +11,7 @@ import grp
 import os
 import struct
 import termios
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -39,6 +40,10 @@ class PortLost(Exception):
     """The port was unplugged or hung up."""
 
 
+class NoPort(RunError):
+    """There is no such port."""
+
+
 class Identity(NamedTuple):
     """What tells a USB adapter from others, whatever its number is: vendor, product, serial number, or place where it has none."""
 
@@ -55,7 +60,7 @@ class SerialPort:
         self.path = path
         is_pty = os.path.realpath(path).startswith("/dev/pts/")
         # one that does not lock it, as a getty, could write to it; its terminal is not touched
-        if Path("/sys/class/tty", Path(os.path.realpath(path)).name).exists() and (users := _users(path)):
+        if Path("/sys/class/tty", Path(os.path.realpath(path)).name).exists() and (users := _users_now_and_then(path)):
             raise _in_use(path, users)
         quiet = _open_quietly(path)
         try:
@@ -64,6 +69,7 @@ class SerialPort:
             os.close(quiet)
         self._fd = self._serial.fileno()
         self._real_path = os.path.realpath(path)
+        self._settings = termios.tcgetattr(self._fd)
         if not is_pty:
             with contextlib.suppress(OSError):
                 fcntl.ioctl(self._fd, termios.TIOCEXCL)
@@ -84,6 +90,17 @@ class SerialPort:
         if not data:
             raise PortLost("hung up")
         return data
+
+    def settings_hold(self) -> bool:
+        """Whether the port still is as it was set; if not it is set again. (Another program, as stty, can change it at any time.)"""
+        try:
+            now = termios.tcgetattr(self._fd)
+            if now == self._settings:
+                return True
+            termios.tcsetattr(self._fd, termios.TCSANOW, self._settings)
+        except (OSError, termios.error):
+            return True  # it has gone, which reading will tell
+        return False
 
     def line_errors(self) -> dict[str, int]:
         """What the driver has counted so far, by kind; empty where it counts nothing (pseudo terminals, some adapters)."""
@@ -126,23 +143,38 @@ def is_mini_uart(path: str, root: Path = Path("/")) -> bool:
     return False
 
 
+def identity_at(path: str) -> Identity | None:
+    """Of the USB adapter that a path leads to now."""
+    real = os.path.realpath(path.partition("@")[0])
+    return next((found for device, found in _adapters() if device == real), None)
+
+
 def find_adapter(identity: Identity) -> str | None:
     """The path of the adapter now, as /dev/ttyUSB1; None while it is not plugged in, or if two are alike."""
     found = [device for device, other in _adapters() if other == identity]
     return found[0] if len(found) == 1 else None
 
 
-def _adapters() -> Iterator[tuple[str, Identity]]:
-    """USB adapters that are plugged in: path and identity."""
-    from serial.tools.list_ports_linux import comports
-
-    with contextlib.suppress(OSError, ValueError):  # one is being unplugged
-        for port in comports():
-            if port.vid is not None and port.pid is not None:
-                # an adapter with several ports has one serial number for all
-                interface = (port.location or "").partition(":")[2]
-                place = interface if port.serial_number else port.location or ""
-                yield port.device, Identity(port.vid, port.pid, port.serial_number or "", place)
+def _adapters(root: Path = Path("/")) -> Iterator[tuple[str, Identity]]:
+    """USB adapters that are plugged in: path and identity. The loop waits for this, so it reads no more than is needed."""
+    names = []
+    with contextlib.suppress(OSError):
+        names = [name for name in os.listdir(root / "sys/class/tty") if name.startswith(("ttyUSB", "ttyACM"))]  # noqa: PTH208
+    for name in names:
+        with contextlib.suppress(OSError, ValueError):  # one is being unplugged
+            folder = Path(os.path.realpath(root / "sys/class/tty" / name / "device"))
+            interface = ""
+            while not (folder / "idVendor").exists() and folder.name:
+                interface = folder.name if ":" in folder.name else interface  # as 1-1.2:1.0
+                folder = folder.parent
+            if not folder.name:
+                continue
+            vendor, product = (int((folder / file).read_text(), 16) for file in ("idVendor", "idProduct"))
+            file = folder / "serial"
+            serial_number = file.read_text().strip() if file.exists() else ""
+            # an adapter with several ports has one serial number for all
+            place = interface.partition(":")[2] if serial_number else interface
+            yield f"/dev/{name}", Identity(vendor, product, serial_number, place)
 
 
 def _in_use(path: str, users: str) -> RunError:
@@ -201,7 +233,7 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
             if ports
             else "Is the adapter plugged in? See `ls /dev/serial/by-id`."
         )
-        return RunError(f"{path}: no such serial port. {there}")
+        return NoPort(f"{path}: no such serial port. {there}")
     if number == errno.EACCES:
         group, shared = "dialout", True
         with contextlib.suppress(OSError, KeyError):
@@ -223,6 +255,20 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
     return RunError(f"{path}: cannot be opened: {text}")
 
 
+_seen_users: set[Path] = set()
+_next_look: dict[str, float] = {}
+_LOOK_PAUSE_S = 10.0
+
+
+def _users_now_and_then(path: str) -> str:
+    """Who has the port open; looked for at first and then no more than every ten seconds, because it takes a while on a slow machine."""
+    now = time.monotonic()
+    if now < _next_look.get(path, 0.0) and not _seen_users:
+        return ""
+    _next_look[path] = now + _LOOK_PAUSE_S
+    return _users(path)
+
+
 def _users(path: str) -> str:
     """Who else has the port open, as far as we may see: without root's rights only who has it as terminal (a getty), and the kernel."""
     device, found = device_of(path), set()
@@ -231,17 +277,22 @@ def _users(path: str) -> str:
         lines = Path("/proc/consoles").read_text().splitlines()
         if any(line.split()[:1] == [name] for line in lines):
             found.add(f"the kernel's console (take console={name} out of the kernel's command line)")
-    for process in Path("/proc").glob("[0-9]*"):
+    seen = [process for process in _seen_users if _has_open(process, device)]
+    # who had it open when we last looked mostly has it still: all programs are not looked through each time
+    for process in seen or Path("/proc").glob("[0-9]*"):
         if process.name != str(os.getpid()) and _has_open(process, device):
             with contextlib.suppress(OSError):
-                found.add(f"{(process / 'comm').read_text().strip()} (pid {process.name})")
+                name = (process / "comm").read_text(errors="replace").strip()
+                found.add(f"{name} (pid {process.name})")
+                _seen_users.add(process)
+    _seen_users.difference_update([process for process in _seen_users if not process.exists()])
     return ", ".join(sorted(found))
 
 
 def _has_open(process: Path, device: int | None) -> bool:
     """True if a process has a device open, or as its controlling terminal (proc(5): field 7 of stat)."""
     with contextlib.suppress(OSError, ValueError, IndexError):
-        terminal = int((process / "stat").read_text().rpartition(")")[2].split()[4])
+        terminal = int((process / "stat").read_text(errors="replace").rpartition(")")[2].split()[4])
         # the kernel packs numbers as minor 7..0, major 19..8, minor 31..20
         if device is not None and terminal == _packed(device):
             return True

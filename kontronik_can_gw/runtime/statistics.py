@@ -11,7 +11,6 @@ import errno
 import json
 import os
 import selectors
-import signal
 import stat
 import threading
 import time
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.snapshot import STALE_NS, Document, with_rates
+from kontronik_can_gw.runtime.threads import start_beside_the_loop
 from kontronik_can_gw.telemetry import SECOND
 
 if TYPE_CHECKING:
@@ -123,13 +123,16 @@ class Statistics:
         selector = selectors.DefaultSelector()
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         selector.register(self._wake, selectors.EVENT_READ)
-        thread = threading.Thread(target=self._work, args=(selector,), name="statistics", daemon=True)
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are to wake the loop
-        try:
-            thread.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        thread = threading.Thread(target=self._run, args=(selector,), name="statistics", daemon=True)
+        if not start_beside_the_loop(thread):
+            raise RuntimeError("no thread can be started")
         self._thread = thread
+
+    def _run(self, selector: selectors.BaseSelector) -> None:
+        try:
+            self._work(selector)
+        except Exception as error:  # a mistake of ours in here must not go unsaid
+            self._reports.append(Report(True, f"the statistics have ended: {error!r}"))
 
     def _work(self, selector: selectors.BaseSelector) -> None:
         file, server = self._file, self._server

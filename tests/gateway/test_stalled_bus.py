@@ -42,7 +42,7 @@ def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(caplog: pyt
     tables = {"canopen": {"enabled": True, "store": "/nowhere"}, "esc": [{"port": "p"}]}
     loaded = assemble(parse(tables, "test"))
     gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
-    loop = Loop(gateway, ["p"], loaded.config.can)
+    loop = Loop(gateway, ["p"], loaded.config.can, clock=lambda: 0)
     port = loop.can.port = Port()  # type: ignore[assignment]
     assert isinstance(port, Port)
     live = bytes.fromhex("4B4F444C 00000000 8A09" + "0000" * 5 + "581F E903 00 00 1D 20 00000200 0C 00 39234C14")

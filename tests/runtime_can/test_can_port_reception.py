@@ -638,7 +638,7 @@ def test_a_link_that_goes_down_or_away_is_an_outage_at_once(scripted: tuple[Loop
     assert loop.can.is_open
     loop.can._follow(LinkFacts(exists=True, up=False), MS)
     assert (loop.can.is_open, node.status.can_state) == (False, CanState.DOWN)
-    assert loop.can.complaint.endswith(": down. Trying again.")
+    assert loop.can.complaint.endswith("the adapter has failed. Trying again.")
 
 
 def test_in_bus_off_nothing_is_handed_to_the_controller_and_the_newest_goes_first_afterwards(

@@ -89,6 +89,10 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_op
 
 
 def test_an_overlong_channel_is_no_trouble() -> None:
-    claims = Claims()
-    assert claims.hold([node_claim("x" * 300, 1)]) == []
+    claims, other = Claims(), Claims()
+    channel = f"/dev/serial/by-id/{CHANNEL}" + "x" * 300
+    names = [node_claim(channel, 1), node_claim(channel, 2), messages_claim(channel, 0x680)]
+    assert claims.hold(names) == []
+    assert other.hold([*names, node_claim(channel + "y", 1)]) == names
     claims.close()
+    other.close()

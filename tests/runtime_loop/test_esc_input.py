@@ -2,6 +2,7 @@
 
 import logging
 import selectors
+import termios
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,9 @@ class Port:
 
     def line_errors(self) -> dict[str, int]:
         return dict(self.counts)
+
+    def settings_hold(self) -> bool:
+        return True
 
     def discard(self) -> None:
         pass
@@ -250,6 +254,46 @@ def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(
     esc.serve(SECOND)
     assert not esc.is_stuck()
     bench.close()
+
+
+def test_a_usb_adapter_is_known_by_vendor_product_serial_number_and_interface(tmp_path: Path) -> None:
+    def plug(tty: str, place: str, serial_number: str) -> None:
+        usb = tmp_path / "sys/devices/pci0/usb1" / place
+        interface = usb / f"{place}:1.0"
+        (interface / tty).mkdir(parents=True)
+        (usb / "idVendor").write_text("0403\n")
+        (usb / "idProduct").write_text("6001\n")
+        if serial_number:
+            (usb / "serial").write_text(f"{serial_number}\n")
+        (tmp_path / "sys/class/tty" / tty).mkdir(parents=True)
+        (tmp_path / "sys/class/tty" / tty / "device").symlink_to(interface / tty)
+
+    plug("ttyUSB0", "1-1", "A1")
+    plug("ttyUSB1", "1-1.2", "")
+    (tmp_path / "sys/class/tty/ttyS0").mkdir()
+    (tmp_path / "sys/class/tty/ttyACM9").mkdir()  # being unplugged
+    assert dict(serial_port._adapters(tmp_path)) == {
+        "/dev/ttyUSB0": Identity(0x403, 0x6001, "A1", "1.0"),
+        "/dev/ttyUSB1": Identity(0x403, 0x6001, "", "1-1.2:1.0"),
+    }
+
+
+def test_settings_that_another_program_changes_are_set_again() -> None:
+    with PtyEsc() as esc:
+        port = serial_port.SerialPort(esc.path)
+        try:
+            assert port.settings_hold()
+            changed = termios.tcgetattr(port.fileno())
+            changed[3] |= termios.ECHO
+            changed[4] = changed[5] = termios.B9600
+            termios.tcsetattr(port.fileno(), termios.TCSANOW, changed)
+            assert not port.settings_hold()
+            assert port.settings_hold()
+            after = termios.tcgetattr(port.fileno())
+            assert not after[3] & termios.ECHO
+            assert after[4] == termios.B115200
+        finally:
+            port.close()
 
 
 def test_the_mini_uart_of_a_raspberry_pi_is_known_by_its_device_tree(tmp_path: Path) -> None:

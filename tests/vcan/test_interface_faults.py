@@ -42,7 +42,7 @@ def test_an_interface_that_goes_down_and_up_is_used_again_within_a_second(vcan: 
             assert first.time - up < 1.2
             assert any(agrees_speed(first.data, live) for when, live in run.live(0) if when > first.time - 0.2)
         assert gateway.end() == 0
-        assert gateway.log.count("down. Trying again") == 3
+        assert gateway.log.count("is down. Start it") == 3
         assert gateway.log.count("frames are sent again") == 3
 
 
