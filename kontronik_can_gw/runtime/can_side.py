@@ -241,7 +241,8 @@ class CanSide:
         if not facts.exists or not facts.up:
             self._lost(Sent.DOWN if facts.exists else Sent.GONE, now)
             return
-        behind = facts.state is CanState.BUS_OFF and now - self._restarted_ns < RESTARTED_NS
+        # a driver may learn of a restart later than who hears its error frames
+        behind = facts.state is CanState.BUS_OFF and (self._off or now - self._restarted_ns < RESTARTED_NS)
         if facts.state is not None and facts.state is not self.port.state and not behind:
             self.port.note_state(facts.state)
         self._follow_state(now)

@@ -146,7 +146,7 @@ def is_mini_uart(path: str, root: Path = Path("/")) -> bool:
 def identity_at(path: str) -> Identity | None:
     """Of the USB adapter that a path leads to now."""
     real = os.path.realpath(path.partition("@")[0])
-    return next((found for device, found in _adapters() if device == real), None)
+    return next((found for device, found in _adapters() if os.path.realpath(device) == real), None)
 
 
 def find_adapter(identity: Identity) -> str | None:

@@ -139,6 +139,38 @@ def test_two_adapters_that_change_their_numbers_stay_with_their_escs(there: dict
     bench.close()
 
 
+def test_adapters_that_all_have_one_serial_number_are_told_apart_by_their_paths(
+    there: dict[str, Identity | None],
+) -> None:
+    there |= {"/dev/ttyUSB0": LEFT, "/dev/ttyUSB1": LEFT}
+    bench = Bench("/dev/ttyUSB0", "/dev/ttyUSB1")
+    for esc in bench.escs:
+        esc.open(0, wait=False)
+    there.clear()
+    bench.lose(0, SECOND)
+    bench.lose(1, SECOND)
+    there["/dev/ttyUSB1"] = LEFT
+    bench.reopen(5 * SECOND)
+    assert bench.escs[0].port is None
+    assert bench.port(1).path == "/dev/ttyUSB1"
+    bench.close()
+
+
+def test_an_esc_is_found_behind_every_name_of_its_adapter(
+    there: dict[str, Identity | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there |= {"/dev/ttyUSB0": LEFT, "/dev/ttyUSB1": RIGHT}
+    bench = Bench("/dev/ttyUSB0")
+    bench.escs[0].open(0, wait=False)
+    there.clear()
+    bench.lose(0, SECOND)
+    there["/dev/ttyUSB1"] = LEFT
+    assert bench.escs[0].is_at("/dev/ttyUSB1@115200")
+    there["/dev/ttyUSB1"] = RIGHT
+    assert not bench.escs[0].is_at("/dev/ttyUSB1")
+    bench.close()
+
+
 def test_another_adapter_on_the_configured_path_is_taken_as_a_replacement(there: dict[str, Identity | None]) -> None:
     there["/dev/ttyUSB0"] = LEFT
     bench = Bench("/dev/ttyUSB0")

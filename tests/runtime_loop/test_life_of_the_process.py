@@ -190,14 +190,26 @@ def test_a_hang_up_reads_the_configuration_again(manager: Manager, esc: PtyEsc) 
     assert manager.restarts == 0
 
 
-def test_a_configuration_that_another_gateway_stands_against_is_given_up_for_the_old_one(
-    manager: Manager, esc: PtyEsc
+def test_no_request_to_read_again_is_lost(manager: Manager, esc: PtyEsc) -> None:
+    """Whatever it comes upon: another reading, or the change to what was read."""
+    for n in range(2, 8):
+        manager.config.write_text(configuration(esc.path, "life").replace("pole_pairs = 7", f"pole_pairs = {n}"))
+        manager.process.send_signal(signal.SIGHUP)
+        time.sleep(0.03 * n)
+    manager.config.write_text(configuration(esc.path, "life").replace("[[esc]]", '[[esc]]\nname = "last"'))
+    manager.process.send_signal(signal.SIGHUP)
+    manager.logged(f"last: {esc.path} is open")
+    assert manager.process.poll() is None
+
+
+def test_a_configuration_that_another_program_stands_against_is_given_up_for_the_old_one(
+    manager: Manager, esc: PtyEsc, tmp_path: Path
 ) -> None:
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", 0))
         busy.listen()
         number = busy.getsockname()[1]
-        more = f'[statistics]\nprometheus = "127.0.0.1:{number}"'
+        more = f'[statistics]\nprometheus = "127.0.0.1:{number}"\n[canopen]\nenabled = true\nstore = "{tmp_path}"'
         manager.config.write_text(configuration(esc.path, "life", more))
         manager.process.send_signal(signal.SIGHUP)
         manager.logged("going on with the old one")

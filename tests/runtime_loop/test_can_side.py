@@ -1,0 +1,326 @@
+"""The CAN interface in the loop: bus-off and its end, outages, what is late. Time is passed in, port and kernel are scripted."""
+
+import logging
+import selectors
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config import parse
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime import can_side
+from kontronik_can_gw.runtime.can_port import Sent, socketcan_error
+from kontronik_can_gw.runtime.can_side import CanSide
+from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.link_monitor import LinkFacts
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import MS, SECOND
+
+ACTIVE = LinkFacts(True, True, "can", CanState.ERROR_ACTIVE, 500_000, 100, (0, 0))
+OFF = ACTIVE._replace(state=CanState.BUS_OFF)
+BOOT_UP = (0x701, b"\0")
+
+
+class Port:
+    """A SocketCAN port; ``there`` False: it cannot be opened."""
+
+    there = True
+    tells_busy_from_gone = True
+    gone = False
+    waits_to_be_read = False
+
+    def __init__(self, _config: object) -> None:
+        if not Port.there:
+            raise RunError("CAN interface can0: there is none.")
+        self.state = CanState.UNKNOWN
+        self.bus_off_count = self.overruns = 0
+        self.answer = Sent.OK
+        self.sent: list[CanFrame] = []
+
+    def fileno(self) -> None:
+        return None
+
+    def set_receive_ids(self, ids: object) -> None:
+        pass
+
+    def note_state(self, state: CanState) -> None:
+        self.bus_off_count += state is CanState.BUS_OFF and self.state is not CanState.BUS_OFF
+        self.state = state
+
+    def send(self, frame: CanFrame) -> Sent:
+        if self.answer is Sent.OK:
+            self.sent.append(frame)
+            if self.state is CanState.UNKNOWN:
+                self.state = CanState.ERROR_ACTIVE
+        return self.answer
+
+    def close(self) -> None:
+        pass
+
+
+class Kernel:
+    """What rtnetlink tells: ``facts`` on being asked, and ``news`` by itself."""
+
+    def __init__(self) -> None:
+        self.facts: LinkFacts | None = None
+        self.news: list[LinkFacts] = []
+        self.asked = 0
+        self._waiting: list[LinkFacts] = []
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def open(self, path: Path) -> "Kernel":
+        self._file = path.open("wb")
+        return self
+
+    def ask(self) -> None:
+        self.asked += 1
+        if self.facts is not None:
+            self._waiting.append(self.facts)
+
+    def take(self) -> list[LinkFacts]:
+        told, self._waiting, self.news = [*self.news, *self._waiting], [], []
+        return told
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class Selector(selectors.SelectSelector):
+    """Takes any file, because nothing is waited for."""
+
+    def register(self, fileobj: object, events: int, data: object = None) -> selectors.SelectorKey:
+        return selectors.SelectorKey(fileobj, 0, events, data)  # type: ignore[arg-type]
+
+    def unregister(self, fileobj: object) -> selectors.SelectorKey:
+        return selectors.SelectorKey(fileobj, 0, 0, None)  # type: ignore[arg-type]
+
+
+class Bench:
+    def __init__(self, kernel: Kernel, self_start: bool = True) -> None:
+        canopen = {"enabled": True, "self_start": self_start, "store": "/nowhere"}
+        loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
+        self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
+        self.kernel, self.now, self.clock = kernel, 0, 0
+        self.can = CanSide(loaded.config.can, self.gateway, Selector(), Conditions(), clock=lambda: self.clock)
+
+    @property
+    def port(self) -> Port:
+        assert isinstance(self.can.port, Port)
+        return self.can.port
+
+    def start(self) -> None:
+        self.can.open(self.now, wait=True)
+        self.gateway.start(self.now, self.can.is_open)
+        self.can.transmit(self.now)
+
+    def turn(self, ms: int = 1) -> None:
+        """As the loop does, a millisecond at a time; a deadline that stays in the past would make the loop spin."""
+        for _ in range(ms):
+            self.now += MS
+            self.clock = self.now
+            self.can.hear(self.now)
+            self.can.reopen(self.now)
+            self.can.ask_if_due(self.now)
+            self.gateway.advance(self.now)
+            self.can.follow_ids()
+            self.can.transmit(self.now)
+            due = self.can.due
+            assert due is None or due > self.now or self.can.port is None
+
+    def error_frame(self, state: CanState) -> None:
+        self.port.note_state(state)
+        self.can._follow_reception(self.now)
+
+    def take(self) -> list[tuple[int, bytes]]:
+        sent, self.port.sent = [(frame.can_id, frame.data) for frame in self.port.sent], []
+        return sent
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Kernel]:
+    made = Kernel().open(tmp_path / "kernel")
+    monkeypatch.setattr(can_side, "CanPort", Port)
+    monkeypatch.setattr(can_side, "link_monitor", lambda _name: made)
+    monkeypatch.setattr(Port, "there", True)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def bench(kernel: Kernel) -> Iterator["Bench"]:
+    made = Bench(kernel)
+    yield made
+    made.can.close()
+
+
+def told(frames: list[tuple[int, bytes]]) -> list[str]:
+    """Boot-ups and emergencies, in words."""
+    words = {BOOT_UP: "boot-up"}
+    named = [words.get(frame) or (frame[1][1::-1].hex() if frame[0] == 0x081 else "") for frame in frames]
+    return [name for name in named if name]
+
+
+@pytest.mark.parametrize("late_ms", [0, 1, 40, 300])
+def test_behind_a_restart_the_node_boots_and_says_8140h_as_soon_as_the_queue_runs(
+    bench: Bench, kernel: Kernel, late_ms: int
+) -> None:
+    """The kernel's order: error frame "restarted", then the queue is started, which rtnetlink tells; before that frames vanish."""
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.turn(500)
+    bench.take()
+    kernel.facts = OFF._replace(running=False)
+    bench.error_frame(CanState.BUS_OFF)
+    bench.turn(200)
+    assert bench.take() == [], "nothing is handed to a controller that is off"
+    assert bench.gateway.status.bus_off_count == 1
+    assert bench.gateway.status.can_state is CanState.BUS_OFF
+    bench.error_frame(CanState.ERROR_ACTIVE)
+    if late_ms:
+        bench.turn(late_ms)
+        assert bench.take() == []
+    kernel.facts = ACTIVE
+    kernel.news = [ACTIVE]
+    bench.turn(2)
+    assert told(bench.take()) == ["boot-up", "8140", "0000"]
+    bench.turn(3000)
+    assert told(bench.take()) == []
+    assert bench.gateway.status.bus_off_count == 1
+
+
+def test_a_driver_that_goes_on_telling_of_bus_off_behind_a_restart_does_not_make_the_node_boot_twice(
+    bench: Bench,
+    kernel: Kernel,
+) -> None:
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.turn(500)
+    bench.take()
+    kernel.facts = OFF._replace(running=False)
+    bench.error_frame(CanState.BUS_OFF)
+    bench.turn(50)
+    bench.error_frame(CanState.ERROR_ACTIVE)
+    kernel.facts = OFF  # it runs, and its driver has not noticed
+    bench.turn(300)
+    kernel.facts = ACTIVE
+    bench.turn(2000)
+    assert told(bench.take()) == ["boot-up", "8140", "0000"]
+
+
+def test_a_controller_that_nobody_restarts_costs_nothing_and_is_said_with_the_remedy(
+    bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture
+) -> None:
+    kernel.facts = ACTIVE._replace(restart_ms=0)
+    bench.start()
+    bench.turn(10)
+    bench.port.answer = Sent.BUSY
+    bench.turn(300)
+    kernel.facts = kernel.facts._replace(state=CanState.BUS_OFF, running=False)
+    bench.turn(5000)
+    assert 40 < kernel.asked < 70, "ten times a second"
+    assert sum("restart-ms is 0" in line for line in caplog.messages) == 1
+
+
+def test_an_interface_that_is_missing_at_start_makes_one_boot_up_when_it_comes(bench: Bench, kernel: Kernel) -> None:
+    kernel.facts = LinkFacts(exists=False)
+    Port.there = False
+    bench.start()
+    bench.turn(3000)
+    Port.there = True
+    kernel.facts = ACTIVE
+    kernel.news = [ACTIVE]
+    bench.turn(2)
+    assert told(bench.take()) == ["boot-up"]
+    bench.turn(2000)
+    assert told(bench.take()) == []
+
+
+def test_old_news_of_a_link_that_was_down_does_not_close_what_was_opened_since(bench: Bench, kernel: Kernel) -> None:
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.turn(100)
+    kernel.facts = LinkFacts(exists=False)
+    Port.there = False
+    kernel.news = [LinkFacts(exists=False)]
+    bench.turn(100)
+    assert not bench.can.is_open
+    Port.there = True
+    kernel.facts = ACTIVE
+    bench.now += SECOND
+    kernel.news = []
+    bench.can.reopen(bench.now)  # by its own pause, before the kernel's news of the making are read
+    port = bench.can.port
+    kernel.news = []
+    bench.turn(100)
+    assert bench.can.port is port
+
+
+def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(bench: Bench, kernel: Kernel) -> None:
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now)
+    assert bench.gateway.status.id_conflicts == 0
+    bench.turn(300)
+    bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now)
+    assert bench.gateway.status.id_conflicts == 1
+
+
+def test_a_turn_in_which_the_process_was_stopped_sends_nothing_more(bench: Bench, kernel: Kernel) -> None:
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.turn(100)
+    bench.take()
+    for can_id in range(5):
+        bench.can.mailboxes.put(CanFrame(0x100 + can_id, b"old"))
+    real = bench.port.send
+
+    def stopped_after_two(frame: CanFrame) -> Sent:
+        if frame.can_id == 0x101:
+            bench.clock += 10 * SECOND
+        return real(frame)
+
+    bench.port.send = stopped_after_two  # type: ignore[method-assign]
+    bench.can.transmit(bench.now)
+    assert [frame for frame in bench.take() if frame[1] == b"old"] == [(0x100, b"old"), (0x101, b"old")]
+
+
+def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
+    bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.turn(100)
+    caplog.clear()
+    kernel.facts = LinkFacts(exists=True, up=False)
+    kernel.news = [kernel.facts]
+
+    def is_down(_config: object) -> Port:
+        raise socketcan_error(bench.can.config, 100)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(can_side, "CanPort", is_down)
+        bench.turn(5000)
+    kernel.facts = ACTIVE
+    kernel.news = [ACTIVE]
+    bench.turn(100)
+    down, back = caplog.messages
+    assert down.startswith("CAN interface can0: is down. Start it: sudo ip link set can0 up")
+    assert back.startswith("CAN can0: frames are sent again, after 5.0 s")
+
+
+def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> None:
+    loaded = assemble(parse({"can": {"interface": "slcan", "channel": "/dev/ttyUSB1"}, "esc": [{"port": "p"}]}, "test"))
+    gateway = Gateway(loaded.escs, loaded.layout, 0)
+    side = CanSide(
+        loaded.config.can, gateway, Selector(), Conditions(), lambda path: "left" if "USB1" in path else None
+    )
+    with pytest.raises(RunError, match="is the port of left: nothing may be sent to an ESC"):
+        side.open(0, wait=False)
+    side.close()
