@@ -27,6 +27,7 @@ BUSY_RETRY_NS = 2 * MS
 LASTING_BUSY_NS = SECOND
 ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
 """How often the kernel is asked for the controller's state: as a rule, and in bus-off."""
+ASK_RESTARTING_NS, SETTLING_NS = 20 * MS, 200 * MS
 RESTARTED_NS = SECOND
 """So long behind a restart a driver may go on telling of bus-off."""
 
@@ -65,6 +66,7 @@ class CanSide:
         self._busy_since: int | None = None
         self._stalled = False
         self._off = False
+        self._runs_since: int | None = None
         self._restarted_ns = -RESTARTED_NS
         self._served = True
         self._seen_waiting = False
@@ -253,9 +255,22 @@ class CanSide:
         return self._off and self.facts is not None and self.facts.state is not None
 
     def _has_restarted(self, now: int) -> bool:
-        """Whether the queue of a controller that left bus-off runs again; before that the kernel drops frames without a word."""
+        """Whether a controller that left bus-off takes frames again; before that they vanish without a word.
+
+        The kernel says "restarted" first, then lets the queue run, then starts the controller; only then its state is another one. There
+        are drivers that learn that late: they are not waited for.
+        """
         self._refresh_facts(now)
-        return self.facts is None or (self.facts.up and self.facts.running)
+        if self.facts is None:
+            return True
+        if not self.facts.up or not self.facts.running:
+            self._runs_since = None
+            return False
+        if self.facts.state is CanState.BUS_OFF:
+            self._runs_since = now if self._runs_since is None else self._runs_since
+            self._ask_due = now + ASK_RESTARTING_NS
+            return now - self._runs_since > SETTLING_NS
+        return True
 
     def _refresh_facts(self, now: int) -> None:
         """How the interface is now; what waits of older news is passed over."""
@@ -419,7 +434,7 @@ class CanSide:
         if self._off and port.state is not CanState.BUS_OFF:
             if not self._has_restarted(now):
                 return
-            self._restarted_ns = now
+            self._restarted_ns, self._runs_since = now, None
         self._off = port.state is CanState.BUS_OFF
         self._gateway.set_can_state(port.state, now)
         name = f"CAN {self.config.channel}"

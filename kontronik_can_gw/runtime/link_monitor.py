@@ -19,7 +19,9 @@ _INTERFACE = struct.Struct("=BxHiII")
 _ATTRIBUTE = struct.Struct("=HH")
 _NEW_LINK, _DELETED_LINK, _GET_LINK, _ERROR = 16, 17, 18, 2
 _REQUEST = 1
-_UP, _RUNNING = 0x1, 0x40
+_UP = 0x1
+_RUNS = 0x40 | 0x10000
+"""IFF_RUNNING, which the kernel may tell a second late, and IFF_LOWER_UP: the controller is on."""
 _NAME, _LINK_INFO, _INFO_KIND, _INFO_DATA = 3, 18, 1, 2
 _BIT_TIMING, _STATE, _RESTART_MS, _ERROR_COUNTERS = 1, 4, 6, 8
 _TYPE_MASK = 0x3FFF
@@ -114,7 +116,7 @@ class LinkMonitor:
             _number(can.get(_BIT_TIMING)),
             _number(can.get(_RESTART_MS)),
             struct.unpack_from("=HH", counters) if counters is not None and len(counters) >= 4 else None,
-            bool(flags & _RUNNING),
+            flags & _RUNS == _RUNS,
         )
 
 

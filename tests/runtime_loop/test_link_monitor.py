@@ -18,7 +18,7 @@ def attribute(kind: int, value: bytes) -> bytes:
     return struct.pack("=HH", 4 + len(value), kind) + value + bytes(-len(value) % 4)
 
 
-def link_message(kind: int = 16, name: str = "can0", flags: int = 0x41, can: bytes | None = b"") -> bytes:
+def link_message(kind: int = 16, name: str = "can0", flags: int = 0x10041, can: bytes | None = b"") -> bytes:
     info = b"" if can is None else attribute(18, attribute(1, b"can\0") + attribute(2, can))
     body = struct.pack("=BxHiII", 0, 280, 3, flags, 0) + attribute(3, name.encode() + b"\0") + info
     return struct.pack("=IHHII", 16 + len(body), kind, 0, 0, 0) + body
@@ -84,8 +84,9 @@ def test_a_virtual_interface_has_no_controller() -> None:
     assert heard(link_message(can=None, flags=0)) == [LinkFacts(True, False, running=False)]
 
 
-def test_a_controller_in_bus_off_is_up_and_does_not_run() -> None:
-    (facts,) = heard(link_message(can=can_data(state=3), flags=1))
+@pytest.mark.parametrize("flags", [0x1, 0x41, 0x10001])
+def test_a_controller_in_bus_off_is_up_and_does_not_run(flags: int) -> None:
+    (facts,) = heard(link_message(can=can_data(state=3), flags=flags))
     assert (facts.up, facts.running, facts.state) == (True, False, CanState.BUS_OFF)
 
 
