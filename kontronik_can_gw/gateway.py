@@ -236,7 +236,7 @@ class Gateway:
         """Of each ESC's CANopen node: node-ID, NMT state, PDOs sent so far. Empty without nodes."""
         if self.nodes is None:
             return []
-        return [(node.node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos)) for node in self.nodes.nodes]
+        return [(node.claimed_node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos)) for node in self.nodes.nodes]
 
     def _expire(self, now: int, but: int | None = None) -> None:
         """What is too old by now goes before anything is sent."""

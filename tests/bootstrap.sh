@@ -1,13 +1,14 @@
 #!/bin/sh
-# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test
+# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test|hardware
 #   demo  the project
 #   lint  and its test tools
 #   test  and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and the CANopen
-#         masters of others that the node is tried with (tests/foreign)
+#         masters of others that the node is tried with (tests/foreign); and what ``hardware`` installs
+#   hardware  and the two virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
 
-what=${1:?demo, lint or test}
+what=${1:?demo, lint, test or hardware}
 cd "$(dirname "$0")/.."
 venv=.venv/bin/python
 new_enough='import sys; sys.exit(sys.version_info < (3, 11))'
@@ -98,10 +99,28 @@ install_vcan() {
     tests/vm/setup.sh qemu || say "failed; by hand:  sudo tests/vm/setup.sh qemu"
 }
 
+# The faults that set clocks and mount file systems are never tried on the machine itself.
+install_hardware() {
+    PATH=$PATH:/usr/sbin:/sbin
+    if ! command -v linux.uml >/dev/null; then
+        can_root || { say "cannot install User Mode Linux for the fault programme:  $vm_line"; return; }
+        apt_update
+        say "User Mode Linux for the fault programme"
+        tests/vm/setup.sh uml || say "failed; by hand:  $vm_line"
+    fi
+    if ! command -v qemu-system-x86_64 >/dev/null || ! grep -qs vhci_hcd "${VM_CACHE:-tests/vm/.cache}"/*/modules; then
+        can_root || { say "cannot install QEMU for the fault programme:  sudo tests/vm/setup.sh qemu"; return; }
+        apt_update
+        say "QEMU with a kernel for the fault programme"
+        tests/vm/setup.sh qemu || say "failed; by hand:  sudo tests/vm/setup.sh qemu"
+    fi
+}
+
 [ -x "$venv" ] && "$venv" -c "$new_enough" 2>/dev/null || make_venv
 case $what in
     demo) install_project demo . ;;
     lint) install_project test '.[test]' ;;
-    test) install_project test '.[test]'; install_vcan; tests/foreign/install.sh || say "tests with the masters named above are left out" ;;
-    *) die "$what: demo, lint or test" ;;
+    hardware) install_project test '.[test]'; install_hardware ;;
+    test) install_project test '.[test]'; install_vcan; install_hardware; tests/foreign/install.sh || say "tests with the masters named above are left out" ;;
+    *) die "$what: demo, lint, test or hardware" ;;
 esac

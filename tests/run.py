@@ -1,11 +1,15 @@
 """All checks of the project, one after the other: what `make test` calls.
 
-    python tests/run.py [--only lint|types|unit|vcan]... [-- PYTEST-ARGUMENTS...]
+    python tests/run.py [--only lint|types|unit|vcan|faults|soak]... [-- PYTEST-ARGUMENTS...]
 
 lint   ruff: mistakes and format
 types  mypy --strict
 unit   pytest on this machine, all but tests/vcan
 vcan   pytest tests/vcan on real vcan interfaces: here if this kernel has them, else in a VM (tests/vm/run)
+faults the fault programme on real drivers (tests/faults): in User Mode Linux, and on the emulated hardware of QEMU
+soak   random faults for --minutes from one --seed; only when it is asked for
+
+--long lets the faults come more often and longer (an hour); --keep FOLDER keeps the results as JSON, --table puts them into the README.
 
 Exits with 0 when all that ran passed. Says what was not run, why, and the line that enables it; with CI=true in the
 environment whatever was not run, each skipped test included, is a failure. The last line printed has the totals of
@@ -13,6 +17,7 @@ all tests: `N passed, M failed, K skipped`.
 """
 
 import argparse
+import json
 import os
 import platform
 import shlex
@@ -23,6 +28,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -30,7 +36,10 @@ from typing import NoReturn
 from xml.etree import ElementTree as ET
 
 PROJECT = Path(__file__).resolve().parent.parent
-STEPS = ("lint", "types", "unit", "vcan")
+STEPS = ("lint", "types", "unit", "vcan", "faults")
+ON_DEMAND = ("soak",)
+FAULTS = PROJECT / "tests" / "faults"
+FAULTS_TIMEOUT_S = {False: 1200, True: 4 * 3600}
 VM_RUN = PROJECT / "tests" / "vm" / "vm_run.py"
 VCAN_TIMEOUT_S = 2400
 STEP_TIMEOUT_S = 2500
@@ -38,6 +47,7 @@ SEARCH_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
 
 ENABLE_VM = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
 ENABLE_VCAN_UBUNTU = f"sudo apt-get install linux-modules-extra-{platform.release()} can-utils iproute2"
+ENABLE_QEMU = "sudo tests/vm/setup.sh qemu"
 ENABLE_TOOLS = "sudo apt-get install can-utils iproute2"
 ENABLE_VENV = "python3 -m pip install -e '.[test]'"
 
@@ -88,7 +98,9 @@ def say(line: str) -> None:
     print(line, flush=True)
 
 
-def call(command: Sequence[str], environment: Mapping[str, str] | None = None) -> int:
+def call(
+    command: Sequence[str], environment: Mapping[str, str] | None = None, timeout_s: float = STEP_TIMEOUT_S
+) -> int:
     """Runs a command with our stdout and stderr and the environment's programs; its exit code, 124 if it took too long."""
     say("$ " + shlex.join(command))
     path = os.pathsep.join([str(Path(sys.executable).parent), SEARCH_PATH])
@@ -96,9 +108,9 @@ def call(command: Sequence[str], environment: Mapping[str, str] | None = None) -
         command, cwd=PROJECT, env={**os.environ, "PATH": path, **(environment or {})}, stdin=subprocess.DEVNULL
     ) as process:
         try:
-            return process.wait(STEP_TIMEOUT_S)
+            return process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            say(f"{command[0]}: no end within {STEP_TIMEOUT_S} s")
+            say(f"{command[0]}: no end within {timeout_s:g} s")
             return 124
         finally:  # ours to end, also when we are interrupted
             if process.poll() is None:
@@ -159,6 +171,16 @@ def unit(arguments: Sequence[str], scratch: Path) -> Result:
     return pytest("unit", command, scratch / "unit.xml", {})
 
 
+def in_a_vm(scratch: Path) -> dict[str, str]:
+    """The environment of what runs in a VM, where the project is read-only: only the scratch folder is written to."""
+    # python-can imports asammdf where it is installed, and with it numpy and pandas: 4 s of each process in UML.
+    without = scratch / "without"
+    without.mkdir(exist_ok=True)
+    (without / "asammdf.py").write_text('raise ImportError("kept out of the tests in a VM by tests/run.py")\n')
+    path = os.pathsep.join(filter(None, (str(without), os.environ.get("PYTHONPATH"))))
+    return {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
+
+
 def vcan(arguments: Sequence[str], scratch: Path) -> Result:
     if missing("pytest"):
         return Result("vcan", "not run", reason="pytest is not installed", enable=ENABLE_VENV)
@@ -173,15 +195,9 @@ def vcan(arguments: Sequence[str], scratch: Path) -> Result:
     tools = [tool for tool in ("ip", "candump") if not shutil.which(tool, path=SEARCH_PATH)]
     if tools:
         return Result("vcan", "not run", reason=f"there is no {' and no '.join(tools)}", enable=ENABLE_TOOLS)
-    # python-can imports asammdf where it is installed, and with it numpy and pandas: 4 s of each process in UML.
-    without = scratch / "without"
-    without.mkdir()
-    (without / "asammdf.py").write_text('raise ImportError("kept out of the vcan tests by tests/run.py")\n')
-    # The project is read-only in a VM; only the scratch folder is written to.
     environment = {
-        "PYTHONPATH": os.pathsep.join(filter(None, (str(without), os.environ.get("PYTHONPATH")))),
+        **in_a_vm(scratch),
         "KCG_VCAN": "1",
-        "PYTHONDONTWRITEBYTECODE": "1",
         "HYPOTHESIS_STORAGE_DIRECTORY": str(scratch / "hypothesis"),
     }
     command = [sys.executable, str(VM_RUN), f"--timeout={VCAN_TIMEOUT_S}", "--verbose", f"--rw={scratch}", "--"]
@@ -189,6 +205,76 @@ def vcan(arguments: Sequence[str], scratch: Path) -> Result:
     result = pytest("vcan", command, scratch / "vcan.xml", environment)
     result.detail += f" ({which})"
     return result
+
+
+def faults(scratch: Path, long: bool) -> list[Result]:
+    """The fault programme: what User Mode Linux can show, then the emulated hardware."""
+    limit = FAULTS_TIMEOUT_S[long]
+    options = ["--long"] if long else []
+    results = []
+    if not shutil.which("linux.uml", path=SEARCH_PATH):
+        results.append(Result("faults", "not run", reason="there is no User Mode Linux", enable=ENABLE_VM))
+    else:
+
+        def half(part: int) -> Result:
+            out = scratch / f"faults_uml{part}.json"
+            command = [
+                *uml_run(scratch, limit),
+                str(FAULTS / "programme.py"),
+                f"--out={out}",
+                f"--part={part}",
+                *options,
+            ]
+            return programme(f"uml{part}", command, out, scratch, limit + 60)
+
+        # A machine takes one processor. Where there is none to spare the two would only hold each other up.
+        at_once = 2 if (os.cpu_count() or 1) - os.getloadavg()[0] >= 1.5 else 1
+        with ThreadPoolExecutor(at_once) as machines:
+            results += machines.map(half, (1, 2))
+    qemu = scratch / "faults_qemu.json"
+    kernels = (Path(os.environ.get("VM_CACHE") or VM_RUN.parent / ".cache")).glob("*/vmlinux")
+    if not shutil.which("qemu-system-x86_64", path=SEARCH_PATH) or not any(kernels):
+        results.append(
+            Result("qemu", "not run", reason="there is no QEMU, or no kernel unpacked for it", enable=ENABLE_QEMU)
+        )
+    else:
+        command = [sys.executable, str(FAULTS / "qemu_programme.py"), f"--out={qemu}", *options]
+        results.append(programme("qemu", command, qemu, scratch, limit + 60))
+    return results
+
+
+def soak(scratch: Path, minutes: float, seed: int | None) -> Result:
+    """Random faults from one seed for so many minutes."""
+    if not shutil.which("linux.uml", path=SEARCH_PATH):
+        return Result("soak", "not run", reason="there is no User Mode Linux", enable=ENABLE_VM)
+    limit = 60 * minutes + 300
+    out = scratch / "soak.json"
+    command = [*uml_run(scratch, limit), str(FAULTS / "soak.py"), f"--out={out}", f"--minutes={minutes:g}"]
+    if seed is not None:
+        command.append(f"--seed={seed}")
+    return programme("soak", command, out, scratch, limit + 60)
+
+
+def uml_run(scratch: Path, timeout_s: float) -> list[str]:
+    """The beginning of a command that runs Python in User Mode Linux: the faults set clocks and mount, which no usual machine may bear."""
+    command = [sys.executable, str(VM_RUN), "--backend=uml", f"--timeout={timeout_s:g}", f"--rw={scratch}", "--"]
+    return [*command, sys.executable]
+
+
+def programme(step: str, command: Sequence[str], out: Path, scratch: Path, timeout_s: float) -> Result:
+    """Runs a part of the fault programme; each fault counts as a test."""
+    start = time.monotonic()
+    code = call(command, in_a_vm(scratch), timeout_s)
+    seconds = time.monotonic() - start
+    try:
+        rows = json.loads(out.read_text())["rows"]
+    except (OSError, ValueError, KeyError):
+        return Result(step, "FAILED", seconds, f"ended with {code} and without results", suite=Suite(failed=1))
+    good = sum(row["injected"] == row["recovered"] > 0 and not row["wrong"] and not row["lost"] for row in rows)
+    suite = Suite(passed=good, failed=len(rows) - good)
+    injected, wrong, lost = (sum(row[key] for row in rows) for key in ("injected", "wrong", "lost"))
+    detail = f"{good} of {len(rows)} faults healed, {injected} injected, {wrong} wrong values, {lost} lost"
+    return Result(step, "FAILED" if code or suite.failed else "passed", seconds, detail, suite=suite)
 
 
 def enable_vcan() -> str:
@@ -229,12 +315,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         usage="run.py [--only STEP]... [-- PYTEST-ARGUMENTS]", description=__doc__.partition("\n")[0] if __doc__ else ""
     )
-    parser.add_argument("--only", action="append", choices=STEPS, help="run this step only; may be repeated")
+    parser.add_argument(
+        "--only", action="append", choices=STEPS + ON_DEMAND, help="run this step only; may be repeated"
+    )
+    parser.add_argument("--long", action="store_true", help="faults: more often and longer")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="faults, soak: keep the results there")
+    parser.add_argument("--table", action="store_true", help="faults: put what they showed into README.md")
+    parser.add_argument("--minutes", type=float, default=10, help="soak: for so long")
+    parser.add_argument("--seed", type=int, help="soak: the faults of this seed")
     own, separator, pytest_arguments = list(sys.argv[1:]), "--" in sys.argv[1:], list[str]()
     if separator:
         at = own.index("--")
         own, pytest_arguments = own[:at], own[at + 1 :]
-    only = parser.parse_args(own).only or STEPS
+    args = parser.parse_args(own)
+    only = args.only or STEPS
     strict = os.environ.get("CI", "").lower() not in ("", "0", "false", "no")
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -242,20 +336,31 @@ def main() -> int:
     results: list[Result] = []
     with tempfile.TemporaryDirectory(prefix="kcg-test.", ignore_cleanup_errors=True) as folder:
         scratch = Path(folder)
-        for step in STEPS:
+        for step in STEPS + ON_DEMAND:
             if step not in only:
                 continue
             say(f"\n== {step}")
             if step == "lint":
-                result = lint()
+                found = [lint()]
             elif step == "types":
-                result = types()
+                found = [types()]
             elif step == "unit":
-                result = unit(pytest_arguments, scratch)
+                found = [unit(pytest_arguments, scratch)]
+            elif step == "vcan":
+                found = [vcan(pytest_arguments, scratch)]
+            elif step == "faults":
+                found = faults(scratch, args.long)
             else:
-                result = vcan(pytest_arguments, scratch)
-            say(f"== {step}: {result.state}, {result.seconds:.1f} s")
-            results.append(result)
+                found = [soak(scratch, args.minutes, args.seed)]
+            for result in found:
+                say(f"== {result.step}: {result.state}, {result.seconds:.1f} s")
+            results += found
+        if args.keep:
+            args.keep.mkdir(parents=True, exist_ok=True)
+            for file in scratch.glob("*.json"):
+                shutil.copy(file, args.keep)
+        if args.table and (kept := sorted(map(str, scratch.glob("faults_*.json")))):
+            call([sys.executable, str(FAULTS / "table.py"), *kept, str(PROJECT / "README.md")])
     return summarize(results, strict)
 
 

@@ -79,8 +79,9 @@ def _prepare_streams() -> None:
             os.fstat(number)
         except OSError:  # closed: a serial port must not get this number, or what is said would be sent to an ESC
             os.open(os.devnull, os.O_RDWR)
-    if sys.stderr is None:  # talk must not go to standard output instead
-        sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115  for the whole run
+    for name in ("stdout", "stderr"):  # talk must not go to standard output instead
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115  for the whole run
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without "µ" gets a "?"

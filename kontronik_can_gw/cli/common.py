@@ -33,6 +33,8 @@ from kontronik_can_gw.telemetry import EscSettings
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
+log = logging.getLogger("kontronik_can_gw")
+
 
 def say(text: str) -> None:
     """One line of talk."""
@@ -78,11 +80,29 @@ def fingerprint(config: Config) -> bytes:
     return digest.digest()
 
 
+def check_devices(config: Config) -> None:
+    """What leads to one device by two names: two ESCs on one port, or the CAN adapter on an ESC's. UserError with each."""
+    problems = []
+    ports: dict[str, str] = {}
+    for esc in config.esc:
+        real = os.path.realpath(esc.port)
+        if (other := ports.setdefault(real, esc.name)) != esc.name:
+            problems.append(f"{config.file}: the ports of {other} and {esc.name} are one device, {real}")
+    channel = os.path.realpath(config.can.channel.partition("@")[0])
+    if "/" in config.can.channel and channel in ports:
+        problems.append(
+            f"{config.file}: can.channel {config.can.channel} is the port of {ports[channel]}: nothing may be sent to an ESC."
+        )
+    if problems:
+        raise UserError(*problems)
+
+
 def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     """What belongs to a configuration. Without a store its files are only looked at.
 
     Configuration, DBC and EDS may be refused here. What masters stored may not: it gives way, with a warning, where it does not fit them.
     """
+    check_devices(config)
     escs, plain, kept = config.escs, None, None
     taken: dict[int, str] = {}
     bits = 0.0
@@ -150,7 +170,8 @@ def logging_to_stderr() -> Iterator[None]:
 @contextmanager
 def stopping_on_signals(stop: Callable[[], None], reload: Callable[[], None] | None = None) -> Iterator[None]:
     """SIGTERM and SIGINT call ``stop``, once more end the process at once. SIGHUP calls ``reload``; ``stop`` if the terminal has gone."""
-    has_terminal = _has_terminal()
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # as by nohup: it is to survive its terminal
+    has_terminal = _has_terminal() and not ignored
 
     def end(_number: int, _frame: object) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -159,6 +180,7 @@ def stopping_on_signals(stop: Callable[[], None], reload: Callable[[], None] | N
 
     def hang_up(_number: int, _frame: object) -> None:
         if reload is None or (has_terminal and not _has_terminal()):
+            log.warning("the terminal was closed: ending (nohup, setsid or a service goes on)")
             stop()
         else:
             reload()

@@ -1,6 +1,7 @@
 """``run``: the gateway."""
 
 import argparse
+import gc
 import logging
 import time
 from pathlib import Path
@@ -67,19 +68,22 @@ def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.runtime.systemd import Notifier
 
     notifier = Notifier()
+    refused: UserError | None = None
     with logging_to_stderr():
         try:
             _Run(args, notifier).main()
         except UserError as error:
             if not notifier.present:
                 raise
-            # the service manager starts us again: not ten times a second, for what a person has to mend
+            refused = error
             for problem in error.problems:
                 log.error("%s", problem)
-            notifier.status(f"cannot start: {error.problems[0]}")
-            time.sleep(_PAUSE_S)
-            return error.exit_code
-    return 0
+    if refused is None:
+        return 0
+    # the service manager starts us again: not ten times a second, for what a person has to mend
+    notifier.status(f"cannot start: {refused.problems[0]}")
+    time.sleep(_PAUSE_S)
+    return refused.exit_code
 
 
 class _Run:
@@ -146,9 +150,9 @@ class _Run:
         try:
             self._open(self._with_store(config, assemble), wait=True)
         except UserError as error:
-            for problem in error.problems:
-                log.error("%s", problem)
-            log.error("the new configuration cannot be used: going on with the old one")
+            assert self._loop is not None
+            for problem in (*error.problems, "the new configuration cannot be used: going on with the old one"):
+                self._loop.conditions.say(logging.ERROR, problem)
             # by what is in memory: its DBC and EDS may be others by now
             self._open(self._with_store(old.config, lambda _config, store: with_store(old, store)), wait=True)
 
@@ -193,6 +197,7 @@ class _Run:
         if self._loop is not None:
             gateway.take_over(self._loop.gateway)
             loop.take_over(self._loop)
+            gc.collect()  # what belonged to an old configuration goes in circles
         _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
         loop.open()
         for esc, _ in loaded.damaged:

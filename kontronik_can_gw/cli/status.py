@@ -158,6 +158,8 @@ def main(args: argparse.Namespace) -> int:
 
     seen = look()
     if not seen:
+        if args.json:
+            print(json.dumps({"gateways": []}))
         raise NotRunning(_no_file(configuration.file if configuration else None))
     console = Console(highlight=False)
     if not args.json and all(each.document is None for each in seen):
@@ -230,7 +232,8 @@ def judge(file: Path, document: Node, now: int, alive: bool) -> Seen:
     if not alive or age < -STALE_NS:  # from before the machine was started anew
         return Seen(file, NOT_RUNNING, "not running", (), age_s, document)
     if age > STALE_NS:
-        return Seen(file, NOT_RUNNING, f"does not answer since {duration(age_s)}", (), age_s, document)
+        said = f"does not answer since {duration(age_s)} (stopped, or the disk of its file is full)"
+        return Seen(file, NOT_RUNNING, said, (), age_s, document)
     troubles = tuple(_troubles(document))
     sentence = document.part("gateway").text("state") or "running"
     if troubles:

@@ -34,13 +34,24 @@ class Conditions:
         self._known: dict[str, _Condition] = {}
         self._summing: set[str] = set()
 
-    def begin(self, name: str, text: str, now: int, quiet: bool = False, level: int = logging.WARNING) -> None:
-        """Something is wrong from now on. Said once, and once more when ``text`` becomes another one; ``quiet``: only its end is."""
+    def begin(
+        self,
+        name: str,
+        text: str,
+        now: int,
+        quiet: bool = False,
+        level: int = logging.WARNING,
+        since: int | None = None,
+    ) -> None:
+        """Something is wrong from now on. Said once, and once more when ``text`` becomes another one; ``quiet``: only its end is.
+
+        ``since``: when it really began, where that is noticed later.
+        """
         condition = self._known.setdefault(name, _Condition())
         if condition.begun is not None and condition.reason == text:
             return
         if condition.begun is None:
-            condition.begun = now
+            condition.begun = now if since is None else since
         condition.reason = text
         if quiet:
             return
@@ -53,7 +64,7 @@ class Conditions:
             condition.summing, condition.due = True, now + MINUTE
             condition.count = condition.total = 0
             self._summing.add(name)
-            text += " This comes and goes: from now on it is summed up once a minute."
+            text = f"{text.removesuffix('.')}. This comes and goes: from now on it is summed up once a minute."
         self.say(level, text)
 
     def event(self, name: str, text: str, now: int, level: int = logging.WARNING) -> None:

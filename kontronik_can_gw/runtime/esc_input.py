@@ -179,7 +179,7 @@ class EscInput:
             self._lost_counters = (esc.counters.crc_errors, esc.counters.dropped_bytes)
             quiet = esc.link is LinkState.PORT_ERROR  # which is said by itself
             text = f"{name}: telemetry lost; its values are marked as not available"
-            told.begin(self._link_condition, text, now, quiet=quiet)
+            told.begin(self._link_condition, text, now, quiet=quiet, since=esc.live_ns)
             told.forget(self._quality_condition)
         if esc.link not in (LinkState.OK, LinkState.DEGRADED):
             return

@@ -114,6 +114,7 @@ class Loop:
         known = {(esc.name, esc.path): esc.identity for esc in old.escs}
         for esc in self.escs:
             esc.identity = known.get((esc.name, esc.path))
+        self.conditions.recent.extend(old.conditions.recent)
 
     def open(self) -> None:
         """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
@@ -285,7 +286,7 @@ class Loop:
 
     def _take_reloaded(self, _now: int, _events: int) -> None:
         assert self._reloader is not None
-        if self._reloader.take():
+        if self._reloader.take(self.conditions.say):
             self._stopping = True
         else:
             self._notifier.ready(self._status_words())

@@ -43,8 +43,8 @@ class Reloader:
         self._thread = thread
         return True
 
-    def take(self) -> bool:
-        """What came of it, said in the log. True: ``new`` is to take the old configuration's place."""
+    def take(self, say: Callable[[int, str], None]) -> bool:
+        """What came of it, said by ``say(level, text)``. True: ``new`` is to take the old configuration's place."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._event)
         if self._thread is not None:
@@ -54,13 +54,13 @@ class Reloader:
         self.new, self._result = self._result, None
         if problems is not None:
             for problem in problems:
-                log.error("%s", problem)
-            log.error("the new configuration is refused: the old one stays")
+                say(logging.ERROR, problem)
+            say(logging.ERROR, "the new configuration is refused: the old one stays")
             return False
         if self.new is None:
-            log.info("the configuration is unchanged")
+            say(logging.INFO, "the configuration is unchanged")
             return False
-        log.info("the configuration is another one: starting anew with it")
+        say(logging.INFO, "the configuration is another one: starting anew with it")
         return True
 
     def close(self) -> None:

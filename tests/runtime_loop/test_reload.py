@@ -9,10 +9,12 @@ import pytest
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.reload import Reloader
 
+log = logging.getLogger("kontronik_can_gw")
+
 
 def taken(reloader: Reloader) -> bool:
     assert select.select([reloader], [], [], 5)[0]
-    return reloader.take()
+    return reloader.take(log.log)
 
 
 def test_a_faulty_configuration_is_refused_with_its_lines_and_the_next_one_taken(

@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.runtime.claims import Claims
 from kontronik_can_gw.runtime.snapshot import STALE_NS
 from kontronik_can_gw.runtime.statistics import PERIOD_NS, Report, Statistics
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -230,7 +232,16 @@ def test_the_end_removes_the_file_ends_the_thread_and_closes_what_was_opened(fil
     assert os.listdir(file.parent) == []
 
 
-def test_a_file_that_became_another_gateways_is_left_alone(file: Path) -> None:
+def test_a_file_that_another_gateway_writes_is_refused(file: Path) -> None:
+    first = Statistics(file, None)
+    with pytest.raises(RunError, match="another gateway writes it"):
+        Statistics(file, None)
+    first.close()
+    Statistics(file, None).close()
+
+
+def test_a_file_that_became_another_gateways_is_left_alone(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Claims, "hold", lambda _self, _names: [])  # as of gateways in different network namespaces
     first, second = Statistics(file, None), Statistics(file, None)
     put(first, file, 1)
     until(lambda: first.reports(0) == [])

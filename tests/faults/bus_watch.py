@@ -1,0 +1,465 @@
+"""Judges every frame on a bus: a value is marked not available, or it is what an ESC sent a moment ago. Everything else is a wrong value.
+
+``Judge`` is pure: frames and times in. ``BusWatch`` reads a socket in a thread; times are the kernel's time stamps of the frames,
+brought to the monotonic clock, so what this process loses does not count.
+"""
+
+import contextlib
+import select
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self
+
+from encoding import info_values, live_values
+from feeder import CURRENT, SPEED, FedEsc
+from signals import Message, Table
+
+MS = 1_000_000
+SECOND = 1000 * MS
+TIMEOUT_NS = 250 * MS
+INFO_TIMEOUT_NS = 10 * SECOND
+LOOKED_BACK = 3000
+"""So many frames are searched to say where a wrong value comes from."""
+KEPT = 100
+
+_SO_TIMESTAMPNS = 35
+_SO_RCVBUFFORCE = 33
+_ERR_FILTER = 2
+_FRAME = struct.Struct("=IB3x8s")
+_STAMP = struct.Struct("=qq")
+_EXTENDED, _ERROR, _ID = 0x80000000, 0x20000000, 0x1FFFFFFF
+_FOLLOWS = {"Speed": SPEED, "Current": CURRENT}
+
+
+class Wrong(NamedTuple):
+    """A value that should not have been on the bus."""
+
+    at_ns: int
+    message: str
+    data: str
+    why: str
+    since_ns: int | None = None
+    """Where it is right but old: when it was sent."""
+    excess_ns: int = 0
+    """And by how much it is too old."""
+    esc: int = 0
+    n: int = -1
+    follows: int = 0
+
+
+class Fresh(NamedTuple):
+    """A right value frame: when, and the number of the live frame that it is from."""
+
+    at_ns: int
+    n: int
+
+
+class Emergency(NamedTuple):
+    at_ns: int
+    node: int
+    code: int
+    data: bytes
+
+
+class Judge:
+    """What was sent, what came, and whether it is right.
+
+    ``timeout_ns``: how old a live value may be by the configuration; ``slack_ns``: what the machine is given on top.
+    """
+
+    def __init__(
+        self,
+        table: Table,
+        escs: Sequence[FedEsc],
+        slack_ns: int = 60 * MS,
+        timeout_ns: int = TIMEOUT_NS,
+        node_ids: Sequence[int] = (),
+    ) -> None:
+        self.table = table
+        self.escs = escs
+        self.slack_ns = slack_ns
+        self.timeout_ns = timeout_ns
+        self.wrong: list[Wrong] = []
+        """The newest ones, settled."""
+        self.wrong_count = 0
+        """Settled ones; see ``settle``."""
+        self.late_count = 0
+        """Values that were old only because the machine stood still."""
+        self.frames = 0
+        self.values = 0
+        """Frames with values that were compared and right."""
+        self.marked = 0
+        """Frames in which all values were marked not available."""
+        self.unknown = 0
+        self.boot_ups: list[tuple[int, int]] = []
+        """(time, node)"""
+        self.heartbeats: deque[tuple[int, int, int]] = deque(maxlen=1000)
+        """(time, node, state)"""
+        self.emergencies: list[Emergency] = []
+        self.errors: deque[tuple[int, int, bytes]] = deque(maxlen=1000)
+        """Error frames of the watched interface: (time, class, data)."""
+        self.fresh: list[deque[Fresh]] = [deque(maxlen=5_000) for _ in escs]
+        """The EscSpeed frames that were right."""
+        self.marks: list[int] = [0 for _ in escs]
+        """When an EscSpeed frame marked as not available came last."""
+        self.longest_silence_ns = [0 for _ in escs]
+        self.last_ns = 0
+        self._last_fresh_ns = [0 for _ in escs]
+        self._suspects: list[Wrong] = []
+        self._newest: dict[int, int] = {}  # CAN id -> number of the newest live frame that it has carried
+        self._bits: dict[str, tuple[int, Message, int]] = {}  # message name -> time, message, content
+        self._nodes = set(node_ids) or set(range(1, len(escs) + 1))
+        self._live: list[dict[int, dict[str, float]]] = [{} for _ in escs]
+        self._info: list[dict[int, dict[str, float]]] = [{} for _ in escs]
+        self._devices: list[int | None] = [None for _ in escs]
+
+    def take(self, can_id: int, data: bytes, at_ns: int) -> None:
+        """A classic frame with an 11-bit identifier that the gateway has sent."""
+        self.frames += 1
+        self.last_ns = at_ns
+        if can_id > 0x700 and can_id - 0x700 in self._nodes and len(data) == 1:
+            if data[0] == 0:
+                self.boot_ups.append((at_ns, can_id - 0x700))
+            self.heartbeats.append((at_ns, can_id - 0x700, data[0]))
+            return
+        if 0x80 < can_id <= 0xFF and can_id - 0x80 in self._nodes and len(data) == 8:
+            self.emergencies.append(Emergency(at_ns, can_id - 0x80, int.from_bytes(data[:2], "little"), data))
+            return
+        message = self.table.get(can_id)
+        if message is None:
+            self.unknown += 1
+            return
+        bits = int.from_bytes(data, "little")
+        if message.kind == "other":
+            name = message.stem if message.esc is None else f"Esc{message.esc + 1}{message.stem}"
+            self._bits[name] = (at_ns, message, bits)
+            if message.stem == "Link":
+                self._judge_age(message, bits, at_ns)
+            return
+        present = []
+        for place in message.places:
+            raw = bits >> place.start & place.mask
+            if raw & place.sign:
+                raw -= place.mask + 1
+            if raw != place.not_available:
+                present.append((place.name, raw * place.scale, place.scale / 2 + 1e-9))
+        assert message.esc is not None
+        if not present:
+            self.marked += 1
+            if message.stem == "Speed":
+                self.marks[message.esc] = at_ns
+            return
+        start, mask = message.flags
+        has_state = mask and any(name in ("operating_state", "device") for name, _, _ in present)
+        flags = (bits >> start & mask) if has_state else None
+        if message.kind == "info":
+            self._judge_info(message, data, present, flags, at_ns)
+        else:
+            self._judge_live(message, data, present, flags, at_ns)
+
+    def value(self, message: str, signal: str) -> int | None:
+        """The newest raw value of a signal of the gateway's own messages or of ``EscNLink``; None before the first."""
+        found = self._bits.get(message)
+        if found is None:
+            return None
+        return next(place.raw(found[2]) for place in found[1].places if place.name == signal)
+
+    def info_device(self, esc: int) -> int | None:
+        """The device number that an ESC's newest right EscInfo told."""
+        return self._devices[esc]
+
+    def time_of(self, message: str) -> int:
+        """When that message came last, 0 if never."""
+        return self._bits[message][0] if message in self._bits else 0
+
+    def first_fresh(self, esc: int, after_ns: int, sent_after_ns: int = 0) -> Fresh | None:
+        """The first right value frame of an ESC after a time, of a live frame that was sent after another."""
+        found, back = None, 1
+        frames, sent = self.fresh[esc], self.escs[esc].sent
+        while back <= len(frames):  # not by iterating: the judge goes on meanwhile
+            fresh = frames[-back]
+            if fresh.at_ns <= after_ns:
+                break
+            if sent[fresh.n] >= sent_after_ns:
+                found = fresh
+            back += 1
+        return found
+
+    def settle(self, stood_still: Callable[[int, int], int]) -> None:
+        """Decide on what came too late so far: the time in which the machine as a whole stood still does not count."""
+        suspects, self._suspects = self._suspects, []
+        for each in suspects:
+            stood = 0 if each.since_ns is None else stood_still(each.since_ns, each.at_ns)
+            # short standstills between the long ones are not noted: four fifths have to be
+            if each.since_ns is not None and 5 * stood >= 4 * each.excess_ns:
+                self.late_count += 1
+                if each.follows:
+                    self.escs[each.esc].seen[each.n] |= each.follows
+            else:
+                self.wrong_count += 1
+                if stood:
+                    each = each._replace(why=f"{each.why}; the machine stood still for {stood // MS} ms of it")
+                self.wrong.append(each)
+                del self.wrong[:-KEPT]
+
+    def forgive(self, most: int, begin_ns: int, end_ns: int) -> int:
+        """Take back so many settled values of that time at most that were right but old; how many it were."""
+        old = [each for each in self.wrong if each.since_ns is not None and begin_ns <= each.at_ns <= end_ns][:most]
+        for each in old:
+            self.wrong.remove(each)
+            self.wrong_count -= 1
+            if each.follows:
+                self.escs[each.esc].seen[each.n] |= each.follows
+        return len(old)
+
+    def reset_silence(self) -> None:
+        """Measure the longest silence anew."""
+        now = time.monotonic_ns()
+        self.longest_silence_ns = [0 for _ in self.escs]
+        self._last_fresh_ns = [now for _ in self.escs]
+
+    # --- judging
+
+    def _judge_live(
+        self, message: Message, data: bytes, present: list[tuple[str, float, float]], flags: int | None, at_ns: int
+    ) -> None:
+        assert message.esc is not None
+        esc = self.escs[message.esc]
+        newest = esc.newest(at_ns + MS)
+        n = newest
+        while n >= 0 and at_ns - esc.left(n) <= self.timeout_ns + self.slack_ns:
+            if self._is_live(message.esc, n, present, flags):
+                break
+            n -= 1
+        else:
+            self._suspects.append(self._origin(message, data, n, newest, present, flags, at_ns))
+            return
+        if n < self._newest.get(message.can_id, -1):
+            newer = self._newest[message.can_id]
+            self._say_wrong(message, data, at_ns, f"values of frame {n} after those of frame {newer}")
+            return
+        self._newest[message.can_id] = n
+        self.values += 1
+        if follows := _FOLLOWS.get(message.stem):
+            esc.seen[n] |= follows
+            if follows == SPEED:
+                self.fresh[message.esc].append(Fresh(at_ns, n))
+                if (last := self._last_fresh_ns[message.esc]) and at_ns - last > self.longest_silence_ns[message.esc]:
+                    self.longest_silence_ns[message.esc] = at_ns - last
+                self._last_fresh_ns[message.esc] = at_ns
+
+    def _origin(
+        self,
+        message: Message,
+        data: bytes,
+        n: int,
+        newest: int,
+        present: list[tuple[str, float, float]],
+        flags: int | None,
+        at_ns: int,
+    ) -> Wrong:
+        """Where values come from that none of the newest frames had."""
+        assert message.esc is not None
+        fed = self.escs[message.esc]
+        name = f"Esc{message.esc + 1}{message.stem}"
+        oldest = max(0, newest - LOOKED_BACK)
+        while n >= oldest:
+            if self._is_live(message.esc, n, present, flags, keep=False):
+                age = at_ns - fed.left(n)
+                why = f"old: frame {n}, sent {age / SECOND:.3f} s before"
+                excess = age - self.timeout_ns - self.slack_ns
+                follows = _FOLLOWS.get(message.stem, 0)
+                return Wrong(at_ns, name, data.hex(), why, fed.sent[n], excess, message.esc, n, follows)
+            n -= 1
+        for other in range(len(self.escs)):
+            if other != message.esc and (m := self.escs[other].newest(at_ns)) >= 0:
+                for k in range(m, max(-1, m - 20), -1):
+                    if self._is_live(other, k, present, flags, keep=False):
+                        return Wrong(at_ns, name, data.hex(), f"of another ESC: frame {k} of esc{other + 1}")
+        text = ", ".join(f"{value_name} {value:g}" for value_name, value, _ in present)
+        return Wrong(at_ns, name, data.hex(), f"never sent: {text}; newest frame {newest}")
+
+    def _judge_info(
+        self, message: Message, data: bytes, present: list[tuple[str, float, float]], flags: int | None, at_ns: int
+    ) -> None:
+        assert message.esc is not None
+        esc = self.escs[message.esc]
+        m = newest = esc.newest_info(at_ns + MS)
+        while m >= 0 and at_ns - esc.info_sent[m] <= INFO_TIMEOUT_NS + self.slack_ns:
+            values = self._info[message.esc].get(m)
+            if values is None:
+                values = info_values(esc.info(m))
+                self._keep(self._info[message.esc], m, values)
+            if not flags and _same(values, present):
+                self.values += 1
+                if "device" in values and message.stem == "Info":
+                    self._devices[message.esc] = int(values["device"])
+                return
+            m -= 1
+        text = ", ".join(f"{name} {value:g}" for name, value, _ in present)
+        self._say_wrong(message, data, at_ns, f"no info of the last 10 s: {text}; newest {newest}")
+
+    def _judge_age(self, message: Message, bits: int, at_ns: int) -> None:
+        """The age of the data must not be told younger than what was sent last."""
+        assert message.esc is not None
+        place = next(place for place in message.places if place.name == "data_age")
+        age = place.raw(bits)
+        if age == place.not_available or age >= 65_000:
+            return
+        newest = self.escs[message.esc].newest(at_ns + MS)
+        true_age = (at_ns - self.escs[message.esc].left(newest)) / MS if newest >= 0 else 1e9
+        if age < true_age - self.slack_ns / MS - 5:
+            sent = self.escs[message.esc].sent[newest] if newest >= 0 else None
+            why = f"an age of {age} ms; the newest is {true_age:.0f} ms old"
+            excess = int((true_age - age) * MS) - self.slack_ns
+            name = f"Esc{message.esc + 1}{message.stem}"
+            self._suspects.append(Wrong(at_ns, name, f"{bits:016x}", why, sent, excess))
+
+    def _is_live(
+        self, esc: int, n: int, present: list[tuple[str, float, float]], flags: int | None, keep: bool = True
+    ) -> bool:
+        values = self._live[esc].get(n)
+        if values is None:
+            fed = self.escs[esc]
+            data = fed.live(n)
+            values = live_values(data, fed.identity_of_live(n).cells)
+            values["flags"] = data.operating_errors & 0xFFFFFF
+            if keep:
+                self._keep(self._live[esc], n, values)
+        return _same(values, present) and (flags is None or flags == values["flags"])
+
+    @staticmethod
+    def _keep(cache: dict[int, dict[str, float]], n: int, values: dict[str, float]) -> None:
+        cache[n] = values
+        if len(cache) > 80:
+            del cache[next(iter(cache))]
+
+    def _say_wrong(self, message: Message, data: bytes, at_ns: int, why: str) -> None:
+        name = message.stem if message.esc is None else f"Esc{message.esc + 1}{message.stem}"
+        self._suspects.append(Wrong(at_ns, name, data.hex(), why))
+
+
+def _same(values: dict[str, float], present: list[tuple[str, float, float]]) -> bool:
+    return all(abs(values[name] - value) <= half for name, value, half in present)
+
+
+def _both_clocks() -> tuple[int, int]:
+    """Monotonic and wall clock of one moment: not with another thread's turn in between."""
+    for _ in range(20):
+        before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        if after - before < MS // 5:
+            break
+    return after, wall
+
+
+class BusWatch(Judge):
+    """A judge with a socket on all interfaces, of which one is listened to: it may be deleted and made again meanwhile.
+
+    ``ignore_local``: frames that were sent on the watched interface itself are foreign traffic and not judged. That is so where
+    the gateway is at the other end: of a vxcan pair, of a controller pair, of two adapters.
+    """
+
+    def __init__(
+        self,
+        interface: str,
+        table: Table,
+        escs: Sequence[FedEsc],
+        *,
+        slack_ns: int = 60 * MS,
+        timeout_ns: int = TIMEOUT_NS,
+        ignore_local: bool = True,
+        node_ids: Sequence[int] = (),
+    ) -> None:
+        super().__init__(table, escs, slack_ns, timeout_ns, node_ids)
+        self.interface = interface
+        self.foreign = 0
+        self.extended = 0
+        self.failure: BaseException | None = None
+        self._ignore_local = ignore_local
+        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        for option in (_SO_RCVBUFFORCE, socket.SO_RCVBUF):
+            with contextlib.suppress(OSError):
+                self._socket.setsockopt(socket.SOL_SOCKET, option, 48 << 20)
+                break
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._socket.setsockopt(socket.SOL_CAN_RAW, _ERR_FILTER, 0x1FFFFFFF)
+        self._socket.bind(("",))
+        self._socket.settimeout(0.1)
+        now, wall = _both_clocks()
+        self._offsets = deque([wall - now], maxlen=8)
+        """Wall clock less monotonic clock, one for each time that it was set."""
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="bus watch", daemon=True)
+
+    def start(self) -> Self:
+        self._thread.start()
+        return self
+
+    def _run(self) -> None:
+        try:
+            while not self._closed:
+                try:
+                    data, ancillary, flags, address = self._socket.recvmsg(16, 64)
+                except TimeoutError:
+                    continue
+                except OSError:  # an interface went down or away; the socket is still good
+                    continue
+                self._received(data, ancillary, flags, address)
+        except BaseException as error:
+            self.failure = error
+            raise
+
+    def _received(self, data: bytes, ancillary: list[Any], flags: int, address: Any) -> None:
+        if address[0] != self.interface or len(data) != _FRAME.size:
+            return
+        now, wall = _both_clocks()
+        self._note_offset(wall - now)
+        at_ns = now
+        for _, kind, content in ancillary:
+            if kind == _SO_TIMESTAMPNS and len(content) >= _STAMP.size:
+                seconds, rest = _STAMP.unpack(content[: _STAMP.size])
+                at_ns = self._monotonic(seconds * SECOND + rest, now)
+        can_id, size, content = _FRAME.unpack(data)
+        if can_id & _ERROR:
+            self.errors.append((at_ns, can_id & _ID, content))
+        elif self._ignore_local and flags & socket.MSG_DONTROUTE:
+            self.foreign += 1
+        elif can_id & _EXTENDED:
+            self.extended += 1
+        else:
+            self.take(can_id & 0x7FF, content[:size], at_ns)
+
+    def catch_up(self, seconds: float = 90) -> None:
+        """Wait until everything that has come was judged: on a busy machine the judge may be seconds behind, which matters to nobody."""
+        deadline = time.monotonic() + seconds
+        while select.select([self._socket], [], [], 0)[0] and time.monotonic() < deadline:
+            time.sleep(0.005)
+        time.sleep(0.02)
+
+    def note_clocks(self) -> None:
+        """To be called before and after the wall clock is set."""
+        now, wall = _both_clocks()
+        self._note_offset(wall - now)
+
+    def _note_offset(self, offset: int) -> None:
+        if abs(offset - self._offsets[-1]) > 50 * MS:
+            self._offsets.append(offset)
+        else:
+            self._offsets[-1] = offset  # as it drifts
+
+    def _monotonic(self, stamp: int, now: int) -> int:
+        """A kernel's time stamp on the monotonic clock, whatever the wall clock was set to when it was made."""
+        for offset in reversed(self._offsets):
+            if self.last_ns - SECOND // 10 <= stamp - offset <= now + MS:
+                return stamp - offset
+        return now
+
+    def close(self) -> None:
+        self._closed = True
+        if self._thread.is_alive():
+            self._thread.join(5)
+        self._socket.close()

@@ -1,0 +1,571 @@
+"""The bench of the fault programme: fed ESCs, a gateway process, a judge of the bus, and the account of each injected fault.
+
+    bench = Bench(interfaces, [PtyPort(...)], report)           # or any port with ``fed``, ``close`` and ``received``
+    with bench.injection(fault, escs=(0,)) as injection:        # who is disturbed by it; () : nobody may be
+        ...the fault is on...
+        injection.cleared()                                     # its cause is gone: from now on the recovery counts
+        injection.wait_recovery()                               # the first right value that was sent since then
+
+At the end of the ``with`` the bus is watched a while longer, then wrong and lost values are put down to the fault. Times are
+monotonic nanoseconds, of frames the kernel's.
+"""
+
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Protocol, Self
+
+from bus_watch import MS, SECOND, BusWatch, Judge
+from encoding import GEAR, POLE_PAIRS, Identity
+from fault_report import FAULTS, Fault, Report, Row, fault, line
+from feeder import CURRENT, SPEED, FedEsc, Feeder
+from signals import Table, table_of_configuration
+
+from kontronik_can_gw.offline.pty import PtyEsc
+
+__all__ = [
+    "FAULTS",
+    "MS",
+    "SECOND",
+    "Bench",
+    "BusWatch",
+    "Fault",
+    "FedEsc",
+    "Feeder",
+    "Gateway",
+    "Identity",
+    "Injection",
+    "Judge",
+    "Metronome",
+    "NotRecovered",
+    "Port",
+    "PtyPort",
+    "Report",
+    "Row",
+    "fault",
+    "line",
+]
+
+IN_FLIGHT_NS = 60 * MS
+"""A frame that was handed over so shortly before a fault may be its victim."""
+SETTLE_S = 0.5
+STANDSTILL_NS = 8 * MS
+AHEAD = ("chrt", "-f", "10")
+"""The gateway goes before the bench's own processes, with which it shares a processor here."""
+_METRONOME = """
+import sys, time
+last = time.monotonic_ns()
+while True:
+    time.sleep(0.004)
+    now = time.monotonic_ns()
+    if now - last > 12_000_000:
+        print(last + 4_000_000, now, flush=True)
+    last = now
+"""
+
+
+class NotRecovered(AssertionError):
+    """The gateway did not come back in time."""
+
+
+class Gateway:
+    """``kontronik-can-gw run`` as its own process, with a prefix (``setpriv``) and an environment if need be.
+
+    (Like GatewayProcess of the vcan tests, without the libraries that those import: emulated, they cost seconds.)
+    """
+
+    def __init__(
+        self,
+        config: Path,
+        *options: str,
+        prefix: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        command = [*AHEAD, *prefix, sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)]
+        self.started_ns = time.monotonic_ns()
+        self.process = subprocess.Popen(
+            [*command, *options],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **(environment or {})},
+        )
+        self.lines: list[str] = []
+        """What it has logged so far."""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr
+        for text in self.process.stderr:
+            self.lines.append(text.rstrip())
+
+    @property
+    def log(self) -> str:
+        return "\n".join(self.lines)
+
+    def end(self, number: int = 15, seconds: float = 5) -> int:
+        """Send a signal and wait for the exit code."""
+        self.process.send_signal(number)
+        try:
+            return self.process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            raise NotRecovered(f"it did not end within {seconds:g} s of signal {number}") from None
+
+    def kill(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self._reader.join(2)
+        if self.process.stderr and not self.process.stderr.closed:
+            self.process.stderr.close()
+
+    @property
+    def alive(self) -> bool:
+        return self.process.poll() is None
+
+    def figures(self) -> dict[str, int]:
+        """Resident memory in KiB, open descriptors, threads."""
+        folder = Path("/proc", str(self.process.pid))
+        status = dict(row.split(":", 1) for row in (folder / "status").read_text().splitlines())
+        return {
+            "rss": int(status["VmRSS"].split()[0]),
+            "descriptors": len(list((folder / "fd").iterdir())),
+            "threads": int(status["Threads"]),
+        }
+
+    def processor_seconds(self) -> float:
+        fields = Path("/proc", str(self.process.pid), "stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+class Port(Protocol):
+    """An ESC and the line to the gateway."""
+
+    fed: FedEsc
+
+    @property
+    def path(self) -> str:
+        """What the gateway opens."""
+
+    def received(self) -> int:
+        """Bytes that the gateway has sent to the ESC so far."""
+
+    def close(self) -> None: ...
+
+
+class PtyPort:
+    """A fed ESC on a pseudo terminal behind a symbolic link; it may be unplugged and plugged in again."""
+
+    def __init__(self, link: Path, identity: Identity, rate_hz: float = 50, plugged: bool = True) -> None:
+        self.link = link
+        self.fed = FedEsc(self.write, identity, rate_hz)
+        self._lock = threading.Lock()
+        self._received = 0
+        self._pty: PtyEsc | None = None
+        if plugged:
+            self.plug()
+
+    @property
+    def path(self) -> str:
+        return str(self.link)
+
+    @property
+    def device(self) -> str:
+        """The terminal behind the link."""
+        assert self._pty is not None
+        return self._pty.path
+
+    def write(self, data: bytes) -> bool:
+        with self._lock:
+            return self._pty is not None and self._pty.write(data)
+
+    def unplug(self) -> None:
+        """The terminal hangs up, the link goes."""
+        with self._lock:
+            pty, self._pty = self._pty, None
+            if pty is not None:
+                pty.check()
+                self._received += pty.received
+                pty.close()
+
+    def plug(self, other: bool = False) -> None:
+        """A new terminal behind the same link; ``other``: certainly under another number than the one before."""
+        before = PtyEsc() if other else None
+        with self._lock:
+            assert self._pty is None
+            self._pty = PtyEsc(self.link)
+        if before is not None:
+            before.close()
+
+    def received(self) -> int:
+        with self._lock:
+            if self._pty is not None:
+                self._pty.check()
+                return self._received + self._pty.received
+            return self._received
+
+    def close(self) -> None:
+        self.unplug()
+
+
+class Metronome:
+    """A process that only wakes up, and notes when it could not: then nothing could run, the gateway neither."""
+
+    def __init__(self) -> None:
+        self.stalls: list[tuple[int, int]] = []
+        command = ["chrt", "-f", "20", sys.executable, "-S", "-E", "-c", _METRONOME]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout
+        for words in self._process.stdout:
+            begin, end = words.split()
+            self.stalls.append((int(begin), int(end)))
+
+    def stood_still(self, begin_ns: int, end_ns: int) -> int:
+        """Nanoseconds of that time in which nothing ran."""
+        total = 0
+        for begin, end in reversed(self.stalls):
+            if end < begin_ns:
+                break
+            total += max(0, min(end, end_ns) - max(begin, begin_ns))
+        return total
+
+    def close(self) -> None:
+        self._process.terminate()
+        self._process.wait()
+        self._thread.join(2)
+        if self._process.stdout:
+            self._process.stdout.close()
+
+
+class Bench:
+    """Everything that runs around one gateway.
+
+    ``interface`` is the gateway's, ``watched`` where the judge listens: the far end of it, where there is one. ``options``
+    is further text of the configuration's tables; ``esc_options`` of each ESC's.
+    """
+
+    def __init__(
+        self,
+        interface: str,
+        watched: str,
+        ports: Sequence[Port],
+        report: Report,
+        *,
+        slack_ns: int = 60 * MS,
+        canopen: str | None = "self_start = true",
+        options: str = "",
+        esc_options: str = "",
+        table: Table | None = None,
+        store: Path | None = None,
+        run_options: Sequence[str] = ("--wait",),
+        prefix: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+        start_limit_s: float = 20,
+    ) -> None:
+        self.interface = interface
+        self.watched = watched
+        self.ports = list(ports)
+        self.fed = [port.fed for port in ports]
+        self.report = report
+        self.folder = Path(tempfile.mkdtemp(prefix="faults."))
+        self.store = store or self.folder / "store"
+        self.config = self.folder / "gateway.toml"
+        self.run_options = tuple(run_options)
+        self.prefix = tuple(prefix)
+        self.environment = dict(environment or {})
+        self.start_limit_s = start_limit_s
+        self._canopen = canopen
+        self.write_configuration(options, esc_options)
+        if table is None:
+            table = table_of_configuration(self.config, canopen is not None, len(ports))
+        self.watch = BusWatch(watched, table, self.fed, slack_ns=slack_ns, ignore_local=watched != interface).start()
+        self.metronome = Metronome()
+        self.feeder = Feeder(self.fed).start()
+        self.gateway: Gateway | None = None
+        self.losses: list[tuple[int, str]] = []
+        """When each value was sent that was lost, and which it was."""
+        self._accounted = [0 for _ in ports]
+        self._received = 0
+        self._excluded: list[list[tuple[int, int]]] = [[] for _ in ports]
+
+    def write_configuration(self, options: str = "", esc_options: str = "") -> None:
+        self.config.write_text(self.configuration(options, esc_options))
+
+    def configuration(self, options: str = "", esc_options: str = "") -> str:
+        text = f'[can]\ninterface = "socketcan"\nchannel = "{self.interface}"\nbitrate = 1000000\n'
+        if self._canopen is not None:
+            text += (
+                f'[canopen]\nenabled = true\nnode_id = 1\nserial = 1050112\nstore = "{self.store}"\n{self._canopen}\n'
+            )
+        text += f"{options}\n"
+        for i, port in enumerate(self.ports):
+            text += f'[[esc]]\nname = "esc{i + 1}"\nport = "{port.path}"\npole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n'
+            text += f"{esc_options}\n"
+        return text
+
+    # --- the gateway
+
+    def start(self, *, wait: bool = True) -> Gateway:
+        """Start the gateway; ``wait``: until every ESC that is on has its values on the bus. NotRecovered if they do not come."""
+        assert self.gateway is None
+        begin = time.monotonic_ns()
+        self.gateway = Gateway(self.config, *self.run_options, prefix=self.prefix, environment=self.environment)
+        if wait:
+            on = [i for i, fed in enumerate(self.fed) if fed.on]
+            self.wait_fresh(on, begin, self.start_limit_s)
+            self.leave_out(range(len(self.ports)), begin - IN_FLIGHT_NS, time.monotonic_ns())
+        return self.gateway
+
+    def stop(self, number: int = 15) -> int:
+        """End the gateway by a signal; its exit code."""
+        assert self.gateway is not None
+        gateway, self.gateway = self.gateway, None
+        try:
+            return gateway.end(number, 10)
+        finally:
+            gateway.kill()
+
+    def wait_fresh(self, escs: Sequence[int], after_ns: int, seconds: float, sent_after_ns: int = 0) -> int:
+        """Wait until each of these ESCs has had a right value on the bus after a time; when the last of them came first."""
+        deadline, judged_ns = time.monotonic_ns() + int(seconds * SECOND), 0
+        while True:
+            found = [self.watch.first_fresh(esc, after_ns, sent_after_ns) for esc in escs]
+            if all(found):
+                return max([fresh.at_ns for fresh in found if fresh] or [time.monotonic_ns()])
+            if judged_ns:
+                silent = [f"esc{esc + 1}" for esc, fresh in zip(escs, found, strict=True) if fresh is None]
+                raise NotRecovered(f"no right value of {', '.join(silent)} within {seconds:g} s; {self.last_words()}")
+            self.check_alive()
+            if time.monotonic_ns() > deadline:
+                self.watch.catch_up()  # and look once more
+                judged_ns = time.monotonic_ns()
+            else:
+                time.sleep(0.01)
+
+    def wait_until(self, condition: Callable[[], bool], seconds: float, what: str) -> float:
+        """Wait until something holds; the seconds it took. NotRecovered when it does not come."""
+        begin, last = time.monotonic(), False
+        while not condition():
+            if last:
+                raise NotRecovered(f"{what}: not within {seconds:g} s; {self.last_words()}")
+            self.check_alive()
+            if time.monotonic() - begin > seconds:
+                self.watch.catch_up()
+                last = True
+            else:
+                time.sleep(0.01)
+        return time.monotonic() - begin
+
+    def check_alive(self) -> None:
+        if self.gateway is not None and not self.gateway.alive:
+            raise NotRecovered(f"the gateway ended with {self.gateway.process.returncode}; {self.last_words()}")
+        for failure in (self.feeder.error, self.watch.failure):
+            if failure is not None:
+                raise failure
+
+    def last_words(self) -> str:
+        lines = self.gateway.lines[-6:] if self.gateway is not None else []
+        return "the gateway's last lines: " + " | ".join(lines) if lines else "the gateway said nothing"
+
+    def running_s(self, begin_ns: int, end_ns: int) -> float:
+        """Seconds of that time in which the machine did not stand still."""
+        time.sleep(0.02)
+        return (end_ns - begin_ns - self.metronome.stood_still(begin_ns, end_ns)) / SECOND
+
+    # --- accounts
+
+    def leave_out(self, escs: Sequence[int] | range, begin_ns: int, end_ns: int) -> None:
+        """What these ESCs sent in that time need not come to the bus."""
+        for esc in escs:
+            self._excluded[esc].append((begin_ns, end_ns))
+
+    def account(self, until_ns: int | None = None) -> tuple[int, int]:
+        """How many values that were sent since the last account, outside of all faults, never came; how many were excused."""
+        if until_ns is None:
+            until_ns = time.monotonic_ns() - 150 * MS
+        self.watch.catch_up()
+        time.sleep(0.05)  # until the metronome has told of the last standstill
+        self.watch.settle(self.metronome.stood_still)
+        lost = excused = 0
+        for index, fed in enumerate(self.fed):
+            last = fed.newest(until_ns)
+            for n in range(self._accounted[index], last + 1):
+                if not fed.whole[n] or fed.seen[n] == SPEED | CURRENT:
+                    continue
+                at = fed.sent[n]
+                if any(begin <= at <= end for begin, end in self._excluded[index]):
+                    continue
+                following = fed.sent[n + 1] if n + 1 < len(fed.sent) else at + SECOND // 20
+                if self.metronome.stood_still(at - 5 * MS, following + 5 * MS) >= STANDSTILL_NS:
+                    excused += 1
+                else:
+                    lost += 1
+                    missing = (
+                        "EscSpeed, EscCurrent"
+                        if not fed.seen[n]
+                        else "EscCurrent"
+                        if fed.seen[n] & SPEED
+                        else "EscSpeed"
+                    )
+                    self.losses.append((at, f"esc{index + 1} frame {n} of {len(fed.sent)}: no {missing}"))
+            self._accounted[index] = max(self._accounted[index], last + 1)
+            self._excluded[index] = [x for x in self._excluded[index] if x[1] > until_ns]
+        return lost, excused
+
+    @contextlib.contextmanager
+    def injection(
+        self, fault: Fault, escs: Sequence[int] | None = None, settle_s: float = SETTLE_S
+    ) -> Iterator["Injection"]:
+        """One injection of a fault; ``escs``: those that it disturbs, all unless given. A failed one is noted and raised again."""
+        row = self.report.row(fault)
+        self.check_alive()
+        lost, excused = self.account()  # of before; nobody's fault is the programme's too
+        row.lost += lost
+        row.excused += excused
+        wrong = self.watch.wrong_count
+        injection = Injection(self, fault, range(len(self.ports)) if escs is None else escs)
+        row.injected += 1
+        failed = True
+        try:
+            yield injection
+            injection.end()
+            time.sleep(settle_s)
+            self.check_alive()
+            failed = False
+        except NotRecovered as error:
+            row.notes.append(str(error))
+            raise
+        finally:
+            if failed:
+                injection.leave_out_until(time.monotonic_ns())
+            lost, excused = self.account()
+            row.lost += lost
+            row.excused += excused
+            if injection.in_the_controller:
+                most, end_ns = injection.in_the_controller
+                forgiven = self.watch.forgive(most, injection.begin_ns, end_ns)
+                row.figures["values in the controller already"] = max(
+                    forgiven, row.figures.get("values in the controller already", 0)
+                )
+            fresh_wrong = self.watch.wrong_count - wrong
+            row.wrong += fresh_wrong
+            if fresh_wrong and len(row.notes) < 8:
+                for each in self.watch.wrong[-min(fresh_wrong, 3) :]:
+                    late = (each.at_ns - injection.begin_ns) / SECOND
+                    row.notes.append(
+                        f"wrong value {late:.3f} s after the injection: {each.message} {each.data}: {each.why}"
+                    )
+            if lost and len(row.notes) < 8:
+                when = [f"{(at - injection.begin_ns) / SECOND:.3f} s {what}" for at, what in self.losses[-lost:]]
+                row.notes.append(
+                    f"{lost} values lost, cleared at {injection.after(injection.cleared_ns)}, recovered at "
+                    f"{injection.after(injection.recovered_ns)}: {'; '.join(when[:4])}"
+                )
+            received, self._received = self._received, sum(port.received() for port in self.ports)
+            if self._received > received:
+                failed = True
+                row.notes.append(f"{self._received - received} bytes were transmitted to the ESCs")
+            if not failed and injection.in_time:
+                row.recovered += 1
+            row.worst_s = max(row.worst_s, injection.recovery_s)
+
+    def close(self) -> None:
+        """End the gateway and everything else; the folder stays for a look at it as long as the machine lives."""
+        self.feeder.close()
+        if self.gateway is not None:
+            self.gateway.kill()
+            self.gateway = None
+        self.watch.close()
+        self.metronome.close()
+        for port in self.ports:
+            port.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Injection:
+    """One fault while it is on and until it is healed."""
+
+    def __init__(self, bench: Bench, fault: Fault, escs: Sequence[int] | range) -> None:
+        self.bench = bench
+        self.fault = fault
+        self.escs = list(escs)
+        self.begin_ns = time.monotonic_ns()
+        self.cleared_ns: int | None = None
+        self.recovered_ns: int | None = None
+        self.recovery_s = 0.0
+        self.in_the_controller: tuple[int, int] | None = None
+        """So many values may come late until then: the controller had them, and nobody can take them back from it."""
+        self.boot_ups = len(bench.watch.boot_ups)
+        self.emergencies = len(bench.watch.emergencies)
+
+    def cleared(self) -> None:
+        """The cause is gone; what is sent from now on has to arrive soon."""
+        self.cleared_ns = time.monotonic_ns()
+
+    def wait_recovery(self, within_s: float | None = None) -> float:
+        """Wait for the first right value of each disturbed ESC that was sent since ``cleared``; the seconds from there."""
+        assert self.cleared_ns is not None
+        limit = within_s or (self.fault.limit_s or 1.0)
+        self.recovered_ns = self.bench.wait_fresh(self.escs, self.cleared_ns, limit * 3 + 2, self.cleared_ns)
+        self.recovery_s = self.bench.running_s(self.cleared_ns, self.recovered_ns)
+        return self.recovery_s
+
+    def healed_at(self, at_ns: int) -> None:
+        """Something else that had to heal too was good at that time."""
+        assert self.cleared_ns is not None
+        self.recovery_s = max(self.recovery_s, self.bench.running_s(self.cleared_ns, at_ns))
+
+    def wait_boot_up(self, node: int, within_s: float = 3) -> None:
+        """Wait for a boot-up message of a node since the injection."""
+
+        def seen() -> bool:
+            return any(found == node for _, found in self.bench.watch.boot_ups[self.boot_ups :])
+
+        self.bench.wait_until(seen, within_s, f"boot-up of node {node}")
+        at_ns = next(at for at, found in self.bench.watch.boot_ups[self.boot_ups :] if found == node)
+        if self.cleared_ns is not None:
+            self.healed_at(at_ns)
+
+    def emergency_codes(self, node: int) -> list[int]:
+        """Codes of the EMCYs of a node since the injection."""
+        return [each.code for each in self.bench.watch.emergencies[self.emergencies :] if each.node == node]
+
+    def expect(self, holds: bool, what: str) -> None:
+        """NotRecovered unless something holds."""
+        if not holds:
+            raise NotRecovered(f"{what}; {self.bench.last_words()}")
+
+    def after(self, at_ns: int | None) -> str:
+        """A time since the injection in words."""
+        return "no time" if at_ns is None else f"{(at_ns - self.begin_ns) / SECOND:.3f} s"
+
+    @property
+    def in_time(self) -> bool:
+        return self.fault.limit_s is None or self.recovery_s <= self.fault.limit_s
+
+    def leave_out_until(self, end_ns: int) -> None:
+        if self.escs:
+            self.bench.leave_out(self.escs, self.begin_ns - IN_FLIGHT_NS, end_ns)
+
+    def end(self) -> None:
+        """What was sent until the recovery may be lost."""
+        self.leave_out_until(self.recovered_ns or time.monotonic_ns())
+        if not self.in_time:
+            note = f"recovered only after {self.recovery_s:.2f} s"
+            self.bench.report.row(self.fault).notes.append(note)

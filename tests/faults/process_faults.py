@@ -1,0 +1,240 @@
+"""Faults of the process: killed, ended, told to read its configuration again, started twice, hung."""
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from fault_report import WITH_PYTHON
+from harness import AHEAD, Bench, Fault, Gateway, Injection, NotRecovered, PtyPort, fault
+from raw_bus import RawBus
+
+LIMIT_S = 1.0
+STOPPING = 2
+TIMEOUT_OBJECT = 0x2100, 4
+"""Telemetry time-out in ms, which a master may set and store."""
+
+
+def python_start_s(bench: Bench) -> float:
+    """How long a Python with the libraries takes to start here and now: no part of the gateway's own time."""
+    command = [*AHEAD, sys.executable, "-c", "import can, canopen, serial, cantools.database"]
+    begin = time.monotonic_ns()
+    subprocess.run(command, check=True)
+    return bench.running_s(begin, time.monotonic_ns())
+
+
+def start_and_wait(injection: Injection) -> None:
+    """Start the gateway. Its recovery is the time until the first right values, less Python's own start."""
+    bench = injection.bench
+    python_s = python_start_s(bench)
+    injection.cleared()
+    assert injection.cleared_ns is not None
+    bench.start(wait=False)
+    injection.recovered_ns = bench.wait_fresh(injection.escs, injection.cleared_ns, 30)
+    whole = bench.running_s(injection.cleared_ns, injection.recovered_ns)
+    injection.recovery_s = max(0.0, whole - python_s)
+    figures = bench.report.row(injection.fault).figures
+    for name, seconds in ((WITH_PYTHON, whole), ("s of it for Python and its libraries", python_s)):
+        figures[name] = max(round(seconds, 2), figures.get(name, 0))
+
+
+@fault("Process", "kill -9 at any instant, and restart", LIMIT_S)
+def killed(bench: Bench, fault: Fault, times: int) -> None:
+    """Also while it stores parameters: afterwards they are those before or those after, never anything else."""
+    generator = random.Random(6)
+    known = {250}
+    with RawBus(bench.watched) as master:
+        for i in range(times + 1):
+            with bench.injection(fault) as injection:
+                value = 200 + generator.randrange(90)
+                injection.expect(master.write(1, *TIMEOUT_OBJECT, value, 2) == 0, "the master cannot set the time-out")
+                known.add(value)
+                if i % 2:
+                    injection.expect(master.store(1) == 0, "the master cannot store")
+                    known = {value}
+                else:
+                    master.send(0x601, bytes([0x23, 0x10, 0x10, 1]) + b"save")
+                    time.sleep(generator.random() * 0.02)
+                assert bench.gateway is not None
+                bench.gateway.kill()
+                bench.gateway = None
+                time.sleep(generator.random() * 0.3)
+                start_and_wait(injection)
+                found = master.read(1, *TIMEOUT_OBJECT)
+                injection.expect(found in known, f"the stored time-out is {found}, not one of {sorted(known)}")
+                assert found is not None
+                known = {found}
+        master.write(1, *TIMEOUT_OBJECT, 250, 2)
+        master.store(1)
+
+
+@fault("Process", "SIGTERM, and restart", LIMIT_S)
+def ended(bench: Bench, fault: Fault, times: int) -> None:
+    """Ends within 0.5 s, and its last status says so."""
+    for _ in range(times):
+        with bench.injection(fault) as injection:
+            begin = time.monotonic()
+            code = bench.stop()
+            took = time.monotonic() - begin
+            time.sleep(0.1)
+            injection.expect(code == 0, f"it ended with {code}")
+            state = bench.watch.value("GatewayStatus", "gateway_state")
+            injection.expect(state == STOPPING, f"its last state is {state}, not Stopping")
+            figures = bench.report.row(fault).figures
+            figures["s to its end"] = max(round(took, 2), figures.get("s to its end", 0))
+            injection.expect(took < 0.8, f"it took {took:.2f} s to end; 0.5 s, and 0.3 s for a Python's end here")
+            start_and_wait(injection)
+
+
+@fault("Process", "SIGHUP with an unchanged and with a faulty configuration", None)
+def hangup_faulty(bench: Bench, fault: Fault, times: int) -> None:
+    """Said and refused; the old one goes on undisturbed."""
+    assert bench.gateway is not None
+    text = bench.config.read_text()
+    try:
+        for i in range(times):
+            with bench.injection(fault, []) as injection:
+                said = len(bench.gateway.lines)
+                bench.config.write_text(
+                    text if i % 3 == 0 else text + ("\n[nonsense]\nx = 1\n" if i % 3 == 1 else "\n[[esc")
+                )
+                bench.gateway.process.send_signal(signal.SIGHUP)
+                gateway = bench.gateway
+                bench.wait_until(lambda gateway=gateway, said=said: len(gateway.lines) > said, 5, "a line in the log")  # type: ignore[misc]
+                injection.cleared()
+    finally:
+        bench.config.write_text(text)
+
+
+@fault("Process", "SIGHUP with another configuration", LIMIT_S)
+def hangup(bench: Bench, fault: Fault, times: int) -> None:
+    """The same process goes on with the new one."""
+    assert bench.gateway is not None
+    text = bench.config.read_text()
+    try:
+        for i in range(times):
+            with bench.injection(fault) as injection:
+                changed = (
+                    text.replace("pole_pairs = 7", "pole_pairs = 7\ntelemetry_timeout_ms = 240") if i % 2 == 0 else text
+                )
+                bench.config.write_text(changed)
+                injection.cleared()
+                bench.gateway.process.send_signal(signal.SIGHUP)
+                lines, gateway = len(bench.gateway.lines), bench.gateway
+
+                def opened(lines: int = lines, gateway: Gateway = gateway) -> bool:
+                    return any("is open" in line for line in gateway.lines[lines:])
+
+                bench.wait_until(opened, 10, "the new configuration's ports are open")
+                injection.cleared()
+                injection.wait_recovery()
+    finally:
+        bench.config.write_text(text)
+
+
+@fault("Process", "a second instance", None)
+def second(bench: Bench, fault: Fault, times: int) -> None:
+    """On the same port, and with the same nodes on the same interface: refused with one line, the first goes on undisturbed."""
+    other = bench.folder / "second.toml"
+    own = bench.configuration()
+    extra = PtyPort(bench.folder / "second", bench.fed[0].identity)
+    same_port = own.replace("enabled = true", "enabled = false")
+    parts = own.split("[[esc]]")
+    same_nodes = parts[0] + "[[esc]]" + parts[1].replace(bench.ports[0].path, extra.path)
+    try:
+        for i in range(max(2, times)):
+            with bench.injection(fault, []) as injection:
+                other.write_text((same_port, same_nodes)[i % 2])
+                command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(other)]
+                done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+                said = done.stderr.strip()
+                what = ("the same port", "the same nodes")[i % 2]
+                injection.expect(done.returncode == 1, f"with {what} it ended with {done.returncode}: {said}")
+                injection.expect(len(said.splitlines()) == 1, f"with {what} it said: {said}")
+                injection.cleared()
+    finally:
+        extra.close()
+
+
+class Supervisor:
+    """A stand-in for systemd: takes the notifications, and knows when the watchdog was fed last."""
+
+    def __init__(self, watchdog_s: float) -> None:
+        self.path = str(Path(tempfile.mkdtemp(prefix="notify.")) / "notify")
+        self.watchdog_s = watchdog_s
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(self.path)
+        self._socket.setblocking(False)
+        self.fed_at = time.monotonic()
+        self.ready = False
+        self.messages: list[str] = []
+
+    def environment(self) -> dict[str, str]:
+        return {"NOTIFY_SOCKET": self.path, "WATCHDOG_USEC": str(int(self.watchdog_s * 1e6))}
+
+    def listen(self) -> None:
+        while True:
+            try:
+                message = self._socket.recv(4096).decode()
+            except BlockingIOError:
+                return
+            self.messages.append(message)
+            self.ready = self.ready or "READY=1" in message
+            if "WATCHDOG=1" in message:
+                self.fed_at = time.monotonic()
+
+    def wait_hang(self, seconds: float) -> float:
+        """Wait until the watchdog's time is over; how long that took. NotRecovered if the gateway feeds it all the time."""
+        begin = time.monotonic()
+        while time.monotonic() - begin < seconds:
+            self.listen()
+            if time.monotonic() - self.fed_at > self.watchdog_s:
+                return time.monotonic() - begin
+            time.sleep(0.02)
+        raise NotRecovered("the watchdog of a frozen gateway was fed on")
+
+    def close(self) -> None:
+        self._socket.close()
+        os.unlink(self.path)
+
+
+@fault("Process", "a frozen loop, restarted by the watchdog", LIMIT_S)
+def frozen(bench: Bench, fault: Fault, times: int) -> None:
+    """By systemd's rule: no WATCHDOG=1 for its time, then SIGABRT and a new start. Recovery counts from there."""
+    supervisor = Supervisor(2)
+    before = bench.environment
+    bench.environment = before | supervisor.environment()
+    try:
+        for i in range(max(1, times // 2)):
+            with bench.injection(fault) as injection:
+                if i == 0:
+                    bench.stop()
+                    gateway = bench.start(wait=False)
+                    bench.wait_fresh(injection.escs, gateway.started_ns, 20)
+                assert bench.gateway is not None
+                deadline = time.monotonic() + 3
+                while time.monotonic() < deadline:
+                    supervisor.listen()
+                    injection.expect(
+                        time.monotonic() - supervisor.fed_at < 2, "the watchdog of a healthy gateway was not fed"
+                    )
+                    time.sleep(0.02)
+                injection.expect(supervisor.ready, "it never said READY=1")
+                bench.gateway.process.send_signal(signal.SIGSTOP)
+                supervisor.wait_hang(4)
+                bench.gateway.process.send_signal(signal.SIGABRT)
+                bench.gateway.process.send_signal(signal.SIGCONT)
+                bench.gateway.kill()
+                bench.gateway = None
+                supervisor.fed_at = time.monotonic() + 60
+                start_and_wait(injection)
+                supervisor.listen()
+                supervisor.fed_at = time.monotonic()
+    finally:
+        bench.environment = before
+        supervisor.close()

@@ -1,0 +1,368 @@
+"""Faults of the serial line and of the ESC behind it. The other ESC's values must not be disturbed by any of them."""
+
+import contextlib
+import fcntl
+import os
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+from harness import SECOND, Bench, Fault, Identity, PtyPort, fault
+
+from kontronik_can_gw.protocol.codec import Layout
+from kontronik_can_gw.protocol.states import Device
+
+LIMIT_S = 2.0
+LOST = 4
+
+
+def port_of(bench: Bench) -> PtyPort:
+    port = bench.ports[0]
+    assert isinstance(port, PtyPort)
+    return port
+
+
+def link_state(bench: Bench, esc: int = 0) -> int | None:
+    name = "EscLink" if len(bench.ports) == 1 else f"Esc{esc + 1}Link"
+    return bench.watch.value(name, "link_state")
+
+
+def random_bytes(generator: random.Random, size: int) -> bytes:
+    return generator.randbytes(size)
+
+
+@contextlib.contextmanager
+def mangled(bench: Bench, how: Callable[[bytes], tuple[bytes, bool]]) -> Iterator[None]:
+    fed = bench.fed[0]
+    fed.mangle = how
+    try:
+        yield
+    finally:
+        fed.mangle = None
+
+
+@fault("Serial", "port busy at its return", LIMIT_S)
+def busy(bench: Bench, fault: Fault, times: int) -> None:
+    port = port_of(bench)
+    for _ in range(times):
+        with bench.injection(fault, [0]) as injection:
+            with _taken_by_another(port):
+                time.sleep(1.2)
+            injection.cleared()
+            injection.wait_recovery()
+            injection.expect(_said(bench, "in use"), "the log does not say that the port is in use")
+
+
+@contextlib.contextmanager
+def _taken_by_another(port: PtyPort) -> Iterator[None]:
+    """Unplug, plug in again, and lock the port before the gateway can see it."""
+    port.unplug()
+    hidden = port.link.with_name("hidden")
+    link, port.link = port.link, hidden
+    port.plug()
+    port.link = link
+    fd = os.open(port.device, os.O_RDWR | os.O_NOCTTY)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        hidden.rename(link)
+        yield
+    finally:
+        os.close(fd)
+
+
+@fault("Serial", "permission missing at its return", LIMIT_S)
+def permission(bench: Bench, fault: Fault, times: int) -> None:
+    port = port_of(bench)
+    for _ in range(times):
+        with bench.injection(fault, [0]) as injection:
+            port.unplug()
+            link, port.link = port.link, port.link.with_name("hidden")
+            port.plug()
+            os.chmod(port.device, 0)
+            port.link.rename(link)
+            port.link = link
+            time.sleep(1.2)
+            injection.expect(_said(bench, "permission denied"), "the log does not say that the permission is missing")
+            injection.cleared()
+            os.chmod(port.device, 0o620)
+            injection.wait_recovery()
+
+
+@fault("Serial", "port gone and back", LIMIT_S)
+def gone(bench: Bench, fault: Fault, times: int) -> None:
+    port = port_of(bench)
+    for i in range(times * 2):
+        with bench.injection(fault, [0]) as injection:
+            port.unplug()
+            time.sleep((0.05, 0.3, 0.7)[i % 3])
+            injection.cleared()
+            port.plug()
+            injection.wait_recovery()
+
+
+@fault("Serial", "port gone for long", LIMIT_S)
+def gone_long(bench: Bench, fault: Fault, times: int) -> None:
+    port = port_of(bench)
+    for i in range(max(1, times // 3)):
+        with bench.injection(fault, [0]) as injection:
+            port.unplug()
+            time.sleep(4 + 20 * i)
+            injection.expect(link_state(bench) in (LOST, 5), "the link is not said to be lost")
+            injection.cleared()
+            port.plug()
+            injection.wait_recovery()
+
+
+@fault("Serial", "port back under another name", LIMIT_S)
+def other_name(bench: Bench, fault: Fault, times: int) -> None:
+    port = port_of(bench)
+    for _ in range(times):
+        before = port.device
+        with bench.injection(fault, [0]) as injection:
+            held = os.open(
+                before, os.O_RDWR | os.O_NOCTTY
+            )  # keeps the old number taken, as a program does that reads on
+            try:
+                port.unplug()
+                time.sleep(0.3)
+                injection.cleared()
+                port.plug(other=True)
+                injection.expect(port.device != before, "the bench gave the port its old name again")
+                injection.wait_recovery()
+            finally:
+                os.close(held)
+
+
+def _said(bench: Bench, text: str) -> bool:
+    assert bench.gateway is not None
+    return text in bench.gateway.log
+
+
+@fault("Serial", "garbage between frames", None)
+def garbage(bench: Bench, fault: Fault, times: int) -> None:
+    """Whatever comes between whole frames, bits of frames included, no frame is lost."""
+    generator = random.Random(1)
+
+    def with_garbage(wire: bytes) -> tuple[bytes, bool]:
+        kind = generator.randrange(5)
+        if kind == 0:
+            return random_bytes(generator, generator.randrange(1, 400)) + wire, True
+        if kind == 1:
+            return b"KODL" + random_bytes(generator, generator.randrange(20)) + wire, True
+        if kind == 2:
+            return wire[: generator.randrange(1, len(wire))] + wire, True
+        return wire, True
+
+    for _ in range(times):
+        with bench.injection(fault, []) as injection, mangled(bench, with_garbage):
+            time.sleep(1.5)
+            injection.cleared()
+
+
+@fault("Serial", "bit errors and lost bytes", None)
+def bit_errors(bench: Bench, fault: Fault, times: int) -> None:
+    """Frames that are hit are lost and nothing else; none of them shows a wrong value."""
+    generator = random.Random(2)
+
+    def hit(wire: bytes) -> tuple[bytes, bool]:
+        if generator.random() > 0.3:
+            return wire, True
+        at = generator.randrange(len(wire))
+        kind = generator.randrange(3)
+        if kind == 0:
+            return wire[:at] + wire[at + 1 :], False
+        if kind == 1:
+            return wire[:at] + bytes([wire[at] ^ 1 << generator.randrange(8)]) + wire[at + 1 :], False
+        return wire[:at] + bytes([generator.randrange(256)]) + wire[at:], False
+
+    for _ in range(times):
+        with bench.injection(fault, []) as injection, mangled(bench, hit):
+            time.sleep(1.5)
+            injection.cleared()
+
+
+@fault("Serial", "break: only zero bytes", LIMIT_S)
+def line_break(bench: Bench, fault: Fault, times: int) -> None:
+    for _ in range(times):
+        with bench.injection(fault, [0]) as injection:
+            with mangled(bench, lambda wire: (bytes(200), False)):
+                time.sleep(0.8)
+            injection.expect(link_state(bench) == LOST, "the link is not said to be lost")
+            injection.cleared()
+            injection.wait_recovery()
+
+
+@fault("Serial", "every byte hit, as by a wrong parity", LIMIT_S)
+def parity(bench: Bench, fault: Fault, times: int) -> None:
+    """8N1 for 8E1 reads the parity bit as the next byte's start: what comes out is different from byte to byte."""
+    generator = random.Random(3)
+
+    def hit(wire: bytes) -> tuple[bytes, bool]:
+        return bytes(x ^ (0x80 if x.bit_count() & 1 else generator.choice((0, 1, 0x80))) for x in wire), False
+
+    for i in range(times):
+        with bench.injection(fault, [0]) as injection:
+            with mangled(bench, hit):
+                time.sleep(4.5 if i == 0 else 0.8)
+            if i == 0:
+                injection.expect(_said(bench, "parity"), "the log does not name parity or protocol as the cause")
+            injection.cleared()
+            injection.wait_recovery()
+
+
+@fault("Serial", "a 9600 baud stream", LIMIT_S)
+def slow_stream(bench: Bench, fault: Fault, times: int) -> None:
+    """Read twelve times too fast, each bit is a run of equal bits."""
+    generator = random.Random(4)
+
+    def runs(wire: bytes) -> tuple[bytes, bool]:
+        return bytes(generator.choice((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0)) for _ in range(12)), False
+
+    for _ in range(times):
+        with bench.injection(fault, [0]) as injection:
+            with mangled(bench, runs):
+                time.sleep(1)
+            injection.expect(link_state(bench) == LOST, "the link is not said to be lost")
+            injection.cleared()
+            injection.wait_recovery()
+
+
+@fault("Serial", "ESC off and on", LIMIT_S)
+def off(bench: Bench, fault: Fault, times: int) -> None:
+    for i in range(times):
+        with bench.injection(fault, [0]) as injection:
+            bench.fed[0].on = False
+            time.sleep((0.5, 1.5, 3)[i % 3])
+            injection.expect(link_state(bench) == LOST, "the link is not said to be lost")
+            injection.cleared()
+            bench.fed[0].on = True
+            injection.wait_recovery()
+
+
+@fault("Serial", "ESC swapped for another model and layout", LIMIT_S)
+def swapped(bench: Bench, fault: Fault, times: int) -> None:
+    fed = bench.fed[0]
+    models = [
+        Identity(11, Layout.LEGACY, Device.JIVEPRO, 12),
+        Identity(12, Layout.V4, Device.KOLIBRI, 3),
+        Identity(13, Layout.V4, Device.KOSMIK, 14),
+        Identity(1),
+    ]
+    for i in range(times + 1):
+        with bench.injection(fault, [0], settle_s=1) as injection:
+            fed.on = False
+            time.sleep(0.6)
+            fed.become(models[i % 4] if i < times else Identity(1))
+            injection.cleared()
+            fed.on = True
+            injection.wait_recovery()
+            number = fed.identity.device.value
+
+            def known(number: int = number) -> bool:
+                return bench.watch.info_device(0) == number
+
+            bench.wait_until(known, 5, "the new ESC's device on the bus")
+
+
+@fault("Serial", "a stream that stutters, bytes seconds apart", LIMIT_S)
+def stutter(bench: Bench, fault: Fault, times: int) -> None:
+    """A frame of which the end comes seconds after its beginning is old."""
+    port, fed = port_of(bench), bench.fed[0]
+    for _ in range(max(1, times // 2)):
+        with bench.injection(fault, [0]) as injection:
+            fed.on = False
+            pieces: list[bytes] = []
+
+            def caught(wire: bytes, pieces: list[bytes] = pieces) -> tuple[bytes, bool]:
+                pieces.append(wire)
+                return b"", False
+
+            fed.mangle = caught
+            try:
+                time.sleep(0.05)
+                fed.send_one()
+                wire = pieces[-1]
+                for at in range(0, len(wire), 14):
+                    port.write(wire[at : at + 14])
+                    time.sleep(1.2)
+            finally:
+                fed.mangle = None
+            injection.expect(link_state(bench) == LOST, "the link is not said to be lost")
+            injection.cleared()
+            fed.on = True
+            injection.wait_recovery()
+
+
+@fault("Serial", "a line that is never silent", LIMIT_S)
+def never_silent(bench: Bench, fault: Fault, times: int) -> None:
+    """Frame behind frame, as many as 115200 baud carry: of one ESC newer values take the place of older ones, of the other none is lost."""
+    fed = bench.fed[0]
+    for _ in range(times):
+        with bench.injection(fault, [0], settle_s=1) as injection:
+            before, fed.rate_hz = fed.rate_hz, 260
+            time.sleep(1.5)
+            fed.rate_hz = before
+            injection.cleared()
+            injection.wait_recovery()
+
+
+@fault("Serial", "a port that floods", LIMIT_S)
+def flood(bench: Bench, fault: Fault, times: int) -> None:
+    """Rubbish and frames as fast as a pseudo terminal takes them, many times a UART's pace: the other ESC goes on, perhaps thinned out."""
+    port = port_of(bench)
+    rubbish = random.Random(5).randbytes(4096).replace(b"K", b"k")
+    for _ in range(times):
+        with bench.injection(fault, settle_s=1) as injection:
+            bench.watch.reset_silence()
+            stop = threading.Event()
+
+            def pour(stop: threading.Event = stop) -> None:
+                while not stop.is_set():
+                    if not port.write(rubbish):
+                        time.sleep(0.001)
+
+            thread = threading.Thread(target=pour, daemon=True)
+            thread.start()
+            time.sleep(1.5)
+            silence = bench.watch.longest_silence_ns[1] / SECOND
+            stop.set()
+            thread.join()
+            injection.expect(silence < 0.25, f"the other ESC was silent for {silence:.2f} s")
+            injection.cleared()
+            injection.wait_recovery()
+
+
+@fault("Serial", "ports gone and back again and again", LIMIT_S, bench="cycles")
+def cycles(bench: Bench, fault: Fault, times: int) -> None:
+    """Nothing grows: memory, descriptors and threads after the cycles are what they were after the first few."""
+    rounds = 500 if times > 10 else 75
+    ports = [port for port in bench.ports if isinstance(port, PtyPort)]
+    row = bench.report.row(fault)
+    assert bench.gateway is not None
+    before = bench.gateway.figures()
+    for i in range(rounds):
+        with bench.injection(fault, settle_s=0) as injection:
+            for port in ports:
+                port.unplug()
+            time.sleep(0.15)
+            injection.cleared()
+            for port in ports:
+                port.plug()
+            injection.wait_recovery()
+            if i == rounds // 5:
+                before = bench.gateway.figures()
+    row.injected *= len(ports)
+    row.recovered *= len(ports)
+    time.sleep(0.5)
+    after = bench.gateway.figures()
+    row.figures |= {f"{name} before": before[name] for name in before} | {
+        f"{name} after": after[name] for name in after
+    }
+    grown = [name for name in ("descriptors", "threads") if after[name] > before[name]]
+    if after["rss"] > before["rss"] + 1024 + rounds:
+        grown.append("rss")
+    if grown:
+        row.notes.append(f"grown over the cycles: {', '.join(grown)}")
+        row.recovered -= 1
+    bench.watch.reset_silence()

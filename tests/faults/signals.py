@@ -1,0 +1,135 @@
+"""Where the values stand in the frames of a DBC: tables made from it by cantools once, for whoever decodes many frames in slow Python."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from encoding import Identity, info, info_values, live, live_values
+
+LIVE_NAMES = frozenset(live_values(live(Identity(), 0), 1))
+INFO_NAMES = frozenset(info_values(info(Identity(), 0)))
+NOT_FOLLOWED = frozenset({"losses", "layout", "energy_used"})
+"""Amid an ESC's values: what is the gateway's own."""
+STATE_STEMS = frozenset({"Link", "Heartbeat", "Emergency"})
+
+
+class Place(NamedTuple):
+    """A signal: its bits, its scaling, and the raw value that means not available (None: it has none)."""
+
+    name: str
+    start: int
+    mask: int
+    sign: int
+    scale: float
+    not_available: int | None
+
+    def raw(self, bits: int) -> int:
+        x = bits >> self.start & self.mask
+        return x - self.mask - 1 if x & self.sign else x
+
+
+class Message(NamedTuple):
+    """A message: whose it is (None: the gateway's), what its values follow from, and its signals."""
+
+    can_id: int
+    stem: str
+    esc: int | None
+    kind: str
+    """``live``, ``info`` or ``other``."""
+    places: tuple[Place, ...]
+    """All signals; of a live or info message only those that are an ESC's values."""
+    flags: tuple[int, int]
+    """Start and mask of the error bits; a mask of 0: none."""
+
+
+Table = dict[int, Message]
+
+
+def _snake(name: str) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", name.removesuffix("Percent")).lower()
+
+
+def _message(message: Any, count: int) -> Message:
+    whose = re.match(r"Esc(\d*)(?=[A-Z])", message.name)
+    if whose is None or (count > 1) != bool(whose[1]):
+        stem, esc, prefix = message.name, None, ""
+    else:
+        stem, esc = message.name[whose.end() :], int(whose[1] or 1) - 1
+        prefix = whose[0] if count > 1 else ""
+    places: list[Place] = []
+    flags: list[Place] = []
+    for signal in sorted(message.signals, key=lambda s: int(s.start)):
+        assert signal.byte_order == "little_endian" and not signal.offset and not signal.is_multiplexer
+        choices = {str(text): raw for raw, text in (signal.choices or {}).items()}
+        place = Place(
+            _snake(signal.name.removeprefix(prefix)),
+            signal.start,
+            (1 << signal.length) - 1,
+            1 << signal.length - 1 if signal.is_signed else 0,
+            float(signal.scale),
+            choices.get("NotAvailable"),
+        )
+        (flags if signal.length == 1 and not choices else places).append(place)
+    kind = "other"
+    if esc is not None and stem not in STATE_STEMS:
+        known = {place.name for place in places}
+        kind = "live" if known & LIVE_NAMES else "info"
+        followed = LIVE_NAMES if kind == "live" else INFO_NAMES
+        left = known - followed - NOT_FOLLOWED - {"link_state", "live_counter"}
+        left = {name for name in left if not name.endswith("_alive")}
+        assert not left, f"{message.name}: nobody follows {left}"
+        places = [place for place in places if place.name in followed]
+        flags = [flag for flag in flags if flag.name not in ("replay", "info_valid")]
+        assert all(flag.start == flags[0].start + i for i, flag in enumerate(flags))
+    return Message(
+        message.frame_id,
+        stem,
+        esc,
+        kind,
+        tuple(places),
+        (flags[0].start, (1 << len(flags)) - 1) if flags and kind != "other" else (0, 0),
+    )
+
+
+def table_of(texts: Sequence[str], escs: int) -> Table:
+    """The table of all messages of these DBC texts."""
+    import cantools.database
+
+    found: Table = {}
+    for text in texts:
+        database: Any = cantools.database.load_string(text, "dbc", strict=True)
+        for message in database.messages:
+            found[message.frame_id] = _message(message, escs)
+    return found
+
+
+def table_of_configuration(config: Path, canopen: bool, escs: int) -> Table:
+    """The table of what ``kontronik-can-gw dbc`` says that a configuration sends."""
+    command = [sys.executable, "-m", "kontronik_can_gw", "dbc", "-c", str(config)]
+    commands = [command, [*command, "--canopen"]] if canopen else [command]
+    texts = [subprocess.run(words, check=True, capture_output=True, text=True).stdout for words in commands]
+    return table_of(texts, escs)
+
+
+def table_of_shipped(escs: int, canopen: bool = True) -> Table:
+    """The table of the shipped layouts expanded to so many ESCs, nodes from 1 on."""
+    command = [sys.executable, "-m", "kontronik_can_gw", "dbc", "--esc", str(escs)]
+    commands = [command, [*command, "--canopen"]] if canopen else [command]
+    texts = [subprocess.run(words, check=True, capture_output=True, text=True).stdout for words in commands]
+    return table_of(texts, escs)
+
+
+def to_json(table: Table) -> str:
+    return json.dumps(list(table.values()))
+
+
+def from_json(text: str) -> Table:
+    messages = [
+        Message(can_id, stem, esc, kind, tuple(Place(*place) for place in places), (flags[0], flags[1]))
+        for can_id, stem, esc, kind, places, flags in json.loads(text)
+    ]
+    return {message.can_id: message for message in messages}
