@@ -3,7 +3,7 @@
 #   demo  the project
 #   lint  and its test tools
 #   test  and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and the CANopen
-#         masters of others that the node is tried with (tests/foreign); and what ``hardware`` installs
+#         masters of others that the node is tried with (tests/foreign); what `hardware` installs; systemd
 #   hardware  and the two virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
@@ -99,6 +99,16 @@ install_vcan() {
     tests/vm/setup.sh qemu || say "failed; by hand:  sudo tests/vm/setup.sh qemu"
 }
 
+# systemd's own checks of the service, and a real one that runs it in a virtual machine.
+install_systemd() {
+    command -v systemd-analyze >/dev/null && return
+    can_root || { say "no systemd to check the service with:  sudo apt-get install systemd"; return; }
+    apt_update
+    say "systemd, for the tests of the service"
+    as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 \
+        install -y --no-install-recommends systemd </dev/null >/dev/null || say "failed; going on"
+}
+
 # The faults that set clocks and mount file systems are never tried on the machine itself.
 install_hardware() {
     PATH=$PATH:/usr/sbin:/sbin
@@ -121,6 +131,6 @@ case $what in
     demo) install_project demo . ;;
     lint) install_project test '.[test]' ;;
     hardware) install_project test '.[test]'; install_hardware ;;
-    test) install_project test '.[test]'; install_vcan; install_hardware; tests/foreign/install.sh || say "tests with the masters named above are left out" ;;
+    test) install_project test '.[test]'; install_vcan; install_hardware; install_systemd; tests/foreign/install.sh || say "tests with the masters named above are left out" ;;
     *) die "$what: demo, lint, test or hardware" ;;
 esac

@@ -32,7 +32,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 from xml.etree import ElementTree as ET
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -211,12 +211,13 @@ def faults(scratch: Path, long: bool) -> list[Result]:
     """The fault programme: what User Mode Linux can show, then the emulated hardware."""
     limit = FAULTS_TIMEOUT_S[long]
     options = ["--long"] if long else []
-    results = []
+    results: list[Result] = []
+    parts: list[Part] = []
     if not shutil.which("linux.uml", path=SEARCH_PATH):
         results.append(Result("faults", "not run", reason="there is no User Mode Linux", enable=ENABLE_VM))
     else:
 
-        def half(part: int) -> Result:
+        def half(part: int) -> Part:
             out = scratch / f"faults_uml{part}.json"
             command = [
                 *uml_run(scratch, limit),
@@ -225,12 +226,14 @@ def faults(scratch: Path, long: bool) -> list[Result]:
                 f"--part={part}",
                 *options,
             ]
-            return programme(f"uml{part}", command, out, scratch, limit + 60)
+            return Part(
+                f"uml{part}", command, out, limit + 60, programme(f"uml{part}", command, out, scratch, limit + 60)
+            )
 
         # A machine takes one processor. Where there is none to spare the two would only hold each other up.
         at_once = 2 if (os.cpu_count() or 1) - os.getloadavg()[0] >= 1.5 else 1
         with ThreadPoolExecutor(at_once) as machines:
-            results += machines.map(half, (1, 2))
+            parts += machines.map(half, (1, 2))
     qemu = scratch / "faults_qemu.json"
     kernels = (Path(os.environ.get("VM_CACHE") or VM_RUN.parent / ".cache")).glob("*/vmlinux")
     if not shutil.which("qemu-system-x86_64", path=SEARCH_PATH) or not any(kernels):
@@ -239,8 +242,61 @@ def faults(scratch: Path, long: bool) -> list[Result]:
         )
     else:
         command = [sys.executable, str(FAULTS / "qemu_programme.py"), f"--out={qemu}", *options]
-        results.append(programme("qemu", command, qemu, scratch, limit + 60))
-    return results
+        parts.append(Part("qemu", command, qemu, limit + 60, programme("qemu", command, qemu, scratch, limit + 60)))
+    return results + [again(part, scratch) for part in parts]
+
+
+@dataclass
+class Part:
+    """A part of the fault programme that was run."""
+
+    step: str
+    command: list[str]
+    out: Path
+    timeout_s: float
+    result: Result
+
+
+def is_good(row: Mapping[str, Any]) -> bool:
+    return bool(row["injected"] == row["recovered"] > 0 and not row["wrong"] and not row["lost"])
+
+
+def again(part: Part, scratch: Path) -> Result:
+    """Repeats faults that were not healed in time, by themselves, up to twice: a machine that has other work makes everything late.
+
+    What was found at which attempt is kept in the results and told.
+    """
+    seconds = part.result.seconds
+    repeated: set[str] = set()
+    for attempt in (2, 3):
+        try:
+            found = json.loads(part.out.read_text())
+        except (OSError, ValueError):
+            return part.result
+        bad = [row for row in found["rows"] if not is_good(row)]
+        if not bad:
+            break
+        say(f"\n== {part.step}: attempt {attempt} of " + "; ".join(row["name"] for row in bad))
+        out = scratch / f"again_{part.out.name}"
+        out.unlink(missing_ok=True)
+        command = [word for word in part.command if not word.startswith("--out=")]
+        command += [f"--out={out}", *(f"--only={row['name']}" for row in bad)]
+        result = programme(part.step, command, out, scratch, part.timeout_s)
+        seconds += result.seconds
+        if not out.exists():
+            continue
+        new = {row["name"]: row for row in json.loads(out.read_text())["rows"]}
+        for row in bad:
+            if (better := new.get(row["name"])) is not None:
+                better["figures"]["attempts"] = attempt
+                better["notes"] = row["notes"] + better["notes"]
+                found["rows"][found["rows"].index(row)] = better
+                repeated.add(row["name"])
+        part.out.write_text(json.dumps(found, indent=1) + "\n")
+    final = counted(part.step, part.out, 0, seconds)
+    if repeated:
+        final.detail += f", {len(repeated)} repeated"
+    return final
 
 
 def soak(scratch: Path, minutes: float, seed: int | None) -> Result:
@@ -265,12 +321,16 @@ def programme(step: str, command: Sequence[str], out: Path, scratch: Path, timeo
     """Runs a part of the fault programme; each fault counts as a test."""
     start = time.monotonic()
     code = call(command, in_a_vm(scratch), timeout_s)
-    seconds = time.monotonic() - start
+    return counted(step, out, code, time.monotonic() - start)
+
+
+def counted(step: str, out: Path, code: int, seconds: float) -> Result:
+    """What the results of a part of the fault programme come to."""
     try:
         rows = json.loads(out.read_text())["rows"]
     except (OSError, ValueError, KeyError):
         return Result(step, "FAILED", seconds, f"ended with {code} and without results", suite=Suite(failed=1))
-    good = sum(row["injected"] == row["recovered"] > 0 and not row["wrong"] and not row["lost"] for row in rows)
+    good = sum(is_good(row) for row in rows)
     suite = Suite(passed=good, failed=len(rows) - good)
     injected, wrong, lost = (sum(row[key] for row in rows) for key in ("injected", "wrong", "lost"))
     detail = f"{good} of {len(rows)} faults healed, {injected} injected, {wrong} wrong values, {lost} lost"

@@ -35,6 +35,8 @@ def table(rows: Sequence[Row]) -> str:
             worst += f", {row.figures[WITH_PYTHON]:.2f} {WITH_PYTHON}"
         text += f"| {row.machine} | {name_of(row.area, row.name)} | {row.injected} | {row.recovered} | {worst} "
         text += f"| {row.wrong} | {row.lost} |\n"
+    if repeated := [name_of(row.area, row.name) for row in rows if "attempts" in row.figures]:
+        text += f"\nRepeated, because at first they took too long on a busy machine: {'; '.join(repeated)}.\n"
     return text
 
 
