@@ -307,12 +307,23 @@ def check_interface(config: CanConfig) -> None:
         raise UserError(f"can.interface: {config.interface!r} is no interface of python-can.{hint}")
 
 
-def is_up(name: str) -> bool | None:
-    """Whether a network interface is up; None where there is none, or no way to know."""
+def fault_of(name: str) -> int:
+    """Why a network interface cannot be used, as in errno: ENODEV, ENETDOWN; 0 where it is up or there is no way to know."""
+    interfaces = Path("/sys/class/net")
     try:
-        return bool(int(Path("/sys/class/net", name, "flags").read_text(), 16) & 1)
-    except (OSError, ValueError):
-        return None
+        return 0 if int((interfaces / name / "flags").read_text(), 16) & 1 else errno.ENETDOWN
+    except OSError:
+        return errno.ENODEV if (interfaces / "lo").exists() and not (interfaces / name).exists() else 0
+    except ValueError:
+        return 0
+
+
+def _has_socketcan() -> bool:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError):
+        return False
+    return True
 
 
 def _is_readable(fd: int) -> bool:
@@ -322,11 +333,6 @@ def _is_readable(fd: int) -> bool:
 
 
 def _open(config: CanConfig) -> "can.BusABC":
-    with without_asammdf():
-        import can
-
-    check_interface(config)
-    options: dict[str, Any] = {}
     mtu = Path("/sys/class/net", config.channel, "mtu")
     if config.interface == "socketcan" and config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
         name = config.channel
@@ -334,8 +340,15 @@ def _open(config: CanConfig) -> "can.BusABC":
             f"CAN interface {name}: does not do CAN FD. Adapter: sudo ip link set {name} up type can bitrate {config.bitrate} "
             f"dbitrate {config.data_bitrate} fd on; vcan: sudo ip link set {name} mtu {_FD.size}; or set can.fd = false."
         )
-    if config.interface == "socketcan" and is_up(config.channel) is False:
-        raise socketcan_error(config, errno.ENETDOWN)
+    if config.interface == "socketcan" and (
+        number := fault_of(config.channel)
+    ):  # before it is tried, which takes a while
+        raise socketcan_error(config, number if _has_socketcan() else errno.EAFNOSUPPORT)
+    with without_asammdf():
+        import can
+
+    check_interface(config)
+    options: dict[str, Any] = {}
     if config.interface != "socketcan":
         options["bitrate"] = config.bitrate
     if config.fd:

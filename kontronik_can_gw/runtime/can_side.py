@@ -46,6 +46,8 @@ class CanSide:
     ) -> None:
         self.config = config
         self.port: CanPort | None = None
+        self.just_opened = False
+        """Set at each opening; who looks at it sets it back."""
         self.mailboxes = Mailboxes()
         self.facts: LinkFacts | None = None
         """What the kernel told last; None where it tells nothing of this interface."""
@@ -136,7 +138,7 @@ class CanSide:
         except RunError as error:
             self._failed(str(error), now)
             return
-        self._gateway.can_returned(now)
+        self._gateway.can_returned(max(now, self._clock()))  # to open may take long
 
     def close(self) -> None:
         """Close everything."""
@@ -160,6 +162,7 @@ class CanSide:
         self._served, self._seen_waiting = True, False
         if (fd := port.fileno()) is not None:
             self._selector.register(fd, selectors.EVENT_READ, self.serve)
+        self.just_opened = True
         self._receive_ids = None
         self.follow_ids()
         self._gateway.can_opened(now)

@@ -154,7 +154,7 @@ class Loop:
                     ready = []  # what they announced is gone; a hang-up comes again
                 for key, events in ready:
                     key.data(now, events)
-                self._reopen(now)
+                now = self._reopen(now)
                 gateway.advance(now)
                 self._keep(now)
                 self.can.follow_ids()
@@ -218,11 +218,20 @@ class Loop:
         for esc in self.escs:
             esc.discard()
 
-    def _reopen(self, now: int) -> None:
+    def _reopen(self, now: int) -> int:
+        """Open what is due. Returns the time: it may have taken long on a slow machine, and what came meanwhile is old then."""
+        begin = now
         for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
             esc.reopen(now, self._others(esc))
         self.can.reopen(now)
         self.can.ask_if_due(now)
+        if self._lost or not self.can.is_open or self.can.just_opened:
+            self.can.just_opened = False
+            now = max(now, self._clock())
+            if now - begin > self._suspended_ns():
+                for esc in self.escs:
+                    esc.discard()
+        return now
 
     # --- parameters
 
