@@ -13,7 +13,6 @@ from harness import SECOND, Bench, Fault, Gateway, PtyPort, Report, fault
 from process_faults import start_and_wait
 from raw_bus import RawBus
 
-LIMIT_S = 1.0
 TIMEOUT_OBJECT = 0x2100, 4
 SLOW_S = 5
 SLOW_DISK = f"""
@@ -132,7 +131,7 @@ def slow(bench: Bench, fault: Fault, times: int) -> None:
                 stores_again(bench, master)
 
 
-@fault("Disk", "parameter file damaged or empty", LIMIT_S, bench="disk")
+@fault("Disk", "parameter file damaged or empty", RESTART_LIMIT_S, bench="disk")
 def damaged(bench: Bench, fault: Fault, times: int) -> None:
     """It starts with its defaults, says so by a line and EMCY 6300h, and stores again."""
     with RawBus(bench.watched) as master:
