@@ -10,7 +10,7 @@ from pathlib import Path
 
 import benches
 from harness import SECOND, Bench, Fault, Gateway, PtyPort, Report, fault
-from process_faults import start_and_wait
+from process_faults import RESTART_LIMIT_S, start_and_wait
 from raw_bus import RawBus
 
 TIMEOUT_OBJECT = 0x2100, 4
