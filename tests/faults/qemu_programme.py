@@ -8,6 +8,7 @@ On any machine with QEMU set up (tests/vm/setup.sh qemu) this starts the emulate
 import argparse
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -291,6 +292,7 @@ def main() -> int:
     parser.add_argument("--verbose", action="store_true", help="print the gateway's log")
     parser.add_argument("--tables", help=argparse.SUPPRESS)
     args = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the machine ends too
     return inside(args) if args.tables and VIRTIO_PORTS.exists() else outside(args)
 
 
