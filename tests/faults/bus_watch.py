@@ -393,6 +393,7 @@ class BusWatch(Judge):
         self._offsets = deque([wall - now], maxlen=8)
         """Wall clock less monotonic clock, one for each time that it was set."""
         self._closed = False
+        self._latest_ns = 0
         self._thread = threading.Thread(target=self._run, name="bus watch", daemon=True)
 
     def start(self) -> Self:
@@ -423,6 +424,7 @@ class BusWatch(Judge):
             if kind == _SO_TIMESTAMPNS and len(content) >= _STAMP.size:
                 seconds, rest = _STAMP.unpack(content[: _STAMP.size])
                 at_ns = self._monotonic(seconds * SECOND + rest, now)
+        self._latest_ns = at_ns
         can_id, size, content = _FRAME.unpack(data)
         if can_id & _ERROR:
             self.errors.append((at_ns, can_id & _ID, content))
@@ -434,9 +436,9 @@ class BusWatch(Judge):
             self.take(can_id & 0x7FF, content[:size], at_ns)
 
     def catch_up(self, seconds: float = 90) -> None:
-        """Wait until everything that has come was judged: on a busy machine the judge may be seconds behind, which matters to nobody."""
-        deadline = time.monotonic() + seconds
-        while select.select([self._socket], [], [], 0)[0] and time.monotonic() < deadline:
+        """Wait until everything that has come by now was judged: on a busy machine the judge may be seconds behind, which matters to nobody."""
+        now, deadline = time.monotonic_ns(), time.monotonic() + seconds
+        while self._latest_ns < now and select.select([self._socket], [], [], 0)[0] and time.monotonic() < deadline:
             time.sleep(0.005)
         time.sleep(0.02)
 
