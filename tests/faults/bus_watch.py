@@ -436,7 +436,7 @@ class BusWatch(Judge):
             self.take(can_id & 0x7FF, content[:size], at_ns)
 
     def catch_up(self, seconds: float = 90) -> None:
-        """Wait until everything that has come by now was judged: on a busy machine the judge may be seconds behind, which matters to nobody."""
+        """Wait until all that has come by now was judged: on a busy machine the judge may be seconds behind, which matters to nobody."""
         now, deadline = time.monotonic_ns(), time.monotonic() + seconds
         while self._latest_ns < now and select.select([self._socket], [], [], 0)[0] and time.monotonic() < deadline:
             time.sleep(0.005)
