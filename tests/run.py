@@ -230,8 +230,7 @@ def faults(scratch: Path, long: bool) -> list[Result]:
                 f"uml{part}", command, out, limit + 60, programme(f"uml{part}", command, out, scratch, limit + 60)
             )
 
-        # A machine takes one processor. Where there is none to spare the two would only hold each other up.
-        at_once = 2 if (os.cpu_count() or 1) - os.getloadavg()[0] >= 1.5 else 1
+        at_once = 2 if (os.cpu_count() or 1) > 1 else 1  # each takes one processor
         with ThreadPoolExecutor(at_once) as machines:
             parts += machines.map(half, (1, 2))
     qemu = scratch / "faults_qemu.json"
