@@ -67,7 +67,7 @@ def main() -> int:
     for file in files:
         if file.suffix == ".md":
             file.write_text(put(file.read_text(), made))
-            print(f"{file}: {made.count(chr(10)) - 2} faults")
+            print(f"{file}: {len(parse(put(BEGIN + END, made)))} faults")
     if len(results) == len(files):
         print(made, end="")
     return 0
