@@ -149,7 +149,7 @@ def test_boot_up_heartbeats_and_nmt_commands(vcan: str, tmp_path: Path) -> None:
         assert (master.number(1, 0x1017), master.number(1, 0x2100, 1)) == (1000, 7)
         with pytest.raises(NmtError):
             node.nmt.wait_for_heartbeat(timeout=0.5)  # the period is a second again
-        assert "node 1 operational" in gateway.log
+        gateway.wait_for_line("node 1 operational", 3)
         assert gateway.end() == 0, gateway.log
 
 

@@ -76,11 +76,11 @@ def test_what_is_saved_is_there_after_a_restart_and_gone_when_restored(vcan: str
             assert kept(master) == saved
             master.write(1, 0x1010, 1, SAVE, 4)
             master.write(1, 0x2100, 1, 99, 1)  # not saved
-            assert "esc1: parameters stored" in gateway.log
+            gateway.wait_for_line("esc1: parameters stored", 3)
             assert gateway.end() == 0
         with started(toml, tmp_path, dump) as gateway:
             assert kept(master) == saved
-            assert "esc1: pole_pairs is 11" in gateway.log
+            gateway.wait_for_line("esc1: pole_pairs is 11", 3)
             master.node(1).nmt.state = "OPERATIONAL"
             wait_for(lambda: len(dump.of(0x1F1)) > 5, 3, "the PDO that was saved")
             assert dump.of(0x1F1)[-1].data[0] & 0x0F == 0
@@ -212,7 +212,7 @@ def test_a_read_only_folder_refuses_saves_and_the_gateway_lives_on(vcan: str, tm
         with read_only(tmp_path / "store"), started(toml, tmp_path, dump) as gateway:
             for _ in range(2):
                 assert master.refusal(lambda: master.write(1, 0x1010, 1, SAVE, 4)) == HARDWARE
-            assert "esc1: parameters cannot be stored" in gateway.log
+            gateway.wait_for_line("esc1: parameters cannot be stored", 3)
             assert master.refusal(lambda: master.write(1, 0x1011, 1, LOAD, 4)) == HARDWARE
             master.write(1, 0x2100, 1, 11, 1)
             assert master.number(1, 0x2100, 1) == 11
