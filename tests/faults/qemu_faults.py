@@ -330,6 +330,7 @@ def fifo_overrun(bench: "MachineBench", fault: Fault, times: int) -> None:
     registers = controller_registers(slot)
     interrupt_enable = 4
     for _ in range(2 * times):
+        time.sleep(1.2)  # the node says it once a second at most
         with bench.injection(fault, escs=()) as injection:
             before = can_details("can0")["stats64"]["rx"]["over_errors"]
             enabled = os.pread(registers, 1, interrupt_enable)
