@@ -18,7 +18,7 @@ from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.runtime.retry import Retry
-from kontronik_can_gw.runtime.snapshot import CanFacts
+from kontronik_can_gw.runtime.snapshot import CanFacts, name_in_words
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND
 
@@ -448,7 +448,7 @@ class CanSide:
             text = f"{name}: error-passive: wrong bit rate, a cable or termination fault, or nobody acknowledges."
             self._conditions.begin(self._controller_condition, text, now)
         elif port.state is not CanState.UNKNOWN:
-            word = port.state.name.lower().replace("_", "-")
+            word = name_in_words(port.state.name)
             self._conditions.end(self._controller_condition, f"{name}: {word}", now)
 
     def _follow_bitrate(self, bitrate: int | None, now: int) -> None:

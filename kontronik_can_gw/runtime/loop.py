@@ -24,7 +24,7 @@ from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
 from kontronik_can_gw.runtime.reload import Reloader
 from kontronik_can_gw.runtime.serial_port import Identity
-from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, process_facts, snapshot
+from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, name_in_words, process_facts, snapshot
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.runtime.systemd import Notifier
@@ -315,8 +315,8 @@ class Loop:
 
     def _status_words(self) -> str:
         """How things are, in one line."""
-        words = [f"CAN {self.can.config.channel} {_words(self.gateway.status.can_state.name)}"]
-        words += [f"{esc.settings.name}: telemetry {_words(esc.link.name)}" for esc in self.gateway.escs]
+        words = [f"CAN {self.can.config.channel} {name_in_words(self.gateway.status.can_state.name)}"]
+        words += [f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}" for esc in self.gateway.escs]
         return "; ".join(words)
 
     # --- words
@@ -335,7 +335,7 @@ class Loop:
         for index, (node_id, state) in enumerate(states):
             if before and before[index] == (node_id, state):
                 continue
-            words = "waits for LSS" if node_id == UNCONFIGURED else f"{node_id} {_words(state.name)}"
+            words = "waits for LSS" if node_id == UNCONFIGURED else f"{node_id} {name_in_words(state.name)}"
             name = f"{self.escs[index].name}: CANopen node"
             self.conditions.event(name, f"{name} {words}", now, logging.INFO)
 
@@ -350,13 +350,13 @@ class Loop:
             return
         seconds = (now - then) / SECOND
         rates = [(new - old) / seconds for new, old in zip(counts, before, strict=True)]
-        words = [f"CAN {_words(status.can_state.name)} {rates[0]:.0f} frames/s"]
+        words = [f"CAN {name_in_words(status.can_state.name)} {rates[0]:.0f} frames/s"]
         for number, esc in enumerate(self.gateway.escs):
             rate = "" if esc.frame_rate is None else f" {esc.frame_rate / 10:.0f} Hz"
-            words.append(f"{esc.settings.name}: telemetry {_words(esc.link.name)}{rate}")
+            words.append(f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}{rate}")
             if states and states[number][0] != UNCONFIGURED:
                 node_id, state, _ = states[number]
-                words.append(f"node {node_id} {_words(state.name)} {rates[1 + number]:.0f} PDOs/s")
+                words.append(f"node {node_id} {name_in_words(state.name)} {rates[1 + number]:.0f} PDOs/s")
         log.info("%s", "; ".join(words))
 
     def _report(self, now: int) -> None:
@@ -378,8 +378,3 @@ class Loop:
             self._tell_status(now)
         self._publish(now)
         self._tell_manager(now)
-
-
-def _words(name: str) -> str:
-    """A constant's name as people read it."""
-    return name.lower().replace("_", "-")

@@ -16,7 +16,7 @@ from typing import Any
 from kontronik_can_gw.cia301.nmt import NmtState
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.protocol.states import ErrorBit, OperatingError, SelfTestError
-from kontronik_can_gw.runtime.snapshot import STALE_NS
+from kontronik_can_gw.runtime.snapshot import STALE_NS, name_in_words
 from kontronik_can_gw.sources import CanState, GatewayState
 from kontronik_can_gw.telemetry import SECOND, LinkState
 
@@ -169,7 +169,7 @@ def _of(esc: Document) -> dict[str, object]:
 
 
 def _states(labels: Labels, states: type[Any], now: str) -> list[Sample]:
-    names = [state.name.lower().replace("_", "-") for state in states]
+    names = [name_in_words(state.name) for state in states]
     return [(dict(labels) | {"state": name}, int(name == now)) for name in names]
 
 

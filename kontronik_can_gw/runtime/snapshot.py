@@ -178,12 +178,16 @@ def snapshot(
             "open_fds": process.open_fds,
             "threads": process.threads,
         },
-        "gateway": {"state": _words(status.state.name), "esc_count": status.esc_count, "escs_ok": status.escs_ok},
+        "gateway": {
+            "state": name_in_words(status.state.name),
+            "esc_count": status.esc_count,
+            "escs_ok": status.escs_ok,
+        },
         "can": {
             "interface": can.interface,
             "channel": can.channel,
             "bitrate": can.bitrate,
-            "state": _words(status.can_state.name),
+            "state": name_in_words(status.can_state.name),
             "open": can.open,
             "stalled": can.stalled,
             "complaint": can.complaint or None,
@@ -197,7 +201,7 @@ def snapshot(
             {
                 "esc": name,
                 "node_id": None if node_id == UNCONFIGURED else node_id,
-                "state": _words(state.name),
+                "state": name_in_words(state.name),
                 "pdos_sent": sent,
             }
             for name, (node_id, state, sent) in zip(names, nodes, strict=False)
@@ -230,7 +234,7 @@ def _seconds(ns: int) -> float:
     return round(ns / SECOND, 3)
 
 
-def _words(name: str) -> str:
+def name_in_words(name: str) -> str:
     """A constant's name as people read it."""
     return name.lower().replace("_", "-")
 
@@ -254,7 +258,7 @@ def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
             "lost_for_s": None if port.lost_since_ns is None else _seconds(now - port.lost_since_ns),
             "line_errors": dict(port.line_errors),
         },
-        "link": _words(esc.link.name),
+        "link": name_in_words(esc.link.name),
         "fresh": live is not None,
         "diagnosis": esc.diagnosis() if live is None and port.open else None,
         "layout": _LAYOUTS[esc.layout],
