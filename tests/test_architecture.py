@@ -36,11 +36,18 @@ ONLY_IN = {
         "dbc_output/prepare.py",
         "dbc_output/writer.py",
         "canopen_dbc.py",
+        "offline/layouts.py",
         "cli",
     ),
     "serial": ("runtime",),
     "can": ("runtime", "cli/demo.py", "offline"),
     "rich": ("cli",),
+    "numpy": ("offline",),
+    "pyarrow": ("offline",),
+    "asammdf": ("offline",),
+    "matplotlib": ("offline",),
+    "paho": ("offline",),
+    "shtab": ("cli",),
     "canopen": ("cia301/eds.py", "cia301/dictionary.py"),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))

@@ -117,6 +117,11 @@ class SignalPlan:
     """Of a float, in raw values; its codes are bit patterns."""
     page: int | None = None
     """The multiplexer value under which the signal is sent; None: always."""
+    factor: Fraction = Fraction(1)
+    offset: Fraction = Fraction(0)
+    """Physical value of a raw one: ``raw * factor + offset``, in ``unit``."""
+    texts: Mapping[int, str] = field(default_factory=dict)
+    """Value table, raw value to text, without the codes for not available and error."""
     notes: tuple[str, ...] = ()
     """What resolution or range is lost, for people."""
 
@@ -599,6 +604,9 @@ class _Compiler:
             "not_available": not_available,
             "error": error,
             "page": page,
+            "factor": factor,
+            "offset": offset,
+            "texts": _value_texts(signal),
         }
         special = [code for name, code in codes.items() if name in _NOT_AVAILABLE_TEXTS | _ERROR_TEXTS]
         limits_set = not (signal.minimum is None and signal.maximum is None) and not (
@@ -720,6 +728,12 @@ class _Compiler:
             notes=tuple(notes),
             **base,
         )
+
+
+def _value_texts(signal: "Signal") -> dict[int, str]:
+    """The value table without its codes."""
+    table = {int(raw): str(text) for raw, text in (signal.choices or {}).items()}
+    return {raw: text for raw, text in table.items() if normalize(text) not in _NOT_AVAILABLE_TEXTS | _ERROR_TEXTS}
 
 
 def _float_codes(signal: "Signal", factor: Fraction, offset: Fraction, codes: Mapping[str, int]) -> dict[str, Any]:

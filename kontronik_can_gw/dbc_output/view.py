@@ -1,0 +1,82 @@
+"""What a participant of the bus knows now: the newest value of each signal, as long as it is fresh. Pure; time is handed in.
+
+A value is None before its first frame, when the gateway says that it is not available, and when its message stays away: a cyclic one for
+three cycles, one that comes with telemetry for a second, one that comes on change only when nothing of the gateway's comes any more.
+"""
+
+from kontronik_can_gw.dbc_output.layout import SendType
+from kontronik_can_gw.dbc_output.unpacker import Chunk, Part, SignalReader, Value
+from kontronik_can_gw.sources import Group
+from kontronik_can_gw.telemetry import MS, SECOND
+
+_LEAST_NS = 250 * MS
+_CYCLES = 3
+_SILENCE_NS = 3 * SECOND
+
+
+class View:
+    """The values of a layout's columns, in the order of ``reader.columns``. ``now``: nanoseconds of one clock, that of the frames."""
+
+    def __init__(self, reader: SignalReader) -> None:
+        self.reader = reader
+        self.values: list[Value] = [None] * len(reader.columns)
+        self.frames = 0
+        """Frames of the layout that were taken."""
+        self.last_ns: int | None = None
+        """When the newest of them came."""
+        self._part_of = {part.first: index for index, part in enumerate(reader.parts)}
+        self._life = [_life(part) for part in reader.parts]
+        self._seen: list[int | None] = [None] * len(reader.parts)
+        self._next_expiry: int | None = None
+
+    def take(self, key: int, data: bytes, now: int) -> list[Chunk] | None:
+        """Take a frame (``key``: its id, with EXTENDED for 29 bits); what it brought, None where it is not of the layout."""
+        chunks = self.reader.read(key, data)
+        if chunks is None:
+            return None
+        self.frames += 1
+        self.last_ns = now
+        values, seen = self.values, self._seen
+        for first, new in chunks:
+            values[first : first + len(new)] = new
+            part = self._part_of[first]
+            seen[part] = now
+            due = now + (self._life[part] or _SILENCE_NS)
+            if self._next_expiry is None or due < self._next_expiry:
+                self._next_expiry = due
+        return chunks
+
+    def expire(self, now: int) -> bool:
+        """Forget what has stayed away for too long; True where something was forgotten."""
+        if self._next_expiry is None or now <= self._next_expiry:
+            return False
+        silent = self.last_ns is not None and now - self.last_ns > _SILENCE_NS
+        forgotten = False
+        due: list[int] = []
+        for index, (part, life) in enumerate(zip(self.reader.parts, self._life, strict=True)):
+            when = self._seen[index]
+            if when is None:
+                continue
+            if silent or (life is not None and now - when > life):
+                self._seen[index] = None
+                self.values[part.first : part.first + part.count] = [None] * part.count
+                forgotten = True
+            else:
+                due.append(when + life if life is not None else (self.last_ns or now) + _SILENCE_NS)
+        self._next_expiry = min(due, default=None)
+        return forgotten
+
+    def value(self, source: str, esc: int | None = None) -> Value:
+        """The value of the signal that is bound to a source; None where the layout has none too."""
+        index = self.reader.column_of(source, esc)
+        return None if index is None else self.values[index]
+
+
+def _life(part: Part) -> int | None:
+    """How long a part's values hold without a new frame; None: as long as anything of the gateway's comes."""
+    plan = part.plan
+    if plan.cycle_ns:
+        return max(_LEAST_NS, _CYCLES * plan.cycle_ns * len(plan.pages))
+    if SendType.EVENT in plan.send_type and Group.LIVE in plan.paces:
+        return SECOND
+    return None
