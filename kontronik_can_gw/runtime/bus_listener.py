@@ -1,0 +1,127 @@
+"""A participant of the CAN bus that only listens, for those who look on: it never sends, claims nothing, and comes back by itself.
+
+It has an interface of its own beside whatever else uses it (a gateway, for one), with receive filters for the ids that were asked for.
+"""
+
+import errno
+import logging
+import select
+import time
+
+from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, fault_of, socketcan_error
+from kontronik_can_gw.sources import CanState
+
+RETRY_S = 0.5
+"""Between two looks at an interface that does not work, and at whether one that works is still up."""
+_MOST_AT_ONCE = 4096
+_BUS_OFF = (
+    "CAN interface {name}: is bus-off: look at bit rate, wiring and termination. "
+    "Start it anew: sudo ip link set {name} down && sudo ip link set {name} up type can restart-ms 100"
+)
+
+
+class BusListener:
+    """An open interface, received from only.
+
+    ``keys``: ids, with EXTENDED for 29 bits. Raises RunError where the interface cannot be opened now, UserError where python-can does
+    not know it; later troubles only show in ``problem``. ``fileno`` does not exist: what stands behind changes with each opening.
+    """
+
+    def __init__(self, config: CanConfig, keys: frozenset[int]) -> None:
+        self.problem = ""
+        """One line with the remedy while the interface does not work; empty while it does."""
+        self.lost_frames = 0
+        """How often frames were lost because they came faster than they were taken."""
+        self._config = config
+        self._keys = keys
+        self._port: CanPort | None = None
+        self._look_at = 0.0
+        # what python-can says of an interface that went away is said by ``problem``, with the remedy
+        logging.getLogger("can").addHandler(logging.NullHandler())
+        self._open()
+
+    def receive(self, timeout_s: float) -> list[CanFrame]:
+        """The frames that have come, oldest first; waits for the first one, at most ``timeout_s``. Never raises."""
+        end = time.monotonic() + timeout_s
+        while True:
+            now = time.monotonic()
+            if now >= self._look_at:
+                self._look_at = now + RETRY_S
+                self._look()
+            if frames := self._take():
+                return frames
+            now = time.monotonic()
+            if now >= end:
+                return []
+            self._wait(min(end, max(now, self._look_at)) - now)
+
+    def close(self) -> None:
+        """May be called again."""
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def _open(self) -> None:
+        port = CanPort(self._config)
+        try:
+            port.set_receive_ids(self._keys)
+        except BaseException:
+            port.close()
+            raise
+        self._port = port
+        self.problem = ""
+
+    def _look(self) -> None:
+        """Whether the interface works; open it anew where it is gone."""
+        config = self._config
+        fault = fault_of(config.channel) if config.interface == "socketcan" else 0
+        if self._port is not None and (fault == errno.ENODEV or self._port.gone):
+            self.close()
+        if fault:
+            self.problem = socketcan_error(config, fault).problems[0]
+        elif self._port is None:
+            try:
+                self._open()
+            except UserError as error:
+                self.problem = error.problems[0]
+        else:
+            is_off = self._port.state is CanState.BUS_OFF and config.interface == "socketcan"
+            self.problem = _BUS_OFF.format(name=config.channel) if is_off else ""
+
+    def _take(self) -> list[CanFrame]:
+        if self._port is None:
+            return []
+        frames: list[CanFrame] = []
+        while len(frames) < _MOST_AT_ONCE:
+            new = self._port.receive()
+            frames += new
+            if len(new) < RECEIVE_LIMIT:
+                break
+        self.lost_frames += self._port.overruns
+        self._port.overruns = 0
+        if self._port.gone:
+            self.close()
+            self.problem = self._gone()
+        elif frames:
+            self.problem = ""
+            if self._port.state in (CanState.BUS_OFF, CanState.DOWN):
+                self._port.state = CanState.ERROR_ACTIVE  # what comes says that it works again
+        return frames
+
+    def _wait(self, seconds: float) -> None:
+        fd = None if self._port is None else self._port.fileno()
+        if fd is None:
+            time.sleep(max(0.0, seconds))
+            return
+        poll = select.poll()
+        poll.register(fd, select.POLLIN)
+        poll.poll(max(0.0, seconds) * 1000)
+
+    def _gone(self) -> str:
+        config = self._config
+        if config.interface == "socketcan":
+            return socketcan_error(config, errno.ENODEV).problems[0]
+        return f"CAN {config.interface} {config.channel}: the adapter does not answer any more. Plug it in again."
