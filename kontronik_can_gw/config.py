@@ -9,7 +9,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -32,10 +32,22 @@ _TEXT = r"^[^\x00]*[^\x00\s][^\x00]*$"
 _BYTE = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
 _PORT = "(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5][0-9]{4}|[1-9][0-9]{0,3})"
 _LOOPBACK = rf"(localhost|127(\.{_BYTE}){{3}}|\[::1\]):{_PORT}"
+_BROKER = rf"([A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*\])(:{_PORT})?"
+_TOPIC = r"[^\s\x00+#/$][^\x00-\x1f\x7f+#/]*(/[^\x00-\x1f\x7f+#/]+){0,7}"
+_LEVEL = "[A-Za-z0-9_-]{1,64}"
+_LONGEST_TOPIC = 200
+_FORMS = {
+    "broker": (_BROKER, "a broker, as broker.example, 192.168.1.5:1883 or [fe80::1]:1883"),
+    "topic": (_TOPIC, "the beginning of topics, as kontronik or fleet/north: no + and #, no / at the ends"),
+    "level": (_LEVEL, "a name of 1 to 64 letters, digits, _ and -"),
+}
 
 
 def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
-    """A configuration key. ``kind``: string, integer, boolean, ratio, bindings, ids, loopback. ``limits``: low, high, choices, pattern."""
+    """A configuration key. ``limits``: low, high, choices, pattern.
+
+    ``kind``: string, integer, number, boolean, ratio, bindings, ids, loopback, broker, topic, level.
+    """
     metadata = {"doc": doc, "kind": kind} | limits
     if isinstance(default, dict):
         return field(default_factory=lambda: dict(default), metadata=metadata)
@@ -217,6 +229,75 @@ class StatisticsConfig:
 
 
 @dataclass(frozen=True)
+class MqttConfig:
+    """What ``kontronik-can-gw mqtt`` publishes, and where."""
+
+    broker: str | None = _key(
+        "MQTT broker, as broker.example or 192.168.1.5:1883 (default port 1883, with TLS 8883)", "broker", None
+    )
+    tls: bool = _key("encrypt, and check the broker's certificate and name", "boolean", False)
+    ca_file: str | None = _key(
+        "certificate of the authority that signed the broker's, relative to this configuration (default: those of the system)",
+        "string",
+        None,
+    )
+    cert_file: str | None = _key("certificate to show to the broker, relative to this configuration", "string", None)
+    key_file: str | None = _key("key of that certificate, relative to this configuration", "string", None)
+    username: str | None = _key("user name at the broker", "string", None)
+    password_file: str | None = _key(
+        "file with the password on its first line, relative to this configuration", "string", None
+    )
+    gateway: str | None = _key("name of this gateway in the topics (default: the host name)", "level", None)
+    topic: str = _key("what all topics begin with", "topic", "kontronik")
+    rate: float = _key("state messages of each ESC in a second", "number", 1.0, low=0.01, high=20)
+    retain: bool = _key("let the broker keep the last state message of each ESC", "boolean", False)
+    discovery: str | None = _key(
+        "topic prefix of Home Assistant's discovery, there mostly 'homeassistant' (default: no discovery)",
+        "topic",
+        None,
+    )
+
+    @property
+    def address(self) -> tuple[str, int] | None:
+        """Host and port of the broker."""
+        if self.broker is None:
+            return None
+        found = re.fullmatch(_BROKER, self.broker)
+        assert found is not None
+        return found[1].strip("[]"), int(found[4] or (8883 if self.tls else 1883))
+
+
+@dataclass(frozen=True)
+class RecordConfig:
+    """Captures of what comes in, to be replayed and converted later."""
+
+    directory: str | None = _key(
+        "folder of the captures, relative to this configuration; 'state' is a folder captures in the service's state folder "
+        "(default: nothing is recorded but by `run --record`)",
+        "string",
+        None,
+    )
+    part_mb: int = _key("begin another file when one has so many megabytes", "integer", 64, low=1, high=4000)
+    part_minutes: int = _key("begin another file after so many minutes", "integer", 60, low=1, high=10_000)
+    keep_mb: int = _key(
+        "remove the oldest captures of the folder when all together have more megabytes; 0: remove nothing",
+        "integer",
+        0,
+        low=0,
+        high=10_000_000,
+    )
+    min_free_mb: int = _key(
+        "record nothing while fewer megabytes are free on the file system", "integer", 100, low=0, high=10_000_000
+    )
+    can_log: str = _key(
+        "beside it a log of the CAN frames sent and received; 'mf4' needs the extra mf4",
+        "string",
+        "none",
+        choices=("none", "candump", "asc", "blf", "trc", "mf4"),
+    )
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole configuration; ``file`` is where it came from."""
 
@@ -227,6 +308,8 @@ class Config:
     esc: tuple[EscConfig, ...]
     file: str = "(built-in)"
     statistics: StatisticsConfig = StatisticsConfig()
+    record: RecordConfig = RecordConfig()
+    mqtt: MqttConfig = MqttConfig()
 
     @cached_property
     def escs(self) -> list[EscSettings]:
@@ -270,6 +353,8 @@ _TABLES: dict[str, type[Any]] = {
     "canopen": CanopenConfig,
     "run": RunConfig,
     "statistics": StatisticsConfig,
+    "record": RecordConfig,
+    "mqtt": MqttConfig,
     "esc": EscConfig,
 }
 
@@ -359,7 +444,7 @@ def schema() -> dict[str, Any]:
 def as_toml(config: Config) -> str:
     """The effective configuration as TOML, defaults included."""
     lines: list[str] = []
-    for name in ("can", "dbc", "canopen", "run", "statistics"):
+    for name in ("can", "dbc", "canopen", "run", "statistics", "record", "mqtt"):
         lines += _toml_table(f"[{name}]", getattr(config, name))
     for esc in config.esc:
         lines += _toml_table("[[esc]]", esc)
@@ -396,6 +481,8 @@ def _value(value: Any, f: Field[Any]) -> Any:
             return value
         case "integer":
             return _integer(value, limits)
+        case "number":
+            return _number(value, limits)
         case "ratio":
             return _ratio(value)
         case "bindings" | "ids":
@@ -418,6 +505,10 @@ def _value(value: Any, f: Field[Any]) -> Any:
         raise ValueError(
             f"{value!r} is no port on this machine, as 127.0.0.1:9123 or [::1]:9123. The statistics are not for the network."
         )
+    if limits["kind"] in _FORMS:
+        pattern, form = _FORMS[limits["kind"]]
+        if len(value) > _LONGEST_TOPIC or not re.fullmatch(pattern, value):
+            raise ValueError(f"{value!r} is not {form}")
     pattern = limits.get("pattern")
     if pattern and not re.fullmatch(pattern, value):
         raise ValueError(
@@ -458,6 +549,14 @@ def _integer(value: Any, limits: Mapping[str, Any]) -> int:
     return value
 
 
+def _number(value: Any, limits: Mapping[str, Any]) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"{value!r} is not a number")
+    if not limits["low"] <= value <= limits["high"]:
+        raise ValueError(f"{value} is outside {limits['low']}..{limits['high']}")
+    return float(value)
+
+
 def _ratio(value: Any) -> Fraction:
     try:
         if isinstance(value, str):
@@ -496,6 +595,36 @@ def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -
             problems.append(
                 f"{file}: esc[{number}].name: {esc.name!r} makes signal names ambiguous. Choose another name."
             )
+
+
+def mqtt_with(config: MqttConfig, given: Mapping[str, Any]) -> MqttConfig:
+    """The same table with other values for some keys, each checked as in a file. UserError names a key as an option."""
+    known = {f.name: f for f in fields(MqttConfig)}
+    problems: list[str] = []
+    values: dict[str, Any] = {}
+    for name, value in given.items():
+        try:
+            values[name] = _value(value, known[name])
+        except ValueError as error:
+            problems.append(f"--{name.replace('_', '-')}: {error}")
+    if not problems:
+        made = replace(config, **values)
+        problems += [f"mqtt.{problem}" for problem in _mqtt_problems(made)]
+        if not problems:
+            return made
+    raise UserError(*problems)
+
+
+def _mqtt_problems(mqtt: MqttConfig) -> list[str]:
+    problems = []
+    for name in ("ca_file", "cert_file", "key_file"):
+        if getattr(mqtt, name) is not None and not mqtt.tls:
+            problems.append(f"{name}: is for TLS, which is off. Switch mqtt.tls on (--tls).")
+    if mqtt.key_file is not None and mqtt.cert_file is None:
+        problems.append("key_file: needs the certificate that it belongs to. Set mqtt.cert_file (--cert-file).")
+    if mqtt.password_file is not None and mqtt.username is None:
+        problems.append("password_file: needs a user name. Set mqtt.username (--username).")
+    return problems
 
 
 def _check_outputs(config: Config, problems: list[str]) -> None:
@@ -568,8 +697,12 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
         case "ids":
             number = {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
             entry |= {"type": "object", "additionalProperties": number}
+        case "number":
+            entry |= {"type": "number", "minimum": limits["low"], "maximum": limits["high"]}
         case "loopback":
             entry |= {"type": "string", "pattern": f"^{_LOOPBACK}$"}
+        case "broker" | "topic" | "level" as kind:
+            entry |= {"type": "string", "pattern": f"^{_FORMS[kind][0]}$", "maxLength": _LONGEST_TOPIC}
         case kind:
             entry["type"] = kind
             if kind == "string":

@@ -195,6 +195,10 @@ class Gateway:
         if self.nodes is not None:
             self.nodes.advance(now)
 
+    def message_bits(self, message: int, now: int, page: int | None = None) -> int:
+        """What the layout's message of this index would hold if it were sent now, alive counter and CRC 0; bit 0 is bit 0 of byte 0."""
+        return self._output.bits(message, now, page)
+
     def next_deadline(self) -> int:
         """When ``advance`` is to be called at the latest."""
         expiry = self._next_expiry or min(esc.next_deadline() for esc in self.escs)

@@ -48,6 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="log a line about telemetry, CAN, NMT states and PDO traffic every so many seconds (default: changes only)",
     )
+    parser.add_argument(
+        "--record",
+        type=Path,
+        metavar="DIR",
+        help="write captures of what comes in to this folder (record.directory)",
+    )
     parser.epilog = (
         "Ends by SIGTERM or SIGINT within half a second. SIGHUP reads the configuration again: a faulty one is refused and the old "
         "one stays. The serial ports are only read; nothing is ever transmitted to an ESC."
@@ -95,6 +101,7 @@ class _Run:
 
         self._file: Path = args.config
         self._wait: bool = args.wait
+        self._record: Path | None = args.record
         self._status_ns = int((args.status or 0) * SECOND)
         self._notifier = notifier
         self._program = program_facts(args.config)
@@ -169,13 +176,19 @@ class _Run:
             raise
 
     def _open(self, loaded: Loaded, wait: bool) -> None:
+        from kontronik_can_gw.cli.recording import recorder_of, setup_of
         from kontronik_can_gw.gateway import Gateway
         from kontronik_can_gw.runtime.loop import Loop
+        from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+        from kontronik_can_gw.runtime.recorder import state_of
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
 
         config = loaded.config
         silent = config.dbc.on_loss == "silent"
-        gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns(), silent, loaded.canopen)
+        created_ns = time.monotonic_ns()
+        parts = (loaded.escs, loaded.layout, created_ns, silent, loaded.canopen)
+        recorder = recorder_of(config, self._record)
+        gateway = Gateway(*parts) if recorder is None else RecordedGateway(recorder.put, *parts)
         try:
             statistics = Statistics(config.statistics_path or default_file(), config.statistics.address)
         except UserError:
@@ -193,12 +206,15 @@ class _Run:
             reloader=self._reloader,
             statistics=statistics,
             program=self._program,
+            recorder=recorder,
         )
         if self._loop is not None:
             gateway.take_over(self._loop.gateway)
             loop.take_over(self._loop)
             gc.collect()  # what belonged to an old configuration goes in circles
         _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
+        if recorder is not None:
+            recorder.header = setup_of(loaded).header() | {"created_ns": created_ns, "state": state_of(gateway)}
         loop.open()
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())

@@ -213,13 +213,18 @@ def normalize(name: str) -> str:
 
 def load_database(path: Path) -> "Database":
     """Read a DBC file. UserError with one line for a file that cannot be read or is no DBC."""
-    with without_asammdf():
-        import cantools.database
-
     try:
         raw = path.read_bytes()
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+    return parse_database(raw, str(path))
+
+
+def parse_database(raw: bytes, path: str) -> "Database":
+    """Read the bytes of a DBC file. UserError with one line that names ``path`` for what is no DBC."""
+    with without_asammdf():
+        import cantools.database
+
     if b"\0" in raw:
         raise UserError(f"{path}: is a binary file, not a DBC")
     try:
@@ -245,7 +250,7 @@ _STRING = re.compile(r'"(?:\\"|[^"])*"')
 _MASKED = re.compile(r'"\0(\d+)\0"')
 
 
-def _spelled_out(text: str, path: Path) -> str:
+def _spelled_out(text: str, path: str) -> str:
     """What other tools write and cantools does not read: a VAL_ that names a VAL_TABLE_, enumeration attributes by text.
 
     Strings are masked while lines are looked at, so that no comment and no value text is touched.

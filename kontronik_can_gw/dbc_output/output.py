@@ -98,6 +98,10 @@ class DbcOutput:
                 message.plan = replace(message.plan, signals=signals)
                 message.pack = compile_pack(message.plan)
 
+    def bits(self, index: int, now: int, page: int | None) -> int:
+        """What a message would hold now, alive counter and CRC 0."""
+        return self._messages[index].pack(self._escs, self._gateway, now, 0, page or 0)
+
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
         for index, triggers in self._listeners[esc]:

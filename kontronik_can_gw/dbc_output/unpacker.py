@@ -84,6 +84,11 @@ class SignalReader:
         self.columns = tuple(columns)
         self._by_source = {(c.source, c.esc): index for index, c in reversed(list(enumerate(columns)))}
 
+    def read_part(self, part: Part, bits: int) -> list[Value]:
+        """The values of a part from the bits of its message."""
+        unpacks = self._messages[part.plan.can_id | (EXTENDED if part.plan.extended else 0)][2]
+        return unpacks[part.page][1](bits)
+
     @property
     def keys(self) -> frozenset[int]:
         """CAN ids of the layout's messages, with ``EXTENDED`` for 29 bits."""

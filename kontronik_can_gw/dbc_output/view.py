@@ -29,6 +29,11 @@ class View:
         self._seen: list[int | None] = [None] * len(reader.parts)
         self._next_expiry: int | None = None
 
+    @property
+    def next_expiry(self) -> int | None:
+        """``expire`` has nothing to do up to this time; None: for ever."""
+        return self._next_expiry
+
     def take(self, key: int, data: bytes, now: int) -> list[Chunk] | None:
         """Take a frame (``key``: its id, with EXTENDED for 29 bits); what it brought, None where it is not of the layout."""
         chunks = self.reader.read(key, data)

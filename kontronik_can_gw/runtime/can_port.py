@@ -12,7 +12,6 @@ import select
 import socket
 import struct
 from collections.abc import Collection
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
 from kontronik_can_gw.sources import CanState
 
@@ -47,19 +47,6 @@ _ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
 _CTRL_RX_OVERFLOW, _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x01, 0x0C, 0x30, 0x40
 _SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
 """The kernel's figures of a socket; the last one counts what it dropped for want of room."""
-
-
-class Sent(Enum):
-    """What became of a frame: accepted, not now (queue full), or the interface is down or gone."""
-
-    OK = 1
-    BUSY = 2
-    FULL = 3
-    """Not now: our own share of the queue is full. The port becomes writable when it is not."""
-    DOWN = 4
-    GONE = 5
-    LATE = 6
-    """Not sent: it has become old while it was to be handed over."""
 
 
 class CanPort:

@@ -12,11 +12,11 @@ from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Conflict, Gateway
-from kontronik_can_gw.runtime.can_port import CanPort, Sent, socketcan_error
+from kontronik_can_gw.mailboxes import Mailboxes, Sent
+from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
 from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
-from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.snapshot import CanFacts, name_in_words
 from kontronik_can_gw.sources import CanState
@@ -51,6 +51,8 @@ class CanSide:
         self.mailboxes = Mailboxes()
         self.facts: LinkFacts | None = None
         """What the kernel told last; None where it tells nothing of this interface."""
+        self.tap: Callable[[CanFrame, int, bool], None] | None = None
+        """Is told each frame that was sent, or received (True), with its time."""
         self._gateway = gateway
         self._selector = selector
         self._conditions = conditions
@@ -310,6 +312,8 @@ class CanSide:
             self._gateway.status.received_frames += len(frames)
             for frame in frames:
                 self._gateway.receive_frame(frame, now)
+                if self.tap is not None:
+                    self.tap(frame, now, True)
             self._follow_reception(now)
 
     def is_stuck(self) -> bool:
@@ -378,7 +382,10 @@ class CanSide:
         if self._clock() - self._turn_ns > self.longest_turn_ns:  # the process was stopped in the middle of its turn
             return Sent.LATE
         assert self.port is not None
-        return self.port.send(frame)
+        answer = self.port.send(frame)
+        if self.tap is not None and answer is Sent.OK:
+            self.tap(frame, self._turn_ns, False)
+        return answer
 
     def _busy(self, answer: Sent, now: int) -> Sent:
         """The interface takes no more for now; GONE if it has not for so long that it must be."""

@@ -2,7 +2,8 @@
 
 What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` and ``reload`` may be called from elsewhere (a
 signal handler, another thread). Threads of their own have the parameter store (store.py), the reading of another configuration
-(reload.py), the statistics (statistics.py), the log (log_writer.py), and reception where python-can has no descriptor (bus_reader.py).
+(reload.py), the statistics (statistics.py), captures (recorder.py), the log (log_writer.py), and reception where python-can has no
+descriptor (bus_reader.py).
 """
 
 import contextlib
@@ -22,6 +23,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
+from kontronik_can_gw.runtime.recorder import Recorder, devices_of, state_of
 from kontronik_can_gw.runtime.reload import Reloader
 from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, name_in_words, process_facts, snapshot
@@ -57,6 +59,7 @@ class Loop:
         reloader: Reloader | None = None,
         statistics: Statistics | None = None,
         program: ProgramFacts | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         self.gateway = gateway
         self.conditions = Conditions()
@@ -77,6 +80,7 @@ class Loop:
         self._statistics = statistics or Statistics(None, None)
         self._program = program or ProgramFacts("")
         self._store_error = ""
+        self._recorder = recorder
         self._reloader = reloader
         self._reload_asked = False
         self._stopping = False
@@ -86,6 +90,8 @@ class Loop:
             EscInput(i, path, gateway, self._selector, self.conditions, self._lost) for i, path in enumerate(ports)
         ]
         self.can = CanSide(can_config, gateway, self._selector, self.conditions, self._esc_at, clock)
+        if recorder is not None and recorder.wants_frames:
+            self.can.tap = recorder.put_frame
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
         if store is not None:
@@ -125,6 +131,8 @@ class Loop:
             for esc in self.escs:
                 esc.open(now, self._wait, self._others(esc))
             self.can.open(now, self._wait)
+            if self._recorder is not None:
+                self._recorder.start()
         except UserError:
             self.close()
             raise
@@ -175,6 +183,8 @@ class Loop:
         self.can.close()
         self._selector.close()
         self._statistics.close()
+        if self._recorder is not None:
+            self._recorder.close()
         if self._store is not None:
             self._store.close(_LAST_SAVE_S)
         for fd in (self._wake_read, self._wake_write):
@@ -276,6 +286,7 @@ class Loop:
                 can=self.can.facts_for_statistics(),
                 store=store,
                 log_lines=list(self.conditions.recent),
+                recorder=None if self._recorder is None else self._recorder.facts,
             )
             self._statistics.publish(document)
         for begins, text in self._statistics.reports(now):
@@ -283,6 +294,18 @@ class Loop:
                 self.conditions.begin("statistics", text, now)
             else:
                 self.conditions.end("statistics", text, now)
+
+    # --- captures
+
+    def _follow_recorder(self, now: int) -> None:
+        if self._recorder is None:
+            return
+        self._recorder.note(state_of(self.gateway), devices_of(self.gateway))
+        for begins, text in self._recorder.reports(now):
+            if begins:
+                self.conditions.begin("captures", text, now)
+            else:
+                self.conditions.end("captures", text, now)
 
     # --- another configuration
 
@@ -376,5 +399,6 @@ class Loop:
         self.conditions.advance(now)
         if self._status_due is not None and now >= self._status_due:
             self._tell_status(now)
+        self._follow_recorder(now)
         self._publish(now)
         self._tell_manager(now)

@@ -8,11 +8,11 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
@@ -29,6 +29,9 @@ from kontronik_can_gw.protocol.states import (
 )
 from kontronik_can_gw.sources import GatewayStatus, Group, Source, sources
 from kontronik_can_gw.telemetry import INFO_TIMEOUT_NS, SECOND, EscSettings, EscTelemetry
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.runtime.recorder import RecorderFacts
 
 FORMAT = 1
 """Of the document; another number for a change that readers must know of. New keys may come without one."""
@@ -157,6 +160,7 @@ def snapshot(
     can: CanFacts,
     store: StoreFacts | None = None,
     log_lines: Sequence[str] = (),
+    recorder: "RecorderFacts | None" = None,
 ) -> Document:
     """The document: plain dictionaries, lists, texts and numbers. ``now`` monotonic nanoseconds, ``wall`` seconds of the wall clock."""
     status, nodes = gateway.status, gateway.node_states()
@@ -207,6 +211,7 @@ def snapshot(
             for name, (node_id, state, sent) in zip(names, nodes, strict=False)
         ],
         "store": None if store is None else {"waiting": store.waiting, "last_error": store.last_error or None},
+        "recording": None if recorder is None else asdict(recorder),
         "log": list(log_lines)[-LOG_LINES:],
     }
 

@@ -93,6 +93,7 @@ def test_an_unknown_option_is_named(command: str) -> None:
         "doctor": ["-c", "x"],
         "decode": ["-"],
         "service": ["status"],
+        "completion": ["bash"],
     }.get(command, [])
     done = inside(command, *needed, "--no-such-option")
     assert (done.returncode, done.stdout) == (2, "")
@@ -109,7 +110,7 @@ def test_a_configuration_is_required(command: str) -> None:
 
 OPTIONS = {
     "demo": ["--seconds", "--seed"],
-    "run": ["-c", "--config", "--wait", "--status"],
+    "run": ["-c", "--config", "--wait", "--status", "--record"],
     "check": ["-c", "--config"],
     "init": ["FILE", "--force"],
     "dbc": [
@@ -124,9 +125,14 @@ OPTIONS = {
         *("--flip-bits", "--dropout", "--error", "--swap-device"),
     ],
     "schema": ["-h"],
+    "describe": ["-c", "--config", "--dbc", "--format", "-o", "--output"],
+    "completion": ["SHELL"],
     "service": ["ACTION"],
     "doctor": ["-c", "--config", "--json"],
     "status": ["-c", "--config", "--file", "--json", "--once", "--interval"],
+    "monitor": [
+        *("FILE", "-c", "--config", "--dbc", "--interface", "--channel", "--speed", "--once", "--timeout", "--interval"),
+    ],
 }
 
 

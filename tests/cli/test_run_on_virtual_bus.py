@@ -27,12 +27,12 @@ from kontronik_can_gw.config import CanConfig, parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Mailboxes, Sent
 from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, OperatingError, encode, rows
 from kontronik_can_gw.runtime import can_port
-from kontronik_can_gw.runtime.can_port import CanPort, Sent
+from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import LinkState

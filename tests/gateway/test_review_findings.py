@@ -16,13 +16,12 @@ from kontronik_can_gw.dbc_output.prepare import prepare
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Mailboxes, Sent
 from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.protocol import codec
 from kontronik_can_gw.protocol.fields import InfoData, LiveData
 from kontronik_can_gw.runtime import can_side
-from kontronik_can_gw.runtime.can_port import Sent
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.runtime.mailboxes import Mailboxes
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 

@@ -8,7 +8,7 @@ from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.can_port import Sent
+from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND

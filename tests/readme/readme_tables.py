@@ -14,6 +14,8 @@ from kontronik_can_gw.config import (
     CanopenConfig,
     DbcConfig,
     EscConfig,
+    MqttConfig,
+    RecordConfig,
     RunConfig,
     StatisticsConfig,
     shipped,
@@ -54,6 +56,8 @@ def configuration() -> str:
         ("canopen", CanopenConfig),
         ("run", RunConfig),
         ("statistics", StatisticsConfig),
+        ("record", RecordConfig),
+        ("mqtt", MqttConfig),
         ("[esc]", EscConfig),
     ):
         for f in fields(table):

@@ -22,10 +22,11 @@ from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.runtime import can_port, can_side
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, Sent
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState

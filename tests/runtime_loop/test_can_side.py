@@ -12,8 +12,9 @@ from kontronik_can_gw.config import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime import can_side
-from kontronik_can_gw.runtime.can_port import Sent, socketcan_error
+from kontronik_can_gw.runtime.can_port import socketcan_error
 from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts

@@ -7,11 +7,11 @@ from kontronik_can_gw.config import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.protocol.codec import Layout, encode
 from kontronik_can_gw.protocol.fields import LiveData
 from kontronik_can_gw.runtime import can_side
-from kontronik_can_gw.runtime.can_port import Sent
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND

@@ -19,10 +19,11 @@ from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.protocol import Layout as UartLayout
 from kontronik_can_gw.protocol import LiveData, encode
-from kontronik_can_gw.runtime.can_port import CanPort, Sent
+from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import EscSettings

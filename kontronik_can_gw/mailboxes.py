@@ -2,11 +2,24 @@
 
 from collections import deque
 from collections.abc import Callable
+from enum import Enum
 
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime.can_port import Sent
 
 QUEUE_LENGTH = 2048
+
+
+class Sent(Enum):
+    """What became of a frame: accepted, not now (queue full), or the interface is down or gone."""
+
+    OK = 1
+    BUSY = 2
+    FULL = 3
+    """Not now: our own share of the queue is full. The port becomes writable when it is not."""
+    DOWN = 4
+    GONE = 5
+    LATE = 6
+    """Not sent: it has become old while it was to be handed over."""
 
 
 class Mailboxes:

@@ -1,0 +1,292 @@
+"""The capture file (.kcap): what came in from the ESCs and from the bus, with times. Pure: bytes to entries and back.
+
+A file is a row of blocks, each written at once and good for itself, so that a loss of power costs the last block and a damaged stretch
+only what is in it. All numbers are little-endian. A block::
+
+    4 bytes  "KCB1"
+    u8       kind: "H" header (JSON), "I" information (JSON, adds to the header), "D" data, "E" end (empty: closed in good order)
+    u8       1: the payload is deflated (zlib)
+    u16      0
+    u32      length of the payload as stored
+    u32      length of the payload when inflated
+    u32      number of the block in this file, from 0
+    u32      CRC-32 (zlib) of the 20 bytes above and the payload as stored
+    payload
+
+A file begins with a header block. The payload of a data block is a table, then the data of its entries one behind the other::
+
+    u32      number of entries
+    entries  16 bytes each: u64 time in ns of the recording machine's monotonic clock, u8 kind (``Kind``), u8 flags, u16 index (of the ESC),
+             u32 length of its data
+
+Times do not decrease. The entries are every call that the gateway's core was given, in order: played again they give every CAN frame that
+was sent, at its time.
+"""
+
+import json
+import struct
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.frames import EXTENDED, CanFrame
+
+SUFFIX = ".kcap"
+MAGIC = b"KCB1"
+FORMAT, VERSION = "kontronik-can-gw capture", 1
+LARGEST_PAYLOAD = 1 << 24
+_HEAD = struct.Struct("<4scBHIII")
+_CRC = struct.Struct("<I")
+HEAD_LENGTH = _HEAD.size + _CRC.size
+_ENTRY = struct.Struct("<QBBHI")
+_COUNT = struct.Struct("<I")
+_FRAME = struct.Struct("<IB")
+_FD, _REMOTE = 1, 2
+_COUNTERS = struct.Struct("<8Q")
+_NUMBER = struct.Struct("<Q")
+
+
+class Kind(IntEnum):
+    """What an entry tells; in brackets its data."""
+
+    BYTES = 1
+    """Bytes of an ESC's UART, as they were read."""
+    FRAME = 2
+    """A CAN frame that the gateway received (``frame_data``)."""
+    ADVANCE = 3
+    """Time passed; then the frames to send were taken."""
+    START = 4
+    """The gateway started; flags 1: the interface was open."""
+    STOP = 5
+    PORT_OPENED = 6
+    PORT_LOST = 7
+    CAN_OPENED = 8
+    CAN_RETURNED = 9
+    CAN_STATE = 10
+    """flags: the state (``sources.CanState``)."""
+    OVERRUN = 11
+    SAVED = 12
+    """Parameters were stored; flags 1: they could not be (UTF-8: why)."""
+    DAMAGED = 13
+    COUNTERS = 14
+    """The gateway's own counters were changed from outside (``counters_data``)."""
+    LINE_ERRORS = 15
+    """Line errors of an ESC's port so far (u64)."""
+    CLOCK = 16
+    """The wall clock at this time: Unix time in ns (u64)."""
+    LOST = 17
+    """So many entries could not be recorded (u64): what follows does not go on where what came before ended."""
+
+
+class Entry(NamedTuple):
+    """One entry. ``time_ns``: the recording machine's monotonic clock."""
+
+    time_ns: int
+    kind: int
+    esc: int = 0
+    data: bytes = b""
+    flags: int = 0
+
+
+class Block(NamedTuple):
+    """A block whose CRC is right; ``payload`` inflated. ``offset``: where it begins in the file."""
+
+    kind: bytes
+    number: int
+    payload: bytes
+    offset: int
+
+
+class Damage(NamedTuple):
+    """Bytes that belong to no block."""
+
+    offset: int
+    length: int
+
+
+def block(kind: bytes, number: int, payload: bytes) -> bytes:
+    """One block, deflated where that makes it shorter."""
+    packed = zlib.compress(payload, 1)
+    deflated = len(packed) < len(payload)
+    stored = packed if deflated else payload
+    head = _HEAD.pack(MAGIC, kind, deflated, 0, len(stored), len(payload), number & 0xFFFFFFFF)
+    return head + _CRC.pack(zlib.crc32(stored, zlib.crc32(head))) + stored
+
+
+def json_payload(content: Mapping[str, Any]) -> bytes:
+    """Payload of a header or information block."""
+    return json.dumps(content, ensure_ascii=False, sort_keys=True).encode("utf-8", "surrogatepass")
+
+
+def read_json(payload: bytes) -> dict[str, Any]:
+    """The content of a header or information block. ValueError for what is none."""
+    content = json.loads(payload.decode("utf-8", "surrogatepass"))
+    if not isinstance(content, dict):
+        raise ValueError("is no JSON object")
+    return content
+
+
+def data_payload(entries: Iterable[tuple[int, int, int, bytes, int]]) -> bytes:
+    """Payload of a data block, from tuples as of ``Entry``."""
+    table = bytearray()
+    data = []
+    count = 0
+    for time_ns, kind, index, content, flags in entries:
+        table += _ENTRY.pack(time_ns, kind, flags, index, len(content))
+        if content:
+            data.append(content)
+        count += 1
+    return b"".join((_COUNT.pack(count), table, *data))
+
+
+def read_entries(payload: bytes) -> Iterator[Entry]:
+    """The entries of a data block. ValueError where its table does not fit it."""
+    if len(payload) < _COUNT.size:
+        raise ValueError("has no table")
+    count = _COUNT.unpack_from(payload)[0]
+    at = _COUNT.size + count * _ENTRY.size
+    if at > len(payload):
+        raise ValueError("is shorter than its table")
+    for time_ns, kind, flags, index, length in _ENTRY.iter_unpack(payload[_COUNT.size : at]):
+        yield Entry(time_ns, kind, index, payload[at : at + length], flags)
+        at += length
+    if at != len(payload):
+        raise ValueError("is not as long as its table says")
+
+
+def frame_data(frame: CanFrame) -> bytes:
+    """A CAN frame as the data of an entry: u32 id (bit 31: 29 bits), u8 flags (1 FD, 2 remote), its bytes."""
+    return _FRAME.pack(frame.key, (_FD if frame.fd else 0) | (_REMOTE if frame.remote else 0)) + frame.data
+
+
+def read_frame(data: bytes) -> CanFrame:
+    """The CAN frame of an entry. ValueError where it is too short."""
+    if len(data) < _FRAME.size:
+        raise ValueError("is no CAN frame")
+    key, flags = _FRAME.unpack_from(data)
+    extended = bool(key & EXTENDED)
+    return CanFrame(key & ~EXTENDED, data[_FRAME.size :], extended, bool(flags & _FD), remote=bool(flags & _REMOTE))
+
+
+def counters_data(counters: tuple[int, ...]) -> bytes:
+    """The gateway's counters (``COUNTERS``) as the data of an entry."""
+    return _COUNTERS.pack(*counters)
+
+
+def read_counters(data: bytes) -> tuple[int, ...]:
+    """ValueError where the length is wrong."""
+    if len(data) != _COUNTERS.size:
+        raise ValueError("has other counters")
+    return _COUNTERS.unpack(data)
+
+
+COUNTERS = (
+    "sent_frames",
+    "replaced_frames",
+    "send_failures",
+    "received_frames",
+    "bus_off_count",
+    "dropped_frames",
+    "id_conflicts",
+    "started_ns",
+)
+"""Attributes of GatewayStatus in a COUNTERS entry, in its order; each a u64."""
+
+
+def number_data(number: int) -> bytes:
+    return _NUMBER.pack(max(0, number))
+
+
+def read_number(data: bytes) -> int:
+    """ValueError where the length is wrong."""
+    if len(data) != _NUMBER.size:
+        raise ValueError("is no number")
+    number: int = _NUMBER.unpack(data)[0]
+    return number
+
+
+class Scanner:
+    """Finds every intact block in a stream of bytes, whatever stands between them. ``feed`` and ``flush``, as of a deframer."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._offset = 0
+        """Of the buffer's first byte."""
+        self._bad_from: int | None = None
+
+    def feed(self, data: bytes) -> list[Block | Damage]:
+        """Take the next bytes; what is certain by now."""
+        self._buffer += data
+        return self._scan(final=False)
+
+    def flush(self) -> list[Block | Damage]:
+        """The stream ended."""
+        found = self._scan(final=True)
+        self._skip(len(self._buffer))
+        self._close_damage(found)
+        return found
+
+    def _scan(self, final: bool) -> list[Block | Damage]:
+        found: list[Block | Damage] = []
+        buffer = self._buffer
+        while True:
+            at = buffer.find(MAGIC)
+            if at < 0:
+                keep = 0 if final else next((n for n in (3, 2, 1) if buffer.endswith(MAGIC[:n])), 0)
+                self._skip(len(buffer) - keep)
+                return found
+            self._skip(at)
+            if len(buffer) < HEAD_LENGTH:
+                if not final:
+                    return found
+                self._skip(1)
+                continue
+            _, kind, deflated, zero, stored, size, number = _HEAD.unpack_from(buffer)
+            if deflated > 1 or zero or stored > LARGEST_PAYLOAD or size > LARGEST_PAYLOAD:
+                self._skip(1)
+                continue
+            if len(buffer) < HEAD_LENGTH + stored:
+                if not final:
+                    return found
+                self._skip(1)
+                continue
+            payload = _payload(buffer, deflated, stored, size)
+            if payload is None:
+                self._skip(1)
+                continue
+            self._close_damage(found)
+            found.append(Block(kind, number, payload, self._offset))
+            self._drop(HEAD_LENGTH + stored)
+
+    def _skip(self, count: int) -> None:
+        if count:
+            if self._bad_from is None:
+                self._bad_from = self._offset
+            self._drop(count)
+
+    def _drop(self, count: int) -> None:
+        del self._buffer[:count]
+        self._offset += count
+
+    def _close_damage(self, found: list[Block | Damage]) -> None:
+        if self._bad_from is not None:
+            if self._offset > self._bad_from:
+                found.append(Damage(self._bad_from, self._offset - self._bad_from))
+            self._bad_from = None
+
+
+def _payload(buffer: bytearray, deflated: int, stored: int, size: int) -> bytes | None:
+    """The inflated payload of the block at the buffer's beginning; None where it is not what it says."""
+    payload = bytes(buffer[HEAD_LENGTH : HEAD_LENGTH + stored])
+    crc = zlib.crc32(payload, zlib.crc32(buffer[: _HEAD.size]))
+    if crc != _CRC.unpack_from(buffer, _HEAD.size)[0]:
+        return None
+    if not deflated:
+        return payload if stored == size else None
+    try:
+        inflater = zlib.decompressobj()
+        inflated = inflater.decompress(payload, size + 1)
+    except zlib.error:
+        return None
+    return inflated if len(inflated) == size and inflater.eof else None

@@ -1,0 +1,422 @@
+"""Recordings of every kind as one thing: CAN frames in order of time, and rows of all values.
+
+A capture (.kcap) goes through the gateway's core with the recorded clock. Plain UART bytes have no time: their live frames are taken to
+come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what a file is by its content.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+from typing import IO, Any, Protocol, Self
+
+from kontronik_can_gw.capture import (
+    MAGIC,
+    SUFFIX,
+    Block,
+    Damage,
+    Entry,
+    Kind,
+    Scanner,
+    read_entries,
+    read_json,
+    read_number,
+)
+from kontronik_can_gw.capture_setup import CaptureSetup
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout
+from kontronik_can_gw.dbc_output.unpacker import SignalReader
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.offline.can_logs import CanLog, log_format
+from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.offline.replay import Replay, TimedFrame, follow_bytes
+from kontronik_can_gw.offline.samples import Sample, SampledGateway, samples_of_frames
+from kontronik_can_gw.protocol.codec import Kind as FrameKind
+from kontronik_can_gw.protocol.deframer import Deframer
+from kontronik_can_gw.telemetry import SECOND
+
+CHUNK = 1 << 18
+LIVE_RATE = 100.0
+"""Live frames a second that plain bytes are taken to have come at."""
+_LOOK = 1 << 16
+
+
+class Input(Protocol):
+    """A recording. Each of ``frames``, ``samples``, ``esc_bytes`` reads it from its beginning."""
+
+    name: str
+    bus: BusLayout
+    provenance: dict[str, str]
+    """What is known of where it came from, in words."""
+    size: int
+    position: int
+    """Bytes read so far, of ``size``."""
+    damage: list[str]
+    """What was not intact, a line each; complete when it was read to the end."""
+    times_assumed: bool
+    """True where the recording has no times."""
+
+    @property
+    def reader(self) -> SignalReader:
+        """Reads frames of ``bus``; its columns are those of the samples."""
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The CAN frames that were sent (or would have been) and received."""
+
+    def samples(self) -> Iterator[Sample]:
+        """Rows of all values."""
+
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        """The UART bytes of one ESC. UserError where the recording has none."""
+
+    def wall_ns(self, time_ns: int) -> int | None:
+        """Unix time, where it is known."""
+
+    def close(self) -> None:
+        """Close the files."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+class _Base:
+    """What all of them have."""
+
+    def __init__(self, name: str, bus: BusLayout, size: int) -> None:
+        self.name = name
+        self.bus = bus
+        self.size = size
+        self.position = 0
+        self.provenance: dict[str, str] = {}
+        self.damage: list[str] = []
+        self.times_assumed = False
+
+    @cached_property
+    def reader(self) -> SignalReader:
+        return SignalReader(self.bus.layout)
+
+    def close(self) -> None:
+        pass
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE) -> Input:
+    """Open a recording. UserError for what is none, RunError for what cannot be read.
+
+    ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run. ``layout``: of CAN
+    logs and plain bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
+    """
+    parts = _parts(path)
+    if parts is not None:
+        return CaptureInput(parts, layout)
+    try:
+        with path.open("rb") as file:
+            head = file.read(_LOOK)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
+    if not head:
+        raise UserError(f"{path}: is empty")
+    if MAGIC in head or path.suffix == SUFFIX:
+        return CaptureInput([path], layout)
+    if log_format(path) is not None:
+        return CanLogInput(path, layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc")))
+    if b"KOD" in head:
+        return DumpInput(path, layout, live_rate)
+    raise UserError(
+        f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_LOOK // 1024} kB"
+    )
+
+
+def _parts(path: Path) -> list[Path] | None:
+    """The captures that a folder, or the beginning of a name, means; None for a plain file."""
+    if path.is_dir():
+        found = sorted(path.glob(f"*{SUFFIX}"))
+        if not found:
+            raise UserError(f"{path}: has no captures (*{SUFFIX})")
+    elif not path.exists():
+        found = sorted(p for p in path.parent.glob(f"*{SUFFIX}") if p.name.startswith(path.name)) if path.name else []
+        if not found:
+            raise RunError(f"{path}: there is no such file.")
+    else:
+        return None
+    runs = list(dict.fromkeys(p.name.removesuffix(SUFFIX).rpartition("-")[0] for p in found))
+    if len(runs) > 1:
+        raise UserError(
+            f"{path}: has captures of {len(runs)} runs; give the beginning of the names of one: {', '.join(runs[-8:])}"
+        )
+    return found
+
+
+class CaptureInput(_Base):
+    """Captures of one run, in the order of their parts."""
+
+    def __init__(self, paths: Sequence[Path], layout: BusLayout | None = None) -> None:
+        self._paths = list(paths)
+        try:
+            size = sum(path.stat().st_size for path in self._paths)
+        except OSError as error:
+            raise RunError(f"{error.filename}: cannot be read: {error.strerror}.") from None
+        self.header = self._first_header()
+        try:
+            self.setup = CaptureSetup.of(self.header)
+        except ValueError as error:
+            raise UserError(f"{self._paths[0]}: {error}") from None
+        found = self.setup.database()
+        name = str(self._paths[0]) if len(self._paths) == 1 else f"{self._paths[0].parent}/{self._paths[0].stem[:-5]}"
+        if layout is None:
+            shown = layout_of_dbc(shipped("dbc/kontronik_esc.dbc")) if found is None else None
+            layout = shown or BusLayout(found[0], found[1], self.setup.escs) if found else shown
+            assert layout is not None
+        self._sent = found[1] if found is not None else Layout("", "", ())
+        super().__init__(name, layout, size)
+        if len(layout.escs) > len(self.setup.escs):
+            raise UserError(
+                f"{layout.layout.file}: describes {len(layout.escs)} ESCs, the capture has {len(self.setup.escs)}"
+            )
+        self._offsets: list[tuple[int, int]] = []
+        self._file: IO[bytes] | None = None
+        self._devices: list[Any] = list(self.header.get("devices") or [])
+        self._describe()
+
+    def frames(self, marked: bool = False) -> Iterator[TimedFrame]:
+        """``marked``: the gateway's state in the frames is REPLAY."""
+        gateway = self.setup.gateway(self._sent, self._created_ns)
+        replay = Replay(gateway, self.header.get("state"), marked)
+        yield from replay.follow(self.entries())
+        self._tell(replay)
+
+    def samples(self) -> Iterator[Sample]:
+        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, self._created_ns)
+        replay = Replay(gateway, self.header.get("state"))
+        for entry in self.entries():
+            replay.play(entry)
+            if gateway.rows:
+                yield from gateway.rows
+                gateway.rows.clear()
+        yield from gateway.finish()
+        self._tell(replay)
+
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        for entry in self.entries():
+            if entry.kind == Kind.BYTES and entry.esc == esc:
+                yield entry.data
+
+    def wall_ns(self, time_ns: int) -> int | None:
+        offset = next((offset for since, offset in reversed(self._offsets) if since <= time_ns), None)
+        if offset is None:
+            offset = int(self.header["wall_ns"]) - int(self.header["monotonic_ns"])
+        return time_ns + offset
+
+    def entries(self) -> Iterator[Entry]:
+        """All entries of all parts. What is damaged is passed over, and told in ``damage``."""
+        self.position = 0
+        self.damage = []
+        self._offsets = []
+        last = 0
+        for number, path in enumerate(self._paths):
+            for entry in self._entries_of(path, number):
+                if entry.kind == Kind.CLOCK:
+                    self._offsets.append((entry.time_ns, read_number(entry.data) - entry.time_ns))
+                if entry.time_ns < last:
+                    entry = entry._replace(time_ns=last)
+                last = entry.time_ns
+                yield entry
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    @property
+    def _created_ns(self) -> int:
+        """When the recorded gateway was made: its cycles count from there."""
+        return int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
+
+    def _first_header(self) -> Mapping[str, Any]:
+        self.damage = []
+        self.position = 0
+        self._file = None
+        for found in self._blocks(self._paths[0]):
+            if isinstance(found, Block) and found.kind == b"H":
+                try:
+                    return read_json(found.payload)
+                except ValueError:
+                    break
+        raise UserError(f"{self._paths[0]}: has no header that could be read, so nothing is known of what was recorded")
+
+    def _blocks(self, path: Path) -> Iterator[Block | Damage]:
+        scanner = Scanner()
+        try:
+            with path.open("rb") as self._file:
+                while data := self._file.read(CHUNK):
+                    self.position += len(data)
+                    yield from scanner.feed(data)
+        except OSError as error:
+            raise RunError(f"{path}: cannot be read: {error.strerror}.") from None
+        yield from scanner.flush()
+
+    def _entries_of(self, path: Path, part: int) -> Iterator[Entry]:
+        expected, ended = 0, False
+        for found in self._blocks(path):
+            if isinstance(found, Damage):
+                self.damage.append(f"{path.name}: {found.length} bytes at {found.offset} are damaged")
+                continue
+            if found.number > expected:
+                self.damage.append(
+                    f"{path.name}: {found.number - expected} blocks in front of byte {found.offset} are missing"
+                )
+            expected, ended = found.number + 1, found.kind == b"E"
+            try:
+                if found.kind == b"D":
+                    yield from read_entries(found.payload)
+                elif found.kind == b"I":
+                    self._devices = read_json(found.payload).get("devices", self._devices)
+                    self._describe()
+                elif found.kind == b"H":
+                    self._check_part(read_json(found.payload), path, part)
+            except ValueError as error:
+                self.damage.append(f"{path.name}: the block at {found.offset} {error}")
+        if not ended:
+            self.damage.append(f"{path.name}: was not closed: up to the last second before its end may be missing")
+
+    def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
+        if header.get("run") != self.header.get("run"):
+            raise UserError(f"{path}: is of another run than {self._paths[0]}. Convert each run by itself.")
+        if "monotonic_ns" in header and "wall_ns" in header:
+            self._offsets.append((int(header["monotonic_ns"]), int(header["wall_ns"]) - int(header["monotonic_ns"])))
+        missing = int(header.get("part", part)) - int(self.header.get("part", 0)) - part
+        if missing:
+            self.damage.append(f"{path.name}: {missing} parts of the run in front of it are not given")
+
+    def _tell(self, replay: Replay) -> None:
+        if replay.lost:
+            self.damage.append(f"{replay.lost} entries could not be recorded: the disk was too slow or full")
+        if replay.passed_over:
+            self.damage.append(f"{replay.passed_over} entries make no sense to this version")
+
+    def _describe(self) -> None:
+        header, words = self.header, self.provenance
+        program = header.get("program", {})
+        words["program"] = f"kontronik-can-gw {program.get('version', '?')}, Python {program.get('python', '?')}"
+        words["machine"] = str(program.get("machine", ""))
+        words["run"] = f"{header.get('run', '')}, part {int(header.get('part', 0)) + 1}"
+        words["configuration"] = self.setup.file
+        words["DBC"] = self.setup.dbc[0] if self.setup.dbc else ""
+        for index, (esc, port) in enumerate(zip(self.setup.escs, self.setup.ports, strict=False)):
+            device = self._devices[index] if index < len(self._devices) else None
+            told = "device not known"
+            if isinstance(device, dict):
+                told = f"{device.get('device')} {device.get('variant')}, firmware {device.get('firmware')}, {device.get('layout')} layout"
+            words[esc.name] = f"{told}, at {port}"
+
+
+class DumpInput(_Base):
+    """The bytes of one ESC, without times."""
+
+    def __init__(self, path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE) -> None:
+        layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+        if len(layout.escs) != 1:
+            raise UserError(f"{path}: holds the bytes of one ESC, {layout.layout.file} describes {len(layout.escs)}")
+        super().__init__(str(path), layout, path.stat().st_size)
+        self.times_assumed = True
+        self._path = path
+        self._period_ns = max(1, round(SECOND / live_rate))
+        esc = replace(layout.escs[0], timeout_ns=max(layout.escs[0].timeout_ns, 3 * self._period_ns))
+        self.setup = CaptureSetup((esc,), (str(path),), None, DbcSettings(), False, False, None)
+        self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
+
+    def frames(self) -> Iterator[TimedFrame]:
+        yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self._chunks())
+
+    def samples(self) -> Iterator[Sample]:
+        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, 0)
+        for _ in follow_bytes(gateway, self._chunks()):
+            if gateway.rows:
+                yield from gateway.rows
+                gateway.rows.clear()
+        yield from gateway.finish()
+
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        if esc:
+            raise UserError(f"{self.name}: holds the bytes of one ESC")
+        yield from self._read()
+
+    def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
+        return None
+
+    def _read(self) -> Iterator[bytes]:
+        self.position = 0
+        try:
+            with self._path.open("rb") as file:
+                while data := file.read(CHUNK):
+                    self.position += len(data)
+                    yield data
+        except OSError as error:
+            raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
+
+    def _chunks(self) -> Iterator[tuple[int, bytes]]:
+        """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period behind."""
+        self.damage = []
+        deframer = Deframer()
+        waiting, at = bytearray(), 0
+        now, lives = 0, 0
+        for data in chain(self._read(), (None,)):
+            if data is not None:
+                waiting += data
+            for frame in deframer.feed(data) if data is not None else deframer.flush():
+                if frame.kind is FrameKind.LIVE:
+                    now = lives * self._period_ns
+                    lives += 1
+                else:
+                    now = max(now, lives * self._period_ns - self._period_ns // 2)
+                end = frame.offset + frame.form.length - at
+                yield now, bytes(waiting[:end])
+                del waiting[:end]
+                at += end
+        if waiting:
+            yield now, bytes(waiting)
+        counters = deframer.counters
+        if counters.dropped_bytes:
+            self.damage.append(f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors")
+        if not lives:
+            self.damage.append(counters.diagnosis() or "no live frame")
+
+
+class CanLogInput(_Base):
+    """Frames as a CAN tool logged them."""
+
+    def __init__(self, path: Path, layout: BusLayout) -> None:
+        self._log = CanLog(path)
+        super().__init__(str(path), layout, self._log.size)
+        self._path = path
+
+    def frames(self) -> Iterator[TimedFrame]:
+        self._log.close()
+        self._log = CanLog(self._path)
+        for time_ns, frame, received in self._log.frames():
+            self.position = self._log.position
+            yield TimedFrame(time_ns, frame, received)
+        self.position = self.size
+        self.damage = list(self._log.damage)
+
+    def samples(self) -> Iterator[Sample]:
+        yield from samples_of_frames(self.frames(), self.reader)
+
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")
+
+    def wall_ns(self, time_ns: int) -> int | None:
+        if self._log.wall:
+            return time_ns
+        start = self._log.wall_start_ns
+        return None if start is None else start + time_ns
+
+    def close(self) -> None:
+        self._log.close()

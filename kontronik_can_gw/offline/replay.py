@@ -1,0 +1,168 @@
+"""A capture's entries through the gateway's core: the CAN frames that the recorded gateway sent, each at its time.
+
+The core is the same as live, and its clock is the recorded one; so frames and times are those of the live run, bit for bit, as long as no
+entry is missing. Nothing here waits or sends.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.capture import COUNTERS, Entry, Kind, read_counters, read_frame, read_number
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Mailboxes, Sent
+from kontronik_can_gw.sources import CanState, GatewayState
+
+
+class TimedFrame(NamedTuple):
+    """A CAN frame at a time. ``received``: it came from the bus; otherwise the gateway sent it."""
+
+    time_ns: int
+    frame: CanFrame
+    received: bool = False
+
+
+class Replay:
+    """A gateway that is given entries. ``marked``: its state on the bus is REPLAY, not RUNNING.
+
+    ``state``: of a header, where recording had begun before; without a START entry the gateway starts with the first entry.
+    """
+
+    def __init__(self, gateway: Gateway, state: Mapping[str, Any] | None = None, marked: bool = False) -> None:
+        self.gateway = gateway
+        self.lost = 0
+        """Entries that the recorder could not record."""
+        self.passed_over = 0
+        """Entries that make no sense."""
+        self._marked = marked
+        self._waiting = Mailboxes()
+        self._started = False
+        self._take_up(state or {})
+
+    def follow(self, entries: Iterable[Entry]) -> Iterator[TimedFrame]:
+        """The frames received and sent, in order."""
+        for entry in entries:
+            yield from self.play(entry)
+
+    def play(self, entry: Entry) -> list[TimedFrame]:
+        """Give one entry to the gateway; the frames that it received or sent with it."""
+        try:
+            return self._play(entry)
+        except (ValueError, IndexError):
+            self.passed_over += 1
+            return []
+
+    def _play(self, entry: Entry) -> list[TimedFrame]:
+        now, kind, esc, data, flags = entry
+        gateway = self.gateway
+        if not self._started and kind == Kind.ADVANCE:  # the beginning is missing
+            self._start(now, True)
+        if kind == Kind.BYTES:
+            gateway.receive_bytes(esc, data, now)
+        elif kind == Kind.ADVANCE:
+            gateway.advance(now)
+            return self._take(now)
+        elif kind == Kind.FRAME:
+            frame = read_frame(data)
+            gateway.receive_frame(frame, now)
+            return [TimedFrame(now, frame, True)]
+        elif kind == Kind.START:
+            self._start(now, bool(flags))
+            return self._take(now)
+        elif kind == Kind.STOP:
+            gateway.stop(now)
+            return self._take(now)
+        elif kind == Kind.COUNTERS:
+            for name, value in zip(COUNTERS, read_counters(data), strict=True):
+                setattr(gateway.status, name, value)
+        elif kind == Kind.LINE_ERRORS:
+            gateway.escs[esc].line_errors = read_number(data)
+        elif kind == Kind.LOST:
+            self.lost += read_number(data)
+        else:
+            self._play_rare(entry)
+        return []
+
+    def _play_rare(self, entry: Entry) -> None:
+        now, kind, esc, data, flags = entry
+        gateway = self.gateway
+        match kind:
+            case Kind.PORT_OPENED:
+                gateway.port_opened(esc, now)
+            case Kind.PORT_LOST:
+                gateway.port_lost(esc, now)
+            case Kind.CAN_OPENED:
+                gateway.can_opened(now)
+            case Kind.CAN_RETURNED:
+                gateway.can_returned(now)
+            case Kind.CAN_STATE:
+                gateway.set_can_state(CanState(flags), now)
+            case Kind.OVERRUN:
+                gateway.receive_overrun(now)
+            case Kind.SAVED:
+                gateway.saved(esc, data.decode("utf-8", "replace") if flags else None, now)
+            case Kind.DAMAGED:
+                gateway.parameters_damaged(esc, now)
+            case Kind.CLOCK:
+                pass
+            case _:
+                raise ValueError(f"unknown kind {kind}")
+
+    def _start(self, now: int, can_open: bool) -> None:
+        self._started = True
+        self.gateway.start(now, can_open)
+        if self._marked:
+            self.gateway.status.state = GatewayState.REPLAY
+
+    def _take(self, now: int) -> list[TimedFrame]:
+        gateway = self.gateway
+        gateway.take_saves()  # what nobody fetches would grow
+        frames = in_order(gateway.take_frames(), self._waiting)
+        gateway.status.sent_frames += len(frames)
+        gateway.take_link_changes()
+        gateway.take_misfits()
+        gateway.take_conflicts()
+        return [TimedFrame(now, frame) for frame in frames]
+
+    def _take_up(self, state: Mapping[str, Any]) -> None:
+        """Go on with what was counted before recording began."""
+        for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
+            esc.energy, esc.run_time, esc.losses = (int(found[name]) for name in ("energy", "run_time", "losses"))
+        if "started_ns" in state:
+            self.gateway.status.started_ns = int(state["started_ns"])
+        if "can_state" in state:
+            self.gateway.status.can_state = CanState(state["can_state"])
+
+
+def in_order(frames: list[CanFrame], waiting: Mailboxes) -> list[CanFrame]:
+    """The frames of one turn as an interface that takes them all is given them; ``waiting``: the same one for each turn."""
+    if len(frames) < 2:
+        return frames
+    for frame in frames:
+        waiting.put(frame)
+    sent: list[CanFrame] = []
+
+    def take(frame: CanFrame) -> Sent:
+        sent.append(frame)
+        return Sent.OK
+
+    waiting.flush(take)
+    return sent
+
+
+def follow_bytes(gateway: Gateway, chunks: Iterable[tuple[int, bytes]]) -> Iterator[TimedFrame]:
+    """What a gateway sends that is given (time, bytes of its first ESC), starts with them, and is never late."""
+    started = False
+    waiting = Mailboxes()
+    for now, data in chunks:
+        if not started:
+            started = True
+            gateway.port_opened(0, now)
+            gateway.start(now)
+        while (due := gateway.next_deadline()) < now:
+            gateway.advance(due)
+            yield from (TimedFrame(due, frame) for frame in in_order(gateway.take_frames(), waiting))
+        gateway.receive_bytes(0, data, now)
+        gateway.advance(now)
+        yield from (TimedFrame(now, frame) for frame in in_order(gateway.take_frames(), waiting))
+        gateway.take_link_changes()

@@ -1,0 +1,114 @@
+"""Rows of all values of a layout, from bytes of ESCs through the core, or from CAN frames.
+
+A row holds each column's value as it is known at the row's time; None where it is not available. From bytes a row comes with each telemetry
+frame, and with its loss; from CAN frames with each group of messages that belong together. What comes of another ESC, or in another
+message, within 5 ms goes into the same row.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+from kontronik_can_gw.capture_setup import CaptureSetup
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.dbc_output.unpacker import Part, SignalReader, Value
+from kontronik_can_gw.dbc_output.view import View
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.offline.replay import TimedFrame
+from kontronik_can_gw.sources import Group
+from kontronik_can_gw.telemetry import MS, Event
+
+SAME_ROW_NS = 5 * MS
+_GATEWAY_NS = 100 * MS
+
+
+class Sample(NamedTuple):
+    """A row. ``values``: in the order of the layout's columns; the list is the taker's own."""
+
+    time_ns: int
+    values: list[Value]
+
+
+class SampledGateway(Gateway):
+    """A gateway that makes rows beside its frames. They gather in ``rows``, which the owner empties; ``finish`` gives the last."""
+
+    def __init__(self, setup: CaptureSetup, layout: Layout, reader: SignalReader, now: int) -> None:
+        self.rows: list[Sample] = []
+        self._reader = reader
+        self._values: list[Value] = [None] * len(reader.columns)
+        self._row_ns: int | None = None
+        self._in_row: set[int] = set()
+        self._gateway_ns = now - _GATEWAY_NS
+        self._indices = {plan.name: index for index, plan in enumerate(layout.messages)}
+        self._by_esc = [[p for p in reader.parts if esc in p.plan.escs] for esc in range(len(setup.escs))]
+        self._of_gateway = [p for p in reader.parts if not p.plan.escs]
+        super().__init__(setup.escs, layout, now, setup.silent_on_loss, setup.canopen)
+
+    def finish(self) -> list[Sample]:
+        """The row that is not closed yet."""
+        self._close_row()
+        rows, self.rows = self.rows, []
+        return rows
+
+    def _follow(self, esc: int, events: int, now: int) -> None:
+        super()._follow(esc, events, now)
+        if not events & (Event.LIVE | Event.LINK | Event.INFO):
+            return
+        state = self.escs[esc]
+        when = now
+        if events & Event.LIVE and state.live is not None and state.live_ns is not None:
+            when = min(now, state.live_ns)  # of its last byte on the wire
+        if self._row_ns is not None:
+            when = max(when, self._row_ns)
+            again = events & Event.LIVE and esc in self._in_row
+            if again or when - self._row_ns > SAME_ROW_NS:
+                self._close_row()
+        for part in self._by_esc[esc]:
+            paces = part.plan.paces
+            if events & (Event.LINK | Event.INFO) or Group.LIVE in paces or Group.LINK in paces:
+                self._read(part, when)
+        if when - self._gateway_ns >= _GATEWAY_NS or events & Event.LINK:
+            self._gateway_ns = when
+            for part in self._of_gateway:
+                self._read(part, when)
+        if events & Event.LIVE:
+            self._in_row.add(esc)
+            if self._row_ns is None:
+                self._row_ns = when
+
+    def _read(self, part: Part, now: int) -> None:
+        bits = self.message_bits(self._indices[part.plan.name], now, part.page)
+        self._values[part.first : part.first + part.count] = self._reader.read_part(part, bits)
+
+    def _close_row(self) -> None:
+        if self._row_ns is not None:
+            self.rows.append(Sample(self._row_ns, list(self._values)))
+            self._row_ns = None
+            self._in_row.clear()
+
+
+def samples_of_frames(frames: Iterable[TimedFrame], reader: SignalReader) -> Iterator[Sample]:
+    """Rows of CAN frames, as a listener has them: values hold while they are fresh."""
+    view = View(reader)
+    row_ns: int | None = None
+    in_row: set[int] = set()
+    for time_ns, frame, _ in frames:
+        key = frame.key
+        if key not in reader.keys:
+            continue
+        if row_ns is not None and (key in in_row or time_ns - row_ns > SAME_ROW_NS):
+            yield Sample(row_ns, list(view.values))
+            row_ns = None
+            in_row.clear()
+        while (due := view.next_expiry) is not None and due < time_ns:  # a loss is a row of its own
+            if view.expire(due + 1):
+                if row_ns is not None:
+                    row_ns = None
+                    in_row.clear()
+                yield Sample(due + 1, list(view.values))
+        if view.take(key, frame.data, time_ns) is None:
+            continue
+        in_row.add(key)
+        if row_ns is None:
+            row_ns = time_ns
+    if row_ns is not None:
+        yield Sample(row_ns, list(view.values))

@@ -1,0 +1,82 @@
+"""A CAN log beside a capture, by python-can's writers, so that every tool reads it. Called by the recorder's thread only."""
+
+import contextlib
+import os
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.lean import without_asammdf
+
+_SUFFIXES = {"candump": ".log", "asc": ".asc", "blf": ".blf", "trc": ".trc", "mf4": ".mf4"}
+_WRITERS = {
+    "candump": "CanutilsLogWriter",
+    "asc": "ASCWriter",
+    "blf": "BLFWriter",
+    "trc": "TRCWriter",
+    "mf4": "MF4Writer",
+}
+
+
+def suffix_of(kind: str) -> str:
+    """The file name's ending of a kind of log."""
+    return _SUFFIXES[kind]
+
+
+def check_kind(kind: str) -> None:
+    """UserError where a kind needs a package that is missing."""
+    if kind == "mf4" and find_spec("asammdf") is None:
+        raise UserError("record.can_log \"mf4\" needs asammdf: pip install 'kontronik-can-gw[mf4]'")
+
+
+class CanLog:
+    """One log. OSError where it cannot be written."""
+
+    def __init__(self, path: Path, kind: str, channel: str) -> None:
+        # never over something else, nor through a link
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640))
+        if kind == "mf4":
+            can = import_module("can")
+        else:
+            with without_asammdf():
+                can = import_module("can")
+        self._message = can.Message
+        writer = getattr(import_module("can.io"), _WRITERS[kind])
+        options: dict[str, Any] = {"channel": channel} if kind == "candump" else {}
+        self._writer = writer(str(path), **options)
+        # candump names the interface, the others count channels from 1
+        self._channel: str | int = channel if kind == "candump" else 0
+
+    def add(self, frame: CanFrame, when_s: float, received: bool) -> None:
+        """A frame at a Unix time."""
+        self._writer.on_message_received(
+            self._message(
+                timestamp=when_s,
+                arbitration_id=frame.can_id,
+                is_extended_id=frame.extended,
+                data=b"" if frame.remote else frame.data,
+                dlc=len(frame.data),
+                is_remote_frame=frame.remote,
+                is_fd=frame.fd,
+                is_rx=received,
+                channel=self._channel,
+            )
+        )
+
+    def flush(self) -> None:
+        """Hand to the system what the writer holds, as far as it can."""
+        file = getattr(self._writer, "file", None)
+        if file is not None:
+            file.flush()
+
+    def close(self) -> None:
+        """Close in good order: a BLF file is readable only then."""
+        self._writer.stop()
+
+    def abandon(self) -> None:
+        """Close whatever happens."""
+        with contextlib.suppress(Exception):
+            self._writer.stop()

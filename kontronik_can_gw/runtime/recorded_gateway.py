@@ -1,0 +1,111 @@
+"""A gateway whose every call is handed to a recorder: played again in their order they give the same frames (offline/replay.py)."""
+
+from collections.abc import Callable, Sequence
+
+from kontronik_can_gw.capture import COUNTERS, Kind, counters_data, frame_data, number_data
+from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import EscSettings
+
+Put = Callable[[int, int, int, bytes, int], None]
+"""(time, kind, ESC's index, data, flags), as the fields of ``capture.Entry``."""
+
+
+class RecordedGateway(Gateway):
+    """What the runtime changes besides, the counters of ``status`` and line errors, is noticed at the next call."""
+
+    def __init__(
+        self,
+        put: Put,
+        escs: Sequence[EscSettings],
+        layout: Layout,
+        now: int,
+        silent_on_loss: bool = False,
+        canopen: CanopenSetup | None = None,
+    ) -> None:
+        super().__init__(escs, layout, now, silent_on_loss, canopen)
+        self._put = put
+        self._counters = self._counters_now()
+        self._line_errors = [0] * len(escs)
+
+    def start(self, now: int, can_open: bool = True) -> None:
+        self._note(now, Kind.START, flags=int(can_open))
+        super().start(now, can_open)
+
+    def stop(self, now: int) -> None:
+        self._note(now, Kind.STOP)
+        super().stop(now)
+
+    def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
+        errors = self.escs[esc].line_errors
+        if errors != self._line_errors[esc]:
+            self._line_errors[esc] = errors
+            self._put(now, Kind.LINE_ERRORS, esc, number_data(errors), 0)
+        self._note(now, Kind.BYTES, esc, data)
+        super().receive_bytes(esc, data, now)
+
+    def receive_frame(self, frame: CanFrame, now: int) -> None:
+        self._note(now, Kind.FRAME, data=frame_data(frame))
+        super().receive_frame(frame, now)
+
+    def can_opened(self, now: int) -> None:
+        self._note(now, Kind.CAN_OPENED)
+        super().can_opened(now)
+
+    def receive_overrun(self, now: int) -> None:
+        self._note(now, Kind.OVERRUN)
+        super().receive_overrun(now)
+
+    def saved(self, esc: int, error: str | None, now: int) -> None:
+        self._note(now, Kind.SAVED, esc, (error or "").encode(), flags=int(error is not None))
+        super().saved(esc, error, now)
+
+    def parameters_damaged(self, esc: int, now: int) -> None:
+        self._note(now, Kind.DAMAGED, esc)
+        super().parameters_damaged(esc, now)
+
+    def port_opened(self, esc: int, now: int) -> None:
+        self._note(now, Kind.PORT_OPENED, esc)
+        super().port_opened(esc, now)
+
+    def port_lost(self, esc: int, now: int) -> None:
+        self._note(now, Kind.PORT_LOST, esc)
+        super().port_lost(esc, now)
+
+    def can_returned(self, now: int) -> None:
+        self._note(now, Kind.CAN_RETURNED)
+        super().can_returned(now)
+
+    def set_can_state(self, state: CanState, now: int) -> None:
+        self._note(now, Kind.CAN_STATE, flags=int(state))
+        super().set_can_state(state, now)
+
+    def advance(self, now: int) -> None:
+        self._note(now, Kind.ADVANCE)
+        super().advance(now)
+
+    def take_frames(self) -> list[CanFrame]:
+        frames = super().take_frames()
+        # as a rule all of them are sent: only what comes otherwise is recorded
+        self._counters = (self._counters[0] + len(frames), *self._counters[1:])
+        return frames
+
+    def _note(self, now: int, kind: Kind, esc: int = 0, data: bytes = b"", flags: int = 0) -> None:
+        counters = self._counters_now()
+        if counters != self._counters:
+            self._counters = counters
+            self._put(now, Kind.COUNTERS, 0, counters_data(counters), 0)
+        self._put(now, kind, esc, data, flags)
+
+    def _counters_now(self) -> tuple[int, ...]:
+        s = self.status
+        return (
+            *(s.sent_frames, s.replaced_frames, s.send_failures, s.received_frames),
+            *(s.bus_off_count, s.dropped_frames, s.id_conflicts, s.started_ns),
+        )
+
+
+assert len(COUNTERS) == 8  # in the order of ``_counters_now``

@@ -1,0 +1,445 @@
+"""Captures of a running gateway: a folder of .kcap files (capture.py) and, if wanted, of CAN logs, written by a thread.
+
+What may touch what: ``put``, ``put_frame``, ``note`` and ``reports`` are called by the loop's thread and never wait; only ``_work`` and
+what it calls touch the disk. Entries go from one to the other by a deque with a bound: what finds no room is counted, and the count is
+recorded when there is room again. Each half second what has come is one block, forced to the disk: a loss of power costs that and no more.
+"""
+
+import contextlib
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from kontronik_can_gw.capture import (
+    SUFFIX,
+    Kind,
+    block,
+    data_payload,
+    json_payload,
+    number_data,
+)
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.protocol.states import device_text
+from kontronik_can_gw.runtime.can_log import CanLog, suffix_of
+from kontronik_can_gw.runtime.statistics import Report
+from kontronik_can_gw.runtime.threads import start_beside_the_loop
+from kontronik_can_gw.telemetry import MS, SECOND
+
+CAPACITY = 50_000
+"""Entries that may wait to be written: about two minutes of one ESC, 15 seconds of eight."""
+PERIOD_S = 0.5
+_CLOSE_S = 0.35
+_RETRY_NS = 5 * SECOND
+_LOOK_AT_SPACE_NS = 5 * SECOND
+_CLOCK_NS = 10 * SECOND
+_STEP_NS = MS
+_SLOW_NS = 5 * SECOND
+_MB = 1_000_000
+_LARGEST_BLOCK = 1 << 22
+
+Item = tuple[int, int, int, Any, int]
+_SENT, _RECEIVED = 100, 101
+"""Kinds of items for the CAN log only; their data is the frame."""
+
+
+@dataclass(frozen=True)
+class RecordSettings:
+    """How captures are written. Sizes in bytes, 0: no bound."""
+
+    folder: Path
+    part_bytes: int = 64 * _MB
+    part_ns: int = 3600 * SECOND
+    keep_bytes: int = 0
+    """The oldest captures of the folder are removed when all together are larger."""
+    least_free_bytes: int = 100 * _MB
+    """With less than this free nothing is written."""
+    can_log: str = "none"
+    """none, candump, asc, blf, trc or mf4."""
+    channel: str = "can0"
+    """The interface's name in a candump log."""
+
+
+@dataclass
+class RecorderFacts:
+    """How recording goes, for the statistics."""
+
+    file: str = ""
+    """The capture that is being written; empty while none is."""
+    bytes: int = 0
+    """Written since the start."""
+    lost: int = 0
+    """Entries that were not recorded."""
+    problem: str = ""
+
+
+class Recorder:
+    """Writes what it is given from ``start`` until ``close``. RunError by ``start`` where the folder cannot be used."""
+
+    def __init__(self, settings: RecordSettings, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self.settings = settings
+        self.facts = RecorderFacts()
+        self._clock = clock
+        self._entries: deque[Item] = deque()
+        self._lost = 0
+        self._told_lost = 0
+        self._reports: deque[Report] = deque()
+        self.header: Mapping[str, Any] = {}
+        """What is known of gateway and ESCs, set before ``start``; a part's own numbers are added."""
+        self._state: Mapping[str, Any] = {}
+        self._devices: list[Any] = []
+        self._news: dict[str, Any] | None = None
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._busy_since: int | None = None
+        self._told_slow = False
+        self._file: _Files | None = None
+        self._run = os.urandom(8).hex()
+        self._stamp = ""
+        self._part = 0
+        self._retry_ns = 0
+        self._space_ns = 0
+        self._clock_ns = 0
+        self._offset = 0
+        self._failed = False
+        self._full = False
+        self._recorded_losses = 0
+
+    # --- the loop's side
+
+    def start(self) -> None:
+        """Begin to write."""
+        folder = self.settings.folder
+        try:
+            folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+            if not os.access(folder, os.W_OK | os.X_OK):
+                raise RunError(
+                    f"captures: {folder}: may not be written to. Give another folder (record.directory, --record)."
+                )
+        except OSError as error:
+            raise RunError(
+                f"captures: {folder}: {error.strerror}. Give another folder (record.directory, --record)."
+            ) from None
+        thread = threading.Thread(target=self._run_thread, name="recorder", daemon=True)
+        if not start_beside_the_loop(thread):
+            raise RunError("captures: the system gives no thread to write them")
+        self._thread = thread
+
+    def put(self, time_ns: int, kind: int, index: int, data: bytes, flags: int) -> None:
+        """Record an entry, as of ``capture.Entry``. Never waits."""
+        if len(self._entries) >= CAPACITY:
+            self._lost += 1
+        else:
+            self._entries.append((time_ns, kind, index, data, flags))
+
+    @property
+    def wants_frames(self) -> bool:
+        """True where there is a CAN log to write."""
+        return self.settings.can_log != "none"
+
+    def put_frame(self, frame: CanFrame, time_ns: int, received: bool) -> None:
+        """Record a frame that was sent or received, for the CAN log."""
+        if self.settings.can_log != "none" and len(self._entries) < CAPACITY:
+            self._entries.append((time_ns, _RECEIVED if received else _SENT, 0, frame, 0))
+
+    def note(self, state: Mapping[str, Any], devices: list[Any]) -> None:
+        """How the gateway is now (for the header of the next part), and what is known of the devices (told when it changes)."""
+        self._state = state
+        if devices != self._devices:
+            self._devices = devices
+            self._news = {"devices": devices}
+
+    def reports(self, now: int) -> list[Report]:
+        """Take what went wrong, or is right again, since the last call."""
+        taken: list[Report] = []
+        while self._reports:
+            taken.append(self._reports.popleft())
+        if self._lost != self._told_lost and self._lost - self._told_lost >= max(1, self._told_lost):
+            self._told_lost = self._lost
+            taken.append(
+                Report(True, f"captures: {self._lost} entries could not be recorded so far: the disk is too slow")
+            )
+        since = self._busy_since
+        if since is not None and now - since > _SLOW_NS and not self._told_slow:
+            self._told_slow = True
+            taken.append(
+                Report(True, f"captures: {self.settings.folder}: the disk does not answer; the gateway is not held up.")
+            )
+        elif since is None and self._told_slow:
+            self._told_slow = False
+            taken.append(Report(False, f"captures: {self.settings.folder}: the disk answers again"))
+        self.facts.lost = self._lost
+        return taken
+
+    def close(self) -> None:
+        """Write what waits and end the thread; a disk that does not answer is waited for 0.35 s and no longer."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join(_CLOSE_S)
+            self._thread = None
+
+    # --- the thread's side
+
+    def _run_thread(self) -> None:
+        try:
+            while not self._ending.wait(PERIOD_S):
+                self._work()
+            self._work()
+            self._end_part()
+        except Exception as error:  # a mistake of ours in here must not go unsaid
+            self.facts.problem = repr(error)
+            self._reports.append(Report(True, f"captures: recording has ended: {error!r}"))
+
+    def _work(self) -> None:
+        """Write what has come."""
+        entries = self._entries
+        items = [entries.popleft() for _ in range(len(entries))]
+        now = self._clock()
+        self._busy_since = now
+        try:
+            self._write(items, now)
+        except OSError as error:
+            self._fail(error.strerror or str(error), now, len(items))
+        self._busy_since = None
+
+    def _write(self, items: list[Item], now: int) -> None:
+        if not self._may_write(now):
+            self._lose(items)
+            return
+        if self._file is None:
+            self._begin_part(now)
+        assert self._file is not None
+        if (news := self._news) is not None:
+            self._news = None
+            self._file.write(b"I", json_payload(news))
+        if self._lost != self._file.lost:
+            lost = self._lost - self._file.lost
+            self._file.lost = self._lost
+            items.append((now, Kind.LOST, 0, number_data(lost), 0))
+        if now - self._clock_ns >= _CLOCK_NS:
+            self._clock_ns = now
+            offset = time.time_ns() - self._clock()
+            if abs(offset - self._offset) > _STEP_NS:
+                self._offset = offset
+                items.append((now, Kind.CLOCK, 0, number_data(now + offset), 0))
+        self._file.take(items, self._offset)
+        self.facts.bytes += self._file.sync()
+        self.facts.file = str(self._file.path)
+        if self._failed:
+            self._failed = False
+            self.facts.problem = ""
+            self._reports.append(Report(False, f"captures: {self._file.path} is written"))
+        settings = self.settings
+        too_large = settings.part_bytes and self._file.size >= settings.part_bytes
+        if too_large or (settings.part_ns and now - self._file.begun >= settings.part_ns):
+            self._end_part()
+
+    def _may_write(self, now: int) -> bool:
+        if now >= self._space_ns:
+            self._space_ns = now + _LOOK_AT_SPACE_NS
+            self._remove_oldest()
+            found = os.statvfs(self.settings.folder)
+            free = found.f_bavail * found.f_frsize
+            self._full = free < self.settings.least_free_bytes
+            if self._full:
+                self._end_part()
+                least = self.settings.least_free_bytes // _MB
+                self._say_failed(f"{self.settings.folder}: less than {least} MB are free: nothing is recorded")
+        return not self._full and (self._file is not None or now >= self._retry_ns)
+
+    def _lose(self, items: list[Item]) -> None:
+        self._lost += sum(item[1] < _SENT for item in items)
+        self._told_lost = self._lost  # why, was said
+
+    def _fail(self, reason: str, now: int, count: int) -> None:
+        self._lost += count
+        self._told_lost = self._lost
+        file, self._file = self._file, None
+        if file is not None:
+            file.abandon()
+        self.facts.file = ""
+        self._retry_ns = now + _RETRY_NS
+        self._say_failed(f"{self.settings.folder}: cannot be written: {reason}. Trying again.")
+
+    def _say_failed(self, text: str) -> None:
+        self.facts.problem = text
+        if not self._failed:
+            self._failed = True
+            self._reports.append(Report(True, f"captures: {text}"))
+
+    def _begin_part(self, now: int) -> None:
+        wall = time.time_ns()
+        self._offset = wall - now
+        self._clock_ns = now
+        if not self._stamp:
+            self._stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(wall // SECOND))
+        header = dict(self.header) | {
+            "run": self._run,
+            "part": self._part,
+            "monotonic_ns": now,
+            "wall_ns": wall,
+            "devices": self._devices,
+        }
+        if self._part:
+            header["state"] = self._state
+        base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{self._part:04d}"
+        self._file = _Files(base, json_payload(header), now, self.settings)
+        self._file.lost = self._recorded_losses
+        self._news = None
+        self._part += 1
+        self._remove_oldest()
+
+    def _end_part(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            self._recorded_losses = file.lost
+            self.facts.bytes += file.close()
+            self.facts.file = ""
+
+    def _remove_oldest(self) -> None:
+        """Keep the folder within its bound; what is being written stays."""
+        if not self.settings.keep_bytes:
+            return
+        current = "" if self._file is None else self._file.path.stem
+        found = sorted(
+            (p.stem, p, p.lstat().st_size)
+            for p in self.settings.folder.iterdir()
+            if is_ours(p.name) and not p.is_symlink() and p.is_file()
+        )
+        total = sum(size for _, _, size in found)
+        for stem, path, size in found:
+            if total <= self.settings.keep_bytes:
+                return
+            if stem != current:
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                    total -= size
+
+
+def is_ours(name: str) -> bool:
+    """True for the name of a capture, or of a CAN log beside one."""
+    stem, _, suffix = name.partition(".")
+    stamp, _, rest = stem.partition("-")
+    run, _, part = rest.partition("-")
+    made = len(stamp) == 16 and stamp.endswith("Z") and len(run) == 6 and part.isdecimal()
+    return made and f".{suffix}" in (SUFFIX, *(suffix_of(kind) for kind in ("candump", "asc", "blf", "trc", "mf4")))
+
+
+class _Files:
+    """One part: the capture, and the CAN log beside it."""
+
+    def __init__(self, base: Path, header: bytes, now: int, settings: RecordSettings) -> None:
+        self.path = base.with_name(base.name + SUFFIX)
+        self.begun = now
+        self.size = 0
+        self.lost = 0
+        self._number = 0
+        self._new = 0
+        self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
+        self._log: CanLog | None = None
+        try:
+            self.write(b"H", header)
+            _sync_folder(base.parent)
+            if settings.can_log != "none":
+                self._log = CanLog(
+                    base.with_name(base.name + suffix_of(settings.can_log)), settings.can_log, settings.channel
+                )
+        except BaseException:
+            os.close(self._fd)
+            raise
+
+    def write(self, kind: bytes, payload: bytes) -> None:
+        """Append a block."""
+        data = memoryview(block(kind, self._number, payload))
+        self._number += 1
+        self.size += len(data)
+        self._new += len(data)
+        while data:
+            data = data[os.write(self._fd, data) :]
+
+    def take(self, items: list[Item], offset: int) -> None:
+        """Append what came; ``offset``: wall clock less monotonic clock."""
+        entries: list[Item] = []
+        room = _LARGEST_BLOCK
+        for item in items:
+            if item[1] >= _SENT:
+                if self._log is not None:
+                    self._log.add(item[3], (item[0] + offset) / SECOND, item[1] == _RECEIVED)
+                continue
+            entries.append(item)
+            room -= 16 + len(item[3])
+            if room < 0:
+                self._write_entries(entries)
+                entries, room = [], _LARGEST_BLOCK
+        self._write_entries(entries)
+
+    def _write_entries(self, entries: list[Item]) -> None:
+        if entries:
+            self.write(b"D", data_payload((t, kind, index, data, flags) for t, kind, index, data, flags in entries))
+
+    def sync(self) -> int:
+        """Force to the disk what was written; how many bytes since the last call."""
+        if self._log is not None:
+            self._log.flush()
+        if self._new:
+            os.fdatasync(self._fd)
+        new, self._new = self._new, 0
+        return new
+
+    def close(self) -> int:
+        """Close in good order; how many bytes since the last ``sync``."""
+        try:
+            self.write(b"E", b"")
+            if self._log is not None:
+                self._log.close()
+            os.fdatasync(self._fd)
+        finally:
+            os.close(self._fd)
+        return self._new
+
+    def abandon(self) -> None:
+        """Close without writing any more."""
+        with contextlib.suppress(OSError):
+            os.close(self._fd)
+        if self._log is not None:
+            self._log.abandon()
+
+
+def _sync_folder(folder: Path) -> None:
+    """So that the file's name survives a loss of power too."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with contextlib.suppress(OSError):  # a file system that cannot
+            os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def state_of(gateway: Gateway) -> dict[str, Any]:
+    """What a replay that begins now cannot know."""
+    return {
+        "escs": [{"energy": esc.energy, "run_time": esc.run_time, "losses": esc.losses} for esc in gateway.escs],
+        "can_state": int(gateway.status.can_state),
+        "started_ns": gateway.status.started_ns,
+    }
+
+
+def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
+    """What each ESC's last info frame told of the device now on its line; None where none has come."""
+    return [
+        None
+        if esc.last_info is None
+        else {
+            "device": device_text(esc.last_info.device) or str(esc.last_info.device),
+            "variant": esc.last_info.variant,
+            "firmware": esc.last_info.firmware,
+            "layout": ("", "V4", "legacy")[esc.layout],
+        }
+        for esc in gateway.escs
+    ]
