@@ -1,0 +1,181 @@
+"""A log of CAN frames, whatever its format: its frames in order, as a stream, and an account of what is damaged."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO, Self
+
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline.can_logs.blf import BlfReader
+from kontronik_can_gw.offline.can_logs.record import SECOND_NS, Damage, LogFrame, Reader
+from kontronik_can_gw.offline.can_logs.text import (
+    ASC_HEAD,
+    ASC_LINE,
+    CANDUMP_LINE,
+    TRC_HEAD,
+    AscReader,
+    CandumpReader,
+    TrcReader,
+)
+
+FORMATS = ("candump", "asc", "blf", "trc", "mf4")
+SUFFIXES = {
+    ".log": "candump",
+    ".candump": "candump",
+    ".asc": "asc",
+    ".blf": "blf",
+    ".trc": "trc",
+    ".mf4": "mf4",
+    ".mdf": "mf4",
+}
+_HEAD = 1 << 16
+_BACK_NS = 10 * SECOND_NS
+_AHEAD_NS = 86_400 * SECOND_NS
+"""A step of time that is larger must be confirmed by the frame after it, or it is a damaged time."""
+
+
+def log_format(path: Path) -> str | None:
+    """The format of a log: what its first 64 KiB look like, else what its suffix says; None where both say nothing. RunError."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
+    if head.startswith(b"LOGG"):
+        return "blf"
+    if head.startswith((b"MDF     ", b"UnFinMF ")):
+        return "mf4"
+    lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 2000)[:2000]
+    for line in lines:
+        if CANDUMP_LINE.fullmatch(line) is not None:
+            return "candump"
+        if ASC_HEAD.match(line) is not None or ASC_LINE.match(line) is not None:
+            return "asc"
+        if TRC_HEAD.match(line) is not None:
+            return "trc"
+    if b"LOBJ" in head:
+        return "blf"
+    return SUFFIXES.get(path.suffix.lower())
+
+
+_READERS: dict[str, Callable[[BinaryIO, Damage], Reader]] = {
+    "candump": CandumpReader,
+    "asc": AscReader,
+    "trc": TrcReader,
+    "blf": BlfReader,
+}
+
+
+class CanLog:
+    """An open log. ``channel``: only frames of this interface (candump: ``can0``, else the number in the log, from 1); None: all.
+
+    UserError where it is no log that is known, or MF4 and asammdf is missing; RunError where it cannot be opened.
+    """
+
+    def __init__(self, path: Path, channel: str | None = None) -> None:
+        self.path = path
+        self._channel = channel
+        self._damage = Damage()
+        self.channels: dict[str, int] = {}
+        """Frames of each interface so far, those that ``channel`` leaves out too."""
+        self.format = log_format(path) or ""
+        if not self.format:
+            raise UserError(f"{path}: is no CAN log that is known (candump, ASC, BLF, TRC, MF4).")
+        self._file: BinaryIO | None = None
+        self._mf4 = None
+        try:
+            self.size = path.stat().st_size
+            if self.format != "mf4":
+                self._file = path.open("rb")
+        except OSError as error:
+            raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
+        self._reader: Reader
+        if self._file is None:
+            from kontronik_can_gw.offline.can_logs.mf4 import Mf4Reader
+
+            self._reader = self._mf4 = Mf4Reader(path, self._damage)
+        else:
+            self._reader = _READERS[self.format](self._file, self._damage)
+
+    @property
+    def wall_start_ns(self) -> int | None:
+        """Unix time in ns of the log's time 0; 0 where its times are Unix times, None where it does not say."""
+        return self._reader.wall_start_ns
+
+    @property
+    def wall(self) -> bool:
+        """True where the frames' times are Unix times."""
+        return self._reader.wall_start_ns == 0
+
+    @property
+    def position(self) -> int:
+        """Bytes read so far."""
+        if self._mf4 is not None:
+            return self._mf4.position
+        assert self._file is not None
+        return self.size if self._file.closed else min(self._file.tell(), self.size)
+
+    @property
+    def damage(self) -> list[str]:
+        """One line for each kind of damage; complete after the frames."""
+        return self._damage.texts()
+
+    @property
+    def foreign(self) -> dict[str, int]:
+        """Frames that are whole but no data frames: error frames, remote frames, other events of TRC."""
+        return self._damage.foreign
+
+    def frames(self) -> Iterator[tuple[int, CanFrame, bool]]:
+        """Time in ns, frame, whether it is marked as received; in the order of the log. RunError where the file cannot be read."""
+        channels, only = self.channels, self._channel
+        try:
+            for time_ns, frame, received, channel in self._plausible(iter(self._reader)):
+                channels[channel] = channels.get(channel, 0) + 1
+                if only is None or channel == only:
+                    yield time_ns, frame, received
+        except OSError as error:
+            raise RunError(f"{self.path}: cannot be read: {_reason(error)}.") from None
+
+    def _plausible(self, items: Iterator[LogFrame]) -> Iterator[LogFrame]:
+        """Without those whose time leads far away and back: a digit or a bit of it is damaged."""
+        last: int | None = None
+        doubtful: LogFrame | None = None
+        wrong = 0
+        for item in items:
+            time_ns = item.time_ns
+            if last is not None and not -_BACK_NS <= time_ns - last <= _AHEAD_NS:
+                if doubtful is not None and not -_BACK_NS <= time_ns - doubtful.time_ns <= _AHEAD_NS:
+                    wrong += 1
+                elif doubtful is not None:  # two agree: the clock was set, or the first frame was the damaged one
+                    yield doubtful
+                    yield item
+                    doubtful, last = None, time_ns
+                    continue
+                doubtful = item
+                continue
+            if doubtful is not None:
+                wrong += 1
+                doubtful = None
+            last = time_ns
+            yield item
+        if doubtful is not None:
+            yield doubtful
+        if wrong:
+            self._damage.notes.append(f"{wrong} frame{'s' if wrong > 1 else ''} with an impossible time left out")
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+        if self._mf4 is not None:
+            self._mf4.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)

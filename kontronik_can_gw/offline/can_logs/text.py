@@ -1,0 +1,288 @@
+"""Readers of logs that are text: candump, Vector ASC, PEAK TRC. A line that cannot be read is counted, the next one is read again.
+
+Times stay whole numbers of nanoseconds. The formats, where no specification is public, are read as python-can reads them.
+"""
+
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from typing import BinaryIO
+
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline.can_logs.record import (
+    FD_LENGTHS,
+    OLDEST_WALL_S,
+    SECOND_NS,
+    Damage,
+    LogFrame,
+    is_possible,
+)
+
+LONGEST_LINE = 4096
+"""Bytes; a line of any of these formats is far shorter."""
+_HEAD_LINES = 200
+
+CANDUMP_LINE = re.compile(
+    rb"\((\d{1,12})\.(\d{1,9})\)[ \t]+([\x21-\x7e]{1,64})[ \t]+"
+    rb"([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#(?:(#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2})*)(?:_[0-9A-Fa-f])?|([Rr][0-9A-Fa-f]{0,2}))"
+    rb"(?:[ \t]+([RTrt]))?[ \t\r\n]*"
+)
+_CANDUMP_END = re.compile(CANDUMP_LINE.pattern + rb"\Z")
+_ERROR_FLAG = 0x20000000
+
+ASC_LINE = re.compile(
+    rb"[ \t]*(\d{1,10})\.(\d{1,9})[ \t]+(?:"
+    rb"(\d{1,3})[ \t]+([0-9A-Fa-f]{1,9})([xX]?)[ \t]+(Rx|Tx|TxRq)[ \t]+(?:d[ \t]+([0-9A-Fa-f]{1,2})((?:[ \t]+[0-9A-Fa-f]{1,3})*)|([rR]))"
+    rb"|CANFD[ \t]+(\d{1,3})[ \t]+(Rx|Tx|TxRq)[ \t]+([0-9A-Fa-f]{1,9})([xX]?)[ \t]+(?:[^\d\s]\S*[ \t]+)?([01])[ \t]+([01])[ \t]+"
+    rb"([0-9A-Fa-f])[ \t]+(\d{1,2})((?:[ \t]+[0-9A-Fa-f]{1,3})*)"
+    rb"|(?:CANFD[ \t]+)?\d{1,3}[ \t]+(?:(?:Rx|Tx)[ \t]+)?(ErrorFrame)"
+    rb")",
+    re.IGNORECASE,
+)
+ASC_HEAD = re.compile(rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)", re.IGNORECASE)
+_ASC_OTHER = re.compile(
+    rb"\s*(?://.*|(?:date|base|begin|end|no|internal|previous)\b.*|\d+\.\d+\s+(?!\d+\s+\S+\s+(?:Rx|Tx)\b)(?!CANFD\b)[\x09\x20-\x7e\x80-\xff]+)?\s*",
+    re.IGNORECASE,
+)
+_ASC_BASE = re.compile(rb"\s*base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.IGNORECASE)
+_ASC_DATE = re.compile(r"\s*(?:date|begin\s+triggerblock)\s+\w+\s+(.+?)\s*$", re.IGNORECASE)
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
+_RELATIVE = b"relative"
+
+TRC_HEAD = re.compile(rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE)
+_TRC_COLUMNS = {"1.0": "N,O,I,l,D", "1.1": "N,O,d,I,l,D", "1.3": "N,O,B,d,I,R,l,D", "2.0": "N,O,T,I,d,l,D"}
+_TRC_NEWEST = "N,O,T,B,I,d,R,L,D"
+_TRC_FRAMES = {"DT": False, "FD": True, "FB": True, "FE": True, "BI": True}
+_TRC_EVENTS = frozenset(("ST", "EC", "ER", "EV"))
+_TRC_OLD_EVENTS = frozenset((b"Warng", b"Error", b"ErrCt", b"Event"))
+_TRC_DAY0 = datetime(1899, 12, 30, tzinfo=UTC)
+
+
+def lines_of(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Number (from 1) and bytes of each line; of one that is longer than a line can be its end."""
+    number = 0
+    while line := file.readline(LONGEST_LINE):
+        number += 1
+        if len(line) == LONGEST_LINE and not line.endswith(b"\n"):
+            while (more := file.readline(LONGEST_LINE)) and not more.endswith(b"\n"):
+                line = more
+            line = (line + more)[-LONGEST_LINE:]
+        yield number, line
+
+
+class CandumpReader:
+    """``candump -L`` and ``-l``: ``(1700000000.123456) can0 681#0011223344556677 R``."""
+
+    def __init__(self, file: BinaryIO, damage: Damage) -> None:
+        self._file = file
+        self._damage = damage
+        self.wall_start_ns: int | None = None
+        for _, line in zip(range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False):
+            if (match := CANDUMP_LINE.fullmatch(line)) is not None:
+                self.wall_start_ns = 0 if int(match[1]) >= OLDEST_WALL_S else None
+                break
+        file.seek(0)
+
+    def __iter__(self) -> Iterator[LogFrame]:
+        damage, whole = self._damage, CANDUMP_LINE.fullmatch
+        channels: dict[bytes, str] = {}
+        for number, line in lines_of(self._file):
+            match = whole(line)
+            if match is None:
+                if not line.strip():
+                    continue
+                damage.line(number)
+                start = line.rfind(b"(")  # rubbish in front of a whole line
+                match = _CANDUMP_END.match(line, start) if start > 0 else None
+                if match is None:
+                    continue
+            seconds, fraction, name, id_text, flags, data_text, remote, direction = match.groups()
+            can_id = int(id_text, 16)
+            extended = len(id_text) == 8
+            if extended and can_id & _ERROR_FLAG:
+                damage.skip("error frames")
+                continue
+            if remote is not None:
+                damage.skip("remote frames")
+                continue
+            data = bytes.fromhex(data_text.decode("ascii"))
+            fd = flags is not None
+            if not is_possible(can_id, extended, len(data), fd):
+                damage.line(number)
+                continue
+            channel = channels.get(name)
+            if channel is None:
+                channel = channels[name] = name.decode("ascii")
+            time_ns = int(seconds) * SECOND_NS + int(fraction.ljust(9, b"0"))
+            yield LogFrame(time_ns, CanFrame(can_id, data, extended, fd), direction in (b"R", b"r"), channel)
+
+
+class AscReader:
+    """Vector ASC, base hex or dec, times absolute or relative, CAN and CAN FD; other events are passed over."""
+
+    def __init__(self, file: BinaryIO, damage: Damage) -> None:
+        self._file = file
+        self._damage = damage
+        self._base = 16
+        self._relative = False
+        self.wall_start_ns: int | None = None
+        for _, line in zip(range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False):
+            if (match := _ASC_BASE.match(line)) is not None:
+                self._base = 10 if match[1].lower() == b"dec" else 16
+                self._relative = (match[2] or b"").lower() == _RELATIVE
+            elif (date := _ASC_DATE.match(line.decode("utf-8", "replace"))) is not None:
+                started = asc_time(date[1])
+                if started is not None and started >= OLDEST_WALL_S * SECOND_NS:
+                    self.wall_start_ns = started
+            elif ASC_LINE.match(line) is not None:
+                break
+        file.seek(0)
+
+    def __iter__(self) -> Iterator[LogFrame]:
+        damage, base, relative = self._damage, self._base, self._relative
+        find, other = ASC_LINE.match, _ASC_OTHER.fullmatch
+        now = 0
+        for number, line in lines_of(self._file):
+            match = find(line)
+            if match is None:
+                if other(line) is None:
+                    damage.line(number)
+                elif relative and (event := re.match(rb"\s*(\d+)\.(\d{1,9})\s", line)) is not None:
+                    now += int(event[1]) * SECOND_NS + int(event[2].ljust(9, b"0"))
+                continue
+            time_ns = int(match[1]) * SECOND_NS + int(match[2].ljust(9, b"0"))
+            if relative:
+                time_ns = now = now + time_ns
+            if match[19] is not None:
+                damage.skip("error frames")
+                continue
+            if match[9] is not None:
+                damage.skip("remote frames")
+                continue
+            fd = match[10] is not None
+            channel, direction, id_text, x = (
+                (match[10], match[11], match[12], match[13]) if fd else (match[3], match[6], match[4], match[5])
+            )
+            try:
+                can_id = int(id_text, base)
+                if fd:
+                    size = int(match[17])
+                    if size == 0 and int(match[16], 16):
+                        damage.skip("remote frames")
+                        continue
+                    words = match[18].split()[:size]
+                else:
+                    size = min(8, int(match[7], base))
+                    words = match[8].split()[:size]
+                data = bytes.fromhex(b"".join(words).decode("ascii")) if base == 16 else bytes(map(int, words))
+            except ValueError:
+                damage.line(number)
+                continue
+            if len(data) != size or not is_possible(can_id, bool(x), size, fd):
+                damage.line(number)
+                continue
+            received = direction.lower() == b"rx"
+            yield LogFrame(time_ns, CanFrame(can_id, data, bool(x), fd), received, channel.decode("ascii"))
+
+
+def asc_time(text: str) -> int | None:
+    """Unix time in ns of ``Nov 14 10:13:20.123 pm 2023``, local time as ASC files have it; None where it is no date."""
+    words = text.lower().split()
+    if len(words) not in (4, 5):
+        return None
+    month = _GERMAN_MONTHS.get(words[0][:3], words[0][:3])
+    try:
+        clock, _, fraction = words[2].partition(".")
+        hour, minute, second = (int(part) for part in clock.split(":"))
+        if len(words) == 5:
+            hour = hour % 12 + (12 if words[3] == "pm" else 0)
+        moment = datetime(int(words[-1]), _MONTHS.index(month) + 1, int(words[1]), hour, minute, second)  # noqa: DTZ001  local
+        return int(moment.timestamp()) * SECOND_NS + int((fraction or "0").ljust(9, "0")[:9])
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
+class TrcReader:
+    """PEAK TRC, file versions 1.0, 1.1, 1.3, 2.0 and 2.1."""
+
+    def __init__(self, file: BinaryIO, damage: Damage) -> None:
+        self._file = file
+        self._damage = damage
+        self.wall_start_ns: int | None = None
+        version, columns = "", ""
+        for _, line in zip(range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False):
+            text = line.decode("latin-1").strip()
+            if text and not text.startswith(";"):
+                break
+            key, _, value = text.partition("=")
+            if key == ";$FILEVERSION":
+                version = value.strip()
+            elif key == ";$COLUMNS":
+                columns = value.strip()
+            elif key == ";$STARTTIME":
+                self.wall_start_ns = _trc_start(value)
+        file.seek(0)
+        if not columns:
+            columns = _TRC_COLUMNS.get(version, _TRC_NEWEST if version.startswith("2") else _TRC_COLUMNS["1.0"])
+        self._columns = [column.strip() for column in columns.split(",")]
+
+    def __iter__(self) -> Iterator[LogFrame]:
+        damage = self._damage
+        columns = self._columns
+        at = {column: index for index, column in enumerate(columns)}
+        count = len(columns)
+        has_data = columns[-1:] == ["D"]
+        least = count - 1 if has_data else count
+        o, i = at.get("O", 1), at.get("I", 2)
+        t, d, bus = at.get("T"), at.get("d"), at.get("B")
+        size_at, is_length = (at["l"], True) if "l" in at else (at.get("L", count - 2), False)
+        for number, line in lines_of(self._file):
+            words = line.split(None, count - 1)
+            if not words or words[0][:1] == b";":
+                continue
+            try:
+                if len(words) < least:
+                    raise ValueError
+                kind = "DT" if t is None else words[t].decode("ascii")
+                direction = b"" if d is None else words[d]
+                if kind == "RR" or (t is None and len(words) == count and words[-1].strip().upper() == b"RTR"):
+                    damage.skip("remote frames")
+                    continue
+                if kind in _TRC_EVENTS or (t is None and direction in _TRC_OLD_EVENTS):
+                    damage.skip("other events")
+                    continue
+                if kind not in _TRC_FRAMES or direction not in (b"", b"Rx", b"Tx"):
+                    raise ValueError
+                id_text = words[i]
+                if id_text == b"FFFFFFFF":
+                    damage.skip("other events")
+                    continue
+                fd = _TRC_FRAMES[kind]
+                milliseconds, _, fraction = words[o].partition(b".")
+                if len(fraction) > 6 or not milliseconds.isdigit():
+                    raise ValueError
+                time_ns = int(milliseconds) * 1_000_000 + int(fraction.ljust(6, b"0"))
+                can_id = int(id_text, 16)
+                extended = len(id_text) > 4
+                size = int(words[size_at])
+                if not is_length:
+                    size = FD_LENGTHS[size]
+                data = bytes.fromhex(words[-1].decode("ascii")) if len(words) == count else b""
+                if len(data) != size or not is_possible(can_id, extended, size, fd):
+                    raise ValueError
+                channel = "1" if bus is None else words[bus].decode("ascii")
+            except (ValueError, IndexError):  # of numbers, texts, lengths
+                damage.line(number)
+                continue
+            yield LogFrame(time_ns, CanFrame(can_id, data, extended, fd), direction == b"Rx", channel)
+
+
+def _trc_start(text: str) -> int | None:
+    """Unix time in ns of days since 1899-12-30; None where it is none, or before 1990."""
+    try:
+        moment = _TRC_DAY0 + timedelta(days=float(text))
+    except (ValueError, OverflowError):
+        return None
+    start = round((moment - datetime(1970, 1, 1, tzinfo=UTC)) / timedelta(microseconds=1)) * 1000
+    return start if start >= OLDEST_WALL_S * SECOND_NS else None

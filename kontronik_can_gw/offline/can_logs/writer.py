@@ -1,0 +1,204 @@
+"""Writes CAN frames as candump log, ASC, BLF or TRC, as python-can's writers do, and as MF4 bus logging.
+
+The same frames give the same bytes: no file tells when it was written.
+"""
+
+import io
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.offline.can_logs.record import SECOND_NS
+
+if TYPE_CHECKING:
+    from can import Message
+
+TEXT_FORMATS = ("candump", "asc", "trc")
+_MS = 1_000_000
+
+
+class CanLogWriter:
+    """Writes one log.
+
+    ``file``: open for bytes, stays open; of MF4 a path. ``wall_start_ns``: Unix time in ns of time 0, None where unknown.
+    ``first_ns``: time of the first frame, where an ASC, BLF, TRC or MF4 file that tells the Unix time begins.
+    ``name``: what the file will be called (TRC says it).
+    """
+
+    def __init__(
+        self,
+        file: "IO[bytes] | Path",
+        format_: str,
+        wall_start_ns: int | None,
+        first_ns: int = 0,
+        channel: str = "can0",
+        name: str = "",
+        comment: str = "",
+    ) -> None:
+        self.left_out: dict[str, int] = {}
+        """Frames that the format does not know, by what they are."""
+        self.frames = 0
+        self.write: Callable[[int, CanFrame, bool], None]
+        """Add a frame: its time in ns, the frame, whether it was received."""
+        self._close: Callable[[], None] = lambda: None
+        self._discard: Callable[[], None] = lambda: None
+        if format_ == "mf4":
+            from kontronik_can_gw.offline.can_logs.mf4 import Mf4Writer
+
+            assert isinstance(file, Path)
+            start_ns = None if wall_start_ns is None else _whole_us(wall_start_ns + first_ns)
+            mf4 = Mf4Writer(file, start_ns, comment)
+            shift = 0 if start_ns is None else start_ns - (wall_start_ns or 0)
+            self.write = lambda time_ns, frame, received: mf4.write(time_ns - shift, frame, received)
+            self._close, self._discard = mf4.close, mf4.discard
+            return
+        assert not isinstance(file, Path)
+        self._file = file
+        if format_ == "candump":
+            self.write = _candump(file, wall_start_ns or 0, channel)
+            return
+        # Vector's and PEAK's headers count milliseconds
+        base_ns = 0 if wall_start_ns is None else (wall_start_ns + first_ns) // _MS * _MS - wall_start_ns
+        start_ns = None if wall_start_ns is None else wall_start_ns + base_ns
+        {"asc": self._asc, "blf": self._blf, "trc": self._trc}[format_](file, base_ns, start_ns, name)
+
+    def _asc(self, file: IO[bytes], base_ns: int, start_ns: int | None, _name: str) -> None:
+        with without_asammdf():
+            from can import ASCWriter
+        # python-can's header tells when the file was written, and cuts zeros of the milliseconds
+        # local time, as ASC has it
+        moment = datetime(1970, 1, 1) if start_ns is None else datetime.fromtimestamp(start_ns // SECOND_NS)  # noqa: DTZ001, DTZ006
+        stamp = moment.strftime(f"%a %b %d %H:%M:%S.{(start_ns or 0) // _MS % 1000:03d} %Y")
+        text = io.TextIOWrapper(file, encoding="ascii", newline="\n", write_through=True)
+        writer = ASCWriter(io.StringIO())
+        writer.file = text
+        writer.header_written = True
+        head = f"date {stamp}\nbase hex  timestamps absolute\ninternal events logged\nBegin Triggerblock {stamp}\n"
+        text.write(head + f"{0.0: 9.6f} Start of measurement\n")
+        self._through(writer.on_message_received, base_ns)
+
+        def close() -> None:
+            text.write("End TriggerBlock\n")
+            text.detach()
+
+        def discard() -> None:
+            text.detach()
+
+        self._close, self._discard = close, discard
+
+    def _blf(self, file: IO[bytes], base_ns: int, start_ns: int | None, _name: str) -> None:
+        with without_asammdf():
+            from can import BLFWriter
+        writer = BLFWriter(file)  # type: ignore[arg-type]
+        writer.start_timestamp = 0.0
+        # half a nanosecond more: the writer cuts where it should round
+        self._through(writer.on_message_received, base_ns, 0.5)
+
+        def close() -> None:
+            last = writer.stop_timestamp or 0.0
+            start = 0.0 if start_ns is None else start_ns / SECOND_NS
+            writer.start_timestamp, writer.stop_timestamp = start, start + last
+            held, writer.file = writer.file, _Unclosed(file)  # type: ignore[assignment]
+            writer.stop()
+            writer.file = held
+
+        self._close = close
+
+    def _trc(self, file: IO[bytes], base_ns: int, start_ns: int | None, name: str) -> None:
+        with without_asammdf():
+            from can import TRCWriter
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="\r\n", write_through=True)
+        writer = TRCWriter(_Named(text, name))  # type: ignore[arg-type]
+        writer.filepath = name
+        writer.first_timestamp = 0.0
+        writer.header_written = True
+        writer.file = text
+        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(milliseconds=(start_ns or 0) // _MS)
+        writer.write_header(moment.timestamp())
+        through = writer.on_message_received
+        self._through(through, base_ns)
+        plain = self.write
+
+        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
+            if frame.fd:
+                self.left_out["CAN FD frames"] = self.left_out.get("CAN FD frames", 0) + 1
+            else:
+                plain(time_ns, frame, received)
+
+        def detach() -> None:
+            text.detach()
+
+        self.write = write
+        self._close, self._discard = detach, detach
+
+    def _through(self, take: "Callable[[Message], None]", base_ns: int, more_ns: float = 0.0) -> None:
+        """Write by one of python-can's writers. Times go in seconds since ``base_ns``, for which a float is exact enough."""
+        from can import Message
+
+        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
+            take(
+                Message(
+                    (max(time_ns - base_ns, 0) + more_ns) / SECOND_NS,
+                    frame.can_id,
+                    frame.extended,
+                    data=frame.data,
+                    is_fd=frame.fd,
+                    bitrate_switch=frame.fd,
+                    is_rx=received,
+                )
+            )
+
+        self.write = write
+
+    def close(self) -> None:
+        """Write what is held back, and the end. The file stays open."""
+        self._close()
+
+    def discard(self) -> None:
+        """Release what is held, where the log is not to be kept."""
+        self._discard()
+
+
+class _Unclosed:
+    """A file that does not let its writer close it."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def close(self) -> None:
+        """The one who opened it closes it."""
+
+
+class _Named:
+    """What python-can's TRCWriter asks of its file while it is made."""
+
+    def __init__(self, file: io.TextIOWrapper, name: str) -> None:
+        self.name = name
+        self.reconfigure = file.reconfigure
+
+
+def _candump(file: IO[bytes], wall_start_ns: int, channel: str) -> Callable[[int, CanFrame, bool], None]:
+    """As python-can's CanutilsLogWriter writes it, at several times its speed."""
+    write = file.write
+    half = 500 + wall_start_ns
+
+    def one(time_ns: int, frame: CanFrame, received: bool) -> None:
+        us = (time_ns + half) // 1000
+        can_id, data, extended, fd = frame[:4]
+        flags = "#1" if fd else ""  # with a switched bit rate, as the gateway sends them
+        name = f"{can_id:08X}" if extended else f"{can_id:03X}"
+        end = "R" if received else "T"
+        line = f"({us // 1000000}.{us % 1000000:06d}) {channel} {name}#{flags}{data.hex().upper()} {end}\n"
+        write(line.encode("ascii"))
+
+    return one
+
+
+def _whole_us(ns: int) -> int:
+    return ns // 1000 * 1000

@@ -1,0 +1,75 @@
+"""Logs of random CAN frames for the tests, written by our writer or by python-can's."""
+
+import random
+from pathlib import Path
+
+import can
+
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline.can_logs import CanLog, CanLogWriter
+
+Item = tuple[int, CanFrame, bool]
+
+WALL_NS = 1_700_000_000_123_456_000
+SUFFIX = {"candump": ".log", "asc": ".asc", "blf": ".blf", "trc": ".trc", "mf4": ".mf4"}
+READERS = {
+    "candump": can.CanutilsLogReader,
+    "asc": can.ASCReader,
+    "blf": can.BLFReader,
+    "trc": can.TRCReader,
+    "mf4": can.MF4Reader,
+}
+
+
+def some_frames(count: int, seed: int = 1, fd: bool = False) -> list[Item]:
+    """Frames of both id lengths, times in whole microseconds, rising."""
+    chance = random.Random(seed)
+    now = 0
+    items = []
+    for _ in range(count):
+        now += chance.randrange(1, 20_000) * 1000
+        extended = chance.random() < 0.3
+        is_fd = fd and chance.random() < 0.3
+        size = chance.choice((0, 1, 8, 12, 20, 64)) if is_fd else chance.randrange(9)
+        can_id = chance.randrange(1 << 29) if extended else chance.randrange(1 << 11)
+        items.append((now, CanFrame(can_id, chance.randbytes(size), extended, is_fd), chance.random() < 0.5))
+    return items
+
+
+def write_log(path: Path, format_: str, items: list[Item], wall_start_ns: int | None = WALL_NS) -> None:
+    """By our writer."""
+    first = items[0][0] if items else 0
+    if format_ == "mf4":
+        writer = CanLogWriter(path, format_, wall_start_ns, first)
+        for item in items:
+            writer.write(*item)
+        writer.close()
+        return
+    with path.open("wb") as file:
+        writer = CanLogWriter(file, format_, wall_start_ns, first, name=path.name)
+        for item in items:
+            writer.write(*item)
+        writer.close()
+
+
+def read_log(path: Path, channel: str | None = None) -> tuple[list[Item], list[str]]:
+    """By our reader: frames with Unix times (if the log has them), and the damage."""
+    with CanLog(path, channel) as log:
+        items = [((log.wall_start_ns or 0) + time_ns, frame, received) for time_ns, frame, received in log.frames()]
+        return items, log.damage
+
+
+def read_by_library(path: Path, format_: str) -> list[Item]:
+    """By python-can; times to a microsecond."""
+    options = {"relative_timestamp": False} if format_ == "asc" else {}
+    found = []
+    with READERS[format_](path, **options) as reader:
+        for m in reader:
+            frame = CanFrame(m.arbitration_id, bytes(m.data), m.is_extended_id, m.is_fd)
+            found.append((round(m.timestamp * 1e6) * 1000, frame, m.is_rx))
+    return found
+
+
+def at_wall(items: list[Item], wall_start_ns: int = WALL_NS) -> list[Item]:
+    """The same with Unix times."""
+    return [(wall_start_ns + time_ns, frame, received) for time_ns, frame, received in items]

@@ -1,0 +1,259 @@
+"""CAN logs are written as python-can reads them and read as python-can writes them, frame by frame, to the microsecond."""
+
+import io
+from pathlib import Path
+
+import can
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from log_files import READERS, SUFFIX, WALL_NS, Item, at_wall, read_by_library, read_log, some_frames, write_log
+
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline.can_logs import CanLog, CanLogWriter, log_format
+
+FORMATS = sorted(READERS)
+WITH_FD = sorted(set(FORMATS) - {"trc"})
+
+
+@pytest.mark.parametrize("format_", FORMATS)
+@pytest.mark.parametrize("wall", [WALL_NS, None])
+def test_what_is_written_is_read_again(tmp_path: Path, format_: str, wall: int | None) -> None:
+    items = some_frames(500, fd=format_ in WITH_FD)
+    path = tmp_path / f"log{SUFFIX[format_]}"
+    write_log(path, format_, items, wall)
+    found, damage = read_log(path)
+    assert found == (at_wall(items) if wall is not None else items)
+    assert damage == []
+    with CanLog(path) as log:
+        assert log.format == format_
+        assert (log.wall_start_ns is None) == (wall is None)
+        assert log.wall == (format_ == "candump" and wall is not None)
+        for _ in log.frames():
+            assert 0 <= log.position <= log.size
+        assert log.position == log.size == path.stat().st_size
+
+
+@pytest.mark.parametrize("format_", FORMATS)
+def test_python_can_reads_what_is_written(tmp_path: Path, format_: str) -> None:
+    items = some_frames(300, fd=format_ in WITH_FD)
+    path = tmp_path / f"log{SUFFIX[format_]}"
+    write_log(path, format_, items)
+    assert read_by_library(path, format_) == at_wall(items)
+
+
+@pytest.mark.parametrize("format_", FORMATS)
+def test_what_python_can_writes_is_read(tmp_path: Path, format_: str) -> None:
+    items = at_wall(some_frames(300, fd=format_ in WITH_FD))
+    path = tmp_path / f"log{SUFFIX[format_]}"
+    with can.Logger(path) as writer:
+        for time_ns, frame, received in items:
+            writer(
+                can.Message(
+                    time_ns / 1e9,
+                    frame.can_id,
+                    frame.extended,
+                    data=frame.data,
+                    is_fd=frame.fd,
+                    is_rx=received,
+                    channel=0,
+                )
+            )
+    found, damage = read_log(path)
+    assert damage == []
+    assert [item[1:] for item in found] == [item[1:] for item in items]
+    if format_ == "asc":  # python-can's header of 5 ms says 500: the start may be wrong, the distances are not
+        shift = found[0][0] - items[0][0]
+        found = [(time_ns - shift, *rest) for time_ns, *rest in found]  # type: ignore[misc]
+    assert max(abs(a[0] - b[0]) for a, b in zip(found, items, strict=True)) <= 1000
+
+
+@pytest.mark.parametrize("format_", FORMATS)
+def test_the_same_frames_give_the_same_bytes(tmp_path: Path, format_: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import time
+
+    items = some_frames(50)
+    first, second = tmp_path / "a", tmp_path / "b"
+    now = time.time()
+    for folder, moment in ((first, now), (second, now + 12345)):
+        folder.mkdir()
+        monkeypatch.setattr(time, "time", lambda moment=moment: moment)
+        write_log(folder / f"log{SUFFIX[format_]}", format_, items)
+    one, other = ((folder / f"log{SUFFIX[format_]}").read_bytes() for folder in (first, second))
+    assert one == other
+
+
+ITEM = st.builds(
+    lambda us, extended, can_id, fd, data, received: (
+        us * 1000,
+        CanFrame(can_id if extended else can_id & 0x7FF, data if fd else data[:8], extended, fd),
+        received,
+    ),
+    st.integers(0, 10**11),
+    st.booleans(),
+    st.integers(0, (1 << 29) - 1),
+    st.booleans(),
+    st.sampled_from((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64)).flatmap(lambda n: st.binary(min_size=n, max_size=n)),
+    st.booleans(),
+)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(ITEM, max_size=20))
+def test_candump_lines_are_those_of_python_can(items: list[Item]) -> None:
+    items.sort(key=lambda item: item[0])
+    ours, theirs = io.BytesIO(), io.StringIO()
+    writer = CanLogWriter(ours, "candump", 0, channel="can3")
+    library = can.CanutilsLogWriter(theirs, channel="can3")
+    for time_ns, frame, received in items:
+        writer.write(time_ns, frame, received)
+        library.on_message_received(
+            can.Message(
+                time_ns / 1e9,
+                frame.can_id,
+                frame.extended,
+                data=frame.data,
+                is_fd=frame.fd,
+                bitrate_switch=frame.fd,
+                is_rx=received,
+            )
+        )
+    writer.close()
+    assert ours.getvalue().decode() == theirs.getvalue()
+
+
+@pytest.mark.parametrize("format_", ["candump", "asc", "blf", "trc"])
+@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(items=st.lists(ITEM, min_size=1, max_size=20))
+def test_any_frames_come_back(tmp_path: Path, format_: str, items: list[Item]) -> None:
+    items.sort(key=lambda item: item[0])
+    if format_ == "trc":
+        items = [item for item in items if not item[1].fd]
+    path = tmp_path / f"any{SUFFIX[format_]}"
+    write_log(path, format_, items, None)
+    assert read_log(path) == (items, [])
+
+
+def test_a_candump_log_of_other_tools_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "other.log"
+    path.write_text(
+        "(1700000000.000001) can0 681#0011\n"
+        "(1700000000.000002)  can1  00000123#\n"
+        "(1700000000.000003) can0 123#R4\n"
+        "(1700000000.000004) can0 20000080#0000000000000000\n"
+        "\n"
+        "(1700000000.000005) can0 123##3001122\r\n"
+        "(1700000000.000006) vcan0 123#1122334455667788_E T\n"
+        "(1700000000.000007) can0 7FF#AA R"
+    )
+    with CanLog(path) as log:
+        found = list(log.frames())
+        assert log.damage == []
+        assert log.foreign == {"remote frames": 1, "error frames": 1}
+        assert log.channels == {"can0": 3, "can1": 1, "vcan0": 1}
+    at = 1_700_000_000_000_000_000
+    assert found == [
+        (at + 1000, CanFrame(0x681, b"\x00\x11"), False),
+        (at + 2000, CanFrame(0x123, b"", True), False),
+        (at + 5000, CanFrame(0x123, b"\x00\x11\x22", fd=True), False),
+        (at + 6000, CanFrame(0x123, bytes.fromhex("1122334455667788")), False),
+        (at + 7000, CanFrame(0x7FF, b"\xaa"), True),
+    ]
+    assert [frame.can_id for _, frame, _ in read_log(path, "can1")[0]] == [0x123]
+
+
+def test_asc_with_decimal_base_and_relative_times_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "decimal.asc"
+    path.write_text(
+        "date Wed Nov 15 10:13:20.250 am 2023\n"
+        "base dec  timestamps relative\n"
+        "internal events logged\n"
+        "// version 9.0.0\n"
+        "   0.000000 Start of measurement\n"
+        "   0.010000 1  1665            Rx   d 3 0 17 255  Length = 112 BitCount = 60\n"
+        "   0.010000 CAN 1 Status:chip status error active\n"
+        "   0.010000 2  291x            Tx   d 0\n"
+        "   0.010000 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n"
+        "   0.000500 1  ErrorFrame\n"
+        "   0.000500 1  291             Rx   r\n"
+        "End TriggerBlock\n"
+    )
+    with CanLog(path) as log:
+        found = list(log.frames())
+        assert log.damage == []
+        assert log.foreign == {"error frames": 1, "remote frames": 1}
+        assert log.channels == {"1": 1, "2": 1}
+        assert log.wall_start_ns is not None
+        assert log.wall_start_ns % 1_000_000_000 == 250_000_000
+    assert found == [
+        (10_000_000, CanFrame(1665, b"\x00\x11\xff"), True),
+        (30_000_000, CanFrame(291, b"", True), False),
+    ]
+
+
+TRC = {
+    "1.0": "      1)      1841      0001 8 00 00 00 00 00 00 00 00\n      2)      1842  00000402 2 01 02\n",
+    "1.1": "     1)      1059.9  Rx         0300  7  00 00 00 00 04 00 00\n"
+    "     2)      1283.2  Rx         0300  0\n     3)  1298.9  Warng  FFFFFFFF  4  00 00 00 08  BUSHEAVY\n"
+    "     4)      1299.0  Tx     18EFC034  2  A1 B2\n",
+    "2.0": "      1      1059.900 DT     0300 Rx 7  00 00 00 00 04 00 00\n"
+    "      2      1283.231 FD 18EFC034 Tx 12 01 02 03 04 05 06 07 08 09 0A 0B 0C\n"
+    "      3      1298.945 ST          Rx    00 00 00 08\n      4      1300.000 RR     0301 Rx 4\n",
+}
+
+
+@pytest.mark.parametrize("version", sorted(TRC))
+def test_older_trc_files_are_read_as_python_can_reads_them(tmp_path: Path, version: str) -> None:
+    head = "" if version == "1.0" else f";$FILEVERSION={version}\n;$STARTTIME=45245.5\n"
+    columns = ";$COLUMNS=N,O,T,I,d,l,D\n" if version == "2.0" else ""
+    path = tmp_path / "old.trc"
+    path.write_text(head + columns + ";########\n" + TRC[version])
+    expected = [
+        (round(m.timestamp * 1e6) * 1000, m.arbitration_id, m.is_extended_id, bytes(m.data), m.is_rx)
+        for m in can.TRCReader(path)
+        if not m.is_remote_frame
+    ]
+    found, damage = read_log(path)
+    assert damage == []
+    assert [(t, f.can_id, f.extended, f.data) for t, f, _ in found] == [item[:4] for item in expected]
+    if version != "1.0":  # which does not say the direction
+        assert [received for _, _, received in found] == [item[4] for item in expected]
+
+
+def test_the_content_tells_the_format_before_the_suffix(tmp_path: Path) -> None:
+    for format_ in FORMATS:
+        path = tmp_path / f"{format_}.bin"
+        write_log(path, format_, some_frames(5))
+        assert log_format(path) == format_
+    rubbish = tmp_path / "rubbish.txt"
+    rubbish.write_text("no log\n")
+    assert log_format(rubbish) is None
+    with pytest.raises(UserError, match="is no CAN log that is known"):
+        CanLog(rubbish)
+    with pytest.raises(RunError, match="cannot be opened: No such file"):
+        CanLog(tmp_path / "missing.log")
+    with pytest.raises(RunError, match="cannot be opened: Is a directory"):
+        CanLog(tmp_path)
+
+
+def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    path = tmp_path / "log.mf4"
+    write_log(path, "mf4", some_frames(5))
+    monkeypatch.setitem(sys.modules, "asammdf", None)
+    with pytest.raises(UserError, match=r"MF4 needs asammdf: pip install 'kontronik-can-gw\[mf4\]'"):
+        CanLog(path)
+    with pytest.raises(UserError, match="MF4 needs asammdf"):
+        write_log(tmp_path / "new.mf4", "mf4", some_frames(5))
+
+
+def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:
+    with (tmp_path / "fd.trc").open("wb") as file:
+        writer = CanLogWriter(file, "trc", None)
+        for item in (some := some_frames(100, fd=True)):
+            writer.write(*item)
+        writer.close()
+    assert writer.left_out == {"CAN FD frames": sum(frame.fd for _, frame, _ in some)}
+    assert read_log(tmp_path / "fd.trc")[0] == [item for item in some if not item[1].fd]

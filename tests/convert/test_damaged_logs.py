@@ -1,0 +1,233 @@
+"""Of a damaged log everything that is intact is given, before and behind the damage, and the damage is told.
+
+Nothing raises but RunError.
+"""
+
+import random
+import re
+from pathlib import Path
+
+import pytest
+from log_files import SUFFIX, Item, at_wall, read_log, some_frames, write_log
+
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.offline.can_logs import CanLog
+
+OWN = ["candump", "asc", "trc", "blf"]
+TEXT = ["candump", "asc", "trc"]
+
+
+def _log(tmp_path: Path, format_: str, count: int) -> tuple[Path, list[Item], bytes]:
+    items = some_frames(count)
+    path = tmp_path / f"log{SUFFIX[format_]}"
+    write_log(path, format_, items)
+    return path, at_wall(items), path.read_bytes()
+
+
+def _is_part(found: list[Item], items: list[Item]) -> bool:
+    """True where ``found`` is ``items`` with some left out."""
+    rest = iter(items)
+    return all(any(item == other for other in rest) for item in found)
+
+
+@pytest.mark.parametrize("format_", OWN)
+def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(tmp_path: Path, format_: str) -> None:
+    path, items, content = _log(tmp_path, format_, 12)
+    most = 0
+    for cut in range(len(content) - 1, 0, -1):
+        path.write_bytes(content[:cut])
+        found, damage = read_log(path)
+        if format_ == "blf" and cut < 56:  # not even its header
+            assert found == []
+            continue
+        if format_ in TEXT:
+            # of a line that is cut a shorter number may be left, which nobody can tell
+            whole = found[:-1] if found and not content[:cut].endswith(b"\n") else found
+            lines = content[:cut].count(b"\n") - content.count(b"\n") + len(items) + (format_ == "asc")
+            assert len(whole) >= min(lines, len(items)) - 1
+        else:
+            whole = found
+            assert damage
+        if content[:cut].count(b"\n") > 3 or format_ not in TEXT:  # the header tells the wall clock
+            assert [item[1:] for item in whole] == [item[1:] for item in items[: len(whole)]]
+        most = max(most, len(found))
+    assert most >= len(items) - 1
+
+
+@pytest.mark.parametrize("format_", TEXT)
+def test_a_flipped_bit_costs_one_line_at_most(tmp_path: Path, format_: str) -> None:
+    path, items, content = _log(tmp_path, format_, 30)
+    start = content.index(b"\n", len(content) // 2) + 1
+    for place in range(start, start + 60):
+        for bit in range(8):
+            damaged = bytearray(content)
+            damaged[place] ^= 1 << bit
+            path.write_bytes(damaged)
+            found, _ = read_log(path)
+            same = sum(item in items for item in found)
+            # a line end that goes takes two lines with it
+            assert same >= len(items) - (2 if content[place] == 10 else 1)
+            assert len(found) <= len(items)
+
+
+@pytest.mark.parametrize("format_", TEXT)
+@pytest.mark.parametrize("rubbish", [b"\0" * 10_000, b"hello\n", bytes(range(256)) * 3 + b"\n", b"\n\n", b"(1.5) \n"])
+def test_rubbish_between_lines_costs_no_frame(tmp_path: Path, format_: str, rubbish: bytes) -> None:
+    path, items, content = _log(tmp_path, format_, 40)
+    at = content.index(b"\n", len(content) // 2) + 1
+    path.write_bytes(content[:at] + rubbish + content[at:])
+    found, damage = read_log(path)
+    assert len(found) >= len(items) - (not rubbish.endswith(b"\n"))
+    assert _is_part(found, items)
+    if rubbish.strip():
+        assert len(damage) == 1
+        assert "damaged line" in damage[0]
+
+
+def test_damaged_lines_are_summed_up(tmp_path: Path) -> None:
+    path, _, content = _log(tmp_path, "candump", 100)
+    lines = content.splitlines(keepends=True)
+    for number in (17, 30, 31):
+        lines[number - 1] = b"?" + lines[number - 1][:20] + b"\n"
+    path.write_bytes(b"".join(lines))
+    assert read_log(path)[1] == ["3 damaged lines: 17, 30 to 31"]
+    path.write_bytes(b"".join(line if i % 2 else b"x\n" for i, line in enumerate(lines)))
+    assert read_log(path)[1] == ["51 damaged lines: 1, 3, 5, 7, 9, 11, 13, 15, and 43 more"]
+
+
+def _containers(content: bytes) -> list[int]:
+    places, at = [], content.find(b"LOBJ")
+    while at >= 0:
+        places.append(at)
+        at = content.find(b"LOBJ", at + 1)
+    return places
+
+
+def test_a_damaged_container_costs_only_itself(tmp_path: Path) -> None:
+    path, items, content = _log(tmp_path, "blf", 12_000)
+    starts = _containers(content)
+    assert len(starts) == 5
+    per_container = 128 * 1024 // 48
+    for index, start in enumerate(starts[:4]):
+        damaged = bytearray(content)
+        damaged[start + 500 : start + 510] = b"0123456789"
+        path.write_bytes(damaged)
+        found, damage = read_log(path)
+        assert any("damaged stretch" in line for line in damage), damage
+        assert _is_part(found, items)
+        # the objects over both borders go too
+        assert len(found) >= len(items) - per_container - 2, index
+        assert found[-1] == items[-1]
+
+
+def test_rubbish_between_containers_costs_nothing_or_the_frame_on_the_border(tmp_path: Path) -> None:
+    path, items, content = _log(tmp_path, "blf", 6_000)
+    second = _containers(content)[1]
+    path.write_bytes(content[:second] + b"\xa5" * 4096 + content[second:])
+    found, damage = read_log(path)
+    assert _is_part(found, items)
+    assert len(found) >= len(items) - 1
+    told = re.fullmatch(r"a damaged stretch of (\d+) bytes at offset (\d+)", damage[0])
+    assert told is not None
+    assert 4096 <= int(told[1]) < 4096 + 4
+    assert second - 4 < int(told[2]) <= second
+
+
+def test_blf_without_its_header_loses_only_the_wall_clock(tmp_path: Path) -> None:
+    path, items, content = _log(tmp_path, "blf", 50)
+    path.write_bytes(b"\0" * 144 + content[144:])
+    found, damage = read_log(path)
+    assert [item[1:] for item in found] == [item[1:] for item in items]
+    assert damage == ["a damaged stretch of 144 bytes at offset 0"]
+
+
+def test_a_flipped_bit_in_an_uncompressed_container_costs_one_frame(tmp_path: Path) -> None:
+    import can
+
+    items = at_wall(some_frames(20))
+    path = tmp_path / "log.blf"
+    with can.BLFWriter(path, compression_level=0) as writer:
+        for time_ns, frame, received in items:
+            writer(can.Message(time_ns / 1e9, frame.can_id, frame.extended, data=frame.data, is_rx=received))
+    content = path.read_bytes()
+    known = {item[1] for item in items}
+    start = content.index(b"LOBJ", 200)
+    for place in range(start, start + 96):
+        for bit in range(8):
+            damaged = bytearray(content)
+            damaged[place] ^= 1 << bit
+            path.write_bytes(damaged)
+            found, _ = read_log(path)
+            assert sum(item[1] in known for item in found) >= len(items) - 2, (place - start, bit)
+
+
+@pytest.mark.parametrize("format_", [*OWN, "mf4"])
+def test_no_damage_raises_anything_else(tmp_path: Path, format_: str) -> None:
+    path, _, content = _log(tmp_path, format_, 40)
+    chance = random.Random(7)
+    for _ in range(60 if format_ == "mf4" else 300):
+        damaged = bytearray(content)
+        for _ in range(chance.choice((1, 1, 3, 20))):
+            match chance.randrange(3):
+                case 0:
+                    damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
+                case 1:
+                    at = chance.randrange(len(damaged))
+                    damaged[at:at] = chance.randbytes(chance.randrange(40))
+                case _:
+                    at = chance.randrange(len(damaged))
+                    del damaged[at : at + chance.randrange(40)]
+        path.write_bytes(damaged)
+        problem = ""
+        try:
+            read_log(path)
+        except RunError as error:
+            problem = str(error)
+        assert "\n" not in problem
+
+
+@pytest.mark.parametrize("format_", OWN)
+def test_an_empty_file_has_no_frames(tmp_path: Path, format_: str) -> None:
+    path = tmp_path / f"empty{SUFFIX[format_]}"
+    path.write_bytes(b"")
+    assert read_log(path) == ([], [])
+
+
+def test_an_empty_mf4_cannot_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mf4"
+    path.write_bytes(b"")
+    with pytest.raises(RunError, match=r"empty\.mf4: cannot be read as MF4"):
+        CanLog(path)
+
+
+@pytest.mark.parametrize("format_", OWN)
+def test_content_of_another_kind_is_damage(tmp_path: Path, format_: str) -> None:
+    path = tmp_path / f"picture{SUFFIX[format_]}"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + random.Random(1).randbytes(100_000))
+    try:
+        found, damage = read_log(path)
+    except UserError:
+        return
+    assert found == []
+    assert damage
+
+
+@pytest.mark.parametrize("format_", ["candump", "blf"])
+def test_a_damaged_time_is_left_out(tmp_path: Path, format_: str) -> None:
+    items = at_wall(some_frames(30))
+    day = 86_400 * 10**9
+    for number in (0, 10, 11, 20):
+        items[number] = (items[number][0] + (400 + number * 50) * day, *items[number][1:])
+    path = tmp_path / f"log{SUFFIX[format_]}"
+    write_log(path, "candump", items, 0)
+    found, damage = read_log(path)
+    assert [i for i, item in enumerate(items) if item not in found] == [10, 11, 20]
+    assert damage == ["3 frames with an impossible time left out"]
+
+
+def test_a_clock_that_was_set_leaves_nothing_out(tmp_path: Path) -> None:
+    items = at_wall(some_frames(30))
+    items[15:] = [(time_ns + 10**18, *rest) for time_ns, *rest in items[15:]]  # type: ignore[misc]
+    path = tmp_path / "log.log"
+    write_log(path, "candump", items, 0)
+    assert read_log(path) == (items, [])
