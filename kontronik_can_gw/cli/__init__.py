@@ -8,7 +8,7 @@ import errno
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -25,9 +25,14 @@ COMMANDS = {
     "init": "write a commented example configuration",
     "dbc": "write the DBC for several ESCs or for a configuration",
     "eds": "write the EDS, or the DCF of a CANopen node",
+    "monitor": "a live screen of the ESCs, from the CAN bus or a recording",
     "decode": "decode recorded UART bytes to JSON lines or CSV",
+    "replay": "play a recording on a CAN bus, on pseudo terminals, or as a log",
     "simulate": "simulate ESCs on pseudo terminals",
+    "mqtt": "publish the ESCs' values from the bus to an MQTT broker",
     "schema": "print the JSON Schema of the configuration",
+    "describe": "what is sent and what it means: messages, objects, errors with remedies; the man page",
+    "completion": "print the completion script of a shell",
 }
 
 
@@ -35,20 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
     _prepare_streams()
     words = list(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="kontronik-can-gw",
-        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN, described by a DBC.",
-        epilog="kontronik-can-gw COMMAND --help tells more of a command.",
-    )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     chosen = next((word for word in words if not word.startswith("-")), None)
-    for name, line in COMMANDS.items():
-        sub = commands.add_parser(name, help=line, description=line[0].upper() + line[1:] + ".")
-        if name == chosen:
-            module = import_module(f"kontronik_can_gw.cli.{name}")
-            module.add_arguments(sub)
-            sub.set_defaults(main=module.main)
+    parser = make_parser([] if chosen is None else [chosen])
     args = parser.parse_args(words)
     try:
         code: int = args.main(args)
@@ -70,6 +63,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return code
+
+
+def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+    """The parser of the whole program. Only the commands in ``complete`` have their options: a run needs those of one alone."""
+    parser = argparse.ArgumentParser(
+        prog="kontronik-can-gw",
+        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN, described by a DBC.",
+        epilog="kontronik-can-gw COMMAND --help tells more of a command.",
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, line in COMMANDS.items():
+        sub = commands.add_parser(name, help=line, description=line[0].upper() + line[1:] + ".")
+        if name in complete:
+            module = import_module(f"kontronik_can_gw.cli.{name}")
+            module.add_arguments(sub)
+            sub.set_defaults(main=module.main)
+    return parser
 
 
 def _prepare_streams() -> None:

@@ -4,6 +4,7 @@ A capture (.kcap) goes through the gateway's core with the recorded clock. Plain
 come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what a file is by its content.
 """
 
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -214,6 +215,14 @@ class CaptureInput(_Base):
             offset = int(self.header["wall_ns"]) - int(self.header["monotonic_ns"])
         return time_ns + offset
 
+    @property
+    def channel(self) -> str:
+        """The CAN channel that was sent on."""
+        try:
+            return str(tomllib.loads(self.setup.configuration)["can"]["channel"])
+        except (ValueError, KeyError, TypeError):
+            return "can0"
+
     def entries(self) -> Iterator[Entry]:
         """All entries of all parts. What is damaged is passed over, and told in ``damage``."""
         self.position = 0
@@ -333,11 +342,11 @@ class DumpInput(_Base):
         self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
 
     def frames(self) -> Iterator[TimedFrame]:
-        yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self._chunks())
+        yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self.chunks())
 
     def samples(self) -> Iterator[Sample]:
         gateway = SampledGateway(self.setup, self.bus.layout, self.reader, 0)
-        for _ in follow_bytes(gateway, self._chunks()):
+        for _ in follow_bytes(gateway, self.chunks()):
             if gateway.rows:
                 yield from gateway.rows
                 gateway.rows.clear()
@@ -361,7 +370,7 @@ class DumpInput(_Base):
         except OSError as error:
             raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
 
-    def _chunks(self) -> Iterator[tuple[int, bytes]]:
+    def chunks(self) -> Iterator[tuple[int, bytes]]:
         """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period behind."""
         self.damage = []
         deframer = Deframer()

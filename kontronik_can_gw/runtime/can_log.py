@@ -50,11 +50,11 @@ class CanLog:
         # candump names the interface, the others count channels from 1
         self._channel: str | int = channel if kind == "candump" else 0
 
-    def add(self, frame: CanFrame, when_s: float, received: bool) -> None:
-        """A frame at a Unix time."""
+    def add(self, frame: CanFrame, unix_ns: int, received: bool) -> None:
+        """A frame at a Unix time; it is kept to the microsecond."""
         self._writer.on_message_received(
             self._message(
-                timestamp=when_s,
+                timestamp=(unix_ns + 500) // 1000 / 1e6,
                 arbitration_id=frame.can_id,
                 is_extended_id=frame.extended,
                 data=b"" if frame.remote else frame.data,

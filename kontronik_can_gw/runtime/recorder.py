@@ -218,16 +218,8 @@ class Recorder:
         if (news := self._news) is not None:
             self._news = None
             self._file.write(b"I", json_payload(news))
-        if self._lost != self._file.lost:
-            lost = self._lost - self._file.lost
-            self._file.lost = self._lost
-            items.append((now, Kind.LOST, 0, number_data(lost), 0))
-        if now - self._clock_ns >= _CLOCK_NS:
-            self._clock_ns = now
-            offset = time.time_ns() - self._clock()
-            if abs(offset - self._offset) > _STEP_NS:
-                self._offset = offset
-                items.append((now, Kind.CLOCK, 0, number_data(now + offset), 0))
+        if items:
+            self._remark(items, now)
         self._file.take(items, self._offset)
         self.facts.bytes += self._file.sync()
         self.facts.file = str(self._file.path)
@@ -239,6 +231,20 @@ class Recorder:
         too_large = settings.part_bytes and self._file.size >= settings.part_bytes
         if too_large or (settings.part_ns and now - self._file.begun >= settings.part_ns):
             self._end_part()
+
+    def _remark(self, items: list[Item], now: int) -> None:
+        """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
+        assert self._file is not None
+        last = items[-1][0]
+        if (lost := self._lost - self._file.lost) > 0:
+            self._file.lost += lost
+            items.append((last, Kind.LOST, 0, number_data(lost), 0))
+        if now - self._clock_ns >= _CLOCK_NS:
+            self._clock_ns = now
+            offset = time.time_ns() - self._clock()
+            if abs(offset - self._offset) > _STEP_NS:
+                self._offset = offset
+                items.append((last, Kind.CLOCK, 0, number_data(last + offset), 0))
 
     def _may_write(self, now: int) -> bool:
         if now >= self._space_ns:
@@ -370,7 +376,7 @@ class _Files:
         for item in items:
             if item[1] >= _SENT:
                 if self._log is not None:
-                    self._log.add(item[3], (item[0] + offset) / SECOND, item[1] == _RECEIVED)
+                    self._log.add(item[3], item[0] + offset, item[1] == _RECEIVED)
                 continue
             entries.append(item)
             room -= 16 + len(item[3])

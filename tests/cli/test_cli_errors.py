@@ -92,6 +92,7 @@ def test_an_unknown_option_is_named(command: str) -> None:
         "check": ["-c", "x"],
         "doctor": ["-c", "x"],
         "decode": ["-"],
+        "replay": ["x", "--to", "log"],
         "service": ["status"],
         "completion": ["bash"],
     }.get(command, [])
@@ -119,6 +120,10 @@ OPTIONS = {
     ],
     "eds": ["-c", "--config", "--node-id", "-o", "--output"],
     "decode": ["FILE", "--csv", "--stats"],
+    "replay": [
+        *("FILE", "--to", "-c", "--config", "--dbc", "--speed", "--interface", "--channel", "--unmarked", "--link"),
+        *("--delay", "-o", "--output", "--force"),
+    ],
     "simulate": [
         *("--esc", "--device", "--layout", "--variant", "--firmware", "--cells", "--rate", "--info-every"),
         *("--info-replaces", "--idle", "--seconds", "--seed", "--link", "--out", "--noise", "--lose-bytes"),

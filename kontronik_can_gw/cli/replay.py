@@ -1,0 +1,288 @@
+"""``kontronik-can-gw replay``: what was recorded, once more: on a CAN bus, on pseudo terminals, or as a log."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.cli.bus_layout import add_layout_arguments
+from kontronik_can_gw.errors import RunError, UserError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from kontronik_can_gw.frames import CanFrame
+    from kontronik_can_gw.offline.inputs import Input
+    from kontronik_can_gw.offline.pacing import Pace
+    from kontronik_can_gw.runtime.can_port import CanPort
+
+EPILOG = """\
+FILE is a capture (.kcap; a folder, or the beginning of the names of one run's, for all its parts), a file of plain UART
+bytes, or a CAN log (candump, ASC, BLF, TRC, MF4). A capture goes through the gateway's core with the recorded clock:
+frames and times are those that the live gateway sent, bit for bit.
+
+--to can  sends the frames on a CAN bus. They are old: the message with the gateway's state says Replay (GatewayState),
+          unless --unmarked says that they are to be exactly as recorded. Refused where a gateway of this machine sends the same
+          messages. Frames that the gateway had received are not sent; of a CAN log all frames are.
+--to pty  plays an ESC's bytes on a pseudo terminal, one for each ESC, for a gateway to read: prints "esc1 /dev/pts/5".
+--to log  writes the frames to -o FILE (.log, .asc, .blf, .trc, .mf4), or as a candump log to standard output, as fast as
+          possible.
+
+examples:
+  kontronik-can-gw replay flight.kcap --to can --channel vcan0
+  kontronik-can-gw replay flight.kcap --to pty --link /tmp/esc{n} --speed 4
+  kontronik-can-gw replay flight.kcap --to log -o flight.log
+
+exit codes: 0 done, 1 failed while running, 2 wrong usage, or a file that is no recording
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare FILE and the options."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    parser.add_argument("file", type=Path, metavar="FILE", help="the recording")
+    parser.add_argument("--to", choices=("can", "pty", "log"), required=True, help="where to")
+    add_layout_arguments(parser)
+    parser.add_argument(
+        "--speed",
+        type=_speed,
+        default=1.0,
+        metavar="FACTOR",
+        help="times real time, 0.01 to 1000, or max: as fast as possible (default 1; --to log is always max)",
+    )
+    parser.add_argument("--interface", metavar="NAME", help="--to can: python-can interface (default socketcan)")
+    parser.add_argument("--channel", metavar="NAME", help="--to can: its channel, as vcan0 (default: that of -c)")
+    parser.add_argument("--unmarked", action="store_true", help="--to can: do not mark the frames as replay")
+    parser.add_argument("--link", metavar="PATH", help="--to pty: symbolic link; {n} is the ESC's number, from 1")
+    parser.add_argument(
+        "--delay", type=_seconds, default=1.0, metavar="S", help="--to pty: time for a gateway to open them (default 1)"
+    )
+    parser.add_argument(
+        "-o", "--output", default="-", metavar="FILE", help="--to log: file (default -: standard output)"
+    )
+    parser.add_argument("--force", action="store_true", help="--to log: replace FILE if it exists")
+
+
+def _speed(text: str) -> float | None:
+    if text == "max":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0
+    if not 0.01 <= value <= 1000:
+        raise argparse.ArgumentTypeError(f"{text!r} is no factor, 0.01 to 1000, and not max")
+    return value
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value <= 3600:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds")
+    return value
+
+
+_OPTIONS = {
+    "can": ("interface", "channel", "unmarked"),
+    "pty": ("link",),
+    "log": ("force",),
+}
+
+
+def main(args: argparse.Namespace) -> int:
+    """Replay args.file."""
+    from kontronik_can_gw.cli.bus_layout import bus_layout
+    from kontronik_can_gw.cli.common import say, stopping_on_signals
+    from kontronik_can_gw.offline.inputs import open_input
+    from kontronik_can_gw.offline.pacing import Pace
+
+    for place, names in _OPTIONS.items():
+        given = [name for name in names if getattr(args, name)]
+        if place != args.to and given:
+            raise UserError(f"--{given[0]} is for --to {place}")
+    if args.to != "log" and args.output != "-":
+        raise UserError("--output is for --to log")
+    given_layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
+    pace = Pace(args.speed)
+    with open_input(args.file, given_layout) as recording, stopping_on_signals(pace.stop):
+        play = {"can": _to_can, "pty": _to_pty, "log": _to_log}[args.to]
+        text = play(args, recording, pace)
+        if recording.times_assumed:
+            text += f"; times are assumed: {recording.provenance['times'].removeprefix('assumed: ')}"
+        say(f"{text}{', stopped' if pace.stopped else ''}")
+        for line in recording.damage:
+            say(f"warning: {line}")
+    return 0
+
+
+def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
+    from itertools import chain
+
+    from kontronik_can_gw.cli.progress import Progress
+    from kontronik_can_gw.offline.can_logs import SUFFIXES, CanLogWriter
+    from kontronik_can_gw.offline.inputs import CaptureInput
+    from kontronik_can_gw.offline.part_file import PartFile
+
+    name = args.output
+    suffix = Path(name).suffix
+    if name != "-" and suffix not in SUFFIXES:
+        raise UserError(f"{name}: what log it is to be is told by its ending: {', '.join(SUFFIXES)}")
+    target = Path(name)
+    if name != "-" and target.exists():
+        if target.resolve() == args.file.resolve():
+            raise UserError(f"{name}: is the recording itself. Give another -o.")
+        if target.is_file() and not args.force:
+            raise UserError(f"{name}: exists. Give another -o, or --force.")
+    frames = recording.frames()
+    first = next(frames, None)
+    if first is None:
+        raise RunError("; ".join([f"{recording.name}: has no CAN frames", *recording.damage]))
+    start = first.time_ns
+    wall = recording.wall_ns(start)
+    part = None if name == "-" else PartFile(target)
+    try:
+        file = sys.stdout.buffer if part is None else part.open()
+        kind = "candump" if part is None else SUFFIXES[suffix]
+        channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
+        place = part.path if part is not None and kind == "mf4" else file
+        writer = CanLogWriter(place, kind, None if wall is None else wall - start, start, channel, name)
+        count = 0
+        with Progress(recording.name, recording.size, name == "-") as progress:
+            for item in chain((first,), frames):
+                if pace.stopped:
+                    break
+                writer.write(*item)
+                count += 1
+                if not count & 0x3FF:
+                    progress.reach(recording.position)
+        writer.close()
+        if part is not None:
+            part.finish()
+    except BaseException as error:
+        if part is not None:
+            part.discard()
+        if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+            raise RunError(f"{name}: cannot be written: {error.strerror or error}.") from None
+        raise
+    return f"{count} frames{'' if name == '-' else f' to {name}'}"
+
+
+def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
+    from kontronik_can_gw.cli.common import say
+    from kontronik_can_gw.config import CanConfig
+    from kontronik_can_gw.offline.inputs import CaptureInput
+    from kontronik_can_gw.offline.marking import Marker
+    from kontronik_can_gw.runtime.can_port import CanPort, check_interface
+    from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim
+
+    config = recording.bus.config.can if args.config and recording.bus.config else None
+    channel = args.channel or (config.channel if config else None)
+    if channel is None:
+        raise UserError("--to can needs --channel, as vcan0, or a configuration (-c) that names one")
+    interface = args.interface or (config.interface if config else "socketcan")
+    can = CanConfig(interface, channel, fd=any(plan.fd for plan in recording.bus.layout.messages))
+    check_interface(can)
+    claims = Claims()
+    if interface != "virtual":
+        for key in sorted(recording.reader.keys)[:1]:
+            for taken in claims.hold([messages_claim(channel, key)]):
+                raise in_use(taken)
+    marker = None if args.unmarked else Marker(recording.bus.layout)
+    if marker is not None and not marker.can_mark:
+        say("warning: no message of this DBC tells the gateway's state: nobody can see that it is a replay")
+    port = CanPort(can)
+    count = 0
+    try:
+        frames = (
+            recording.frames(marked=not args.unmarked) if isinstance(recording, CaptureInput) else recording.frames()
+        )
+        sent_only = isinstance(recording, CaptureInput)
+        for time_ns, frame, received in frames:
+            if received and sent_only:
+                continue
+            if not pace.wait(time_ns):
+                break
+            _send(port, marker.mark(frame) if marker is not None else frame, channel, pace)
+            count += 1
+    finally:
+        port.close()
+        claims.close()
+    late = f", at most {pace.latest_ns / 1e6:.1f} ms late" if pace.speed else ""
+    return f"{count} frames to {channel}{late}"
+
+
+_BUSY_S = 0.0005
+_LONGEST_BUSY_S = 5
+
+
+def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> None:
+    """Hand over one frame; what is full is waited for. RunError where the bus takes nothing any more."""
+    import time
+
+    from kontronik_can_gw.mailboxes import Sent
+
+    since = time.monotonic()
+    while (answer := port.send(frame)) is not Sent.OK:
+        if answer in (Sent.DOWN, Sent.GONE):
+            raise RunError(f"CAN {channel}: went down, or away.")
+        if pace.stopped:
+            return
+        if time.monotonic() - since > _LONGEST_BUSY_S:
+            raise RunError(
+                f"CAN {channel}: no frame can be sent for {_LONGEST_BUSY_S} s: nobody acknowledges, or the bus is full."
+            )
+        time.sleep(_BUSY_S)
+
+
+def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
+    from contextlib import ExitStack
+
+    from kontronik_can_gw.offline.pty import PtyEsc
+
+    chunks = _chunks(recording)
+    names = [esc.name for esc in recording.bus.escs]
+    total = 0
+    with ExitStack() as stack:
+        terminals = [
+            stack.enter_context(PtyEsc(args.link and args.link.replace("{n}", str(number))))
+            for number in range(1, len(names) + 1)
+        ]
+        for name, terminal in zip(names, terminals, strict=True):
+            print(f"{name} {terminal.path}")
+        sys.stdout.flush()
+        pace.pause(args.delay)
+        for time_ns, esc, data in chunks:
+            if not pace.wait(time_ns):
+                break
+            terminals[esc].write(data)
+            total += len(data)
+        pace.pause(_DRAIN_S)
+        for terminal in terminals:
+            terminal.check()
+        dropped = sum(terminal.dropped_bytes for terminal in terminals)
+        received = [name for name, terminal in zip(names, terminals, strict=True) if terminal.received]
+    if received:
+        raise RunError(f"{', '.join(received)}: the gateway transmits to the ESC, which could take it for a command")
+    return f"{total} bytes to {len(names)} pseudo terminals{f', {dropped} of them dropped (nobody read)' if dropped else ''}"
+
+
+_DRAIN_S = 0.2
+"""For a gateway to read the last bytes before the terminals go."""
+
+
+def _chunks(recording: "Input") -> "Iterator[tuple[int, int, bytes]]":
+    """(time, ESC, bytes) of a capture or of plain bytes."""
+    from kontronik_can_gw.capture import Kind
+    from kontronik_can_gw.offline.inputs import CaptureInput, DumpInput
+
+    if isinstance(recording, CaptureInput):
+        return ((e.time_ns, e.esc, e.data) for e in recording.entries() if e.kind == Kind.BYTES)
+    if isinstance(recording, DumpInput):
+        return ((time_ns, 0, data) for time_ns, data in recording.chunks())
+    raise UserError(
+        f"{recording.name}: is a log of CAN frames, which has no bytes of ESCs. --to can and --to log are possible."
+    )

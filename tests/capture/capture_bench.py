@@ -1,0 +1,137 @@
+"""A gateway that is recorded while random things happen to it, without a clock: what it sent, and the entries."""
+
+import random
+from dataclasses import dataclass, field
+
+from kontronik_can_gw.capture import Entry
+from kontronik_can_gw.capture_setup import CaptureSetup
+from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.cli.recording import setup_of
+from kontronik_can_gw.config import parse
+from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.mailboxes import Mailboxes
+from kontronik_can_gw.offline.replay import TimedFrame, in_order
+from kontronik_can_gw.protocol import Device
+from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import MS, SECOND
+
+START = 5_000 * SECOND + 123
+
+
+def made(escs: int = 1, canopen: bool = False, **dbc: object) -> tuple[CaptureSetup, Layout]:
+    """A gateway's making, and the layout of what it sends."""
+    tables: dict[str, object] = {
+        "can": {"interface": "virtual"},
+        "dbc": dbc,
+        "canopen": {"enabled": canopen, "self_start": True, "store": "/nonexistent/store"},
+        "esc": [{"port": f"/dev/ttyUSB{n}", "name": f"e{n}", "pole_pairs": n + 1} for n in range(escs)],
+    }
+    loaded = assemble(parse(tables, "bench.toml"))
+    return setup_of(loaded), loaded.layout
+
+
+@dataclass
+class Bench:
+    """``entries``: as recorded; ``sent``: what the live gateway handed to an interface that takes everything."""
+
+    setup: CaptureSetup
+    layout: Layout
+    entries: list[Entry] = field(default_factory=list)
+    sent: list[TimedFrame] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        canopen: CanopenSetup | None = self.setup.canopen
+        self.gateway = RecordedGateway(
+            self._put, self.setup.escs, self.layout, START, self.setup.silent_on_loss, canopen
+        )
+        self._waiting = Mailboxes()
+        self._saves: list[int] = []
+
+    def _put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int) -> None:
+        self.entries.append(Entry(time_ns, kind, esc, data, flags))
+
+    def take(self, now: int) -> None:
+        frames = in_order(self.gateway.take_frames(), self._waiting)
+        self.gateway.status.sent_frames += len(frames)
+        self.sent += [TimedFrame(now, frame) for frame in frames]
+        self._saves += [esc for esc, _ in self.gateway.take_saves()]
+
+    def live(self, seed: int, seconds: float, wild: bool = True) -> "Bench":
+        """Run: bytes in random pieces, turns that come late, the bus and the ports go and come, a master asks."""
+        rng = random.Random(seed)
+        gateway, now = self.gateway, START + rng.randrange(MS)
+        escs = [
+            SimulatedEsc(
+                EscOptions(
+                    device=rng.choice([Device.KOSMIK, Device.JIVEPRO]),
+                    faults=Faults(noise=0.5, lost_bytes=0.002, flipped_bits=0.0002),
+                ),
+                seed=rng.randrange(1000),
+                start_ns=now,
+            )
+            for _ in self.setup.escs
+        ]
+        for index in range(len(escs)):
+            gateway.port_opened(index, now)
+        gateway.start(now, rng.random() < 0.9)
+        self.take(now)
+        open_ports = [True] * len(escs)
+        end = now + int(seconds * SECOND)
+        while now < end:
+            late = rng.choice([0, 0, rng.randrange(200_000), rng.randrange(3 * MS)])
+            now = max(now + 1, min(gateway.next_deadline(), now + rng.randrange(1, 12 * MS)) + late)
+            if wild and rng.random() < 0.002:
+                now += rng.randrange(400 * MS)
+            for index, esc in enumerate(escs):
+                data = b"".join(sent.wire for sent in esc.frames_until(now))
+                if data and open_ports[index]:
+                    cut = rng.randrange(len(data) + 1)
+                    for part in (data[:cut], data[cut:]):
+                        if part:
+                            gateway.receive_bytes(index, part, now)
+            if wild:
+                self._happens(rng, now, open_ports)
+            gateway.advance(now)
+            self.take(now)
+        gateway.stop(now)
+        self.take(now)
+        return self
+
+    def _happens(self, rng: random.Random, now: int, open_ports: list[bool]) -> None:
+        gateway = self.gateway
+        index = rng.randrange(len(open_ports))
+        what = rng.random()
+        if what < 0.002:
+            open_ports[index] = not open_ports[index]
+            (gateway.port_opened if open_ports[index] else gateway.port_lost)(index, now)
+        elif what < 0.006:
+            gateway.set_can_state(rng.choice(list(CanState)), now)
+        elif what < 0.008:
+            gateway.can_opened(now)
+            gateway.can_returned(now)
+        elif what < 0.01:
+            gateway.status.bus_off_count += 1
+            gateway.status.replaced_frames += rng.randrange(5)
+            gateway.escs[index].line_errors += 3
+        elif what < 0.012:
+            gateway.receive_overrun(now)
+        elif what < 0.03 and self._saves:
+            gateway.saved(self._saves.pop(0), rng.choice([None, "disk full"]), now)
+        elif what < 0.06 and gateway.receive_ids:
+            can_id = rng.choice(sorted(gateway.receive_ids))
+            data = rng.choice(
+                [
+                    bytes((0x40, 0x10 + rng.randrange(16), 0x20, rng.randrange(4), 0, 0, 0, 0)),
+                    b"\x23\x10\x10\x01save",
+                    bytes((0x2B, 0x17, 0x10, 0, rng.randrange(256), 1, 0, 0)),
+                    bytes((0x2F, 0x00, 0x21, 1, rng.randrange(1, 9), 0, 0, 0)),
+                    bytes((rng.choice([1, 2, 0x80, 0x81, 0x82]), rng.randrange(3))),
+                    rng.randbytes(rng.randrange(9)),
+                ]
+            )
+            gateway.status.received_frames += 1
+            gateway.receive_frame(CanFrame(can_id & 0x7FF, data), now)

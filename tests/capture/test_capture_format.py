@@ -1,0 +1,152 @@
+"""The capture's format: every entry comes back, every intact block is found, damage is told and costs nothing else."""
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kontronik_can_gw.capture import (
+    MAGIC,
+    Block,
+    Damage,
+    Entry,
+    Scanner,
+    block,
+    counters_data,
+    data_payload,
+    frame_data,
+    json_payload,
+    number_data,
+    read_counters,
+    read_entries,
+    read_frame,
+    read_json,
+    read_number,
+)
+from kontronik_can_gw.frames import CanFrame
+
+entries = st.builds(
+    Entry,
+    st.integers(0, 2**64 - 1),
+    st.integers(0, 255),
+    st.integers(0, 65535),
+    st.binary(max_size=80),
+    st.integers(0, 255),
+)
+payloads = st.one_of(st.binary(max_size=200), st.just(b"x" * 5000), st.just(MAGIC * 30))
+
+
+def scanned(data: bytes, size: int | None = None) -> list[Block | Damage]:
+    scanner = Scanner()
+    found: list[Block | Damage] = []
+    step = size or max(1, len(data))
+    for at in range(0, len(data), step):
+        found += scanner.feed(data[at : at + step])
+    return found + scanner.flush()
+
+
+@given(st.lists(entries, max_size=20))
+def test_entries_come_back(listed: list[Entry]) -> None:
+    assert list(read_entries(data_payload(listed))) == listed
+
+
+@given(st.binary(max_size=200))
+def test_rubbish_as_a_table_is_refused_or_read_but_never_more(data: bytes) -> None:
+    try:
+        found = list(read_entries(data))
+    except ValueError:
+        return
+    assert data_payload(found) == data
+
+
+@given(st.lists(st.tuples(st.sampled_from([b"H", b"D", b"I", b"E"]), payloads), max_size=6), st.integers(1, 300))
+def test_blocks_come_back_however_they_are_cut(listed: list[tuple[bytes, bytes]], size: int) -> None:
+    data = b"".join(block(kind, number, payload) for number, (kind, payload) in enumerate(listed))
+    found = scanned(data, size)
+    assert [(b.kind, b.payload) for b in found if isinstance(b, Block)] == listed
+    assert not any(isinstance(b, Damage) for b in found)
+    assert [b.number for b in found if isinstance(b, Block)] == list(range(len(listed)))
+
+
+@given(st.lists(payloads, min_size=1, max_size=5), st.lists(st.binary(max_size=60), min_size=6, max_size=6), st.data())
+def test_blocks_are_found_amid_rubbish_and_every_byte_is_accounted_for(
+    listed: list[bytes], rubbish: list[bytes], data: st.DataObject
+) -> None:
+    stream, places = b"", []
+    for number, payload in enumerate(listed):
+        stream += rubbish[number]
+        places.append(len(stream))
+        stream += block(b"D", number, payload)
+    stream += rubbish[-1]
+    found = scanned(stream, data.draw(st.integers(1, len(stream))))
+    blocks = [b for b in found if isinstance(b, Block)]
+    assert [(b.offset, b.payload) for b in blocks] == list(zip(places, listed, strict=True))
+    damaged = sum(d.length for d in found if isinstance(d, Damage))
+    assert damaged == sum(len(rubbish[n]) for n in range(len(listed))) + len(rubbish[-1])
+
+
+def test_any_flipped_bit_costs_its_block_and_no_other() -> None:
+    parts = [block(b"D", n, bytes((n,)) * 50) for n in range(3)]
+    stream = b"".join(parts)
+    rng = random.Random(1)
+    for bit in rng.sample(range(len(stream) * 8), 300):
+        broken = bytearray(stream)
+        broken[bit // 8] ^= 1 << bit % 8
+        hit = next(n for n in range(3) if bit // 8 < sum(map(len, parts[: n + 1])))
+        found = scanned(bytes(broken), 64)
+        assert {b.number for b in found if isinstance(b, Block)} == {0, 1, 2} - {hit}
+        assert [d.length for d in found if isinstance(d, Damage)] == [len(parts[hit])]
+
+
+def test_a_file_cut_anywhere_gives_what_was_whole() -> None:
+    parts = [block(b"D", n, random.Random(n).randbytes(40)) for n in range(3)]
+    stream = b"".join(parts)
+    for cut in range(len(stream) + 1):
+        found = scanned(stream[:cut], 7)
+        whole = sum(sum(map(len, parts[: n + 1])) <= cut for n in range(3))
+        assert [b.number for b in found if isinstance(b, Block)] == list(range(whole))
+        assert sum(d.length for d in found if isinstance(d, Damage)) == cut - sum(map(len, parts[:whole]))
+
+
+def test_a_block_that_claims_to_be_huge_is_none() -> None:
+    """A deflated bomb, or a length from rubbish, must not make the reader wait or swell."""
+    import struct
+    import zlib
+
+    packed = zlib.compress(bytes(1 << 22), 9)
+    head = struct.pack("<4scBHIII", MAGIC, b"D", 1, 0, len(packed), 1000, 0)
+    bomb = head + struct.pack("<I", zlib.crc32(packed, zlib.crc32(head))) + packed
+    good = block(b"D", 1, b"good")
+    found = scanned(bomb + good)
+    assert [b.payload for b in found if isinstance(b, Block)] == [b"good"]
+
+
+@given(
+    st.builds(
+        CanFrame,
+        st.integers(0, 0x7FF),
+        st.binary(max_size=64),
+        st.booleans(),
+        st.booleans(),
+        page=st.just(0),
+        remote=st.booleans(),
+        queued=st.just(False),
+    )
+)
+def test_a_can_frame_comes_back(frame: CanFrame) -> None:
+    assert read_frame(frame_data(frame)) == frame
+
+
+def test_numbers_counters_and_json_come_back() -> None:
+    assert read_number(number_data(2**63)) == 2**63
+    assert read_counters(counters_data(tuple(range(8)))) == tuple(range(8))
+    content = {"a": [1, 2.5, None], "µ": "°\udcff"}
+    assert read_json(json_payload(content)) == content
+
+
+@pytest.mark.parametrize("read", [read_frame, read_number, read_counters])
+def test_data_that_is_too_short_is_refused(read: object) -> None:
+    assert callable(read)
+    with pytest.raises(ValueError):
+        read(b"abc")

@@ -1,0 +1,371 @@
+"""The recorder: what it is given is in the files, whatever the disk does, and nobody ever waits for it."""
+
+import errno
+import os
+import stat
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import pytest
+from capture_bench import made
+
+from kontronik_can_gw.capture import Entry, Kind, read_number
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline.inputs import CaptureInput, open_input
+from kontronik_can_gw.runtime import can_log, recorder
+from kontronik_can_gw.runtime.can_log import check_kind
+from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder, RecordSettings, is_ours
+from kontronik_can_gw.telemetry import SECOND
+
+HEADER = made(1)[0].header()
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder, "PERIOD_S", 0.005)
+    monkeypatch.setattr(recorder, "_CLOSE_S", 20)
+
+
+def begun(folder: Path, clock: Callable[[], int] = time.monotonic_ns, **more: object) -> Recorder:
+    made_with = {"folder": folder, "least_free_bytes": 0} | more
+    found = Recorder(RecordSettings(**made_with), clock)  # type: ignore[arg-type]
+    found.header = HEADER
+    found.start()
+    return found
+
+
+def entries(count: int, since: int = 0) -> list[Entry]:
+    return [
+        Entry(1000 + n, Kind.BYTES, n % 3, bytes((n & 255,)) * (n % 50), n % 2) for n in range(since, since + count)
+    ]
+
+
+def put(to: Recorder, listed: list[Entry]) -> None:
+    for entry in listed:
+        to.put(entry.time_ns, entry.kind, entry.esc, entry.data, entry.flags)
+
+
+def recorded(folder: Path) -> list[Entry]:
+    with open_input(folder) as found:
+        assert isinstance(found, CaptureInput)
+        return [entry for entry in found.entries() if entry.kind != Kind.CLOCK]
+
+
+def until(condition: Callable[[], bool], seconds: float = 20) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it does not come"
+        time.sleep(0.002)
+
+
+def test_entries_are_in_the_file_in_order(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "captures"
+    it = begun(folder)
+    listed = entries(3000)
+    put(it, listed)
+    it.close()
+    assert recorded(folder) == listed
+    [file] = folder.iterdir()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o640
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o750
+    assert is_ours(file.name)
+    assert it.facts.bytes == file.stat().st_size
+    assert not it.reports(0)
+
+
+def test_parts_by_size_go_on_from_each_other(tmp_path: Path) -> None:
+    it = begun(tmp_path, part_bytes=3000)
+    listed = entries(2000)
+    for at in range(0, 2000, 100):
+        before = it.facts.bytes
+        put(it, listed[at : at + 100])
+        until(lambda before=before: it.facts.bytes > before)  # type: ignore[misc]
+    it.close()
+    files = sorted(tmp_path.iterdir())
+    assert len(files) > 3
+    assert [f.stem.rpartition("-")[2] for f in files] == [f"{n:04d}" for n in range(len(files))]
+    assert recorded(tmp_path) == listed
+    with open_input(tmp_path) as found:
+        assert isinstance(found, CaptureInput)
+        assert sum(1 for _ in found.entries()) >= 2000
+        assert found.damage == []
+        assert found.position == found.size == sum(f.stat().st_size for f in files)
+    prefix = tmp_path / files[0].name.rpartition("-")[0]
+    with open_input(prefix) as found:
+        assert isinstance(found, CaptureInput)
+        assert len(list(found.entries())) >= 2000
+
+
+def test_a_missing_part_is_told(tmp_path: Path) -> None:
+    it = begun(tmp_path, part_bytes=1)
+    for n in range(4):
+        put(it, entries(5, 5 * n))
+        until(lambda n=n: len(list(tmp_path.iterdir())) > n and it.facts.file == "")  # type: ignore[misc]
+    it.close()
+    sorted(tmp_path.iterdir())[1].unlink()
+    with open_input(tmp_path) as found:
+        assert isinstance(found, CaptureInput)
+        assert len([e for e in found.entries() if e.kind == Kind.BYTES]) >= 10
+        assert any("1 parts of the run in front of it are not given" in line for line in found.damage)
+
+
+def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
+    now = 10 * SECOND
+    it = begun(tmp_path, clock=lambda: now, part_ns=60 * SECOND)
+    put(it, entries(1))
+    until(lambda: bool(it.facts.file))
+    now += 61 * SECOND
+    put(it, entries(1, 1))
+    until(lambda: it.facts.file == "")
+    put(it, entries(1, 2))
+    it.close()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_the_header_tells_where_it_comes_from(tmp_path: Path) -> None:
+    it = begun(tmp_path)
+    it.note({}, [None])
+    put(it, entries(1))
+    until(lambda: it.facts.bytes > 0)
+    it.note({}, [{"device": "KOSMIK", "variant": 160, "firmware": "4.17", "layout": "V4"}])
+    until(lambda: it._news is None)
+    it.close()
+    with open_input(tmp_path) as found:
+        assert isinstance(found, CaptureInput)
+        list(found.entries())
+        assert found.provenance["e0"] == "KOSMIK 160, firmware 4.17, V4 layout, at /dev/ttyUSB0"
+        assert found.provenance["DBC"] == "kontronik_esc.dbc"
+        assert "port" in found.setup.configuration
+        now = time.time_ns()
+        assert abs((found.wall_ns(time.monotonic_ns()) or 0) - now) < SECOND
+
+
+def test_too_little_room_is_said_and_nothing_is_written(tmp_path: Path) -> None:
+    it = begun(tmp_path, least_free_bytes=1 << 60)
+    put(it, entries(10))
+    until(lambda: it.facts.problem != "")
+    put(it, entries(10, 10))
+    it.close()
+    assert list(tmp_path.iterdir()) == []
+    [report] = it.reports(0)
+    assert report.begins
+    assert "MB are free" in report.text
+    assert it.facts.lost == 20
+
+
+def test_room_again_and_it_goes_on_and_the_loss_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 10 * SECOND
+    free = 0
+    real = os.statvfs(tmp_path)
+
+    def statvfs(_path: object) -> os.statvfs_result:
+        values = list(real)
+        values[4] = free // real.f_frsize
+        return os.statvfs_result(values)
+
+    monkeypatch.setattr(os, "statvfs", statvfs)
+    it = begun(tmp_path, clock=lambda: now, least_free_bytes=1000 * real.f_frsize)
+    put(it, entries(10))
+    until(lambda: it.facts.problem != "" and not it._entries)
+    free = 2000 * real.f_frsize
+    now += 6 * SECOND
+    until(lambda: it._file is not None)
+    put(it, entries(10, 10))
+    it.close()
+    found = recorded(tmp_path)
+    assert [e for e in found if e.kind == Kind.BYTES] == entries(10, 10)
+    assert [read_number(e.data) for e in found if e.kind == Kind.LOST] == [10]
+    assert [r.begins for r in it.reports(0)] == [True, False]
+
+
+def test_the_oldest_captures_go_and_nothing_else(tmp_path: Path) -> None:
+    names = [f"2025010{n}T000000Z-abcdef-0000.kcap" for n in range(1, 6)]
+    for name in names:
+        (tmp_path / name).write_bytes(bytes(1000))
+        (tmp_path / name.replace(".kcap", ".log")).write_bytes(bytes(500))
+    (tmp_path / "flight.kcap").write_bytes(bytes(9000))
+    (tmp_path / "20250101T000000Z-abcdef-0000.txt").write_bytes(bytes(9000))
+    it = begun(tmp_path, keep_bytes=40_000)
+    put(it, entries(5))
+    it.close()
+    assert len(list(tmp_path.iterdir())) == 13
+    it = begun(tmp_path, keep_bytes=4_000)
+    put(it, entries(5))
+    it.close()
+    left = {p.name for p in tmp_path.iterdir()}
+    assert "flight.kcap" in left
+    assert "20250101T000000Z-abcdef-0000.txt" in left
+    assert names[0] not in left
+    assert sum(p.stat().st_size for p in tmp_path.iterdir() if is_ours(p.name)) <= 40_000
+
+
+def test_a_disk_that_fails_costs_what_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 10 * SECOND
+    broken = threading.Event()
+    real = os.write
+
+    def write(fd: int, data: bytes) -> int:
+        if broken.is_set():
+            real(fd, bytes(data)[:7])  # half a block stays behind
+            raise OSError(errno.EIO, "Input/output error")
+        return real(fd, data)
+
+    monkeypatch.setattr(os, "write", write)
+    it = begun(tmp_path, clock=lambda: now)
+    put(it, entries(10))
+    until(lambda: it.facts.bytes > 0 and not it._entries)
+    broken.set()
+    put(it, entries(10, 10))
+    until(lambda: it.facts.problem != "")
+    put(it, entries(5, 20))
+    until(lambda: not it._entries)
+    broken.clear()
+    now += 6 * SECOND
+    until(lambda: it._file is not None)
+    put(it, entries(10, 30))
+    it.close()
+    found = recorded(tmp_path)
+    assert [e for e in found if e.kind == Kind.BYTES] == entries(10) + entries(10, 30)
+    assert sum(read_number(e.data) for e in found if e.kind == Kind.LOST) == 15
+    assert [r.begins for r in it.reports(0)] == [True, False]
+    with open_input(tmp_path) as capture:
+        assert isinstance(capture, CaptureInput)
+        list(capture.entries())
+        assert any("are damaged" in line for line in capture.damage)
+        assert any("was not closed" in line for line in capture.damage)
+
+
+def test_a_disk_that_stands_still_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stuck, go_on = threading.Event(), threading.Event()
+    real = os.fdatasync
+
+    def fdatasync(fd: int) -> None:
+        if stuck.is_set():
+            go_on.wait(30)
+        real(fd)
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    it = begun(tmp_path)
+    put(it, entries(10))
+    until(lambda: it.facts.bytes > 0)
+    stuck.set()
+    put(it, entries(1, 10))
+    until(lambda: it._busy_since is not None and not it._entries)
+    begin = time.monotonic()
+    put(it, entries(CAPACITY + 500, 11))
+    assert time.monotonic() - begin < 5
+    assert len(it._entries) == CAPACITY
+    reports = it.reports(time.monotonic_ns() + 6 * SECOND)
+    assert [r.begins for r in reports] == [True, True]
+    assert "500 entries" in reports[0].text
+    assert "does not answer" in reports[1].text
+    stuck.clear()
+    go_on.set()
+    until(lambda: not it._entries and it._busy_since is None)
+    assert [r.begins for r in it.reports(time.monotonic_ns())] == [False]
+    it.close()
+    found = recorded(tmp_path)
+    assert len([e for e in found if e.kind == Kind.BYTES]) == 11 + CAPACITY
+    assert sum(read_number(e.data) for e in found if e.kind == Kind.LOST) == 500
+
+
+def test_the_end_waits_for_a_stuck_disk_but_not_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder, "_CLOSE_S", 0.1)
+    go_on = threading.Event()
+    monkeypatch.setattr(os, "fdatasync", lambda _fd: go_on.wait(30))
+    it = begun(tmp_path)
+    put(it, entries(3))
+    until(lambda: it._busy_since is not None)
+    begin = time.monotonic()
+    it.close()
+    assert time.monotonic() - begin < 2
+    go_on.set()
+
+
+def test_a_folder_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match=r"record\.directory"):
+        begun(tmp_path / "file" / "captures")
+
+
+def test_another_file_is_never_overwritten_nor_a_link_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "urandom", lambda n: bytes(n))
+    monkeypatch.setattr(time, "strftime", lambda *_: "20260101T000000Z")
+    target = tmp_path / "precious"
+    target.write_text("precious")
+    folder = tmp_path / "captures"
+    folder.mkdir()
+    (folder / "20260101T000000Z-000000-0000.kcap").symlink_to(target)
+    it = begun(folder)
+    put(it, entries(3))
+    until(lambda: it.facts.problem != "")
+    it.close()
+    assert target.read_text() == "precious"
+    assert "cannot be written" in it.reports(0)[0].text
+
+
+FRAMES = [
+    (CanFrame(0x688, b"12345678"), False),
+    (CanFrame(0x601, b"\x40\x18\x10\x01\0\0\0\0"), True),
+    (CanFrame(0x12345678, b"ab", extended=True), False),
+    (CanFrame(0x0, b"\x01\x00"), True),
+    (CanFrame(0x700, b"", remote=True), True),
+]
+
+
+@pytest.mark.parametrize("kind", ["candump", "asc", "blf", "trc", "mf4"])
+def test_the_can_log_is_read_by_python_can(kind: str, tmp_path: Path) -> None:
+    check_kind(kind)
+    it = begun(tmp_path, can_log=kind, channel="can7")
+    start = time.monotonic_ns()
+    wall = time.time()
+    for number, (frame, received) in enumerate(FRAMES):
+        it.put_frame(frame, start + number * 10_000_000, received)
+    put(it, entries(3))
+    it.close()
+    [log] = [p for p in tmp_path.iterdir() if p.suffix != ".kcap"]
+    assert is_ours(log.name)
+    assert stat.S_IMODE(log.stat().st_mode) == 0o640
+    with can.LogReader(log) as reader:
+        found = list(reader)
+    wanted = [f for f in FRAMES if kind != "trc" or not f[0].remote]  # python-can's TRC writer knows no remote frames
+    key = [(m.arbitration_id, m.is_extended_id, bytes(m.data), m.is_rx, m.is_remote_frame) for m in found]
+    assert sorted(key) == sorted((f.can_id, f.extended, f.data, r, f.remote) for f, r in wanted)
+    if kind in ("candump", "blf"):
+        assert abs(found[0].timestamp - wall) < 1
+        assert found[1].timestamp - found[0].timestamp == pytest.approx(0.01, abs=2e-4)
+    if kind == "candump":
+        assert {m.channel for m in found} == {"can7"}
+    assert len(recorded(next(p for p in tmp_path.iterdir() if p.suffix == ".kcap"))) == 3
+
+
+def test_mf4_without_its_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(can_log, "find_spec", lambda _name: None)
+    with pytest.raises(UserError, match=r"kontronik-can-gw\[mf4\]"):
+        check_kind("mf4")
+
+
+def test_the_wall_clock_that_is_set_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, shift = 10 * SECOND, 0
+    it = begun(tmp_path, clock=lambda: now)
+    monkeypatch.setattr(time, "time_ns", lambda: now + 1_700_000_000 * SECOND + shift)
+    it.put(now, Kind.BYTES, 0, b"a", 0)
+    until(lambda: it._file is not None and not it._entries)
+    now += 11 * SECOND
+    shift = 3600 * SECOND
+    it.put(now, Kind.BYTES, 0, b"x", 0)
+    until(lambda: it._offset == 1_700_000_000 * SECOND + shift)
+    now += SECOND
+    it.put(now, Kind.BYTES, 0, b"b", 0)
+    it.close()
+    with open_input(tmp_path) as found:
+        assert isinstance(found, CaptureInput)
+        walls = {e.data: found.wall_ns(e.time_ns) for e in found.entries() if e.kind == Kind.BYTES}
+    first, second = walls[b"a"], walls[b"b"]
+    assert first is not None
+    assert second is not None
+    assert second - first == 3612 * SECOND

@@ -1,0 +1,142 @@
+"""What a replay gives is what the live gateway sent: every frame, every byte, every time."""
+
+import json
+
+import pytest
+from capture_bench import START, Bench, made
+
+from kontronik_can_gw.capture import Block, Entry, Scanner, block, data_payload, json_payload, read_entries, read_json
+from kontronik_can_gw.capture_setup import CaptureSetup
+from kontronik_can_gw.offline.marking import Marker
+from kontronik_can_gw.offline.replay import Replay, TimedFrame
+
+
+def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:
+    """Through the bytes of a capture, and a gateway made from its header."""
+    data = block(b"H", 0, json_payload(bench.setup.header()))
+    for number, at in enumerate(range(0, len(bench.entries), 500)):
+        data += block(b"D", number + 1, data_payload(bench.entries[at : at + 500]))
+    scanner = Scanner()
+    found = [*scanner.feed(data), *scanner.flush()]
+    assert all(isinstance(b, Block) for b in found)
+    blocks = [b for b in found if isinstance(b, Block)]
+    setup = CaptureSetup.of(read_json(blocks[0].payload))
+    made_again = setup.database()
+    assert made_again is not None
+    replay = Replay(setup.gateway(made_again[1], START), None, marked)
+    entries: list[Entry] = []
+    for b in blocks[1:]:
+        entries += read_entries(b.payload)
+    frames = list(replay.follow(entries))
+    assert (replay.lost, replay.passed_over) == (0, 0)
+    return frames
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("escs", "canopen"), [(1, False), (1, True), (3, True)])
+def test_frames_and_times_are_those_of_the_live_run(seed: int, escs: int, canopen: bool) -> None:
+    bench = Bench(*made(escs, canopen)).live(seed, 8)
+    frames = [frame for frame in replayed(bench) if not frame.received]
+    assert len(bench.sent) > 500
+    assert frames == bench.sent
+
+
+def test_the_silent_gateway_too() -> None:
+    bench = Bench(*made(2, on_loss="silent")).live(5, 6)
+    assert [frame for frame in replayed(bench) if not frame.received] == bench.sent
+
+
+def test_what_was_received_is_told_as_received() -> None:
+    bench = Bench(*made(1, True)).live(7, 6)
+    received = [frame for frame in replayed(bench) if frame.received]
+    assert len(received) == sum(entry.kind == 2 for entry in bench.entries) > 3
+
+
+def test_a_marked_replay_differs_in_the_state_and_nowhere_else() -> None:
+    bench = Bench(*made(1)).live(3, 4, wild=False)
+    found = bench.setup.database()
+    assert found is not None
+    database, layout = found
+    marker = Marker(layout)
+    assert marker.can_mark
+    differing: set[str] = set()
+    states: list[object] = []
+    marked = replayed(bench, marked=True)
+    for one, other in zip(bench.sent, marked, strict=True):
+        message = database.get_message_by_frame_id(one.frame.can_id)
+        if any(signal.name == "GatewayState" for signal in message.signals):
+            states.append(str(message.decode_simple(other.frame.data)["GatewayState"]))
+            if str(message.decode_simple(one.frame.data)["GatewayState"]) == "Running":
+                # a log is marked frame by frame: the same comes out
+                assert marker.mark(one.frame).data == other.frame.data
+        if one != other:
+            assert one.time_ns == other.time_ns
+            a, b = message.decode_simple(one.frame.data), message.decode_simple(other.frame.data)
+            differing |= {name for name in a if a[name] != b[name]}
+    assert differing == {"GatewayState"}
+    assert states[-1] == "Stopping"
+    assert set(states[:-1]) == {"Replay"}
+
+
+def test_the_beginning_of_a_run_may_be_missing() -> None:
+    """A later part alone: the gateway starts with the first entry, and is right from there on."""
+    bench = Bench(*made(1)).live(2, 6, wild=False)
+    half = next(i for i, e in enumerate(bench.entries) if e.time_ns > START + 3 * 10**9)
+    found = bench.setup.database()
+    assert found is not None
+    replay = Replay(bench.setup.gateway(found[1], START), {"escs": [{"energy": 7, "run_time": 8, "losses": 9}]})
+    frames = list(replay.follow(bench.entries[half:]))
+    late = START + 5 * 10**9
+
+    def speeds(listed: list[TimedFrame]) -> list[tuple[int, bytes]]:
+        """Without the alive counter, which counts from the start."""
+        key = found[0].get_message_by_name("EscSpeed").frame_id if found else 0
+        return [(f.time_ns, f.frame.data[:7]) for f in listed if f.frame.can_id == key and f.time_ns > late]
+
+    assert speeds(frames) == speeds(bench.sent)
+    assert speeds(frames)
+    assert replay.gateway.escs[0].losses >= 9
+
+
+def test_rubbish_entries_are_counted_and_passed_over() -> None:
+    bench = Bench(*made(1)).live(1, 1, wild=False)
+    found = bench.setup.database()
+    assert found is not None
+    replay = Replay(bench.setup.gateway(found[1], START))
+    bad = [
+        Entry(START, 1, 9, b"x"),
+        Entry(START, 2, 0, b""),
+        Entry(START, 99),
+        Entry(START, 14, 0, b"1"),
+        Entry(START, 10, flags=200),
+    ]
+    for entry in bad:
+        assert replay.play(entry) == []
+    assert replay.passed_over == len(bad)
+
+
+def test_a_header_of_another_kind_is_refused_with_the_reason() -> None:
+    header = Bench(*made(1, True)).setup.header()
+    json.dumps(header)
+    changes: list[dict[str, object]] = [
+        {"format": "x"},
+        {"version": 99},
+        {"escs": None},
+        {"dbc": {}},
+        {"canopen": {"eds": 1}},
+    ]
+    for change in changes:
+        with pytest.raises(ValueError, match=r"header|version"):
+            CaptureSetup.of(header | change)
+
+
+def test_a_setup_comes_back_from_its_header() -> None:
+    setup = Bench(*made(3, True, bind={"EscEnergy.EnergyAlive": 3.0})).setup
+    again = CaptureSetup.of(read_json(json_payload(setup.header())))
+    assert again.header() == setup.header()
+    assert again.escs == setup.escs
+    assert again.dbc_settings == setup.dbc_settings
+    assert again.canopen is not None
+    assert setup.canopen is not None
+    assert again.canopen.settings == setup.canopen.settings
+    assert again.canopen.eds.data == setup.canopen.eds.data
