@@ -264,6 +264,8 @@ def _troubles(document: Node) -> Iterator[str]:
         yield f"{esc.text('name')}: {reason or 'no telemetry'}"
     if failed := document.part("store").text("last_error"):
         yield f"parameters cannot be stored: {failed}"
+    if failed := document.part("recording").text("problem"):
+        yield f"captures: {failed}"
 
 
 def _is_alive(process: Node) -> bool:
@@ -333,6 +335,7 @@ def screen(seen: Seen, size: tuple[int, int] | None = None) -> list[Line]:
     lines += _node_lines(document, width)
     if (waiting := document.part("store").count("waiting")) > 0:
         lines.append([Piece(f"{waiting} parameters wait for the disk", _POOR)])
+    lines += _recording_lines(document)
     log = _log_lines(document)
     if height is not None:
         room = height - len(lines)
@@ -462,6 +465,16 @@ def _node_lines(document: Node, width: int | None) -> list[Line]:
     count = max(1, ((width or 80) + 2) // longest) if words else 1
     lines = [words[at : at + count] for at in range(0, len(words), count)]
     return [[Piece("".join(word.ljust(longest) for word in line).rstrip())] for line in lines]
+
+
+def _recording_lines(document: Node) -> list[Line]:
+    """The capture that is being written."""
+    recording = document.part("recording")
+    if not (file := recording.text("file")):
+        return []
+    lost = recording.count("lost")
+    words = f"recording to {file}, {recording.count('bytes') / 1e6:.1f} MB"
+    return [[Piece(f"{words}, {lost} entries lost", _POOR) if lost else Piece(words)]]
 
 
 def _log_lines(document: Node) -> list[Line]:

@@ -15,7 +15,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import kontronik_can_gw
-from kontronik_can_gw.config import Config, as_toml, load, parse, schema, shipped
+from kontronik_can_gw.config import Config, as_toml, load, mqtt_with, parse, schema, shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.telemetry import MS
@@ -29,6 +29,11 @@ TABLES: dict[str, tuple[str, ...]] = {
     ),
     "run": ("wait_for_devices",),
     "statistics": ("file", "prometheus"),
+    "record": ("directory", "part_mb", "part_minutes", "keep_mb", "min_free_mb", "can_log"),
+    "mqtt": (
+        *("broker", "tls", "ca_file", "cert_file", "key_file", "username", "password_file"),
+        *("gateway", "topic", "rate", "retain", "discovery"),
+    ),
     "esc": ("port", "name", "pole_pairs", "gear", "cell_count", "telemetry_timeout_ms", "node_id", "device"),
 }
 DEFAULTS: dict[str, dict[str, object]] = {
@@ -47,6 +52,10 @@ DEFAULTS: dict[str, dict[str, object]] = {
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
     "run": {"wait_for_devices": False},
     "statistics": {"file": None, "prometheus": None},
+    "record": {"directory": None, "part_mb": 64, "part_minutes": 60, "keep_mb": 0, "min_free_mb": 100}
+    | {"can_log": "none"},
+    "mqtt": dict.fromkeys(("broker", "ca_file", "cert_file", "key_file", "username", "password_file"), None)
+    | {"tls": False, "gateway": None, "topic": "kontronik", "rate": 1.0, "retain": False, "discovery": None},
     "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250}
     | {"node_id": None, "device": None},
 }
@@ -58,14 +67,20 @@ RANGES = {
     ("canopen", "vendor_id"): (0, 0xFFFFFFFF),
     ("canopen", "serial"): (0, 0xFFFFFFFF),
     ("canopen", "node_id"): (1, 127),
+    ("record", "part_mb"): (1, 4000),
+    ("record", "part_minutes"): (1, 10_000),
+    ("record", "keep_mb"): (0, 10_000_000),
+    ("record", "min_free_mb"): (0, 10_000_000),
     ("esc", "node_id"): (1, 127),
     ("esc", "pole_pairs"): (1, 100),
     ("esc", "cell_count"): (0, 255),
     ("esc", "telemetry_timeout_ms"): (20, 60_000),
 }
 STRINGS = [("can", "interface"), ("can", "channel"), ("dbc", "file"), ("dbc", "node"), ("esc", "port")]
-STRINGS += [("canopen", "eds"), ("canopen", "store"), ("statistics", "file")]
+STRINGS += [("canopen", "eds"), ("canopen", "store"), ("statistics", "file"), ("record", "directory")]
+STRINGS += [("mqtt", key) for key in ("ca_file", "cert_file", "key_file", "username", "password_file")]
 BOOLEANS = [("can", "fd"), ("run", "wait_for_devices"), ("dbc", "enabled")]
+BOOLEANS += [("mqtt", "tls"), ("mqtt", "retain")]
 BOOLEANS += [("canopen", key) for key in ("enabled", "self_start", "read_only", "cia402_mirrors")]
 
 
@@ -211,6 +226,57 @@ def test_prometheus_on_any_other_address_is_refused(text: str) -> None:
     assert "is not a text" in refused("statistics", "prometheus", 9123)
 
 
+BROKERS = {
+    "broker": ("broker", 1883, 8883),
+    "192.168.1.5:1884": ("192.168.1.5", 1884, 1884),
+    "[fe80::1]": ("fe80::1", 1883, 8883),
+    "[::1]:65535": ("::1", 65_535, 65_535),
+}
+
+
+@pytest.mark.parametrize("text", BROKERS)
+def test_the_port_of_a_broker_is_that_of_mqtt_unless_it_is_given(text: str) -> None:
+    host, plain, encrypted = BROKERS[text]
+    assert parse({"mqtt": {"broker": text}, "esc": [{"port": "x"}]}, "a.toml").mqtt.address == (host, plain)
+    made = parse({"mqtt": {"broker": text, "tls": True}, "esc": [{"port": "x"}]}, "a.toml")
+    assert made.mqtt.address == (host, encrypted)
+    assert parse(tables(), "a.toml").mqtt.address is None
+
+
+@pytest.mark.parametrize("text", ["mqtt://a", "a:0", "a:65536", "a b", "::1", "a/b", "u@a", "-a", "a:", ":1883", "a\n"])
+def test_what_is_no_broker_is_refused_with_examples(text: str) -> None:
+    assert "is not a broker, as broker.example, 192.168.1.5:1883 or [fe80::1]:1883" in refused("mqtt", "broker", text)
+
+
+@pytest.mark.parametrize("key", ["topic", "discovery"])
+@pytest.mark.parametrize("text", ["/a", "a/", "a//b", "a/+/b", "#", "$SYS", "a\tb", "x" * 201, "a/" * 8 + "a"])
+def test_topics_have_no_wildcard_and_no_empty_level(key: str, text: str) -> None:
+    assert "is not the beginning of topics" in refused("mqtt", key, text)
+
+
+@pytest.mark.parametrize("rate", [0.01, 0.5, 1, 20, 20.0])
+def test_a_rate_is_a_number_in_its_range(rate: float) -> None:
+    assert taken("mqtt", "rate", rate) == rate
+
+
+@pytest.mark.parametrize("rate", [0, 0.009, 20.1, -1, math.nan, math.inf, 10**400])
+def test_a_rate_outside_its_range_is_refused(rate: float) -> None:
+    assert "is outside 0.01..20" in refused("mqtt", "rate", rate)
+    assert "is not a number" in refused("mqtt", "rate", "1")
+    assert "is not a number" in refused("mqtt", "rate", True)
+
+
+def test_options_are_checked_as_keys_of_the_file_are() -> None:
+    made = mqtt_with(parse(tables("mqtt", "rate", 5), "a.toml").mqtt, {"broker": "a", "topic": "t"})
+    assert (made.broker, made.topic, made.rate) == ("a", "t", 5)
+    with pytest.raises(UserError) as caught:
+        mqtt_with(made, {"rate": 99.0, "ca_file": "", "broker": "a b"})
+    assert [line.partition(": ")[0] for line in caught.value.problems] == ["--rate", "--ca-file", "--broker"]
+    for key, missing in (("ca_file", "--tls"), ("key_file", "--tls"), ("password_file", "--username")):
+        with pytest.raises(UserError, match=missing):
+            mqtt_with(made, {key: "x"})
+
+
 def test_the_statistics_file_must_be_none_that_is_read() -> None:
     for name, what in (("a.toml", "configuration"), ("./a.toml", "configuration"), ("my.dbc", "DBC")):
         made = tables("statistics", "file", name) | {"dbc": {"file": "my.dbc"}}
@@ -326,7 +392,7 @@ def test_a_data_id_is_a_whole_number_of_16_bits_beside_a_message_name() -> None:
     ("given_tables", "said"),
     [
         ({"cann": {}}, "a.toml: cann: unknown table. Did you mean can?"),
-        ({"xyzzy": {}}, "a.toml: xyzzy: unknown table. Known: can, dbc, canopen, run, statistics, esc."),
+        ({"xyzzy": {}}, "a.toml: xyzzy: unknown table. Known: can, dbc, canopen, run, statistics, record, mqtt, esc."),
         ({"can": {"bitrte": 1}}, "a.toml: can.bitrte: unknown key. Did you mean bitrate?"),
         ({"run": {"x": 1}}, "a.toml: run.x: unknown key. Known: wait_for_devices."),
         ({"can": 3}, "a.toml: can: is a table, written [can]"),
@@ -519,7 +585,8 @@ def test_what_the_example_shows_as_default_is_the_default() -> None:
     examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
     examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options"), ("esc", "node_id"), ("esc", "device")}
     examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store")}
-    examples |= {("statistics", "file"), ("statistics", "prometheus")}
+    examples |= {("statistics", "file"), ("statistics", "prometheus"), ("mqtt", "discovery"), ("mqtt", "gateway")}
+    examples |= {("mqtt", key) for key in ("broker", "ca_file", "cert_file", "key_file", "username", "password_file")}
     for (table, key), value in shown.items():
         if (table, key) not in examples:
             assert value == DEFAULTS[table][key], f"{table}.{key}"
@@ -636,6 +703,11 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
         st.sampled_from(["127.0.0.1", "localhost", "[::1]", "127.255.3.200"]),
         st.integers(1, 65_535),
     ),
+    ("mqtt", "broker"): st.sampled_from(["broker", "192.168.1.5", "a.b-c.example:1", "[::1]:65535", "[fe80::1]", "x_y"]),
+    ("mqtt", "gateway"): st.from_regex(r"\A[A-Za-z0-9_-]{1,64}\Z"),
+    ("mqtt", "topic"): st.sampled_from(["k", "fleet/north", "a b/c", "ü/€", "a$"]),
+    ("mqtt", "discovery"): st.sampled_from(["homeassistant", "ha/x"]),
+    ("mqtt", "rate"): st.one_of(st.floats(0.01, 20), st.integers(1, 20)),
     ("esc", "name"): st.from_regex(r"\A[b-z][A-Za-z0-9_]{0,11}\Z"),
     ("esc", "gear"): st.one_of(
         st.floats(0.001, 1000).filter(lambda value: not value.is_integer()),
@@ -675,6 +747,9 @@ def only_the_parser_can_tell(made: dict[str, Any]) -> bool:
             "makes signal names ambiguous",
             "is outside 0.001..1000",
             "1 to 12 letters",
+            "is not a broker",
+            "is not the beginning of topics",
+            "is not a name of 1 to 64",
             "which would be overwritten",
         )
         return all(any(sign in problem for sign in signs) for problem in error.problems)
