@@ -1,0 +1,553 @@
+"""What ``monitor`` shows: lines of words and bars that fit a terminal of any size, in colour or without, in UTF-8 or ASCII. Pure.
+
+Where the ESCs find room side by side each has a column with everything in it; else they are a table, of two lines each or of one.
+"""
+
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from kontronik_can_gw.cli.status import Line, Piece, compact, duration, printable
+from kontronik_can_gw.dbc_output.layout import normalize
+from kontronik_can_gw.offline.monitor import (
+    PERCENT,
+    QUANTITIES,
+    QUANTITY,
+    SILENCE_NS,
+    EscMonitor,
+    Monitor,
+    Quantity,
+    Scale,
+    Zone,
+    words,
+)
+from kontronik_can_gw.protocol.states import Severity
+from kontronik_can_gw.telemetry import SECOND
+
+GOOD, POOR, BAD, FAINT, TITLE, MARKED = "green", "yellow", "bold red", "dim", "bold", "bold black on yellow"
+_ZONES = {Zone.GOOD: GOOD, Zone.WARNING: POOR, Zone.ALARM: "red"}
+_MARKS = {Zone.GOOD: "", Zone.WARNING: "!", Zone.ALARM: "!!"}
+_SEVERITIES = {Severity.ERROR: BAD, Severity.WARNING: POOR, Severity.STATUS: ""}
+_LINKS = {"ok": GOOD, "degraded": POOR}
+_FILLERS = {"from", "for", "target", "during", "operation"}
+_LABEL = 23
+"""Columns of what a value is called, with its unit."""
+_LEAST_GROUP = 27
+_WIDEST_BAR = 36
+_LEAST_HEIGHT = 16
+"""Lines without which there is no room for details."""
+MOST_ESCS = 8
+"""On one page."""
+
+
+@dataclass(frozen=True)
+class Glyphs:
+    """Characters that the terminal has."""
+
+    full: str = "▇"
+    empty: str = "▁"
+    degree: str = "°C"
+    cut: str = "…"
+    rule: str = "╌"
+
+
+UNICODE = Glyphs()
+ASCII = Glyphs(full="#", empty=".", degree="degC", cut="~", rule="-")
+
+
+@dataclass
+class Choice:
+    """What the person wants to see."""
+
+    page: int = 0
+    esc: int | None = None
+    """Index of the only ESC to be shown; None: all."""
+
+
+class Where(NamedTuple):
+    """Where the frames come from. ``problem``: one line while it does not work; ``progress``: of a file, as ``12:03, 40 %``."""
+
+    name: str
+    is_file: bool = False
+    problem: str = ""
+    progress: str = ""
+    hints: tuple[str, ...] = ()
+    """What may be wrong where no frame comes."""
+    ended: bool = False
+    """True at the end of a file."""
+    keys: bool = True
+    """True where keys can be pressed."""
+
+
+def screen(
+    monitor: Monitor, where: Where, size: tuple[int, int], choice: Choice, glyphs: Glyphs = UNICODE
+) -> list[Line]:
+    """Everything, in at most ``size`` (columns, lines)."""
+    width, height = max(20, size[0]), max(4, size[1])
+    head = [_title(monitor, where, width)]
+    for text, style in notices(monitor, where):
+        head += [[Piece(line, style)] for line in textwrap.wrap(printable(text), width, break_on_hyphens=False)]
+    body_height = height - len(head) - 1
+    shown, pages = _shown(monitor, choice, body_height)
+    group = (width - _LABEL) // max(1, len(shown))
+    if len(shown) == 1 or (group >= _LEAST_GROUP and body_height >= _LEAST_HEIGHT):
+        body = _details(shown, (width, body_height), glyphs)
+    else:
+        body = _table(shown, (width, body_height), glyphs)
+    body += [[] for _ in range(body_height - len(body))]
+    lines = [*head, *body[: max(0, body_height)], _foot(monitor, where, choice, pages, width)]
+    return [fit(line, width, glyphs) for line in lines[:height]]
+
+
+def plain_lines(monitor: Monitor) -> Iterator[str]:
+    """A line for each ESC where there is no screen to draw on."""
+    mark = "REPLAY  " if monitor.is_replay else ""
+    for esc in monitor.escs:
+        parts = [f"{mark}{monitor.watched_s:6.1f} s  {printable(esc.name)}  link {_link(esc)}  state {_state(esc)}"]
+        for source in (*_speeds(esc)[:1], "battery_voltage", "battery_current", "power_stage_temperature"):
+            quantity = QUANTITY[source]
+            parts.append(f"{source} {number(esc.number(source), quantity.digits)} {quantity.unit}")
+        parts += [f"{active.severity.value.upper()} {active.meaning}" for active in esc.alarms]
+        yield "  ".join(parts)
+
+
+def notices(monitor: Monitor, where: Where) -> Iterator[tuple[str, str]]:
+    """What must be said of all this, and its style."""
+    if monitor.is_replay and not where.is_file:
+        yield "REPLAY: the gateway plays a recording; these are not values of a live ESC.", MARKED
+    if where.problem:
+        yield where.problem, BAD
+    elif monitor.silent_ns >= SILENCE_NS and not where.is_file:
+        since = duration(monitor.silent_ns / SECOND)
+        file = monitor.bus.layout.file.rpartition("/")[2]
+        yield f"no frames of {file} on {where.name} for {since}", BAD
+        yield from ((hint, POOR) for hint in where.hints)
+    elif where.ended and not monitor.frames:
+        file = monitor.bus.layout.file.rpartition("/")[2]
+        yield f"{where.name} holds no frame of {file}. Give the DBC of its frames (-c, --dbc).", BAD
+    elif not monitor.frames and not where.is_file:
+        yield f"waiting for frames on {where.name} ...", FAINT
+    count = monitor.gateway_number("esc_count")
+    if count is not None and count > len(monitor.escs):
+        yield (
+            f"the gateway has {count:.0f} ESCs, the DBC in use describes {len(monitor.escs)}: give its configuration (-c) or DBC (--dbc).",
+            POOR,
+        )
+
+
+def fit(line: Line, width: int, glyphs: Glyphs) -> Line:
+    """The line, cut where it is too long."""
+    room = width
+    if sum(len(piece.text) for piece in line) <= room:
+        return line
+    cut: Line = []
+    room -= len(glyphs.cut)
+    for piece in line:
+        cut.append(Piece(piece.text[:room], piece.style))
+        room -= len(piece.text)
+        if room <= 0:
+            break
+    return [*cut, Piece(glyphs.cut, FAINT)]
+
+
+def number(value: float | None, digits: int, width: int = 99) -> str:
+    """A value as people read it, in groups of three where there is room; a dash where it is not available."""
+    if value is None:
+        return "-"
+    text = f"{value:,.{digits}f}".replace(",", " ")
+    return text if len(text) <= width else text.replace(" ", "")
+
+
+def bar(value: float | None, scale: Scale, width: int, glyphs: Glyphs) -> Line:
+    """A bar; its empty part shows by its colours where the limits lie."""
+    text = glyphs.full * (0 if value is None else round(scale.share(value) * width))
+    style = _ZONES[Zone.GOOD if value is None else scale.zone(value)]
+    line = [Piece(text, style)] if text else []
+    for cell in range(len(text), width):
+        zone = scale.zone(scale.low + (cell + 0.5) / width * (scale.high - scale.low))
+        cell_style = FAINT if zone is Zone.GOOD or value is None else f"dim {_ZONES[zone]}"
+        if line and line[-1].style == cell_style:
+            line[-1] = Piece(line[-1].text + glyphs.empty, cell_style)
+        else:
+            line.append(Piece(glyphs.empty, cell_style))
+    return line
+
+
+# --- head and foot
+
+
+def _title(monitor: Monitor, where: Where, width: int) -> Line:
+    left: Line = [Piece(f" {printable(where.name)} ", "bold reverse"), Piece(" ")]
+    if where.progress:
+        left.append(Piece(f"{where.progress}  ", "bold cyan"))
+    file = monitor.bus.layout.file.rpartition("/")[2]
+    if not where.is_file:
+        left.append(Piece(f"{printable(file)}  ", FAINT))
+    state = monitor.gateway_state
+    right: Line = []
+    if state is not None:
+        style = {"running": GOOD, "replay": MARKED}.get(normalize(state), POOR)
+        right += [Piece("gateway "), Piece(words(state), style), Piece("  ")]
+    if monitor.can_state is not None and normalize(monitor.can_state) not in ("unknown", "erroractive"):
+        right += [Piece(f"CAN {words(monitor.can_state)}", POOR), Piece("  ")]
+    rate = monitor.frame_rate
+    right.append(Piece(f"{'-' if rate is None else f'{rate:.0f}'} frames/s"))
+    used = sum(len(piece.text) for piece in (*left, *right))
+    if used > width and not where.is_file:
+        used -= len(left.pop().text)
+    return [*left, Piece(" " * max(1, width - used)), *right]
+
+
+def _foot(monitor: Monitor, where: Where, choice: Choice, pages: int, width: int) -> Line:
+    count = len(monitor.escs)
+    since = f"min/max of {duration(monitor.watched_s)}"
+    keys = ["q quit", "r reset min/max"] if where.keys else ["Ctrl-C ends"]
+    if where.is_file and where.keys:
+        keys.append("space pause")
+    if count > 1 and where.keys:
+        keys.append("a all" if choice.esc is not None else f"1-{min(9, count)} one ESC")
+    if pages > 1 and choice.esc is None:
+        more = f"page {choice.page + 1} of {pages}, {count} ESCs"
+        keys.insert(1, f"n p {more}" if where.keys else f"{more}; -c or --dbc")
+    while len("  ".join([*keys, since])) > width and len(keys) > 1:
+        keys.pop()
+    text = "  ".join(keys)
+    if len(text) + len(since) + 2 > width:
+        return [Piece(text, FAINT)]
+    return [Piece(text, FAINT), Piece(" " * (width - len(text) - len(since))), Piece(since, FAINT)]
+
+
+def _shown(monitor: Monitor, choice: Choice, height: int) -> tuple[Sequence[EscMonitor], int]:
+    """The ESCs of the page that is wanted, and how many pages there are; the choice is set right."""
+    escs = monitor.escs
+    if choice.esc is not None:
+        choice.esc = choice.esc if choice.esc < len(escs) else None
+    if choice.esc is not None:
+        return escs[choice.esc : choice.esc + 1], 1
+    share = max(1, min(MOST_ESCS, height - 2))
+    pages = max(1, -(-len(escs) // share))
+    choice.page %= pages
+    return escs[choice.page * share : (choice.page + 1) * share], pages
+
+
+# --- words of an ESC
+
+
+def _state(esc: EscMonitor) -> str:
+    state = esc.state
+    return "-" if state is None else words(printable(state))
+
+
+def _short_state(esc: EscMonitor, width: int) -> str:
+    """The state without what it can be understood without, where there is no room for all of it."""
+    state = _state(esc)
+    return state if len(state) <= width else " ".join(word for word in state.split() if word not in _FILLERS)
+
+
+def _link(esc: EscMonitor) -> str:
+    link = esc.link
+    if link is None:
+        return "-" if esc.has("link_state") or not esc.is_fresh else "ok"
+    return words(printable(link))
+
+
+def _link_style(esc: EscMonitor) -> str:
+    return _LINKS.get(normalize(_link(esc)), BAD) if _link(esc) != "-" else FAINT
+
+
+def _speeds(esc: EscMonitor) -> list[str]:
+    """The speeds that the DBC has, the one that tells most first."""
+    return [name for name in ("motor_speed", "electrical_speed", "output_speed") if esc.has(name)] or ["motor_speed"]
+
+
+def _name_style(esc: EscMonitor) -> str:
+    severities = {active.severity for active in esc.alarms}
+    if Severity.ERROR in severities:
+        return BAD
+    return "bold yellow" if Severity.WARNING in severities else TITLE
+
+
+def _mark(esc: EscMonitor) -> str:
+    """Behind the name, for those who see no colours."""
+    return {BAD: " !!", "bold yellow": " !"}.get(_name_style(esc), "")
+
+
+def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool) -> list[Line]:
+    """What the ESCs report, errors first; what finds no room is counted."""
+    width, room = size
+    lines: list[Line] = []
+    told = [(esc, active) for esc in escs for active in esc.alarms]
+    for esc, active in sorted(told, key=lambda each: list(Severity).index(each[1].severity)):
+        name = f"{printable(esc.name)} " if named else ""
+        kind = {Severity.STATUS: "note"}.get(active.severity, active.severity.value.upper())
+        text = f"{name}{kind}: {active.meaning}"
+        wrapped = textwrap.wrap(text, width, subsequent_indent="  ")
+        lines += [[Piece(part, _SEVERITIES[active.severity])] for part in wrapped]
+    if len(lines) > room > 0:
+        rest = len(lines) - room + 1
+        lines = [*lines[: room - 1], [Piece(f"... and {rest} lines more of errors and warnings", BAD)]]
+    return lines[: max(0, room)]
+
+
+def _measure(esc: EscMonitor, quantity: Quantity, width: int) -> tuple[str, str]:
+    """A value and its style; beyond its limits it is marked, for those who see no colours."""
+    value = esc.number(quantity.source)
+    text = number(value, quantity.digits, width)
+    if value is None:
+        return text, FAINT
+    zone = Zone.GOOD if quantity.scale is None else quantity.scale.zone(value)
+    style = TITLE if zone is Zone.GOOD else f"bold {_ZONES[zone]}"
+    return _MARKS[zone] + text, style
+
+
+# --- details
+
+
+class _Row(NamedTuple):
+    """A line of the details: what it is, its unit, its cell for an ESC, how soon it is left out (greatest first)."""
+
+    label: str
+    unit: str
+    cell: Callable[[EscMonitor, int], Line]
+    rank: int
+
+
+def _details(escs: Sequence[EscMonitor], size: tuple[int, int], glyphs: Glyphs) -> list[Line]:
+    width, height = size
+    group = (width - _LABEL) // max(1, len(escs))
+    rows = _rows(escs, glyphs)
+    alarms = _alarm_lines(escs, (width, 99), len(escs) > 1)
+    kept = max(1, min(4, len(alarms)))
+    while len(rows) > max(1, height - kept - 1):  # one line parts values and alarms
+        rows.remove(max(rows, key=lambda row: row.rank))
+    lines: list[Line] = []
+    for row in rows:
+        unit = glyphs.degree if row.unit == "degC" else row.unit
+        line: Line = [Piece(row.label.ljust(_LABEL - 6), FAINT), Piece(unit.ljust(6), FAINT)]
+        for esc in escs:
+            line += _padded(fit(row.cell(esc, group - 1), group - 1, glyphs), group)
+        lines.append(line)
+    lines.append([Piece(glyphs.rule * width, FAINT)])
+    room = height - len(lines)
+    if alarms:
+        return [*lines, *_alarm_lines(escs, (width, room), len(escs) > 1)]
+    known = any(esc.state is not None for esc in escs)
+    return [*lines, [Piece("no errors, no warnings", GOOD) if known else Piece("errors: -", FAINT)]]
+
+
+def _rows(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Row]:
+    def has(*names: str) -> bool:
+        return any(esc.has(name) for esc in escs for name in names)
+
+    def title(esc: EscMonitor, width: int) -> Line:
+        state = _short_state(esc, width - len(esc.name) - 5)
+        return [
+            Piece(f"{printable(esc.name)}{_mark(esc)}  ", _name_style(esc)),
+            Piece(state, FAINT if state == "-" else "bold cyan"),
+        ]
+
+    def device(esc: EscMonitor, width: int) -> Line:
+        cells = esc.number("cell_count")
+        what = printable(esc.device) or "-"
+        text = what + (f", {cells:.0f} cells" if cells else "")
+        return [Piece(text if len(text) <= width else text.replace("firmware ", ""), FAINT)]
+
+    def heads(_esc: EscMonitor, width: int) -> Line:
+        now, bars, ends = _widths(width)
+        return [Piece(f"{'now':>{now}} {'min':>{ends}} {'max':>{ends}} {' ' * bars}", FAINT)]
+
+    def charge(esc: EscMonitor, _width: int) -> Line:
+        parts = [(esc.number("consumed_charge"), 0, "mAh"), (esc.number("energy_used"), 1, "Wh")]
+        return [Piece("  ".join(f"{number(value, digits)} {unit}" for value, digits, unit in parts), TITLE)]
+
+    def link(esc: EscMonitor, _width: int) -> Line:
+        rate, age = esc.number("frame_rate"), esc.number("data_age")
+        line = [Piece(_link(esc), _link_style(esc))]
+        if rate is not None:
+            line.append(Piece(f", {rate:.0f} Hz"))
+        return [*line, Piece(f", age {age_text(age)}")] if age is not None else line
+
+    def line_errors(esc: EscMonitor, width: int) -> Line:
+        crc, dropped = compact(esc.number("crc_errors")), compact(esc.number("dropped_bytes"))
+        text = f"CRC errors {crc}, dropped bytes {dropped}"
+        return [Piece(text if len(text) <= width else f"CRC {crc}, dropped {dropped} B")]
+
+    rows = [_Row("", "", title, -2)]
+    if has("device", "device_raw"):
+        rows.append(_Row("", "", device, 9))
+    rows.append(_Row("", "", heads, -1))
+    for quantity in QUANTITIES:
+        if has(quantity.source) or any(esc.number(quantity.source) is not None for esc in escs):
+            rows.append(_Row(quantity.label, quantity.unit, _cell_of(quantity, glyphs), quantity.rank))
+    if has("consumed_charge", "energy_used"):
+        rows.append(_Row("charge, energy", "", charge, 2))
+    rows.append(_Row("link", "", link, 1))
+    if has("crc_errors", "dropped_bytes"):
+        rows.append(_Row("on the line", "", line_errors, 3))
+    return rows
+
+
+def _cell_of(quantity: Quantity, glyphs: Glyphs) -> Callable[[EscMonitor, int], Line]:
+    """The cell of a measured value: now, its bar, least, greatest."""
+
+    def cell(esc: EscMonitor, width: int) -> Line:
+        now, bars, ends = _widths(width)
+        gap = 1 + (width >= 40)
+        text, style = _measure(esc, quantity, now)
+        line = [Piece(text.rjust(now), style)]
+        spread = esc.spreads[quantity.source]
+        for end in (spread.low, spread.high):
+            line.append(Piece(f" {number(end, quantity.digits, ends):>{ends}}", "" if end is not None else FAINT))
+        value = esc.number(quantity.source)
+        if quantity.scale is None or bars < 4:
+            return line
+        if quantity.scale is PERCENT and value is not None and value < 0:
+            return [*line, Piece(" brake"[: bars + 1], "cyan")]
+        return [*line, Piece("  "[:gap]), *bar(value, quantity.scale, bars, glyphs)]
+
+    return cell
+
+
+def _widths(width: int) -> tuple[int, int, int]:
+    """Columns of a value, its bar, and each of its extremes."""
+    now, ends = (9, 8) if width >= 40 else (7, 6)
+    return now, max(0, min(_WIDEST_BAR, width - now - 2 * ends - 3 - (width >= 40))), ends
+
+
+def _padded(line: Line, width: int) -> Line:
+    used = sum(len(piece.text) for piece in line)
+    return [*line, Piece(" " * (width - used))] if used < width else line
+
+
+def age_text(milliseconds: float) -> str:
+    """How old data is."""
+    return f"{milliseconds:.0f} ms" if milliseconds < 10_000 else duration(milliseconds / 1000)
+
+
+# --- the table of many
+
+
+class _Column(NamedTuple):
+    """A column of the table: two heads, width, what stands in both lines, how soon it is left out (greatest first)."""
+
+    heads: tuple[str, str]
+    width: int
+    first: Callable[[EscMonitor], Line]
+    second: Callable[[EscMonitor], Line]
+    rank: int
+    left: bool = False
+    grows: bool = False
+    """True where it takes what is left of the width."""
+
+
+def _table(escs: Sequence[EscMonitor], size: tuple[int, int], glyphs: Glyphs) -> list[Line]:
+    width, height = size
+    columns = _columns(escs, glyphs)
+    while sum(column.width + 1 for column in columns) - 1 > width and len(columns) > 1:
+        columns.remove(max(columns, key=lambda column: column.rank))
+    spare = width + 1 - sum(column.width + 1 for column in columns)
+    columns = [column._replace(width=column.width + min(spare, 8)) if column.grows else column for column in columns]
+    alarms = _alarm_lines(escs, (width, 99), True)
+    least = 2 if alarms else 1
+    two = 2 + 2 * len(escs) + least <= height
+    spare = height - 2 - 2 * len(escs) - least - 1
+    lines: list[Line] = [_table_line([[Piece(c.heads[0], FAINT)] for c in columns], columns, glyphs)]
+    if two:
+        lines.append(_table_line([[Piece(c.heads[1], FAINT)] for c in columns], columns, glyphs))
+    for esc in escs:
+        if two and spare >= len(escs):
+            lines.append([Piece(glyphs.rule * width, FAINT)])
+        lines.append(_table_line([column.first(esc) for column in columns], columns, glyphs))
+        if two:
+            lines.append(_table_line([column.second(esc) for column in columns], columns, glyphs))
+    room = height - len(lines)
+    if room > max(1, len(alarms)):
+        lines.append([Piece(glyphs.rule * width, FAINT)])
+        room -= 1
+    if alarms:
+        return [*lines, *_alarm_lines(escs, (width, room), True)]
+    known = any(esc.state is not None for esc in escs)
+    return [*lines, [Piece("no errors, no warnings", GOOD) if known else Piece("errors: -", FAINT)]]
+
+
+def _table_line(cells: Sequence[Line], columns: Sequence[_Column], glyphs: Glyphs) -> Line:
+    line: Line = []
+    for cell, column in zip(cells, columns, strict=True):
+        fitting = fit(cell, column.width, glyphs)
+        space = Piece(" " * (column.width - sum(len(piece.text) for piece in fitting)))
+        line += [*fitting, space, Piece(" ")] if column.left else [space, *fitting, Piece(" ")]
+    return line[:-1]
+
+
+def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
+    def name(esc: EscMonitor) -> Line:
+        return [Piece(printable(esc.name) + _mark(esc), _name_style(esc))]
+
+    def link(esc: EscMonitor) -> Line:
+        rate = esc.number("frame_rate")
+        text = _link(esc)
+        return [Piece(text if rate is None or text != "ok" else f"{text} {rate:.0f} Hz", _link_style(esc))]
+
+    def state(esc: EscMonitor) -> Line:
+        text = _short_state(esc, 16)
+        if text == "-" and not esc.is_fresh and _link(esc) not in ("-", "ok"):
+            return [Piece("no telemetry", BAD)]
+        return [Piece(text, FAINT if text == "-" else "cyan")]
+
+    def throttle(esc: EscMonitor) -> Line:
+        value = esc.number("throttle")
+        if value is not None and value < 0:
+            return [Piece(f"brake {-value:.0f} %".rjust(16), "cyan")]
+        percent = number(value, 0)
+        return [*bar(value, PERCENT, 10, glyphs), Piece(f"{percent} %".rjust(6), "" if value is not None else FAINT)]
+
+    def measured(source: str, head: str, width: int, rank: int, least: bool = False) -> _Column:
+        quantity = QUANTITY[source]
+
+        def now(esc: EscMonitor) -> Line:
+            return [Piece(*_measure(esc, quantity, width))]
+
+        def end(esc: EscMonitor) -> Line:
+            spread = esc.spreads[source]
+            value = spread.low if least else spread.high
+            return [Piece(number(value, quantity.digits, width), FAINT if value is None else "")]
+
+        return _Column((head, "min" if least else "max"), width, now, end, rank)
+
+    def count(source: str, digits: int) -> Callable[[EscMonitor], Line]:
+        def cell(esc: EscMonitor) -> Line:
+            value = esc.number(source)
+            return [Piece(number(value, digits, 6), FAINT if value is None else "")]
+
+        return cell
+
+    speeds = {"motor_speed": "motor/min", "electrical_speed": "elec./min", "output_speed": "outp./min"}
+    first_speed = _speeds(escs[0])[0] if escs else "motor_speed"
+    longest = max((len(esc.name) for esc in escs), default=0)
+    columns = [
+        _Column(("ESC", "link"), min(14, max(10, longest + 3)), name, link, -2, True),
+        _Column(("state", "throttle"), 16, state, throttle, -1, True, True),
+        measured(first_speed, speeds[first_speed], 9, 0),
+        measured("battery_voltage", "V", 6, 0, True),
+        measured("mean_cell_voltage", "V cell", 6, 4, True),
+        measured("battery_current", "A", 6, 1),
+        measured("motor_current", "A mot", 6, 7),
+        measured("peak_current", "A peak", 6, 8),
+        measured("battery_power", "W", 6, 3),
+        measured("power_stage_temperature", glyphs.degree, 5, 0),
+        measured("bec_temperature", "BEC " + glyphs.degree[-2:], 6, 6),
+        measured("output_opening", "open %", 6, 9),
+        _Column(("mAh", "Wh"), 6, count("consumed_charge", 0), count("energy_used", 1), 2),
+        _Column(("age ms", "CRC"), 6, count("data_age", 0), count("crc_errors", 0), 5),
+    ]
+    wanted = {
+        "V cell": "mean_cell_voltage", "A mot": "motor_current", "A peak": "peak_current", "W": "battery_power",
+        "open %": "output_opening", "BEC " + glyphs.degree[-2:]: "bec_temperature", "mAh": "consumed_charge", "age ms": "data_age",
+    }  # fmt: skip
+    return [
+        column
+        for column in columns
+        if (source := wanted.get(column.heads[0])) is None
+        or any(esc.has(source) or (source in esc.spreads and esc.number(source) is not None) for esc in escs)
+    ]

@@ -1,0 +1,424 @@
+"""What a person who looks on wants to know of one to eight ESCs: newest values, extremes, state, errors, link. Pure; time is handed in.
+
+Everything is asked for by the names of sources (sources.py), never by those of signals: so it works with any DBC, and in the units of
+the sources, whatever units the DBC has. A value that is not available is None, never an old one.
+"""
+
+import re
+from collections import deque
+from collections.abc import Iterable, Mapping
+from enum import Enum
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.dbc_output import units
+from kontronik_can_gw.dbc_output.layout import normalize
+from kontronik_can_gw.dbc_output.unpacker import SignalReader, Value
+from kontronik_can_gw.dbc_output.view import View
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline.layouts import BusLayout
+from kontronik_can_gw.protocol.states import (
+    Device,
+    ErrorBit,
+    OperatingError,
+    SelfTestError,
+    Severity,
+    device_text,
+    state_text,
+)
+from kontronik_can_gw.sources import CanState, GatewayState, Group, sources
+from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, LinkState
+
+SILENCE_NS = 5 * SECOND
+"""So long without a frame it is said in words what may be wrong."""
+_RATE_NS = 2 * SECOND
+_RATE_STEP_NS = 100 * MS
+
+
+class Zone(Enum):
+    """How a value stands to its limits."""
+
+    GOOD = 0
+    WARNING = 1
+    ALARM = 2
+
+
+class Scale(NamedTuple):
+    """A bar from ``low`` to ``high``; from ``warning`` and from ``alarm`` on (downward if they lie the other way) it is to be looked at."""
+
+    low: float
+    high: float
+    warning: float | None = None
+    alarm: float | None = None
+
+    def share(self, value: float) -> float:
+        """Which part of the bar is filled, 0 to 1."""
+        return min(1.0, max(0.0, (value - self.low) / (self.high - self.low)))
+
+    def zone(self, value: float) -> Zone:
+        if self.warning is None or self.alarm is None:
+            return Zone.GOOD
+        sign = 1 if self.alarm >= self.warning else -1
+        if sign * value >= sign * self.alarm:
+            return Zone.ALARM
+        return Zone.WARNING if sign * value >= sign * self.warning else Zone.GOOD
+
+
+PERCENT = Scale(0, 100)
+TEMPERATURE = Scale(0, 110, 80, 100)
+"""degC. The ESC has limits of its own, which it does not tell; these are where a look at the cooling is worth while."""
+CELL = Scale(3.0, 4.2, 3.5, 3.3)
+"""V of a lithium polymer cell: under load below 3.5 V it is nearly empty, below 3.3 V it takes harm."""
+
+
+class Quantity(NamedTuple):
+    """A measured value with its extremes. ``rank``: what is left out first where there is no room (greatest first)."""
+
+    source: str
+    label: str
+    unit: str
+    digits: int
+    rank: int
+    scale: Scale | None = None
+
+
+QUANTITIES = (
+    Quantity("electrical_speed", "electrical speed", "1/min", 0, 8),
+    Quantity("motor_speed", "motor speed", "1/min", 0, 1),
+    Quantity("output_speed", "output speed", "1/min", 0, 6),
+    Quantity("battery_voltage", "battery voltage", "V", 2, 0),
+    Quantity("mean_cell_voltage", "cell voltage", "V", 2, 4, CELL),
+    Quantity("battery_current", "battery current", "A", 1, 0),
+    Quantity("motor_current", "motor current", "A", 1, 5),
+    Quantity("peak_current", "peak current", "A", 1, 7),
+    Quantity("battery_power", "power", "W", 0, 3),
+    Quantity("power_stage_temperature", "power stage", "degC", 0, 0, TEMPERATURE),
+    Quantity("bec_temperature", "BEC", "degC", 0, 4, TEMPERATURE),
+    Quantity("bec_voltage", "BEC voltage", "V", 2, 9),
+    Quantity("bec_current", "BEC current", "A", 2, 10),
+    Quantity("throttle", "throttle", "%", 0, 2, PERCENT),
+    Quantity("output_opening", "opening", "%", 0, 5, PERCENT),
+)
+QUANTITY = {quantity.source: quantity for quantity in QUANTITIES}
+_SUMMARIES = {OperatingError.OPERATING_ERROR_FOUND.text, OperatingError.OPERATING_WARNING_FOUND.text}
+_NO_ALARM = {OperatingError.PROGRAMMING_ALLOWED.text}
+
+
+class Spread:
+    """Least and greatest of the values so far; None before the first."""
+
+    __slots__ = ("high", "low")
+
+    def __init__(self) -> None:
+        self.low: float | None = None
+        self.high: float | None = None
+
+    def take(self, value: float) -> None:
+        if self.low is None or value < self.low:
+            self.low = value
+        if self.high is None or value > self.high:
+            self.high = value
+
+
+class Active(NamedTuple):
+    """A bit that an ESC has set."""
+
+    name: str
+    severity: Severity
+    meaning: str
+
+
+def words(text: str) -> str:
+    """A name as people write it: ``SpoolUpFromStill`` -> ``spool up from still``, ``RpmControl`` -> ``RPM control``."""
+    parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]", text)
+    return " ".join(part if len(part) > 1 and part.isupper() else part.lower() for part in parts).replace("rpm", "RPM")
+
+
+class EscMonitor:
+    """One ESC as the bus tells of it. All values are those of the last ``Monitor.advance``."""
+
+    def __init__(self, settings: EscSettings, index: int, view: View) -> None:
+        self.name = settings.name
+        self.spreads = {quantity.source: Spread() for quantity in QUANTITIES}
+        self._settings = settings
+        self._index = index
+        self._view = view
+        known = sources(settings)
+        columns = [(name, view.reader.column_of(name, index)) for name in known]
+        self._columns = {name: column for name, column in columns if column is not None}
+        self._factors = {
+            name: _to_source(view.reader.columns[column].unit, known[name].unit)
+            for name, column in self._columns.items()
+        }
+        flags = {bit.text for kind in (OperatingError, SelfTestError) for bit in kind}
+        self._plain = {
+            group: [
+                column for name, column in self._columns.items() if known[name].group is group and name not in flags
+            ]
+            for group in (Group.LIVE, Group.INFO)
+        }
+        self.units = {
+            name: known[name].unit
+            for name in self._columns
+            if name not in {*flags, "operating_errors", "selftest_errors"}
+        }
+        """Unit of each source that the DBC has, in the order of the sources; without flags and words of flags."""
+
+    def has(self, source: str) -> bool:
+        """True where the DBC has a signal for a source."""
+        return source in self._columns
+
+    def value(self, source: str) -> Value:
+        """In the source's unit; None where it is not available."""
+        column = self._columns.get(source)
+        if column is None:
+            return None
+        value = self._view.values[column]
+        if value is None or isinstance(value, str):
+            return value
+        return _converted(value, self._factors[source])
+
+    def number(self, source: str) -> float | None:
+        """The same for a source that is a number. The cell voltage is computed where the DBC has none but the cells are known."""
+        value = self.value(source)
+        if value is None and source == "mean_cell_voltage":
+            cells = self._settings.cell_count or self.number("cell_count")
+            voltage = self.value("battery_voltage")
+            if cells and isinstance(voltage, (int, float)):
+                value = voltage / cells
+        return value if isinstance(value, (int, float)) else None
+
+    @property
+    def is_fresh(self) -> bool:
+        """True while there is any measured value."""
+        return any(self._view.values[column] is not None for column in self._plain[Group.LIVE])
+
+    @property
+    def state(self) -> str | None:
+        """The operating state's name; a number that has none as it is; None where it is not available."""
+        value = self.value("operating_state")
+        if value is None:
+            value = self.value("operating_state_raw")
+        if isinstance(value, (int, float)):
+            return state_text(int(value)) or f"state {int(value)}"
+        return value
+
+    @property
+    def link(self) -> str | None:
+        """The link state's name; None where it is not available."""
+        value = self.value("link_state")
+        if isinstance(value, (int, float)):
+            return _enumerated(LinkState, value)
+        return value
+
+    @property
+    def is_link_ok(self) -> bool:
+        """True where the link is known to be good; without a word of the DBC on it: where there are values."""
+        return normalize(self.link or "") == "ok" if self.has("link_state") else self.is_fresh
+
+    @property
+    def device(self) -> str:
+        """Device, variant and firmware; empty where not available."""
+        value = self.value("device")
+        if value is None:
+            value = self.value("device_raw")
+        if isinstance(value, (int, float)):
+            value = device_text(int(value)) or f"device {int(value)}"
+        if value is None:
+            return ""
+        value = next((device.text for device in Device if normalize(device.text) == normalize(value)), value)
+        variant, main, sub = (self.number(name) for name in ("variant", "firmware_main", "firmware_sub"))
+        text = value if variant is None else f"{value} {variant:.0f}"
+        return text if main is None or sub is None else f"{text}, firmware {main:.0f}.{sub:.0f}"
+
+    @property
+    def active(self) -> list[Active]:
+        """The bits that are set, errors first. A flag means nothing while nothing else of its frame is available."""
+        found = [
+            *self._active(OperatingError, "operating_errors", Group.LIVE),
+            *self._active(SelfTestError, "selftest_errors", Group.INFO),
+        ]
+        return sorted(found, key=lambda active: list(Severity).index(active.severity))
+
+    @property
+    def alarms(self) -> list[Active]:
+        """What of it is to be told to people: without what is no alarm, and without a summary of what is told anyway."""
+        told = [active for active in self.active if active.name not in _NO_ALARM]
+        plain = {active.severity for active in told if active.name not in _SUMMARIES}
+        return [active for active in told if active.name not in _SUMMARIES or active.severity not in plain]
+
+    def _active(self, kind: type[ErrorBit], word_source: str, group: Group) -> Iterable[Active]:
+        plain = self._plain[group]
+        if plain and all(self._view.values[column] is None for column in plain):
+            return
+        word_value = self.number(word_source)
+        word = int(word_value) if word_value is not None else 0
+        for bit in kind:
+            if word >> int(bit) & 1 or self.value(bit.text) == 1:
+                yield Active(bit.text, bit.severity, bit.meaning)
+        named = {int(bit) for bit in kind}
+        for number in range(32):
+            if word >> number & 1 and number not in named:
+                yield Active(f"bit{number}", Severity.WARNING, f"bit {number} of {word_source}, which has no name")
+
+
+class Monitor:
+    """The ESCs and the gateway of a layout. ``now``: nanoseconds of one clock, that of the frames."""
+
+    def __init__(self, bus: BusLayout) -> None:
+        self.bus = bus
+        self.view = View(SignalReader(bus.layout))
+        self.escs = tuple(EscMonitor(settings, index, self.view) for index, settings in enumerate(bus.escs))
+        self.start_ns: int | None = None
+        """When watching began, or the extremes were reset."""
+        self._now = 0
+        self._samples: deque[tuple[int, int]] = deque()
+        parts = self.view.reader.parts
+        self._tracked = {part.first: self._tracked_of(part.first, part.count) for part in parts}
+        cyclic = {part.first for part in parts if part.plan.cycle_ns}
+        self._missing = cyclic or {part.first for part in parts}
+
+    @property
+    def keys(self) -> frozenset[int]:
+        """CAN ids that are of interest, with EXTENDED for 29 bits."""
+        return self.view.reader.keys
+
+    @property
+    def is_complete(self) -> bool:
+        """True when every message that comes cyclicly has come."""
+        return not self._missing
+
+    @property
+    def frames(self) -> int:
+        return self.view.frames
+
+    def take(self, frame: CanFrame, now: int) -> None:
+        """A frame that came at ``now``. What is not of the layout is left alone."""
+        if frame.remote:
+            return
+        self._now = now = max(now, self._now)
+        self.view.expire(now)
+        chunks = self.view.take(frame.key, frame.data, now)
+        for first, values in chunks or ():
+            self._missing.discard(first)
+            for offset, spread, factor in self._tracked[first]:
+                value = values[offset]
+                if value is not None and not isinstance(value, str):
+                    spread.take(_converted(value, factor))
+
+    def advance(self, now: int) -> None:
+        """Time has passed: what has stayed away for too long is not available any more."""
+        self._now = now = max(now, self._now)
+        if self.start_ns is None:
+            self.start_ns = now
+        self.view.expire(now)
+        samples = self._samples
+        if not samples or now - samples[-1][0] >= _RATE_STEP_NS:
+            samples.append((now, self.view.frames))
+            while now - samples[0][0] > _RATE_NS:
+                samples.popleft()
+
+    def reset(self) -> None:
+        """Extremes begin anew."""
+        for esc in self.escs:
+            for spread in esc.spreads.values():
+                spread.low = spread.high = None
+        self.start_ns = self._now
+
+    @property
+    def frame_rate(self) -> float | None:
+        """Frames of the layout in a second; None before there is a second to count in."""
+        if len(self._samples) < 2:
+            return None
+        (begin, first), (end, last) = self._samples[0], self._samples[-1]
+        return (last - first) * SECOND / (end - begin) if end - begin >= SECOND // 2 else None
+
+    @property
+    def watched_s(self) -> float:
+        """Since the start, or since the extremes were reset."""
+        return 0.0 if self.start_ns is None else (self._now - self.start_ns) / SECOND
+
+    @property
+    def silent_ns(self) -> int:
+        """Since the last frame, or since the start where none came yet."""
+        last = self.view.last_ns if self.view.last_ns is not None else self.start_ns
+        return 0 if last is None else max(0, self._now - last)
+
+    @property
+    def gateway_state(self) -> str | None:
+        """Name of the gateway's state; None where it is not available."""
+        return self._gateway("gateway_state", GatewayState)
+
+    @property
+    def can_state(self) -> str | None:
+        """Name of the state of the gateway's CAN controller; None where it is not available."""
+        return self._gateway("can_state", CanState)
+
+    @property
+    def is_replay(self) -> bool:
+        """True where the gateway says that it plays a recording."""
+        return normalize(self.gateway_state or "") == "replay"
+
+    def gateway_number(self, source: str) -> float | None:
+        """A number of the gateway's own, as ``esc_count``."""
+        value = self.view.value(source)
+        return value if isinstance(value, (int, float)) else None
+
+    def document(self) -> dict[str, Any]:
+        """Everything for a program: source names, values in the units that stand beside; None for what is not available."""
+        return {
+            "frames": self.frames,
+            "gateway": {
+                "state": self.gateway_state,
+                "can_state": self.can_state,
+                "uptime_s": self.gateway_number("uptime"),
+            },
+            "units": {name: unit for esc in self.escs for name, unit in esc.units.items() if unit},
+            "escs": [
+                {
+                    "name": esc.name,
+                    "link": esc.link,
+                    "state": esc.state,
+                    "device": esc.device or None,
+                    "errors": [active.name for active in esc.active if active.severity is Severity.ERROR],
+                    "warnings": [active.name for active in esc.active if active.severity is Severity.WARNING],
+                    "status": [active.name for active in esc.active if active.severity is Severity.STATUS],
+                    "values": {name: esc.value(name) for name in esc.units},
+                }
+                for esc in self.escs
+            ],
+        }
+
+    def _gateway(self, source: str, kind: type[GatewayState] | type[CanState]) -> str | None:
+        value = self.view.value(source)
+        return _enumerated(kind, value) if isinstance(value, (int, float)) else value
+
+    def _tracked_of(self, first: int, count: int) -> list[tuple[int, Spread, tuple[float, float] | None]]:
+        """Which of a part's values have extremes, and where those are kept."""
+        found = []
+        for offset in range(count):
+            column = self.view.reader.columns[first + offset]
+            if column.esc is None or column.source not in QUANTITY:
+                continue
+            if self.view.reader.column_of(column.source, column.esc) == first + offset:
+                esc = self.escs[column.esc]
+                factor = _to_source(column.unit, sources(self.bus.escs[column.esc])[column.source].unit)
+                found.append((offset, esc.spreads[column.source], factor))
+        return found
+
+
+def _to_source(unit: str, source_unit: str) -> tuple[float, float] | None:
+    """Factor and offset from a signal's unit to that of its source; None where they are the same."""
+    found = units.conversion(unit or source_unit, source_unit)
+    if found is None:
+        return None
+    factor, offset = found
+    return None if factor == 1 and offset == 0 else (float(factor), float(offset))
+
+
+def _converted(value: float, factor: tuple[float, float] | None) -> float:
+    return value if factor is None else round(value * factor[0] + factor[1], 9)
+
+
+def _enumerated(kind: type[LinkState] | type[GatewayState] | type[CanState], number: float) -> str:
+    names: Mapping[int, str] = {int(member): member.name.title().replace("_", "") for member in kind}
+    return names.get(int(number), str(int(number)))

@@ -1,0 +1,200 @@
+"""The screen in a real terminal (tmux): drawn, redrawn after a resize, obeying keys, and leaving the terminal as it was."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from monitor_tools import flight, layout_of, plain, with_errors, write_log
+
+from kontronik_can_gw.protocol.states import OperatingError
+from kontronik_can_gw.simulator import EscOptions
+
+if shutil.which("tmux") is None:
+    pytest.skip("tmux is not installed: apt-get install tmux", allow_module_level=True)
+
+
+class Terminal:
+    """A shell in a tmux server of its own."""
+
+    def __init__(self, folder: Path, size: tuple[int, int], term: str = "screen-256color", **environment: str) -> None:
+        self._socket = str(folder / "tmux")
+        given = {"PATH": os.environ["PATH"], "HOME": str(folder), "LANG": "C.UTF-8", "PS1": "> ", "SHELL": "/bin/sh"}
+        given |= {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))} | environment
+        (folder / "tmux.conf").write_text(f'set -g default-terminal "{term}"\nset -g status off\n')
+        self._environment = given
+        width, height = size
+        self._tmux("-f", str(folder / "tmux.conf"), "new-session", "-d", "-x", str(width), "-y", str(height), "/bin/sh")
+
+    def _tmux(self, *words: str) -> str:
+        done = subprocess.run(
+            ["tmux", "-u", "-S", self._socket, *words], capture_output=True, text=True, env=self._environment, timeout=20
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def type(self, text: str) -> None:
+        self._tmux("send-keys", "-l", text)
+
+    def press(self, key: str) -> None:
+        self._tmux("send-keys", key)
+
+    def resize(self, width: int, height: int) -> None:
+        self._tmux("resize-window", "-x", str(width), "-y", str(height))
+
+    def coloured(self) -> str:
+        return self._tmux("capture-pane", "-e", "-p")
+
+    def lines(self) -> list[str]:
+        return [line.rstrip() for line in self._tmux("capture-pane", "-p").split("\n")[:-1]]
+
+    def until(self, wanted: Callable[[list[str]], object], what: str, seconds: float = 15) -> list[str]:
+        end = time.monotonic() + seconds
+        while not wanted(lines := self.lines()):
+            assert time.monotonic() < end, f"{what}: not within {seconds} s:\n" + "\n".join(lines)
+            time.sleep(0.05)
+        return lines
+
+    def monitor(self, *words: object) -> None:
+        command = shlex.join([sys.executable, "-m", "kontronik_can_gw", "monitor", *map(str, words)])
+        self.type(f"{command}; echo code $?\n")
+
+    def close(self) -> None:
+        self._tmux("kill-server")
+
+
+Open = Callable[..., Terminal]
+
+
+@pytest.fixture
+def terminal(tmp_path: Path) -> Iterator[Open]:
+    opened: list[Terminal] = []
+
+    def start(size: tuple[int, int] = (80, 24), **more: str) -> Terminal:
+        folder = tmp_path / f"t{len(opened)}"
+        folder.mkdir()
+        opened.append(Terminal(folder, size, **more))
+        return opened[-1]
+
+    yield start
+    for each in opened:
+        each.close()
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    for count in (1, 8):
+        names = [f"esc{index + 1}" for index in range(count)]
+        write_log(
+            folder / f"{count}.log",
+            flight(layout_of(names), 60 if count == 1 else 30, [with_errors(OperatingError.UNDERVOLTAGE)]),
+        )
+        escs = "".join(f'[[esc]]\nname = "{name}"\nport = "/dev/ttyX{name}"\npole_pairs = 7\n' for name in names)
+        (folder / f"{count}.toml").write_text(f"[can]\nbitrate = 1000000\n{escs}")
+    write_log(folder / "short.log", flight(layout_of(["esc1"]), 2, [EscOptions()]))
+    return folder
+
+
+def is_drawn(lines: list[str]) -> bool:
+    return "frames/s" in lines[0] and "quit" in lines[-1] and " - frames/s" not in lines[0]
+
+
+def test_one_esc_is_drawn_and_follows_the_size_of_the_terminal(terminal: Open, logs: Path) -> None:
+    screen = terminal()
+    screen.monitor(logs / "1.log", "-c", logs / "1.toml")
+    lines = screen.until(is_drawn, "a screen")
+    assert lines[0].startswith(" 1.log ")
+    assert any(re.match(r"battery voltage +V +\d\d\.\d\d +\d\d\.\d\d +\d\d\.\d\d$", line) for line in lines)
+    assert "ERROR: battery voltage too low" in lines
+    assert re.search(r"\x1b\[(?:\d+;)*31m(?:\x1b\[[\d;]*m)*ERROR: battery", screen.coloured())
+    for width, height in ((120, 40), (60, 20), (80, 24), (40, 10)):
+        screen.resize(width, height)
+        lines = screen.until(
+            lambda lines, w=width, h=height: len(lines) == h and is_drawn(lines) and len(lines[0]) == w,  # type: ignore[misc]
+            f"{width}x{height}",
+        )
+        assert "ERROR: battery voltage too low" in lines
+        assert sum(bool(re.match(r"battery voltage +V +\d\d\.\d\d", line)) for line in lines) == 1
+
+
+def test_values_move_and_keys_are_obeyed(terminal: Open, logs: Path) -> None:
+    screen = terminal()
+    screen.monitor(logs / "8.log", "-c", logs / "8.toml")
+    lines = screen.until(lambda lines: sum(line.startswith("ok 100 Hz") for line in lines) == 8, "a table")
+    assert is_drawn(lines)
+    assert lines[1].startswith("ESC")
+    before = screen.lines()[3]
+    screen.until(lambda lines: lines[3] != before, "another speed")
+    screen.press("3")
+    screen.until(lambda lines: "esc3" in lines[1] and "esc4" not in "".join(lines), "one ESC")
+    screen.press("a")
+    screen.until(lambda lines: lines[1].startswith("ESC"), "all")
+    screen.press("Space")
+    still = screen.until(lambda lines: "PAUSED" in lines[0], "a pause")
+    time.sleep(0.5)
+    assert screen.lines()[:-1] == still[:-1]
+    screen.press("r")
+    screen.until(lambda lines: lines[-1].endswith("min/max of 0 s"), "a reset")
+    screen.press("q")
+    lines = screen.until(lambda lines: any(line == "code 0" for line in lines), "the end")
+    assert any("seen on 8.log, none sent" in line for line in lines)
+    screen.type("echo still he''re\n")
+    screen.until(lambda lines: "still here" in lines and any("echo still" in line for line in lines), "an echo")
+
+
+def test_ctrl_c_ends_it_and_ctrl_z_is_borne(terminal: Open, logs: Path) -> None:
+    screen = terminal()
+    screen.monitor(logs / "1.log")
+    screen.until(is_drawn, "a screen")
+    screen.press("C-z")
+    screen.until(lambda lines: any("Stopped" in line for line in lines), "a shell")
+    screen.type("fg\n")
+    screen.until(is_drawn, "the screen again")
+    screen.press("r")
+    screen.until(lambda lines: lines[-1].endswith("min/max of 0 s"), "a key")
+    screen.press("C-c")
+    screen.until(lambda lines: any("none sent" in line for line in lines), "the end")
+
+
+def test_the_end_of_a_file_stays_on_the_screen(terminal: Open, logs: Path) -> None:
+    screen = terminal()
+    screen.monitor(logs / "short.log")
+    lines = screen.until(lambda lines: "END OF FILE" in lines[0], "the end")
+    assert any(re.match(r"battery voltage +V +\d\d\.\d\d", line) for line in lines)
+    screen.press("q")
+    screen.until(lambda lines: "code 0" in lines, "the end")
+
+
+def test_without_colour_there_is_none(terminal: Open, logs: Path) -> None:
+    screen = terminal(NO_COLOR="1")
+    screen.monitor(logs / "1.log", "-c", logs / "1.toml")
+    screen.until(is_drawn, "a screen")
+    shown = screen.coloured()
+    assert "ERROR: battery voltage too low" in plain(shown)
+    assert not re.search(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7])m", shown)
+
+
+def test_without_utf8_bars_are_ascii(terminal: Open, logs: Path) -> None:
+    screen = terminal(PYTHONIOENCODING="ascii")
+    screen.monitor(logs / "1.log")
+    lines = screen.until(lambda lines: is_drawn(lines) and any("##" in line for line in lines), "a bar")
+    assert "".join(lines).isascii()
+    assert "?" not in "".join(lines)
+    assert any(re.match(r"power stage +degC +\d+ +\d+ +\d+ +#+\.+$", line) for line in lines)
+
+
+def test_a_dumb_terminal_gets_lines(terminal: Open, logs: Path) -> None:
+    screen = terminal((150, 24), TERM="dumb")
+    screen.type("TERM=dumb\n")
+    screen.monitor(logs / "1.log", "--interval", "0.3")
+    lines = screen.until(lambda lines: sum("  esc1  link ok" in line for line in lines) >= 3, "lines")
+    assert not any("frames/s" in line for line in lines)
+    screen.press("C-c")
+    screen.until(lambda lines: "code 0" in lines, "the end")

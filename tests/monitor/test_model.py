@@ -1,0 +1,361 @@
+"""The model: values by the names of sources, extremes, states, errors; what is not available is nothing."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cantools.database
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from monitor_tools import STEP_NS, Timed, flight, layout_of, with_errors
+
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.dbc_output.unpacker import SignalReader
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.offline.monitor import CELL, PERCENT, QUANTITIES, TEMPERATURE, Monitor, Scale, Zone, words
+from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError, Severity
+from kontronik_can_gw.simulator import SECOND_NS, EscOptions
+from kontronik_can_gw.sources import sources
+from kontronik_can_gw.telemetry import EscSettings
+
+ONE = layout_of(["esc1"])
+TWO = layout_of(["left", "right"])
+FLIGHT_OF_TWO = flight(TWO, 12, [EscOptions(device=Device.JIVEPRO), with_errors(OperatingError.UNDERVOLTAGE)])
+
+
+def watched(bus: BusLayout, frames: Timed, until: float | None = None) -> Monitor:
+    """A monitor that has seen frames, and time up to ``until`` (s)."""
+    monitor = Monitor(bus)
+    monitor.advance(0)
+    for now, frame in frames:
+        monitor.take(frame, now)
+        monitor.advance(now)
+    if until is not None:
+        monitor.advance(round(until * SECOND_NS))
+    return monitor
+
+
+def test_values_are_those_that_cantools_decodes() -> None:
+    """An oracle that shares nothing with our reader."""
+    monitor = watched(TWO, FLIGHT_OF_TWO)
+    decoded: dict[str, object] = {}
+    for _, frame in FLIGHT_OF_TWO:
+        decoded.update(TWO.database.decode_message(frame.can_id, frame.data))  # type: ignore[arg-type]
+    compared = 0
+    for esc, prefix in zip(monitor.escs, ("Left", "Right"), strict=True):
+        for source in esc.units:
+            signal = prefix.lower() + "".join(part.title() for part in source.split("_"))
+            found = [name for name in decoded if name.lower() in (signal.lower(), f"{signal.lower()}percent")]
+            assert len(found) == 1, (source, found)
+            value = decoded[found[0]]
+            expected = (
+                None if str(value) == "NotAvailable" else value if isinstance(value, (int, float)) else str(value)
+            )
+            assert esc.value(source) == (pytest.approx(expected) if isinstance(expected, float) else expected), source
+            compared += 1
+    assert compared > 80
+
+
+def test_extremes_are_those_of_all_values_that_came() -> None:
+    monitor = watched(TWO, FLIGHT_OF_TWO)
+    by_signal: dict[str, list[float]] = {}
+    for _, frame in FLIGHT_OF_TWO:
+        for name, value in TWO.database.decode_message(frame.can_id, frame.data).items():  # type: ignore[union-attr]
+            if isinstance(value, (int, float)):
+                by_signal.setdefault(name, []).append(value)
+    for index, prefix in enumerate(("Left", "Right")):
+        for signal, source in (
+            ("BatteryVoltage", "battery_voltage"), ("BatteryCurrent", "battery_current"), ("MotorSpeed", "motor_speed"),
+            ("PowerStageTemperature", "power_stage_temperature"), ("ThrottlePercent", "throttle"),
+            ("BatteryPower", "battery_power"), ("MeanCellVoltage", "mean_cell_voltage"),
+        ):  # fmt: skip
+            values = by_signal[prefix + signal]
+            spread = monitor.escs[index].spreads[source]
+            assert (spread.low, spread.high) == pytest.approx((min(values), max(values)))
+
+
+@given(st.lists(st.one_of(st.none(), st.integers(0, 65533), st.integers(-200, 200)), min_size=1, max_size=30))
+@settings(max_examples=100, deadline=None)
+def test_extremes_and_availability_hold_for_any_values(values: list[int | None]) -> None:
+    """Frames packed by cantools; None is sent as NotAvailable."""
+    message = ONE.database.get_message_by_name("EscCurrent")
+    monitor = Monitor(ONE)
+    esc = monitor.escs[0]
+    sent: list[float] = []
+    for step, value in enumerate(values):
+        current = None if value is None else max(-3276.0, min(3276.0, value / 10))
+        data = {signal.name: 0 for signal in message.signals}
+        data["BatteryCurrent"] = "NotAvailable" if current is None else current  # type: ignore[assignment]
+        monitor.take(CanFrame(message.frame_id, message.encode(data)), step * STEP_NS)
+        if current is not None:
+            sent.append(current)
+        assert esc.number("battery_current") == (None if current is None else pytest.approx(current))
+        spread = esc.spreads["battery_current"]
+        if sent:
+            assert [spread.low, spread.high] == pytest.approx([min(sent), max(sent)])
+        else:
+            assert (spread.low, spread.high) == (None, None)
+    monitor.reset()
+    assert (esc.spreads["battery_current"].low, esc.spreads["battery_current"].high) == (None, None)
+
+
+@given(st.lists(st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans()), max_size=40), st.data())
+@settings(max_examples=100, deadline=None)
+def test_any_frames_are_borne(frames: Sequence[tuple[int, bytes, bool]], data: st.DataObject) -> None:
+    """Foreign ids, short data, any bits; times that jump."""
+    monitor = Monitor(ONE)
+    ids = sorted(key for key in monitor.keys)
+    for number, content, known in frames:
+        can_id = ids[number % len(ids)] if known else number
+        now = data.draw(st.integers(0, 10 * SECOND_NS))
+        monitor.take(CanFrame(can_id, content, can_id > 0x7FF, remote=number % 7 == 0), now)
+        monitor.advance(now)
+        json.dumps(monitor.document(), allow_nan=False)
+        for esc in monitor.escs:
+            assert all(esc.value(source) is None or not isinstance(esc.value(source), bool) for source in esc.units)
+            for spread in esc.spreads.values():
+                assert (spread.low is None) == (spread.high is None)
+                assert spread.low is None or spread.high is None or spread.low <= spread.high
+
+
+def test_nothing_old_is_shown_when_frames_stay_away() -> None:
+    frames = flight(ONE, 2)
+    monitor = watched(ONE, frames)
+    assert monitor.escs[0].number("battery_voltage") is not None
+    assert monitor.escs[0].state is not None
+    monitor.advance(7 * SECOND_NS)
+    esc = monitor.escs[0]
+    assert all(esc.value(source) is None for source in esc.units)
+    assert (esc.state, esc.link, esc.device, esc.active) == (None, None, "", [])
+    assert (monitor.gateway_state, monitor.can_state) == (None, None)
+    assert monitor.silent_ns >= 5 * SECOND_NS
+    assert esc.spreads["battery_voltage"].high is not None, "extremes stay"
+
+
+def test_a_lost_telemetry_line_leaves_the_link_and_no_values() -> None:
+    """The gateway still sends: NotAvailable."""
+    monitor = watched(ONE, flight(ONE, 3, [with_errors(OperatingError.BEC_OVERCURRENT)], until=1.5))
+    esc = monitor.escs[0]
+    assert esc.link == "Lost"
+    assert not esc.is_link_ok
+    assert esc.number("battery_voltage") is None
+    assert esc.active == []
+    assert not esc.is_fresh
+
+
+def test_errors_have_their_meaning_and_come_first() -> None:
+    bits = (
+        OperatingError.POWER_STAGE_OVERTEMP_WARNING,
+        OperatingError.UNDERVOLTAGE,
+        OperatingError.OPERATING_ERROR_FOUND,
+        OperatingError.PROGRAMMING_ALLOWED,
+        SelfTestError.TEST_EEPROM_EMPTY,
+    )
+    (esc,) = watched(ONE, flight(ONE, 3, [with_errors(*bits)])).escs
+    assert {active.name for active in esc.active} == {bit.text for bit in bits}
+    assert [(active.name, active.severity) for active in esc.alarms] == [
+        ("undervoltage", Severity.ERROR),
+        ("test_eeprom_empty", Severity.ERROR),
+        ("power_stage_overtemp_warning", Severity.WARNING),
+    ]
+    assert esc.alarms[0].meaning == OperatingError.UNDERVOLTAGE.meaning
+
+
+def test_a_summary_that_stands_alone_is_told() -> None:
+    (esc,) = watched(ONE, flight(ONE, 2, [with_errors(OperatingError.OPERATING_WARNING_FOUND)])).escs
+    assert [active.name for active in esc.alarms] == ["operating_warning_found"]
+
+
+def test_programming_allowed_is_no_alarm() -> None:
+    (esc,) = watched(ONE, flight(ONE, 2, [with_errors(OperatingError.PROGRAMMING_ALLOWED)])).escs
+    assert esc.alarms == []
+    assert [active.name for active in esc.active] == ["programming_allowed"]
+
+
+USERS_DBC = """VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: Gw Logger
+
+BO_ 2566844672 Main: 8 Gw
+ SG_ PackVolt : 0|16@1+ (1,0) [0|65533] "mV" Logger
+ SG_ StageTemp : 16|16@1+ (0.1,0) [0|6553.3] "K" Logger
+ SG_ ErrorWord : 32|32@1+ (1,0) [0|4294967293] "" Logger
+
+BO_ 257 Other: 8 Gw
+ SG_ Zustand : 0|8@1+ (1,0) [0|253] "" Logger
+ SG_ Zellen : 8|8@1+ (1,0) [0|253] "" Logger
+
+BA_DEF_ BO_  "GenMsgCycleTime" INT 0 65535;
+BA_DEF_DEF_  "GenMsgCycleTime" 0;
+BA_ "GenMsgCycleTime" BO_ 2566844672 20;
+BA_ "GenMsgCycleTime" BO_ 257 100;
+"""
+
+
+@pytest.fixture
+def users(tmp_path: Path) -> BusLayout:
+    """A DBC with other names, units and a 29-bit id, bound by a configuration."""
+    from kontronik_can_gw.cli.common import assemble
+    from kontronik_can_gw.config import parse
+
+    (tmp_path / "car.dbc").write_text(USERS_DBC)
+    bind = {
+        "PackVolt": "battery_voltage", "StageTemp": "power_stage_temperature", "ErrorWord": "operating_errors",
+        "Zustand": "operating_state", "Zellen": "cell_count",
+    }  # fmt: skip
+    tables = {"dbc": {"file": str(tmp_path / "car.dbc"), "bind": bind}, "esc": [{"port": "/dev/ttyX"}]}
+    loaded = assemble(parse(tables, str(tmp_path / "c.toml")))
+    assert loaded.database is not None
+    return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
+
+
+def test_a_users_dbc_with_other_names_and_units_shows_the_same(users: BusLayout) -> None:
+    monitor = Monitor(users)
+    (esc,) = monitor.escs
+    word = 1 << int(OperatingError.UNDERVOLTAGE) | 1 << 30
+    main = users.database.get_message_by_name("Main")
+    data = main.encode({"PackVolt": 22200, "StageTemp": 333.2, "ErrorWord": word})
+    monitor.take(CanFrame(main.frame_id, data, extended=True), STEP_NS)
+    assert not monitor.is_complete
+    monitor.take(CanFrame(257, bytes((26, 6, 0, 0, 0, 0, 0, 0))), 2 * STEP_NS)
+    assert monitor.is_complete
+    assert esc.number("battery_voltage") == 22.2
+    assert esc.number("mean_cell_voltage") == pytest.approx(3.7)
+    assert esc.number("power_stage_temperature") == pytest.approx(60.05)
+    assert esc.spreads["battery_voltage"].low == 22.2
+    assert esc.state == "RPMControl"
+    assert [(active.name, active.severity) for active in esc.alarms] == [
+        ("undervoltage", Severity.ERROR),
+        ("bit30", Severity.WARNING),
+    ]
+    assert not esc.has("motor_speed")
+    assert esc.number("motor_speed") is None
+    assert esc.link is None
+    assert esc.is_link_ok
+    assert monitor.document()["units"]["battery_voltage"] == "V"
+
+
+def test_all_cyclic_messages_make_it_complete() -> None:
+    frames = flight(ONE, 3)
+    monitor = Monitor(ONE)
+    when = None
+    seen = set()
+    cyclic = {plan.can_id for plan in ONE.layout.messages if plan.cycle_ns}
+    for now, frame in frames:
+        monitor.take(frame, now)
+        seen.add(frame.can_id)
+        assert monitor.is_complete == (cyclic <= seen)
+        when = when or (now if monitor.is_complete else None)
+    assert when is not None
+    assert when <= 1.1 * SECOND_NS
+
+
+def test_the_frame_rate_is_that_of_the_last_two_seconds() -> None:
+    frames = flight(ONE, 6)
+    monitor = watched(ONE, frames)
+    recent = sum(now > 4 * SECOND_NS for now, _ in frames) / 2
+    assert monitor.frame_rate == pytest.approx(recent, rel=0.06)
+    for step in range(300):
+        monitor.advance(6 * SECOND_NS + step * STEP_NS)
+    assert monitor.frame_rate == 0
+
+
+def test_replay_is_known_by_the_gateways_word() -> None:
+    assert watched(ONE, flight(ONE, 2, replay=True)).is_replay
+    assert not watched(ONE, flight(ONE, 2)).is_replay
+
+
+def test_the_document_names_sources_and_has_null_for_what_is_not_available() -> None:
+    monitor = watched(TWO, FLIGHT_OF_TWO)
+    document = json.loads(json.dumps(monitor.document(), allow_nan=False))
+    left, right = document["escs"]
+    assert (left["name"], right["name"]) == ("left", "right")
+    assert left["values"]["bec_current"] is None, "a JIVEPro supplies none"
+    assert right["values"]["bec_current"] is not None
+    assert right["errors"] == ["undervoltage"]
+    assert left["device"].startswith("JIVEPro")
+    known = sources(EscSettings())
+    assert set(left["values"]) <= set(known)
+    assert {"crc_errors", "dropped_bytes", "link_state"} <= set(left["values"])
+    assert all(known[name].unit == unit for name, unit in document["units"].items())
+
+
+def test_a_dbc_alone_is_enough() -> None:
+    bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+    monitor = watched(bus, flight(ONE, 2))
+    assert monitor.escs[0].number("battery_voltage") is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("WaitForSignal", "wait for signal"),
+        ("RPMControl", "RPM control"),
+        ("RpmControl", "RPM control"),
+        ("Sync_Forward", "sync forward"),
+        ("Ok", "ok"),
+        ("state 99", "state 99"),
+        ("", ""),
+    ],
+)
+def test_names_are_shown_as_words(name: str, text: str) -> None:
+    assert words(name) == text
+
+
+def test_zones_and_shares_of_the_scales() -> None:
+    assert [TEMPERATURE.zone(v) for v in (20, 79.9, 80, 99.9, 100, 200)] == [
+        Zone.GOOD, Zone.GOOD, Zone.WARNING, Zone.WARNING, Zone.ALARM, Zone.ALARM,
+    ]  # fmt: skip
+    assert [CELL.zone(v) for v in (4.2, 3.51, 3.5, 3.31, 3.3, 0)] == [
+        Zone.GOOD, Zone.GOOD, Zone.WARNING, Zone.WARNING, Zone.ALARM, Zone.ALARM,
+    ]  # fmt: skip
+    assert {PERCENT.zone(v) for v in (-100, 0, 100, 250)} == {Zone.GOOD}
+    assert [TEMPERATURE.share(v) for v in (-20, 0, 55, 110, 300)] == [0, 0, 0.5, 1, 1]
+
+
+@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
+def test_a_warmer_part_is_never_in_a_better_zone(a: float, b: float) -> None:
+    low, high = sorted((a, b))
+    assert TEMPERATURE.zone(low).value <= TEMPERATURE.zone(high).value
+    assert CELL.zone(low).value >= CELL.zone(high).value
+    for scale in (TEMPERATURE, CELL, Scale(-5, 5)):
+        assert 0 <= scale.share(low) <= scale.share(high) <= 1
+
+
+def test_every_quantity_is_a_source_with_a_unit() -> None:
+    from kontronik_can_gw.dbc_output import units
+
+    known = sources(EscSettings())
+    for quantity in QUANTITIES:
+        converted = units.conversion(known[quantity.source].unit, quantity.unit)
+        assert converted is not None
+        factor, offset = converted
+        assert factor == 1
+        assert offset == 0
+
+
+def test_the_model_reads_as_many_frames_as_a_full_bus_brings() -> None:
+    """At least 8000 frames a second on any machine; a bus of 1 Mbit/s has 9000 at most. Much more here."""
+    import time
+
+    frames = FLIGHT_OF_TWO[:4000]
+    monitor = Monitor(TWO)
+    begin = time.process_time()
+    for now, frame in frames:
+        monitor.take(frame, now)
+    seconds = time.process_time() - begin
+    assert len(frames) / seconds > 8000
+    assert not math.isnan(seconds)
+
+
+def test_keys_are_those_of_the_layout() -> None:
+    assert Monitor(TWO).keys == SignalReader(TWO.layout).keys
+    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
+    assert len(Monitor(ONE).keys) == len(database.messages)  # type: ignore[union-attr]
