@@ -9,7 +9,7 @@
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from kontronik_can_gw.cia301.heartbeat import NEVER
 from kontronik_can_gw.protocol.states import OperatingError, Severity
@@ -44,21 +44,43 @@ _SUMMARY_BITS = sum(bit for bit, _ in _SUMMARIES)
 
 
 class GatewayError(Enum):
-    """What the gateway itself finds: error code, byte 4."""
+    """What the gateway itself finds. ``value``: error code, byte 4."""
 
-    TELEMETRY_LOST = 0x7510, 1
-    CRC_RATE = 0x7510, 2
-    PORT_GONE = 0x7510, 3
-    OTHER_DEVICE = 0x7510, 4
-    RECEIVE_OVERRUN = 0x8110, 0
-    CAN_PASSIVE = 0x8120, 0
-    HEARTBEAT_LOST = 0x8130, 0
-    """Byte 4: the node-ID."""
-    BUS_OFF_LEFT = 0x8140, 0
-    ID_COLLISION = 0x8150, 0
-    """Somebody else sends with an id of this node."""
-    SYNC_LENGTH = 0x8240, 0
-    PARAMETER_FILE = 0x6300, 0
+    meaning: str
+    remedy: str
+    """What a person should do."""
+
+    def __new__(cls, code: int, detail: int, meaning: str, remedy: str) -> Self:
+        member = object.__new__(cls)
+        member._value_ = code, detail
+        member.meaning = meaning
+        member.remedy = remedy
+        return member
+
+    # fmt: off
+    TELEMETRY_LOST = (0x7510, 1, "telemetry lost",
+        "Check that the ESC is switched on, its telemetry setting, and the cable to the gateway.")
+    CRC_RATE = (0x7510, 2, "telemetry degraded: many CRC errors or dropped bytes",
+        "Keep the telemetry cable short and away from the motor's wires. Check plugs and ground.")
+    PORT_GONE = (0x7510, 3, "serial port gone",
+        "Check the USB adapter and its plug. It is tried again for ever; kontronik-can-gw doctor says more.")
+    OTHER_DEVICE = (0x7510, 4, "another device than [esc].device says",
+        "Check which ESC is plugged in where, or correct device in the configuration.")
+    RECEIVE_OVERRUN = (0x8110, 0, "received CAN frames were lost",
+        "Let masters send less at once; look for somebody who floods the bus.")
+    CAN_PASSIVE = (0x8120, 0, "CAN controller error passive",
+        "Check bit rate, termination (120 ohm at both ends) and cables of the bus, and that another node is switched on.")
+    HEARTBEAT_LOST = (0x8130, 0, "a watched heartbeat stayed away; byte 4: the node-ID",
+        "Check that node, its supply and its bus cable, and the time in 1016h.")
+    BUS_OFF_LEFT = (0x8140, 0, "back from bus-off",
+        "Look for a short, a wrong bit rate or a bad cable on the bus.")
+    ID_COLLISION = (0x8150, 0, "somebody else sends with an id of this node: two nodes with one node-ID?",
+        "Give each node of the bus another node-ID, and each message another id.")
+    SYNC_LENGTH = (0x8240, 0, "SYNC of a wrong length",
+        "Let the master send SYNC as 1019h says: without data, or with one byte where it has a counter.")
+    PARAMETER_FILE = (0x6300, 0, "the parameter file could not be read: defaults",
+        "Let the master store its parameters anew, or restore the file. Check the disk.")
+    # fmt: on
 
 
 _OF_COMMUNICATION = frozenset(error.value[0] for error in (GatewayError.HEARTBEAT_LOST, GatewayError.SYNC_LENGTH))

@@ -16,7 +16,8 @@ from kontronik_can_gw.telemetry import MS
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration")
     parser.epilog = (
-        "Prints the effective configuration, each message and signal with its source, what is lost, and the bus load."
+        "Prints the effective configuration, each message and signal with its source, what is lost, and the bus load. "
+        "Opens no port and no interface. Exit code: 0 it can be used (there may be warnings), 2 it cannot."
     )
 
 

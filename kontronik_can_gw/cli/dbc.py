@@ -50,6 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--node", metavar="NODE", help="transmitter node of our messages (default: the only one that sends)"
     )
     parser.add_argument("-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)")
+    parser.epilog = (
+        "Prints a DBC that every tool reads; what should be known about it goes to standard error. "
+        "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or DBC."
+    )
 
 
 def main(args: argparse.Namespace) -> int:

@@ -36,6 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the DCF of the node with this node-ID: the EDS and its values",
     )
     parser.add_argument("-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)")
+    parser.epilog = (
+        "Prints the EDS as it is in use, byte by byte, or a DCF by CiA 306. "
+        "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or EDS."
+    )
 
 
 def main(args: argparse.Namespace) -> int:

@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="where to (default gateway.toml; - for standard output)",
     )
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
+    parser.epilog = "Exit code: 0 written, 1 it cannot be written, 2 the file exists, or wrong usage."
 
 
 def main(args: argparse.Namespace) -> int:

@@ -29,6 +29,10 @@ _CHANNEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "install and uninstall need root, except with --root or --dry-run, and print what they do. "
+        "Exit code: 0 done, 1 something failed, 2 wrong usage; of status 0 running, 3 not running."
+    )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     install_parser = actions.add_parser(
         "install", help="write units, udev rules, user and an example configuration; enable"

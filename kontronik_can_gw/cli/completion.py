@@ -1,0 +1,58 @@
+"""``completion``: a script that lets a shell complete commands, options, choices and file names. Made by shtab from the parser."""
+
+import argparse
+from collections.abc import Iterator
+
+from kontronik_can_gw.errors import RunError
+
+SHELLS = ("bash", "zsh", "tcsh", "fish")
+EPILOG = """\
+bash:  kontronik-can-gw completion bash > ~/.local/share/bash-completion/completions/kontronik-can-gw
+       or once, for this shell: eval "$(kontronik-can-gw completion bash)"
+zsh:   kontronik-can-gw completion zsh > ~/.zfunc/_kontronik-can-gw     (~/.zfunc is in fpath before compinit)
+tcsh:  kontronik-can-gw completion tcsh > ~/.kontronik-can-gw.tcsh      (source it in ~/.tcshrc)
+fish:  kontronik-can-gw completion fish > ~/.config/fish/completions/kontronik-can-gw.fish
+
+exit codes: 0 done, 1 the installed shtab does not know this shell, 2 wrong usage
+"""
+_FILES = frozenset({"FILE", "DBC", "PATH", "IN", "OUT"})
+_FOLDERS = frozenset({"DIR", "FOLDER"})
+_ENDINGS = {"config": ("*.toml",), "dbc": ("*.dbc", "*.DBC"), "source": ("*.dbc", "*.DBC")}
+"""Where only some files are meant, by the name under which the option is read."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare SHELL."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    parser.add_argument("shell", metavar="SHELL", choices=SHELLS, help=", ".join(SHELLS))
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print the script. RunError where the installed shtab is too old for the shell."""
+    import shtab
+
+    from kontronik_can_gw.cli import make_parser
+
+    if args.shell not in shtab.SUPPORTED_SHELLS:
+        raise RunError(f"{args.shell}: needs a newer shtab than {shtab.__version__}: pip install --upgrade shtab")
+    parser = make_parser()
+    for action in _actions(parser):
+        names = {action.metavar} if isinstance(action.metavar, str) else set(action.metavar or ())
+        if endings := _ENDINGS.get(action.dest):
+            action.complete = shtab.glob(*endings)  # type: ignore[attr-defined]
+        elif names & _FILES:
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+        elif names & _FOLDERS:
+            action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
+    print(shtab.complete(parser, args.shell))
+    return 0
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Every option and argument of a parser and of its commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for sub in action.choices.values():
+                yield from _actions(sub)

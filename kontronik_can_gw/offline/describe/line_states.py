@@ -1,0 +1,67 @@
+"""What the states of line, CAN controller and gateway mean, and what to do. Names and numbers are in telemetry and sources."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from kontronik_can_gw.sources import CanState, GatewayState
+from kontronik_can_gw.telemetry import LinkState
+
+NOTHING = "Nothing to do."
+
+
+class Text(NamedTuple):
+    """What a state means, and what to do."""
+
+    meaning: str
+    remedy: str = NOTHING
+
+
+LINK_STATES: Mapping[LinkState, Text] = {
+    LinkState.NEVER_SEEN: Text(
+        "nothing has come since the start",
+        "Switch the ESC on. Check the cable and the telemetry setting of the ESC. A KOSMIK sends after one throttle pulse.",
+    ),
+    LinkState.SEARCHING: Text(
+        "bytes come, but no good frame yet",
+        "If it stays: the ESC may be set to another protocol, or the line is disturbed. The log and decode say what it looks like.",
+    ),
+    LinkState.OK: Text("good frames come"),
+    LinkState.DEGRADED: Text(
+        "good frames come, and many CRC errors or dropped bytes with them",
+        "Keep the telemetry cable short and away from the motor's wires. Check plugs and ground.",
+    ),
+    LinkState.LOST: Text(
+        "good frames came, and come no more",
+        "Check that the ESC is switched on, and the cable to the gateway.",
+    ),
+    LinkState.PORT_ERROR: Text(
+        "the serial port cannot be opened or read",
+        "Check the USB adapter and its plug. It is tried again for ever; kontronik-can-gw doctor says more.",
+    ),
+}
+CAN_STATES: Mapping[CanState, Text] = {
+    CanState.UNKNOWN: Text("the CAN interface does not tell"),
+    CanState.ERROR_ACTIVE: Text("works"),
+    CanState.ERROR_WARNING: Text(
+        "works, but there are errors on the bus",
+        "Check bit rate, termination (120 ohm at both ends) and cables of the bus.",
+    ),
+    CanState.ERROR_PASSIVE: Text(
+        "works, with many errors on the bus",
+        "Check bit rate, termination (120 ohm at both ends) and cables of the bus, and that another node is switched on.",
+    ),
+    CanState.BUS_OFF: Text(
+        "switched off by errors on the bus: no frame can leave",
+        "Look for a short, a wrong bit rate or a bad cable. With restart-ms 0 somebody has to restart the interface.",
+    ),
+    CanState.DOWN: Text(
+        "the CAN interface is down or missing: no frame can leave",
+        "Plug the adapter in, set the interface up. kontronik-can-gw doctor names the command.",
+    ),
+}
+GATEWAY_STATES: Mapping[GatewayState, Text] = {
+    GatewayState.STARTING: Text("opens its ports and the CAN interface"),
+    GatewayState.RUNNING: Text("at work"),
+    GatewayState.STOPPING: Text("about to end"),
+    GatewayState.REPLAY: Text("the values come from a recording, not from an ESC"),
+}
