@@ -26,6 +26,7 @@ COMMANDS = {
     "dbc": "write the DBC for several ESCs or for a configuration",
     "eds": "write the EDS, or the DCF of a CANopen node",
     "monitor": "a live screen of the ESCs, from the CAN bus or a recording",
+    "convert": "convert recordings and CAN logs to tables and to CAN logs of other formats",
     "decode": "decode recorded UART bytes to JSON lines or CSV",
     "replay": "play a recording on a CAN bus, on pseudo terminals, or as a log",
     "simulate": "simulate ESCs on pseudo terminals",

@@ -1,7 +1,6 @@
 """``kontronik-can-gw decode``: recorded UART bytes to JSON lines or CSV."""
 
 import argparse
-from typing import Self
 
 EPILOG = """\
 FILE holds the bytes as they came over the UART, nothing else; - is standard input, decoded as it comes.
@@ -31,6 +30,7 @@ def main(args: argparse.Namespace) -> int:
     from contextlib import ExitStack
     from pathlib import Path
 
+    from kontronik_can_gw.cli.progress import Progress
     from kontronik_can_gw.errors import RunError, UserError
     from kontronik_can_gw.offline import decode
 
@@ -76,7 +76,7 @@ def main(args: argparse.Namespace) -> int:
         code = 0
         failure = None
         try:
-            with _Progress(name, status.st_size if is_file else None) as progress:
+            with Progress(name, status.st_size if is_file else None) as progress:
                 if args.csv:
                     write(decode.csv_header())
                 lines = decode.csv_lines if args.csv else decode.json_lines
@@ -104,48 +104,3 @@ def main(args: argparse.Namespace) -> int:
 
 def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error)
-
-
-class _Progress:
-    """A bar on standard error, where a person looks on and the output goes elsewhere; else nothing."""
-
-    def __init__(self, name: str, size: int | None) -> None:
-        import sys
-
-        self._progress = None
-        if not sys.stderr.isatty() or sys.stdout.isatty():
-            return
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            DownloadColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-            TransferSpeedColumn,
-        )
-
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            DownloadColumn(),
-            TransferSpeedColumn(),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            transient=True,
-        )
-        self._task = self._progress.add_task(name, total=size)
-
-    def __enter__(self) -> Self:
-        if self._progress is not None:
-            self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._progress is not None:
-            self._progress.stop()
-
-    def advance(self, size: int) -> None:
-        """So many bytes more are done."""
-        if self._progress is not None:
-            self._progress.advance(self._task, size)

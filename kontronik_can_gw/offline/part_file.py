@@ -18,20 +18,21 @@ class PartFile:
         self.target = target
         self._plain = not target.exists() or target.is_file()
         self.path = target.resolve().with_name(f"{target.name}.part") if self._plain else target
-        self._file: IO[bytes] | None = None
+        self.file: IO[bytes] | None = None
+        """As ``open`` gave it."""
 
     def open(self) -> IO[bytes]:
         """Open it for writing bytes."""
         try:
-            self._file = self.path.open("wb")
+            self.file = self.path.open("wb")
         except OSError as error:
             raise RunError(f"{self.target}: cannot be written: {error.strerror}. Give another OUT.") from None
-        return self._file
+        return self.file
 
     def finish(self) -> None:
         """Everything is written: close it and give it its name."""
-        if self._file is not None:
-            self._file.close()
+        if self.file is not None:
+            self.file.close()
         if self._plain:
             with self.path.open("rb") as file:
                 os.fsync(file.fileno())
@@ -39,8 +40,8 @@ class PartFile:
 
     def discard(self) -> None:
         """It came to nothing: leave no trace."""
-        if self._file is not None:
+        if self.file is not None:
             with suppress(OSError):  # what is buffered found no room
-                self._file.close()
+                self.file.close()
         if self._plain:
             self.path.unlink(missing_ok=True)

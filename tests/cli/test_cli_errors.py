@@ -92,6 +92,7 @@ def test_an_unknown_option_is_named(command: str) -> None:
         "check": ["-c", "x"],
         "doctor": ["-c", "x"],
         "decode": ["-"],
+        "convert": ["x", "y.csv"],
         "replay": ["x", "--to", "log"],
         "service": ["status"],
         "completion": ["bash"],
@@ -119,6 +120,10 @@ OPTIONS = {
         *("-o", "--output"),
     ],
     "eds": ["-c", "--config", "--node-id", "-o", "--output"],
+    "convert": [
+        *("IN", "OUT", "--to", "--force", "-q", "--quiet", "-c", "--config", "--dbc", "--from", "--until", "--esc"),
+        *("--signals", "--rate", "--frames", "--units-line", "--live-rate"),
+    ],
     "decode": ["FILE", "--csv", "--stats"],
     "replay": [
         *("FILE", "--to", "-c", "--config", "--dbc", "--speed", "--interface", "--channel", "--unmarked", "--link"),

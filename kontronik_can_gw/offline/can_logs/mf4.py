@@ -84,7 +84,7 @@ class Mf4Reader:
         for start in range(0, cycles, _CHUNK):
             count = min(_CHUNK, cycles - start)
             columns: dict[str, Any] = {}
-            with _quiet():
+            with quiet():
                 try:
                     for part in ("ID", "DataBytes", "DataLength", "IDE", "Dir", "EDL", "BusChannel"):
                         name = f"{_GROUP}.{part}"
@@ -120,7 +120,7 @@ class Mf4Reader:
 
     def close(self) -> None:
         """Close the file and asammdf's temporary one."""
-        with _quiet():
+        with quiet():
             self._mdf.close()
 
 
@@ -139,7 +139,7 @@ class Mf4Writer:
         self._rows: list[tuple[Any, ...]] = []
         self._times: list[float] = []
         self._last = 0
-        with _quiet():
+        with quiet():
             self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
             set_start(self._mdf, start_ns or 0)
             if comment:
@@ -176,7 +176,7 @@ class Mf4Writer:
                 table[name] = np.frombuffer(b"".join(column), dtype=np.uint8).reshape(-1, 64)
             else:
                 table[name] = column
-        with _quiet():
+        with quiet():
             self._mdf.extend(0, [(np.array(self._times), None), (table, None)])
         self._rows.clear()
         self._times.clear()
@@ -188,7 +188,7 @@ class Mf4Writer:
 
     def discard(self) -> None:
         """Close asammdf's temporary file."""
-        with _quiet():
+        with quiet():
             self._mdf.close()
 
 
@@ -197,7 +197,7 @@ def _opened(module: "ModuleType", path: Path) -> Any:
     hook = sys.unraisablehook
     sys.unraisablehook = lambda _: None  # what is half made complains when it is thrown away
     try:
-        with _quiet():
+        with quiet():
             try:
                 mdf = module.MDF(path)
                 mdf.header.start_time.timestamp()
@@ -218,14 +218,14 @@ def set_start(mdf: Any, start_ns: int) -> None:
 
 def save_mf4(mdf: Any, path: Path) -> None:
     """Save and close; the file says nothing of the time of its writing, so that it is the same each time."""
-    with _quiet():
+    with quiet():
         try:
             start = mdf.header.abs_time
-            saved = Path(mdf.save(path, overwrite=True, compression=2))
-            if saved != path:  # asammdf insists on its suffix
-                saved.replace(path)
+            beside = path.with_name(f"{path.name}.mf4")  # asammdf insists on its suffix
+            Path(mdf.save(beside, overwrite=True, compression=2)).replace(path)
         finally:
             mdf.close()
+            beside.unlink(missing_ok=True)
     with path.open("r+b") as file:
         _set_history_time(file, start)
 
@@ -258,7 +258,7 @@ def _short(error: Exception) -> str:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Warnings of numpy and asammdf are not for the one who converts."""
     import warnings
 

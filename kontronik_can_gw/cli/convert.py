@@ -1,0 +1,418 @@
+"""``kontronik-can-gw convert``: recordings to tables, CAN logs and plain bytes."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+    from typing import IO, Self
+
+    from kontronik_can_gw.cli.progress import Progress
+    from kontronik_can_gw.offline.inputs import Input
+    from kontronik_can_gw.offline.replay import TimedFrame
+    from kontronik_can_gw.offline.tables import Choice
+
+TABLES = ("csv", "jsonl", "parquet", "mf4")
+LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
+BYTES = "bin"
+FORMATS = (*TABLES, *LOGS, BYTES)
+SUFFIXES = {
+    ".csv": "csv",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".mf4": "mf4",
+    ".log": "candump",
+    ".candump": "candump",
+    ".asc": "asc",
+    ".blf": "blf",
+    ".trc": "trc",
+    ".bin": BYTES,
+}
+ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
+"""What may go to standard output: it is text, and is written from its beginning to its end."""
+
+EPILOG = """\
+IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
+BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
+
+OUT is a table of all values (csv, jsonl, parquet, mf4), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
+bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .mf4 .log .candump .asc .blf .trc .bin; --to where it
+does not. - is standard output, for text. Parquet needs pyarrow, MF4 needs asammdf; they are named where they are missing.
+
+Tables have a row at each telemetry frame, or at each group of CAN frames that belong together. Values hold while they are fresh.
+Time [s] counts from the recording's first row; Utc is there where the recording knows the time of day. What is not available is
+empty in CSV, null in JSON lines and Parquet, NaN or NotAvailable in MF4. Flags are 0 and 1.
+
+Of a damaged recording everything that is intact is converted, and a summary says what is not.
+OUT takes its name only when it is whole; until then it is called OUT.part.
+
+exit codes: 0 converted, also where a part of IN is damaged; 1 there is nothing to convert, or something cannot be read or written;
+2 wrong usage
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare IN, OUT and what is wanted of it."""
+    from kontronik_can_gw.cli.bus_layout import add_layout_arguments
+
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes")
+    parser.add_argument("output", metavar="OUT", help="file to write, or - for standard output")
+    parser.add_argument("--to", metavar="FORMAT", choices=FORMATS, help=", ".join(FORMATS))
+    parser.add_argument("--force", action="store_true", help="write over OUT if it is there")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no summary")
+    add_layout_arguments(parser)
+    part = parser.add_argument_group("a part of it")
+    part.add_argument("--from", dest="start", metavar="S", type=_seconds, help="from so many seconds after the start")
+    part.add_argument("--until", dest="end", metavar="S", type=_seconds, help="up to so many seconds after the start")
+    part.add_argument("--esc", metavar="NAME", help="only the signals (or bytes) of this ESC")
+    table = parser.add_argument_group("tables")
+    table.add_argument(
+        "--signals",
+        metavar="A,B*",
+        type=_names,
+        default=[],
+        help="only these signals, in this order; * and ? stand for others",
+    )
+    table.add_argument(
+        "--rate", metavar="HZ", type=_rate, help="at most so many rows a second, the newest of each period"
+    )
+    table.add_argument("--frames", action="store_true", help="a row for each CAN frame, with its own signals only")
+    table.add_argument("--units-line", action="store_true", help="jsonl: a first line with the units")
+    parser.add_argument(
+        "--live-rate",
+        metavar="HZ",
+        type=_rate,
+        default=None,
+        help="live frames a second of plain UART bytes, which have no time (default 100)",
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Convert args.input. UserError for wrong usage, RunError where something cannot be read or written."""
+    import sys
+    import time
+    from pathlib import Path
+
+    from kontronik_can_gw.cli.bus_layout import bus_layout
+    from kontronik_can_gw.cli.progress import Progress
+    from kontronik_can_gw.errors import RunError
+    from kontronik_can_gw.offline.inputs import LIVE_RATE, open_input
+
+    form = _format(args)
+    _check(args, form)
+    source, target = Path(args.input), Path(args.output)
+    layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
+    begun = time.monotonic()
+    with open_input(source, layout, args.live_rate or LIVE_RATE) as recording:
+        work = _work_of(args, form, recording)
+        try:
+            with Progress(source.name, recording.size or None, args.output == "-") as progress:
+                told = work(progress)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            where = "standard output" if args.output == "-" else str(target)
+            raise RunError(f"{where}: cannot be written: {error.strerror or _first_line(error)}.") from None
+        except KeyboardInterrupt:
+            _say("stopped: nothing is written" if args.output != "-" else "stopped")
+            return 130
+        damage = list(recording.damage)
+        if told is None:
+            raise RunError(*_nothing(args, recording, damage))
+        if not args.quiet:
+            _say(f"{args.output}: {told}, in {time.monotonic() - begun:.1f} s")
+            if recording.times_assumed and form != BYTES:
+                _say(f"times are assumed: {args.live_rate or LIVE_RATE:g} live frames a second (--live-rate)")
+        for line in damage:
+            print(f"kontronik-can-gw convert: {args.input}: damaged: {line}", file=sys.stderr)
+    return 0
+
+
+def _work_of(args: argparse.Namespace, form: str, recording: "Input") -> "Callable[[Progress], str | None]":
+    """What does the conversion and tells what it wrote; None where there was nothing. UserError before anything is written."""
+    if form == BYTES:
+        esc = _esc(args, recording, needed=True)
+        assert esc is not None
+        return lambda progress: _write_bytes(args, recording, esc, progress)
+    if form in LOGS:
+        return lambda progress: _write_log(args, form, recording, progress)
+    from kontronik_can_gw.offline.tables import Choice
+
+    choice = Choice.of(
+        recording.reader.columns,
+        args.signals,
+        _esc(args, recording),
+        start_ns=args.start,
+        end_ns=args.end,
+        rate=args.rate,
+    )
+    return lambda progress: _write_table(args, form, recording, choice, progress)
+
+
+def _write_table(
+    args: argparse.Namespace, form: str, recording: "Input", choice: "Choice", progress: "Progress"
+) -> str | None:
+    from kontronik_can_gw.offline.tables import Rows, open_table
+
+    rows = Rows(recording, choice, args.frames)
+    table = rows.table
+    if table is None:
+        return None
+    count = 0
+    with _Out(args) as out:
+        with open_table(out.part if form in ("parquet", "mf4") else out.file, form, table, args.units_line) as writer:
+            write = writer.write
+            for row in rows:
+                write(row)
+                count += 1
+                if not count & 255:
+                    progress.reach(recording.position)
+            last_ns = row.time_ns
+            progress.reach(recording.position)
+        out.is_whole = True
+    signals = len(table.fields) - 2 * args.frames
+    return f"{_many(count, 'row')} of {_many(signals, 'signal')}, up to {last_ns / 1e9:.3f} s"
+
+
+def _write_log(args: argparse.Namespace, form: str, recording: "Input", progress: "Progress") -> str | None:
+    from kontronik_can_gw.offline.can_logs import CanLogWriter
+    from kontronik_can_gw.offline.tables import first_of
+
+    first, frames = first_of(recording.frames())
+    if first is None:
+        return None
+    origin_ns = first.time_ns
+    wall_ns = recording.wall_ns(origin_ns)
+    last, frames = first_of(_cut(frames, origin_ns, args.start, args.end))
+    if last is None:
+        return None
+    count = 0
+    with _Out(args) as out:
+        writer = CanLogWriter(
+            out.part if form == "mf4-log" else out.file,
+            LOGS[form],
+            wall_ns,
+            last.time_ns - origin_ns,
+            name=out.name,
+            comment="\n".join(f"{key}: {value}" for key, value in recording.provenance.items()),
+        )
+        try:
+            for last in frames:
+                writer.write(last.time_ns - origin_ns, last.frame, last.received)
+                count += 1
+                if not count & 255:
+                    progress.reach(recording.position)
+            progress.reach(recording.position)
+            writer.close()
+        except BaseException:
+            writer.discard()
+            raise
+        out.is_whole = True
+    told = (
+        f"{_many(count - sum(writer.left_out.values()), 'CAN frame')}, up to {(last.time_ns - origin_ns) / 1e9:.3f} s"
+    )
+    for what, number in writer.left_out.items():
+        told += f"; {number} {what} left out, which {form} does not know"
+    moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - (last.time_ns - origin_ns)
+    if abs(moved) > 1_000_000_000:
+        told += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
+    return told
+
+
+def _write_bytes(args: argparse.Namespace, recording: "Input", esc: int, progress: "Progress") -> str | None:
+    count = 0
+    with _Out(args) as out:
+        for data in recording.esc_bytes(esc):
+            out.file.write(data)
+            count += len(data)
+            progress.reach(recording.position)
+        if not count:
+            return None
+        out.is_whole = True
+    return f"{_many(count, 'byte')} of {recording.bus.escs[esc].name}"
+
+
+class _Out:
+    """Where the data goes: a file that takes its name when ``is_whole`` was set, or standard output."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        import sys
+        from pathlib import Path
+
+        from kontronik_can_gw.offline.part_file import PartFile
+
+        self.is_whole = False
+        self.name = "" if args.output == "-" else Path(args.output).name
+        self._part = None if args.output == "-" else PartFile(Path(args.output))
+        self._screen = sys.stdout.buffer
+
+    @property
+    def file(self) -> "IO[bytes]":
+        """Open for bytes."""
+        if self._part is None:
+            return self._screen
+        return self._part.file or self._part.open()
+
+    @property
+    def part(self) -> "Path":
+        """For libraries that open the file themselves."""
+        assert self._part is not None
+        return self._part.path
+
+    def __enter__(self) -> "Self":
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if self._part is None:
+            if kind is None:
+                self._screen.flush()
+        elif kind is None and self.is_whole:
+            self._part.finish()
+        else:
+            self._part.discard()
+
+
+def _cut(
+    frames: "Iterator[TimedFrame]", origin_ns: int, start_ns: int | None, end_ns: int | None
+) -> "Iterator[TimedFrame]":
+    for frame in frames:
+        since = frame.time_ns - origin_ns
+        if start_ns is not None and since < start_ns:
+            continue
+        if end_ns is not None and since > end_ns:
+            return
+        yield frame
+
+
+def _format(args: argparse.Namespace) -> str:
+    from pathlib import Path
+
+    from kontronik_can_gw.errors import UserError
+
+    if args.to:
+        return str(args.to)
+    if args.output == "-":
+        raise UserError(f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}")
+    suffix = Path(args.output).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UserError(
+            f"{args.output}: its suffix tells no format. Give --to, or one of these suffixes: {' '.join(SUFFIXES)}"
+        )
+    return SUFFIXES[suffix]
+
+
+def _check(args: argparse.Namespace, form: str) -> None:
+    """Wrong usage that is known before anything is opened. UserError."""
+    from pathlib import Path
+
+    from kontronik_can_gw.errors import UserError
+
+    if args.output == "-" and form not in ON_SCREEN:
+        raise UserError(f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(ON_SCREEN)}")
+    given = {"--signals": args.signals, "--rate": args.rate, "--frames": args.frames}
+    if form not in TABLES:
+        for option, value in given.items():
+            if value:
+                raise UserError(f"{option} is for tables ({', '.join(TABLES)}), not for {form}")
+    if args.units_line and form != "jsonl":
+        raise UserError(f"--units-line is for jsonl, not for {form}")
+    if args.esc is not None and form in LOGS:
+        raise UserError(f"--esc is for tables and bin: {form} holds the frames as they are")
+    if form == BYTES and (args.start is not None or args.end is not None):
+        raise UserError("--from and --until are not for bin, which has no times")
+    if args.start is not None and args.end is not None and args.end < args.start:
+        raise UserError("--until is before --from")
+    if args.output == "-":
+        return
+    target = Path(args.output)
+    try:
+        if target.is_dir():
+            raise UserError(f"{target}: is a directory. Give a file.")
+        if not target.exists():
+            return
+        source = Path(args.input)
+        if source.exists() and source.samefile(target):
+            raise UserError(f"{target}: is IN. Give another OUT.")
+        if target.is_file():
+            if not args.force:
+                raise UserError(f"{target}: is there already. Give --force to write over it.")
+        elif form not in (*ON_SCREEN, BYTES):
+            raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
+    except (OSError, ValueError) as error:
+        raise UserError(f"{target}: cannot be written: {getattr(error, 'strerror', None) or error}.") from None
+
+
+def _esc(args: argparse.Namespace, recording: "Input", needed: bool = False) -> int | None:
+    """Index of the ESC that --esc names; None where none is named and none is needed. UserError."""
+    from kontronik_can_gw.errors import UserError
+
+    names = [esc.name for esc in recording.bus.escs]
+    if args.esc is None:
+        if not needed:
+            return None
+        if len(names) > 1:
+            raise UserError(f"bin holds the bytes of one ESC. Give --esc: {', '.join(names)}")
+        return 0
+    if args.esc not in names:
+        raise UserError(f"--esc {args.esc}: there is no such ESC. There are: {', '.join(names)}")
+    return names.index(args.esc)
+
+
+def _nothing(args: argparse.Namespace, recording: "Input", damage: list[str]) -> list[str]:
+    """Why there is nothing to convert."""
+    told = [f"{args.input}: damaged: {line}" for line in damage]
+    if args.start is not None or args.end is not None:
+        return [*told, f"{args.input}: nothing in it is between --from and --until"]
+    file = recording.bus.layout.file
+    return [
+        *told,
+        f"{args.input}: nothing in it can be converted: no frame of {file}. Give the right DBC by --dbc or -c.",
+    ]
+
+
+def _say(text: str) -> None:
+    import sys
+
+    print(f"kontronik-can-gw convert: {text}", file=sys.stderr)
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def _seconds(text: str) -> int:
+    """Seconds as ns."""
+    from decimal import Decimal, InvalidOperation
+
+    try:
+        number = Decimal(text)
+        if number.is_finite() and 0 <= number < 10**9:
+            return int(number * 10**9)
+    except InvalidOperation:
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds")
+
+
+def _rate(text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0.001 <= rate <= 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r} is no rate between 0.001 and 1000000")
+    return rate
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise argparse.ArgumentTypeError("give names of signals, with commas between")
+    return names

@@ -1,0 +1,120 @@
+"""Tables as MF4 measurement files by asammdf (an extra): signals with units and value texts.
+
+Numbers are floats, NaN where not available; texts are raw numbers with a conversion, ``NotAvailable`` where not available. All signals
+share one channel group and one time, of a table of CAN frames those of each message.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from kontronik_can_gw.dbc_output.unpacker import Value
+from kontronik_can_gw.offline.can_logs.mf4 import asammdf_module, quiet, save_mf4, set_start
+from kontronik_can_gw.offline.tables.fields import Field, Kind, Table
+from kontronik_can_gw.offline.tables.rows import SECOND_NS, Row
+
+ROWS = 8192
+NOT_AVAILABLE = "NotAvailable"
+
+
+class Mf4Table:
+    """Writes at ``close``, from asammdf's temporary file in the target's folder."""
+
+    def __init__(self, path: Path, table: Table) -> None:
+        module = asammdf_module()
+        self._path = path
+        with quiet():
+            self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
+            set_start(self._mdf, table.start_wall_ns or 0)
+            self._mdf.header.comment = "\n".join(f"{key}: {value}" for key, value in table.provenance.items())
+            if table.by_frame:
+                messages = dict.fromkeys(one.message for one in table.fields[2:])
+                self._groups: dict[Value, _Group] = {
+                    message: _Group(self._mdf, module, table.fields, table.indices(message), message)
+                    for message in messages
+                }
+            else:
+                self._group = _Group(self._mdf, module, table.fields, range(len(table.fields)), "ESC values")
+                self._groups = {}
+
+    def write(self, row: Row) -> None:
+        """Add a row."""
+        (self._groups[row.values[1]] if self._groups else self._group).write(row)
+
+    def close(self) -> None:
+        """Write the file."""
+        for group in self._groups.values() if self._groups else [self._group]:
+            group.flush()
+        save_mf4(self._mdf, self._path)
+
+    def discard(self) -> None:
+        """Close asammdf's temporary file."""
+        with quiet():
+            self._mdf.close()
+
+
+class _Group:
+    """One channel group."""
+
+    def __init__(self, mdf: Any, module: Any, fields: Sequence[Field], indices: Sequence[int], name: str) -> None:
+        import numpy as np
+
+        self._np = np
+        self._mdf = mdf
+        self._rows: list[Row] = []
+        self._last = -(1 << 62)
+        self._codes: list[tuple[int, str, dict[Value, int]]] = []
+        """Of each field its index, type and the codes of its texts."""
+        signals = []
+        for index in indices:
+            one = fields[index]
+            codes: dict[Value, int] = {}
+            conversion: dict[str, object] | None = None
+            kind = "<f4" if one.kind is Kind.FLAG else "<f8"
+            if one.kind is Kind.TEXT:
+                texts = {number: text for number, text in one.texts if text != NOT_AVAILABLE}
+                missing = next(
+                    (number for number, text in one.texts if text == NOT_AVAILABLE), max(texts, default=-1) + 1
+                )
+                texts[missing] = NOT_AVAILABLE
+                codes = {text: number for number, text in texts.items()} | {None: missing}
+                kind = "<i8" if min(texts) < 0 else "<u1" if max(texts) < 256 else "<u4"
+                conversion = {"default": ""}
+                for place, (number, text) in enumerate(sorted(texts.items())):
+                    conversion |= {f"val_{place}": number, f"text_{place}": text}
+            self._codes.append((index, kind, codes))
+            signals.append(
+                module.Signal(
+                    samples=np.array([], dtype=kind),
+                    timestamps=np.array([], dtype="<f8"),
+                    name=one.name,
+                    unit=one.unit,
+                    conversion=conversion,
+                    comment=one.message,
+                )
+            )
+        self._number = mdf.append(signals, acq_name=name, comment=name, common_timebase=True)
+
+    def write(self, row: Row) -> None:
+        """Add a row; what is earlier than its predecessor gets that one's time, for a master channel only rises."""
+        if row.time_ns < self._last:
+            row = row._replace(time_ns=self._last)
+        self._last = row.time_ns
+        self._rows.append(row)
+        if len(self._rows) >= ROWS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand what has gathered to asammdf."""
+        np = self._np
+        if not self._rows:
+            return
+        columns = list(zip(*(row.values for row in self._rows), strict=True))
+        times = np.array([row.time_ns for row in self._rows], dtype=np.int64) / SECOND_NS
+        arrays = [(times, None)]
+        for index, kind, codes in self._codes:
+            column = [codes[value] for value in columns[index]] if codes else columns[index]
+            arrays.append((np.array(column, dtype=kind), None))
+        self._rows.clear()
+        with quiet():
+            self._mdf.extend(self._number, arrays)

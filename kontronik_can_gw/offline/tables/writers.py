@@ -1,0 +1,53 @@
+"""The formats of tables behind one surface."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Protocol
+
+from kontronik_can_gw.offline.tables.fields import Table
+from kontronik_can_gw.offline.tables.rows import Row
+from kontronik_can_gw.offline.tables.text import CsvTable, JsonTable
+
+FORMATS = ("csv", "jsonl", "parquet", "mf4")
+
+
+class TableWriter(Protocol):
+    """Writes the rows of one table."""
+
+    def write(self, row: Row) -> None:
+        """Add a row."""
+
+    def close(self) -> None:
+        """Write what is held back, and the end."""
+
+    def discard(self) -> None:
+        """Release what is held; the table is not to be kept."""
+
+
+@contextmanager
+def open_table(target: IO[bytes] | Path, form: str, table: Table, units_line: bool = False) -> Iterator[TableWriter]:
+    """A writer, closed at the end. ``target``: a file that is open for bytes, of Parquet and MF4 a path.
+
+    UserError where a library is missing. ``units_line``: of JSON lines, a first line with the units.
+    """
+    writer: TableWriter
+    if isinstance(target, Path):
+        if form == "parquet":
+            from kontronik_can_gw.offline.tables.parquet import ParquetTable
+
+            writer = ParquetTable(target, table)
+        else:
+            from kontronik_can_gw.offline.tables.mf4 import Mf4Table
+
+            writer = Mf4Table(target, table)
+    elif form == "jsonl":
+        writer = JsonTable(target, table, units_line)
+    else:
+        writer = CsvTable(target, table)
+    try:
+        yield writer
+        writer.close()
+    except BaseException:
+        writer.discard()
+        raise
