@@ -584,7 +584,7 @@ def test_what_the_example_shows_as_default_is_the_default() -> None:
     shown |= {("esc", key): value for key, value in made["esc"][0].items()}
     examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
     examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options"), ("esc", "node_id"), ("esc", "device")}
-    examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store")}
+    examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store"), ("record", "directory")}
     examples |= {("statistics", "file"), ("statistics", "prometheus"), ("mqtt", "discovery"), ("mqtt", "gateway")}
     examples |= {("mqtt", key) for key in ("broker", "ca_file", "cert_file", "key_file", "username", "password_file")}
     for (table, key), value in shown.items():
@@ -680,6 +680,7 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     **{place: st.integers(*ends) for place, ends in RANGES.items()},
     **dict.fromkeys(STRINGS, st.text(min_size=1, max_size=8).map(lambda text: text.strip() or "x")),
     **dict.fromkeys(BOOLEANS, st.booleans()),
+    ("record", "can_log"): st.sampled_from(["none", "candump", "asc", "blf", "trc", "mf4"]),
     ("dbc", "on_loss"): st.sampled_from(["not_available", "silent"]),
     ("esc", "device"): st.sampled_from([device.text for device in Device]),
     ("can", "options"): st.dictionaries(
