@@ -1,0 +1,328 @@
+"""Recordings of every kind as rows and frames: rows are what the bus said, times are those of the wire, nothing old is ever shown."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cantools.database
+import pytest
+from capture_bench import START, Bench, made
+
+from kontronik_can_gw.capture import Entry, block, data_payload, json_payload
+from kontronik_can_gw.capture_setup import CaptureSetup
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.dbc_output.unpacker import SignalReader
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline.decode import Decoder
+from kontronik_can_gw.offline.inputs import CanLogInput, CaptureInput, DumpInput, Input, open_input
+from kontronik_can_gw.offline.layouts import layout_of_dbc
+from kontronik_can_gw.offline.samples import Sample
+from kontronik_can_gw.protocol import Device
+from kontronik_can_gw.simulator import Dropout, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.telemetry import MS, SECOND
+
+_LOADED = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
+assert isinstance(_LOADED, cantools.database.can.Database)
+SHIPPED: cantools.database.can.Database = _LOADED
+
+
+def capture(path: Path, setup: CaptureSetup, entries: Sequence[Entry], **more: object) -> Path:
+    """A capture file as the recorder writes it."""
+    header = setup.header() | {
+        "run": "r",
+        "part": 0,
+        "created_ns": START,
+        "monotonic_ns": START,
+        "wall_ns": 1_700_000_000 * SECOND,
+    }
+    data = block(b"H", 0, json_payload(header | more))
+    number = 1
+    for at in range(0, len(entries), 300):
+        data += block(b"D", number, data_payload(entries[at : at + 300]))
+        number += 1
+    path.write_bytes(data + block(b"E", number, b""))
+    return path
+
+
+def plain_run(seconds: float, escs: int = 1, faults: Faults | None = None) -> tuple[Bench, list[list[Any]]]:
+    """A gateway that reads each frame when its last byte has come; what the ESCs meant, by ESC, (time of the last byte, data)."""
+    bench = Bench(*made(escs))
+    gateway = bench.gateway
+    simulated = [
+        SimulatedEsc(EscOptions(device=Device.KOSMIK, faults=faults or Faults()), seed=n, start_ns=START + n * 3 * MS)
+        for n in range(escs)
+    ]
+    due: list[tuple[int, int, Any]] = []
+    meant: list[list[Any]] = [[] for _ in range(escs)]
+    for index, esc in enumerate(simulated):
+        for sent in esc.frames_until(START + int(seconds * SECOND)):
+            end = sent.time_ns + len(sent.wire) * 11 * SECOND // 115_200
+            due.append((end, index, sent))
+            if sent.intact:
+                meant[index].append((end, sent.data))
+        gateway.port_opened(index, START)
+    gateway.start(START)
+    bench.take(START)
+    for now, index, sent in sorted(due, key=lambda item: item[:2]):
+        while (deadline := gateway.next_deadline()) < now:
+            gateway.advance(deadline)
+            bench.take(deadline)
+        if sent.wire:
+            gateway.receive_bytes(index, sent.wire, now)
+        gateway.advance(now)
+        bench.take(now)
+    return bench, meant
+
+
+def columns(found: Input) -> dict[str, int]:
+    return {column.name: index for index, column in enumerate(found.reader.columns)}
+
+
+def test_rows_of_a_capture_are_the_esc_s_frames_at_their_times(tmp_path: Path) -> None:
+    bench, meant = plain_run(12)
+    lives = [(end, data) for end, data in meant[0] if hasattr(data, "battery_voltage")]
+    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
+        at = columns(found)
+        rows = list(found.samples())
+        assert len(rows) == len(lives) > 1000
+        for row, (end, data) in zip(rows, lives, strict=True):
+            assert abs(row.time_ns - end) <= 1
+            assert row.values[at["BatteryVoltage"]] == pytest.approx(data.battery_voltage / 100)
+            assert row.values[at["BatteryCurrent"]] == pytest.approx(data.battery_current / 10)
+            assert row.values[at["ElectricalSpeed"]] == data.electrical_speed
+            assert row.values[at["ThrottlePercent"]] == data.throttle
+            assert row.values[at["Undervoltage"]] == (data.operating_errors & 1)
+        assert rows[-1].values[at["Device"]] == "Kosmik"
+        assert rows[0].values[at["Device"]] is None
+        assert found.wall_ns(START + 5) == 1_700_000_000 * SECOND + 5
+        assert found.damage == []
+
+
+def test_rows_agree_with_what_was_on_the_bus(tmp_path: Path) -> None:
+    """The row at the time of a frame holds what cantools reads in that frame."""
+    bench, _ = plain_run(8)
+    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
+        at = columns(found)
+        by_time = {row.time_ns: row for row in found.samples()}
+        compared = 0
+        for frame in found.frames():
+            row = by_time.get(frame.time_ns)
+            message = SHIPPED.get_message_by_frame_id(frame.frame.can_id)
+            if row is None or message.name not in ("EscSpeed", "EscCurrent"):
+                continue
+            for name, value in message.decode_simple(frame.frame.data).items():
+                if name in at:
+                    expected = None if str(value) in ("NotAvailable", "Error") else value
+                    assert row.values[at[name]] == (expected if expected is None else pytest.approx(expected)), name
+                    compared += 1
+        assert compared > 3000
+
+
+def test_a_loss_is_a_row_without_values_and_so_is_everything_until_the_next_frame(tmp_path: Path) -> None:
+    bench, _ = plain_run(12, faults=Faults(dropout=Dropout(2 * SECOND, 6 * SECOND)))
+    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
+        at = columns(found)
+        rows = list(found.samples())
+        gaps = [(a, b) for a, b in pairwise(rows) if b.time_ns - a.time_ns > SECOND]
+        assert len(gaps) == 2
+        for lost, back in gaps:
+            assert lost.values[at["BatteryVoltage"]] is None
+            assert lost.values[at["LinkState"]] == "Lost"
+            assert back.values[at["BatteryVoltage"]] is not None
+            before = rows[rows.index(lost) - 1]
+            assert 250 * MS <= lost.time_ns - before.time_ns < 300 * MS
+
+
+def test_rows_of_several_escs_stand_together(tmp_path: Path) -> None:
+    bench, meant = plain_run(6, escs=3)
+    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
+        rows = list(found.samples())
+        at = columns(found)
+        names = [esc.name for esc in found.bus.escs]
+        assert names == ["e0", "e1", "e2"]
+        lives = max(sum(hasattr(data, "battery_voltage") for _, data in m) for m in meant)
+        assert lives <= len(rows) <= 2.2 * lives
+        assert all(a.time_ns < b.time_ns for a, b in pairwise(rows))
+        row = rows[-1]
+        for index in range(3):
+            assert row.values[at[f"E{index}BatteryVoltage"]] == pytest.approx(
+                bench.gateway.escs[index].last_live.battery_voltage / 100  # type: ignore[union-attr]
+            )
+
+
+def test_a_list_that_was_given_is_not_changed_any_more(tmp_path: Path) -> None:
+    bench, _ = plain_run(2)
+    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
+        kept: list[tuple[Sample, list[Any]]] = [(row, list(row.values)) for row in found.samples()]
+        assert all(row.values == copy for row, copy in kept)
+        assert found.position == found.size
+        assert list(found.samples())[-1].values == kept[-1][1]  # and once more from the beginning
+
+
+def test_the_bytes_of_an_esc_come_out_as_they_went_in(tmp_path: Path) -> None:
+    bench, _ = plain_run(4, escs=2, faults=Faults(noise=1.0, lost_bytes=0.01))
+    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
+    for index in range(2):
+        with open_input(path) as found:
+            data = b"".join(found.esc_bytes(index))
+        assert data == b"".join(e.data for e in bench.entries if e.kind == 1 and e.esc == index)
+        dump = tmp_path / f"{index}.bin"
+        dump.write_bytes(data)
+        decoder = Decoder()
+        lives = [r for r in decoder.feed(data) + decoder.flush() if r["kind"] == "live"]
+        with open_input(dump) as plain:
+            assert isinstance(plain, DumpInput)
+            assert plain.times_assumed
+            at = columns(plain)
+            rows = [row for row in plain.samples() if row.values[at["BatteryVoltage"]] is not None]
+            assert [r.values[at["ElectricalSpeed"]] for r in rows] == [r["electrical_speed"] for r in lives]
+            assert [r.time_ns for r in rows] == [n * 10 * MS for n in range(len(lives))]
+            assert b"".join(plain.esc_bytes(0)) == data
+            if decoder.counters.dropped_bytes:
+                assert f"{decoder.counters.dropped_bytes} bytes belong to no frame" in plain.damage[0]
+            assert len(list(plain.frames())) > len(lives)
+
+
+def test_a_dump_at_another_rate(tmp_path: Path) -> None:
+    dump = tmp_path / "a.bin"
+    esc = SimulatedEsc(EscOptions())
+    dump.write_bytes(b"".join(s.wire for s in esc.frames_until(3 * SECOND)))
+    with open_input(dump, live_rate=2) as found:
+        at = columns(found)
+        rows = list(found.samples())
+        assert rows[1].time_ns - rows[0].time_ns == SECOND // 2
+        assert all(row.values[at["BatteryVoltage"]] is not None for row in rows)  # not taken for stale
+
+
+def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> None:
+    bench, _ = plain_run(6)
+    stop, resume = START + 2 * SECOND, START + 5 * SECOND
+    log = tmp_path / "a.log"
+    log.write_text(
+        "".join(
+            f"({(f.time_ns - START) / SECOND + 1_700_000_000:.6f}) can0 {f.frame.can_id:03X}#{f.frame.data.hex().upper()}\n"
+            for f in bench.sent
+            if not stop < f.time_ns < resume
+        )
+    )
+    with open_input(log) as found:
+        assert isinstance(found, CanLogInput)
+        at = columns(found)
+        rows = list(found.samples())
+        start = rows[0].time_ns
+        for row in rows:
+            inside = 2.0 + 1.1 < (row.time_ns - start) / SECOND < 4.99
+            if inside:
+                assert row.values[at["BatteryVoltage"]] is None
+        voltages = [row.values[at["BatteryVoltage"]] for row in rows]
+        assert sum(v is not None for v in voltages) > 250
+        assert any(2.0 < (row.time_ns - start) / SECOND < 4.9 for row in rows), "the loss has a row of its own"
+        assert found.wall_ns(rows[0].time_ns) == pytest.approx(1_700_000_000 * SECOND, abs=2 * MS)
+
+
+def test_frames_of_others_and_short_ones_are_passed_over() -> None:
+    reader = SignalReader(layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout)
+    assert reader.read(0x123, b"12345678") is None
+    assert reader.read(1672, b"1234567") is None
+    assert reader.read(1672 | 0x80000000, b"12345678") is None
+    assert reader.read(1672, b"123456789") is not None
+
+
+def test_every_value_of_the_shipped_dbc_reads_as_cantools_reads_it() -> None:
+    import random
+
+    bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+    reader = SignalReader(bus.layout)
+    rng = random.Random(3)
+    for plan in bus.layout.messages:
+        message = SHIPPED.get_message_by_name(plan.name)
+        for _ in range(300):
+            data = (
+                rng.randbytes(8) if rng.random() < 0.7 else bytes(rng.choice([0, 255, 254, 128, 129]) for _ in range(8))
+            )
+            wanted = message.decode_simple(data)
+            for first, values in reader.read(plan.can_id, data) or ():
+                for offset, value in enumerate(values):
+                    column = reader.columns[first + offset]
+                    other = wanted[column.name]
+                    if isinstance(value, (int, float)):
+                        assert isinstance(other, (int, float))
+                        assert math.isclose(value, other, rel_tol=1e-12), column.name
+                        assert column.digits is not None
+                        assert round(value, column.digits) == value
+                    elif value is None:
+                        assert str(other) in ("NotAvailable", "Error") or column.texts, column.name
+                    else:
+                        assert value == str(other)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (b"hello world\n" * 50, "is no capture"),
+        (block(b"D", 0, data_payload([])), "has no header"),
+        (block(b"H", 0, b"[]"), "has no header"),
+        (block(b"H", 0, b'{"format": "kontronik-can-gw capture", "version": 2}'), "version 2 is unknown"),
+    ],
+)
+def test_what_is_no_recording_is_said_in_one_line(content: bytes, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(content)
+    with pytest.raises(UserError) as caught:
+        open_input(path)
+    [line] = caught.value.problems
+    assert words in line
+    assert line.startswith(str(path))
+
+
+def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
+    bench, _ = plain_run(1)
+    with pytest.raises(UserError, match="has no captures"):
+        open_input(tmp_path)
+    with pytest.raises(RunError, match="no such file"):
+        open_input(tmp_path / "nothing")
+    capture(tmp_path / "20260101T000000Z-aaaaaa-0000.kcap", bench.setup, bench.entries)
+    capture(tmp_path / "20260102T000000Z-bbbbbb-0000.kcap", bench.setup, bench.entries, run="b")
+    with pytest.raises(UserError, match="2 runs"):
+        open_input(tmp_path)
+    with open_input(tmp_path / "20260102") as found:
+        assert isinstance(found, CaptureInput)
+        assert found.header["run"] == "b"
+    capture(tmp_path / "20260102T000000Z-bbbbbb-0001.kcap", bench.setup, bench.entries, run="c", part=1)
+    with open_input(tmp_path / "20260102") as found, pytest.raises(UserError, match="another run"):
+        list(found.samples())
+
+
+def test_a_damaged_capture_gives_all_that_is_intact(tmp_path: Path) -> None:
+    bench, _ = plain_run(6)
+    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    path.write_bytes(whole[:middle] + b"\0" * 20 + whole[middle + 20 :])
+    with open_input(path) as found:
+        at = columns(found)
+        rows = list(found.samples())
+        assert len(found.damage) == 2
+        assert "are damaged" in found.damage[0]
+        assert "1 blocks" in found.damage[1]
+    assert 400 < len([r for r in rows if r.values[at["BatteryVoltage"]] is not None]) < 600
+    path.write_bytes(whole[:-30])
+    with open_input(path) as found:
+        assert len(list(found.samples())) > 500
+        assert "was not closed" in found.damage[-1]
+
+
+def test_another_dbc_shows_a_capture_in_its_own_way(tmp_path: Path) -> None:
+    bench, _ = plain_run(2)
+    text = (shipped("dbc/kontronik_esc.dbc")).read_text().replace("BatteryVoltage", "battery_voltage")
+    other = tmp_path / "other.dbc"
+    other.write_text(text)
+    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
+    with open_input(path, layout_of_dbc(other)) as found:
+        assert "battery_voltage" in columns(found)
+        assert list(found.samples())[-1].values[columns(found)["battery_voltage"]] is not None
+    assert CanFrame(1, b"").key == 1
