@@ -196,6 +196,8 @@ def _title(monitor: Monitor, where: Where, width: int) -> Line:
     used = sum(len(piece.text) for piece in (*left, *right))
     if used > width and not where.is_file:
         used -= len(left.pop().text)
+    while used > width and len(right) > 1:
+        used -= len(right.pop(0).text)
     return [*left, Piece(" " * max(1, width - used)), *right]
 
 
@@ -355,7 +357,8 @@ def _rows(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Row]:
 
     def heads(_esc: EscMonitor, width: int) -> Line:
         now, bars, ends = _widths(width)
-        return [Piece(f"{'now':>{now}} {'min':>{ends}} {'max':>{ends}} {' ' * bars}", FAINT)]
+        extremes = f" {'min':>{ends}} {'max':>{ends}}" if ends else ""
+        return [Piece(f"{'now':>{now}}{extremes} {' ' * bars}", FAINT)]
 
     def charge(esc: EscMonitor, _width: int) -> Line:
         parts = [(esc.number("consumed_charge"), 0, "mAh"), (esc.number("energy_used"), 1, "Wh")]
@@ -397,7 +400,7 @@ def _cell_of(quantity: Quantity, glyphs: Glyphs) -> Callable[[EscMonitor, int], 
         text, style = _measure(esc, quantity, now)
         line = [Piece(text.rjust(now), style)]
         spread = esc.spreads[quantity.source]
-        for end in (spread.low, spread.high):
+        for end in (spread.low, spread.high) if ends else ():
             line.append(Piece(f" {number(end, quantity.digits, ends):>{ends}}", "" if end is not None else FAINT))
         value = esc.number(quantity.source)
         if quantity.scale is None or bars < 4:
@@ -410,8 +413,10 @@ def _cell_of(quantity: Quantity, glyphs: Glyphs) -> Callable[[EscMonitor, int], 
 
 
 def _widths(width: int) -> tuple[int, int, int]:
-    """Columns of a value, its bar, and each of its extremes."""
+    """Columns of a value, its bar, and each of its extremes; 0 where there is no room for them."""
     now, ends = (9, 8) if width >= 40 else (7, 6)
+    if now + 2 * ends + 2 > width:
+        return now, max(0, width - now - 1), 0
     return now, max(0, min(_WIDEST_BAR, width - now - 2 * ends - 3 - (width >= 40))), ends
 
 

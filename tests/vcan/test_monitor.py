@@ -1,0 +1,186 @@
+"""``monitor`` on a real vcan beside a running gateway: what it shows, that it sends nothing, and that it comes back."""
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import can
+from vcan_tools import Candump, GatewayProcess, bench, configuration, ip, wait_for
+
+from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.protocol.states import OperatingError
+from kontronik_can_gw.runtime.bus_listener import BusListener
+from kontronik_can_gw.simulator import ErrorWindow, EscOptions, Faults
+
+Start = Callable[..., GatewayProcess]
+FAULTY = EscOptions(faults=Faults(errors=(ErrorWindow(OperatingError.BEC_OVERCURRENT, 0),)))
+COMMAND = [sys.executable, "-m", "kontronik_can_gw", "monitor"]
+
+
+def once(*words: object) -> subprocess.CompletedProcess[str]:
+    command = [*COMMAND, "--once", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+class Lines:
+    """``monitor`` as its own process, into a pipe."""
+
+    def __init__(self, *words: object) -> None:
+        command = [*COMMAND, *map(str, words)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.out: list[str] = []
+        self.err: list[str] = []
+        self._threads = [
+            threading.Thread(target=self._read, args=pair, daemon=True)
+            for pair in ((self.process.stdout, self.out), (self.process.stderr, self.err))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @staticmethod
+    def _read(stream: Any, lines: list[str]) -> None:
+        for line in stream:
+            lines.append(line.rstrip())
+
+    def end(self) -> int:
+        self.process.terminate()
+        code = self.process.wait(20)
+        for thread in self._threads:
+            thread.join(5)
+        return code
+
+
+@contextmanager
+def lines_of(*words: object) -> Iterator[Lines]:
+    made = Lines(*words)
+    try:
+        yield made
+    finally:
+        made.process.kill()
+        made.process.wait()
+        for stream in (made.process.stdout, made.process.stderr):
+            if stream:
+                stream.close()
+
+
+def sent_on(interface: str) -> int:
+    """Frames that were sent on a vcan, by anybody."""
+    return int(Path("/sys/class/net", interface, "statistics/tx_packets").read_text())
+
+
+def test_once_tells_of_all_escs_of_the_configuration(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+    with bench(FAULTY, EscOptions(cell_count=12)) as run, Candump(vcan) as dump:
+        gateway = start_gateway(configuration(vcan, [port.path for port in run.ports]))
+        gateway.wait_for_line("esc2: /dev/pts")
+        run.start()
+        wait_for(lambda: len(dump.frames) > 300, 10, "frames")
+        done = once("-c", tmp_path / "gateway0.toml", "--timeout", 20)
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        assert done.stdout.count("\n") == 1
+        # every frame on the bus is one of the gateway's
+        assert {frame.can_id for frame in dump.frames} <= set(range(0x680, 0x6E0))
+    found = json.loads(done.stdout)
+    first, second = found["escs"]
+    assert found["interface"] == vcan
+    assert found["gateway"]["state"] == "Running"
+    assert (first["name"], second["name"]) == ("esc1", "esc2")
+    assert (first["errors"], second["errors"]) == (["bec_overcurrent"], [])
+    assert [esc["link"] for esc in found["escs"]] == ["Ok", "Ok"]
+    sent = {live.battery_voltage / 100 for _, live in run.live(0)}
+    assert first["values"]["battery_voltage"] in sent
+    assert second["values"]["cell_count"] == 12
+
+
+def test_once_on_a_silent_bus_is_one_line_and_nothing_is_sent(vcan: str) -> None:
+    done = once("--channel", vcan, "--timeout", 0.5)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.count("\n") == 1
+    assert f"no frame of kontronik_esc.dbc on {vcan} for 0.5 s." in done.stderr
+    assert f"ip -details link show {vcan}" in done.stderr
+    assert sent_on(vcan) == 0
+
+
+def test_an_interface_that_is_down_or_missing_is_told_with_the_remedy(vcan: str) -> None:
+    ip("link", "set", vcan, "down")
+    done = once("--channel", vcan)
+    assert done.returncode == 1
+    assert f"CAN interface {vcan}: is down. Start it: sudo ip link set {vcan} up" in done.stderr
+    done = once("--channel", "nocan9")
+    assert done.returncode == 1
+    assert "nocan9: there is none." in done.stderr
+
+
+def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(vcan: str, start_gateway: Start) -> None:
+    with bench(EscOptions()) as run:
+        gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
+        gateway.wait_for_line("esc1: /dev/pts")
+        run.start()
+        with lines_of("--channel", vcan, "--interval", 0.25) as shown:
+
+            def is_shown() -> bool:
+                return bool(shown.out) and "link ok" in shown.out[-1] and "battery_voltage -" not in shown.out[-1]
+
+            wait_for(is_shown, 20, "values")
+            for act, undo, what in (
+                (("set", vcan, "down"), [("set", vcan, "up")], "is down. Start it"),
+                (("del", vcan), [("add", vcan, "type", "vcan"), ("set", vcan, "up")], "there is none."),
+            ):
+                told, lines = len(shown.err), len(shown.out)
+                ip("link", *act)
+                wait_for(lambda t=told, w=what: any(w in line for line in shown.err[t:]), 5, what)  # type: ignore[misc]
+                wait_for(lambda: "battery_voltage - V" in shown.out[-1], 6, "no old value")
+                assert len(shown.out) > lines
+                assert shown.process.poll() is None
+                for words in undo:
+                    ip("link", *words)
+                wait_for(is_shown, 10, "values again")
+                wait_for(lambda: shown.err[-1].endswith(f"{vcan}: frames come"), 5, "the good news")
+            assert shown.end() == 0
+            assert not any("Traceback" in line for line in shown.err)
+            assert shown.err[-1].endswith(f"seen on {vcan}, none sent")
+
+
+def test_the_listener_takes_only_what_was_asked_for_and_sends_nothing(vcan: str) -> None:
+    listener = BusListener(CanConfig(channel=vcan), frozenset({0x123, 0x1ABCDE | 0x80000000}))
+    assert sent_on(vcan) == 0
+    with can.Bus(interface="socketcan", channel=vcan) as bus:
+        for number in range(50):
+            for can_id, extended in ((0x123, False), (0x124, False), (0x123, True), (0x1ABCDE, True)):
+                bus.send(can.Message(arbitration_id=can_id, data=[number], is_extended_id=extended))
+            bus.send(can.Message(arbitration_id=0x123, is_remote_frame=True, dlc=1, is_extended_id=False))
+            time.sleep(0.001)
+        frames: list[CanFrame] = []
+        end = time.monotonic() + 3
+        while len(frames) < 100 and time.monotonic() < end:
+            frames += listener.receive(0.1)
+    expected = [CanFrame(each, bytes([n]), each != 0x123) for n in range(50) for each in (0x123, 0x1ABCDE)]
+    assert frames == expected
+    assert sent_on(vcan) == 250
+    listener.close()
+
+
+def test_a_second_reader_does_not_disturb_the_gateway(vcan: str, start_gateway: Start) -> None:
+    """Its frames come as often as before, and it counts no conflict."""
+    with bench(EscOptions()) as run, Candump(vcan) as dump:
+        gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
+        gateway.wait_for_line("esc1: /dev/pts")
+        run.start()
+        wait_for(lambda: len(dump.frames) > 100, 10, "frames")
+        with lines_of("--channel", vcan) as shown:
+            wait_for(lambda: len(shown.out) >= 3, 20, "lines")
+            count = len(dump.frames)
+            time.sleep(2)
+            rate = (len(dump.frames) - count) / 2
+            assert shown.end() == 0
+        assert rate > 200
+        lines = len(gateway.lines)
+        assert gateway.end() == 0
+        assert not any("conflict" in line or "another" in line for line in gateway.lines[:lines])
