@@ -37,7 +37,7 @@ td { min-width: 3.5rem; }
 code { font: .92em ui-monospace, monospace; }
 summary { color: var(--soft); font-size: .9rem; cursor: pointer; }
 [hidden] { display: none !important; }
-@media (max-width: 60rem) {
+@media screen and (max-width: 60rem) {
   thead { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }
   table, tbody, tr, td { display: block; }
   tr { margin: .6rem 0; padding: .4rem .6rem; border: 1px solid var(--line); border-radius: .5rem; }
@@ -47,8 +47,12 @@ summary { color: var(--soft); font-size: .9rem; cursor: pointer; }
 }
 @media print {
   :root { color-scheme: light; --ground: #fff; --text: #000; --soft: #444; --line: #999; --band: #eee; --link: #000; }
-  body { max-width: none; padding: 0; font-size: 9pt; }
-  #search { display: none; }
+  html { font-size: 9pt; }
+  body { max-width: none; padding: 0; font-size: 1rem; }
+  #search, nav summary { display: none; }
+  table { font-size: 8pt; }
+  th, td { padding: .15rem .3rem; }
+  td { min-width: 0; }
   a { text-decoration: none; }
   h2, h3 { break-after: avoid; }
   thead { display: table-header-group; }
@@ -127,7 +131,7 @@ def _contents(document: Document) -> Iterator[str]:
         if parts:
             links = "".join(f"<li>{_link(part)}</li>" for part in parts)
             unfolded = " open" if len(parts) <= _MOST_OPEN else ""
-            yield f"<details{unfolded}><summary>{len(parts)} parts</summary><ul>{links}</ul></details>"
+            yield f"<details{unfolded}><summary>{len(parts)} part{'s' * (len(parts) > 1)}</summary><ul>{links}</ul></details>"
         yield "</li>"
     yield "</ul>\n</nav>"
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from kontronik_can_gw.cia301.emergency import GatewayError
 from kontronik_can_gw.sources import CanState, GatewayState
 from kontronik_can_gw.telemetry import LinkState
 
@@ -28,31 +29,22 @@ LINK_STATES: Mapping[LinkState, Text] = {
     LinkState.OK: Text("good frames come"),
     LinkState.DEGRADED: Text(
         "good frames come, and many CRC errors or dropped bytes with them",
-        "Keep the telemetry cable short and away from the motor's wires. Check plugs and ground.",
+        GatewayError.CRC_RATE.remedy,
     ),
-    LinkState.LOST: Text(
-        "good frames came, and come no more",
-        "Check that the ESC is switched on, and the cable to the gateway.",
-    ),
-    LinkState.PORT_ERROR: Text(
-        "the serial port cannot be opened or read",
-        "Check the USB adapter and its plug. It is tried again for ever; kontronik-can-gw doctor says more.",
-    ),
+    LinkState.LOST: Text("good frames came, and come no more", GatewayError.TELEMETRY_LOST.remedy),
+    LinkState.PORT_ERROR: Text("the serial port cannot be opened or read", GatewayError.PORT_GONE.remedy),
 }
 CAN_STATES: Mapping[CanState, Text] = {
     CanState.UNKNOWN: Text("the CAN interface does not tell"),
     CanState.ERROR_ACTIVE: Text("works"),
     CanState.ERROR_WARNING: Text(
         "works, but there are errors on the bus",
-        "Check bit rate, termination (120 ohm at both ends) and cables of the bus.",
+        GatewayError.CAN_PASSIVE.remedy,
     ),
-    CanState.ERROR_PASSIVE: Text(
-        "works, with many errors on the bus",
-        "Check bit rate, termination (120 ohm at both ends) and cables of the bus, and that another node is switched on.",
-    ),
+    CanState.ERROR_PASSIVE: Text("works, with many errors on the bus", GatewayError.CAN_PASSIVE.remedy),
     CanState.BUS_OFF: Text(
         "switched off by errors on the bus: no frame can leave",
-        "Look for a short, a wrong bit rate or a bad cable. With restart-ms 0 somebody has to restart the interface.",
+        f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0 somebody has to restart the interface.",
     ),
     CanState.DOWN: Text(
         "the CAN interface is down or missing: no frame can leave",
