@@ -42,8 +42,9 @@ bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .mf
 does not. - is standard output, for text. Parquet needs pyarrow, MF4 needs asammdf; they are named where they are missing.
 
 Tables have a row at each telemetry frame, or at each group of CAN frames that belong together. Values hold while they are fresh.
-Time [s] counts from the recording's first row; Utc is there where the recording knows the time of day. What is not available is
-empty in CSV, null in JSON lines and Parquet, NaN or NotAvailable in MF4. Flags are 0 and 1.
+Time [s] counts from the recording's first row, with --frames from its first frame; Utc is there where the recording knows
+the time of day. What is not available is empty in CSV, null in JSON lines and Parquet, NaN or NotAvailable in MF4.
+Flags are 0 and 1.
 
 Of a damaged recording everything that is intact is converted, and a summary says what is not.
 OUT takes its name only when it is whole; until then it is called OUT.part.
@@ -124,7 +125,9 @@ def main(args: argparse.Namespace) -> int:
         if told is None:
             raise RunError(*_nothing(args, recording, damage))
         if not args.quiet:
-            _say(f"{args.output}: {told}, in {time.monotonic() - begun:.1f} s")
+            _say(
+                f"{'standard output' if args.output == '-' else args.output}: {told}, in {time.monotonic() - begun:.1f} s"
+            )
             if recording.times_assumed and form != BYTES:
                 _say(f"times are assumed: {args.live_rate or LIVE_RATE:g} live frames a second (--live-rate)")
         for line in damage:
@@ -248,13 +251,14 @@ class _Out:
         self.is_whole = False
         self.name = "" if args.output == "-" else Path(args.output).name
         self._part = None if args.output == "-" else PartFile(Path(args.output))
-        self._screen = sys.stdout.buffer
+        self._screen = sys.stdout.buffer if self._part is None else None
 
     @property
     def file(self) -> "IO[bytes]":
         """Open for bytes."""
-        if self._part is None:
+        if self._screen is not None:
             return self._screen
+        assert self._part is not None
         return self._part.file or self._part.open()
 
     @property
@@ -267,10 +271,12 @@ class _Out:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        if self._part is None:
+        if self._screen is not None:
             if kind is None:
                 self._screen.flush()
-        elif kind is None and self.is_whole:
+            return
+        assert self._part is not None
+        if kind is None and self.is_whole:
             self._part.finish()
         else:
             self._part.discard()

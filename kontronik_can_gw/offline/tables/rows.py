@@ -87,7 +87,7 @@ class Rows:
         fields = [field_of(columns[index]) for index in choice.columns]
         items: Iterator[Row]
         if by_frame:
-            first_frame, frames = first_of(frame for frame in recording.frames() if frame.frame.key in self._names)
+            first_frame, frames = first_of(recording.frames())
             origin_ns = None if first_frame is None else first_frame.time_ns
             items = self._of_frames(frames, origin_ns or 0)
             fields = [*frame_fields(self._names.values()), *fields]
@@ -124,13 +124,13 @@ class Rows:
         wall_ns = self._recording.wall_ns
         count = len(reader.columns)
         for time_ns, frame, _ in frames:
-            chunks = reader.read(frame.key, frame.data)
-            if chunks is None:  # shorter than its message
+            head = names.get(frame.key)
+            if head is None or (chunks := reader.read(frame.key, frame.data)) is None:  # shorter than its message
                 continue
             values: list[Value] = [None] * count
             for first, new in chunks:
                 values[first : first + len(new)] = new
-            yield Row(time_ns - origin_ns, wall_ns(time_ns), names[frame.key] + pick(values))
+            yield Row(time_ns - origin_ns, wall_ns(time_ns), head + pick(values))
 
 
 def _frame_names(reader: SignalReader, choice: Choice) -> dict[int, tuple[str, str]]:

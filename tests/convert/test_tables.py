@@ -1,0 +1,380 @@
+"""Tables in all formats hold what cantools reads from the same frames, and what a recording's rows are, to the last digit."""
+
+import csv
+import json
+import math
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import asammdf
+import cantools.database
+import numpy as np
+import pandas as pd  # type: ignore[import-untyped]
+import pyarrow as pa  # type: ignore[import-untyped]
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pyarrow import parquet
+from recordings import (
+    WALL_NS,
+    candump_lines,
+    capture_bytes,
+    convert,
+    dump_bytes,
+    shipped_database,
+    write_candump,
+)
+
+from kontronik_can_gw.offline.inputs import Input, open_input
+from kontronik_can_gw.offline.tables import Field, Row, Table, open_table
+from kontronik_can_gw.offline.tables.fields import Kind
+from kontronik_can_gw.offline.tables.rows import thinned
+
+Cells = list[dict[str, Any]]
+"""Of each row the values by signal name, None where not available; Time in seconds, Utc as text to the microsecond."""
+
+
+def _unit(header: str) -> str:
+    return header.partition(" [")[0]
+
+
+def read_csv(path: Path, fields: dict[str, Any]) -> Cells:
+    frame = pd.read_csv(path, dtype=object, keep_default_na=False)
+    rows = []
+    for record in frame.to_dict("records"):
+        cells: dict[str, Any] = {}
+        for header, text in record.items():
+            name = _unit(str(header))
+            is_text = name in ("Utc", "Id", "Message") or (name in fields and fields[name].texts)
+            cells[name] = None if text == "" else text if is_text else float(text)
+        rows.append(cells)
+    return rows
+
+
+def read_jsonl(path: Path, _: dict[str, Any]) -> Cells:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def read_parquet(path: Path, _: dict[str, Any]) -> Cells:
+    table = parquet.read_table(path)
+    rows: Cells = []
+    for record in table.to_pylist():
+        cells = {_unit(name): value for name, value in record.items()}
+        if "Utc" in cells and cells["Utc"] is not None:
+            moment = pd.Timestamp(cells["Utc"]).to_pydatetime(warn=False)
+            cells["Utc"] = moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+        rows.append(cells)
+    return rows
+
+
+def read_mf4(path: Path, fields: dict[str, Any]) -> Cells:
+    mdf = asammdf.MDF(path)
+    signals = {name: mdf.get(name) for name in fields}
+    start = mdf.header.start_time.timestamp()
+    first = next(iter(signals.values()))
+    rows: Cells = []
+    for index, stamp in enumerate(first.timestamps):
+        cells: dict[str, Any] = {"Time": float(stamp)}
+        if start:
+            moment = datetime.fromtimestamp(start, UTC) + pd.Timedelta(seconds=float(stamp))
+            cells["Utc"] = moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+        for name, signal in signals.items():
+            value = signal.samples[index]
+            if isinstance(value, bytes):
+                cells[name] = None if value == b"NotAvailable" else value.decode()
+            else:
+                cells[name] = None if math.isnan(value) else float(value)
+        rows.append(cells)
+    mdf.close()
+    return rows
+
+
+READ: dict[str, Callable[[Path, dict[str, Any]], Cells]] = {
+    "csv": read_csv,
+    "jsonl": read_jsonl,
+    "parquet": read_parquet,
+    "mf4": read_mf4,
+}
+
+
+def expected_of(recording: Input) -> Cells:
+    """The rows that every format must have."""
+    names = [column.name for column in recording.reader.columns]
+    rows: Cells = []
+    origin = None
+    for time_ns, values in recording.samples():
+        origin = time_ns if origin is None else origin
+        cells: dict[str, Any] = {"Time": (time_ns - origin) / 1e9}
+        wall_ns = recording.wall_ns(time_ns)
+        if wall_ns is not None:
+            moment = datetime.fromtimestamp(wall_ns // 10**9, UTC)
+            cells["Utc"] = f"{moment:%Y-%m-%dT%H:%M:%S}.{wall_ns % 10**9 // 1000:06d}Z"
+        rows.append(cells | dict(zip(names, values, strict=True)))
+    return rows
+
+
+@pytest.fixture(scope="module", params=["capture", "dump", "candump"])
+def recording(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    if request.param == "capture":
+        path = folder / "two.kcap"
+        path.write_bytes(capture_bytes())
+        return path
+    if request.param == "dump":
+        path = folder / "esc.bytes"
+        path.write_bytes(dump_bytes())
+        return path
+    return write_candump(folder / "bus.log", candump_lines(600))
+
+
+@pytest.mark.parametrize("form", sorted(READ))
+def test_every_format_reads_back_equal(tmp_path: Path, recording: Path, form: str) -> None:
+    out = tmp_path / f"out.{form}"
+    assert convert(recording, out) == 0
+    with open_input(recording) as source:
+        expected = expected_of(source)
+        fields = {column.name: column for column in source.reader.columns}
+    found = READ[form](out, fields)
+    assert len(found) == len(expected) > 100
+    for one, other in zip(found, expected, strict=True):
+        if form == "mf4" and "Utc" in one:  # a float of seconds behind the start
+            one["Utc"] = other["Utc"] if abs(pd.Timestamp(one["Utc"]) - pd.Timestamp(other["Utc"])) < _US else "?"
+        assert one == other
+
+
+_US = pd.Timedelta(microseconds=2)
+
+
+def decoded(lines: list[tuple[int, int, bytes]]) -> Cells:
+    """A row for each frame, by cantools."""
+    database = shipped_database()
+    rows: Cells = []
+    for us, can_id, data in lines:
+        message = database.get_message_by_frame_id(can_id)
+        values = message.decode(data, decode_choices=True)
+        assert isinstance(values, dict)
+        cells: dict[str, Any] = {"Time": (us - lines[0][0]) / 1e6, "Id": f"{can_id:03X}", "Message": message.name}
+        for signal in message.signals:
+            value: Any = values[signal.name]
+            choices = {number: str(text) for number, text in (signal.choices or {}).items()}
+            if isinstance(value, cantools.database.namedsignalvalue.NamedSignalValue):
+                value = None if str(value) in ("NotAvailable", "Error") else str(value)
+            elif set(choices.values()) - {"NotAvailable", "Error"}:
+                value = None  # a number that the DBC has no text for
+            cells[signal.name] = value
+        rows.append(cells)
+    return rows
+
+
+@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet"])
+def test_rows_of_frames_are_what_cantools_reads(tmp_path: Path, form: str) -> None:
+    lines = candump_lines(1000, seed=4)
+    source = write_candump(tmp_path / "bus.log", lines)
+    out = tmp_path / f"out.{form}"
+    assert convert(source, out, "--frames") == 0
+    with open_input(source) as opened:
+        fields = {column.name: column for column in opened.reader.columns}
+    found = READ[form](out, fields)
+    expected = decoded(lines)
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        of_message = {name for name in other if name in fields}
+        for name in ("Time", "Id", "Message", *of_message):
+            assert one[name] == (
+                pytest.approx(other[name], abs=1e-9) if isinstance(other[name], float) else other[name]
+            )
+        others = {name: value for name, value in one.items() if name in fields and name not in of_message}
+        assert not others if form == "jsonl" else set(others.values()) <= {None}
+
+
+def test_mf4_of_frames_has_a_group_for_each_message(tmp_path: Path) -> None:
+    lines = candump_lines(1000, seed=5)
+    source = write_candump(tmp_path / "bus.log", lines)
+    out = tmp_path / "out.mf4"
+    assert convert(source, out, "--frames") == 0
+    mdf = asammdf.MDF(out)
+    groups: list[Any] = list(mdf.groups)
+    assert [group.channel_group.acq_name for group in groups] == [m.name for m in _messages_with_signals(mdf)]
+    for message in _messages_with_signals(mdf):
+        rows = [row for row in decoded(lines) if row["Message"] == message.name]
+        for signal in message.signals:
+            if signal.name not in mdf:
+                continue
+            found = mdf.get(signal.name)
+            assert found.timestamps.tolist() == pytest.approx([row["Time"] for row in rows], abs=1e-9)
+            assert found.unit == (signal.unit or "")
+            texts = [v.decode() if isinstance(v, bytes) else None if math.isnan(v) else v for v in found.samples]
+            assert [None if text == "NotAvailable" else text for text in texts] == [
+                pytest.approx(row[signal.name]) if isinstance(row[signal.name], float) else row[signal.name]
+                for row in rows
+            ]
+    mdf.close()
+
+
+def _messages_with_signals(mdf: Any) -> list[Any]:
+    return [m for m in shipped_database().messages if any(signal.name in mdf for signal in m.signals)]
+
+
+def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
+    source = tmp_path / "two.kcap"
+    source.write_bytes(capture_bytes())
+    for form in READ:
+        assert convert(source, tmp_path / f"out.{form}") == 0
+    with (tmp_path / "out.csv").open() as file:
+        heads = next(csv.reader(file))
+    schema = parquet.read_schema(tmp_path / "out.parquet")
+    mdf = asammdf.MDF(tmp_path / "out.mf4")
+    with open_input(source) as opened:
+        columns = opened.reader.columns
+        provenance = opened.provenance
+    expected = ["Time [s]", "Utc"] + [f"{c.name} [{c.unit}]" if c.unit else c.name for c in columns]
+    assert heads == schema.names == expected
+    assert "E0BatteryVoltage [V]" in heads
+    for column in columns:
+        field = schema.field(f"{column.name} [{column.unit}]" if column.unit else column.name)
+        assert field.metadata[b"unit"].decode() == mdf.get(column.name).unit == column.unit
+        kinds = [pa.int8()] if column.is_flag else [pa.int64()] if column.is_whole else [pa.float64()]
+        assert field.type in (kinds if not column.texts else [pa.dictionary(pa.int32(), pa.string())])
+    assert json.loads(schema.metadata[b"kontronik_can_gw"]) == provenance
+    assert all(f"{key}: {value}" in mdf.header.comment for key, value in provenance.items())
+    assert 0 <= mdf.header.start_time.timestamp() - WALL_NS / 1e9 < 0.1
+    mdf.close()
+
+
+def test_asammdf_makes_a_data_frame_with_gaps(tmp_path: Path) -> None:
+    source = write_candump(tmp_path / "bus.log", candump_lines(600))
+    out = tmp_path / "out.mf4"
+    assert convert(source, out, "--signals", "BatteryVoltage,OperatingState,Undervoltage") == 0
+    with open_input(source) as opened:
+        expected = expected_of(opened)
+    frame = asammdf.MDF(out).to_dataframe()
+    voltage = [math.nan if row["BatteryVoltage"] is None else row["BatteryVoltage"] for row in expected]
+    assert np.array_equal(frame["BatteryVoltage"].to_numpy(), voltage, equal_nan=True)
+    assert [
+        b"NotAvailable" if row["OperatingState"] is None else row["OperatingState"].encode() for row in expected
+    ] == (frame["OperatingState"].tolist())
+
+
+@pytest.mark.parametrize("form", sorted(READ))
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import time
+
+    source = tmp_path / "two.kcap"
+    source.write_bytes(capture_bytes())
+    assert convert(source, tmp_path / f"a.{form}") == 0
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 5000)
+    assert convert(source, tmp_path / f"b.{form}") == 0
+    assert (tmp_path / f"a.{form}").read_bytes() == (tmp_path / f"b.{form}").read_bytes()
+
+
+# --- what is wanted of it
+
+
+def _rows(tmp_path: Path, *options: object) -> Cells:
+    source = tmp_path / "dump"
+    source.write_bytes(dump_bytes())
+    assert convert(source, tmp_path / "out.jsonl", "--force", *options) == 0
+    return read_jsonl(tmp_path / "out.jsonl", {})
+
+
+def test_signals_are_chosen_by_name_in_the_given_order(tmp_path: Path) -> None:
+    rows = _rows(tmp_path, "--signals", "operatingstate, Battery*,BatteryVoltage")
+    assert list(rows[0]) == ["Time", "OperatingState", "BatteryVoltage", "BatteryCurrent", "BatteryPower"]
+
+
+def test_one_signal_alone(tmp_path: Path) -> None:
+    rows = _rows(tmp_path, "--signals", "BatteryVoltage")
+    assert {tuple(row) for row in rows} == {("Time", "BatteryVoltage")}
+    assert rows == [{"Time": r["Time"], "BatteryVoltage": r["BatteryVoltage"]} for r in _rows(tmp_path)]
+
+
+def test_a_cut_has_all_rows_between_the_times_and_keeps_their_times(tmp_path: Path) -> None:
+    every = _rows(tmp_path)
+    assert _rows(tmp_path, "--from", "1", "--until", "2.5") == [row for row in every if 1 <= row["Time"] <= 2.5]
+    assert _rows(tmp_path, "--from", "0", "--until", "0") == every[:1]
+
+
+def test_thinned_rows_are_the_newest_of_each_period(tmp_path: Path) -> None:
+    every = _rows(tmp_path)
+    thin = _rows(tmp_path, "--rate", "10")
+    newest = {int(row["Time"] * 10 + 1e-9): row for row in every}
+    assert thin == list(newest.values())
+    assert len(thin) == pytest.approx(40, abs=1)
+
+
+@given(st.lists(st.integers(0, 10**10), max_size=200), st.floats(0.1, 1000))
+def test_thinning_gives_at_most_the_rate_and_ends_with_the_newest(times: list[int], rate: float) -> None:
+    rows = [Row(time_ns, None, (index,)) for index, time_ns in enumerate(sorted(times))]
+    thin = list(thinned(iter(rows), rate))
+    assert thin[-1:] == rows[-1:]
+    assert all(row in rows for row in thin)
+    slots = [int(row.time_ns // (1e9 / rate)) for row in thin]
+    assert len(slots) == len(set(slots)) == len({int(row.time_ns // (1e9 / rate)) for row in rows})
+
+
+def test_one_esc_of_several(tmp_path: Path) -> None:
+    source = tmp_path / "two.kcap"
+    source.write_bytes(capture_bytes())
+    assert convert(source, tmp_path / "out.csv", "--esc", "e1") == 0
+    heads = (tmp_path / "out.csv").read_text().splitlines()[0].split(",")
+    assert len(heads) > 50
+    assert all(head.startswith("E1") for head in heads[2:])
+
+
+def test_a_first_line_with_the_units(tmp_path: Path) -> None:
+    rows = _rows(tmp_path, "--units-line", "--signals", "BatteryVoltage,OperatingState")
+    assert rows[0] == {"units": {"Time": "s", "BatteryVoltage": "V"}}
+    assert rows[1]["Time"] == 0
+
+
+# --- the writers alone
+
+FIELDS = (
+    Field("Flag", "", Kind.FLAG, "M"),
+    Field("Whole", "us", Kind.WHOLE, "M"),
+    Field("Float", "deg C", Kind.FLOAT, "M"),
+    Field("Text", "", Kind.TEXT, "M", ((0, "Plain"), (1, 'odd, "quoted"'), (7, "{braces}"), (300, "µ"))),
+)
+ROW = st.tuples(
+    st.integers(0, 10**13),
+    st.one_of(st.none(), st.integers(0, 4 * 10**18)),
+    st.tuples(
+        st.sampled_from((None, 0, 1)),
+        st.one_of(st.none(), st.integers(-(1 << 52), 1 << 52)),
+        st.one_of(st.none(), st.floats(allow_nan=False, allow_infinity=False)),
+        st.sampled_from((None, "Plain", 'odd, "quoted"', "{braces}", "µ")),
+    ),
+)
+
+
+@pytest.mark.parametrize("form", sorted(READ))
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(rows=st.lists(ROW, min_size=1, max_size=20), has_utc=st.booleans())
+def test_any_values_read_back_equal(tmp_path: Path, form: str, rows: list[Any], has_utc: bool) -> None:
+    rows.sort(key=lambda row: row[0])
+    path = tmp_path / f"any.{form}"
+    table = Table(FIELDS, has_utc)
+    with open_table(path if form in ("parquet", "mf4") else (file := path.open("wb")), form, table) as writer:
+        for row in rows:
+            writer.write(Row(*row))
+    if form not in ("parquet", "mf4"):
+        file.close()
+    found = READ[form](path, {field.name: field for field in FIELDS})
+    assert len(found) == len(rows)
+    for cells, (time_ns, wall_ns, values) in zip(found, rows, strict=True):
+        assert round(cells["Time"] * 1e9) == time_ns
+        if has_utc and form != "mf4":
+            text = "" if wall_ns is None else f"{datetime.fromtimestamp(wall_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%S}"
+            assert cells["Utc"] == (f"{text}.{wall_ns % 10**9 // 1000:06d}Z" if text else None)
+        assert tuple(cells[field.name] for field in FIELDS) == values
+
+
+def test_what_json_does_not_know_is_null(tmp_path: Path) -> None:
+    path = tmp_path / "odd.jsonl"
+    with path.open("wb") as file, open_table(file, "jsonl", Table(FIELDS[2:3], False)) as writer:
+        for value in (math.inf, -math.inf, 1.5):
+            writer.write(Row(0, None, (value,)))
+    assert [row["Float"] for row in read_jsonl(path, {})] == [None, None, 1.5]
