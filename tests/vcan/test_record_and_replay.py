@@ -1,0 +1,199 @@
+"""Captures of a gateway on a real vcan, and their replay: what comes out is what was on the bus."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import can
+import cantools.database
+import pytest
+from vcan_tools import Bench, Candump, GatewayProcess, bench, canopen_configuration, configuration, ip, wait_for
+
+from kontronik_can_gw.capture import Kind
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.offline.inputs import CaptureInput, open_input
+from kontronik_can_gw.simulator import Dropout, EscOptions, Faults
+
+Start = Callable[..., GatewayProcess]
+NOISY = EscOptions(faults=Faults(noise=0.5, lost_bytes=0.002, dropout=Dropout(700_000_000, 3_000_000_000)))
+
+
+def program(*words: object, seconds: float = 60) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "kontronik_can_gw", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+
+
+def frames_of(dump: Candump) -> list[tuple[int, bytes]]:
+    return [(frame.can_id, frame.data) for frame in dump.frames]
+
+
+def by_id(frames: Sequence[tuple[Any, ...]]) -> dict[int, list[bytes]]:
+    """The data of each id's frames, in order."""
+    found: dict[int, list[bytes]] = {}
+    for can_id, data, *_ in frames:
+        found.setdefault(can_id, []).append(data)
+    return found
+
+
+def recorded_run(run: Bench, start: Start, toml: str, folder: Path, seconds: float) -> GatewayProcess:
+    gateway = start(toml, "--record", str(folder))
+    gateway.wait_for_line(f"esc{len(run.ports)}: /dev/pts")
+    run.start()
+    time.sleep(seconds)
+    return gateway
+
+
+@pytest.fixture
+def second_vcan(vcan: str) -> str:
+    name = f"{vcan}b"
+    ip("link", "add", name, "type", "vcan")
+    ip("link", "set", name, "up")
+    return name
+
+
+def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
+    vcan: str, second_vcan: str, start_gateway: Start, tmp_path: Path
+) -> None:
+    folder = tmp_path / "captures"
+    try:
+        with bench(NOISY, EscOptions()) as run:
+            toml = canopen_configuration(
+                vcan,
+                [p.path for p in run.ports],
+                tmp_path / "store",
+                canopen="self_start = true",
+                dbc='[record]\ncan_log = "candump"',
+            )
+            with Candump(vcan) as live:
+                gateway = recorded_run(run, start_gateway, toml, folder, 5)
+                begin = time.monotonic()
+                assert gateway.end() == 0
+                assert time.monotonic() - begin < 1.5
+        on_bus = frames_of(live)
+        assert len(on_bus) > 1500
+        # the log beside it
+        [log] = folder.glob("*.log")
+        with can.LogReader(log) as reader:
+            logged = [(m.arbitration_id, bytes(m.data), m.timestamp) for m in reader]
+        assert [entry[:2] for entry in logged] == on_bus
+        # through the core, as a log: times and all
+        again = tmp_path / "again.log"
+        done = program("replay", folder, "--to", "log", "-o", again)
+        assert done.returncode == 0, done.stderr
+        with can.LogReader(again) as reader:
+            core = [(m.arbitration_id, bytes(m.data), m.timestamp) for m in reader]
+        assert by_id(core) == by_id(logged)
+        # an interface that takes no frame for a moment is given it a turn later, which the core does not know
+        late = [abs(a[2] - b[2]) for a, b in zip(sorted(core), sorted(logged), strict=True) if a != b]
+        assert len(late) < len(core) / 20
+        assert max(late, default=0) < 0.1
+        # on another bus, in real time times three; and the log itself likewise
+        for source, marked in ((folder, False), (log, False), (folder, True)):
+            with Candump(second_vcan) as replayed:
+                words = [] if marked else ["--unmarked"]
+                done = program("replay", source, "--to", "can", "--channel", second_vcan, "--speed", "3", *words)
+                assert done.returncode == 0, done.stderr
+                assert f"{len(on_bus)} frames to {second_vcan}" in done.stderr
+                wait_for(lambda r=replayed: len(r.frames) >= len(on_bus), 5, "all frames")  # type: ignore[misc]
+            if not marked:
+                assert by_id(frames_of(replayed)) == by_id(on_bus)
+                if source is log:
+                    assert frames_of(replayed) == on_bus
+                continue
+            database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
+            assert isinstance(database, cantools.database.can.Database)
+            state = database.get_message_by_name("GatewayStatus")
+            shown, were = by_id(frames_of(replayed)), by_id(on_bus)
+            assert shown.keys() == were.keys()
+            differing = {can_id for can_id in were if shown[can_id] != were[can_id]}
+            assert differing == {state.frame_id, 0x481, 0x482}  # TPDO 4 has the link status, in which bit 6 says replay
+            states = [
+                str(state.decode_simple(data)["GatewayState"])
+                for can_id, data in frames_of(replayed)
+                if can_id == state.frame_id
+            ]
+            assert set(states[:-1]) == {"Replay"}
+    finally:
+        ip("link", "del", second_vcan)
+
+
+def test_a_replay_keeps_away_from_a_bus_with_a_gateway(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+    with bench(EscOptions()) as run:
+        gateway = recorded_run(run, start_gateway, configuration(vcan, [run.ports[0].path]), tmp_path / "c", 1.5)
+        [file] = (tmp_path / "c").glob("*.kcap")
+        done = program("replay", file, "--to", "can", "--channel", vcan)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr.count("\n") == 1
+        assert "another gateway on this machine sends the messages" in done.stderr
+        assert gateway.end() == 0
+
+
+def test_a_killed_gateway_has_recorded_all_but_the_last_second(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+    folder = tmp_path / "captures"
+    with bench(EscOptions()) as run:
+        gateway = recorded_run(run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4)
+        killed = time.monotonic_ns()
+        gateway.end(signal.SIGKILL)
+    with open_input(folder) as found:
+        assert isinstance(found, CaptureInput)
+        times = [entry.time_ns for entry in found.entries() if entry.kind == Kind.BYTES]
+        assert len(times) > 200
+        assert killed - times[-1] < 1_100_000_000
+        assert [line for line in found.damage if "was not closed" in line]
+
+
+def test_a_blf_beside_it_is_whole_after_sigterm(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+    folder = tmp_path / "captures"
+    with bench(EscOptions()) as run, Candump(vcan) as live:
+        toml = configuration(vcan, [run.ports[0].path], '[record]\ncan_log = "blf"')
+        gateway = recorded_run(run, start_gateway, toml, folder, 3)
+        assert gateway.end() == 0
+    [log] = folder.glob("*.blf")
+    with can.LogReader(log) as reader:
+        assert [(m.arbitration_id, bytes(m.data)) for m in reader] == frames_of(live)
+
+
+def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
+    vcan: str, start_gateway: Start, tmp_path: Path
+) -> None:
+    folder = tmp_path / "captures"
+    with bench(EscOptions()) as run:
+        gateway = recorded_run(run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4)
+        assert gateway.end() == 0
+        sent = {live.battery_voltage for _, live in run.live(0)}
+    link = tmp_path / "played"
+    command = [
+        sys.executable,
+        "-m",
+        "kontronik_can_gw",
+        "replay",
+        str(folder),
+        "--to",
+        "pty",
+        "--link",
+        str(link),
+        "--delay",
+        "4",
+    ]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as player,
+        Candump(vcan) as live,
+    ):
+        wait_for(link.exists, 20, "the pseudo terminal")
+        gateway = start_gateway(configuration(vcan, [str(link)]))
+        gateway.wait_for_line("telemetry ok")
+        assert player.wait(30) == 0
+        assert player.stderr
+        assert "dropped" not in player.stderr.read()
+        gateway.kill()
+    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
+    assert isinstance(database, cantools.database.can.Database)
+    speed = database.get_message_by_name("EscSpeed")
+    values = [speed.decode_simple(frame.data)["BatteryVoltage"] for frame in live.of(speed.frame_id)]
+    numbers = [round(float(value) * 100) for value in values if isinstance(value, (int, float))]
+    assert len(numbers) > 200
+    assert set(numbers) <= sent
