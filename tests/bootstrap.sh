@@ -3,7 +3,7 @@
 #   demo  the project
 #   lint  and its test tools
 #   test  and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and the CANopen
-#         masters of others that the node is tried with (tests/foreign); what `hardware` installs; systemd
+#         masters of others that the node is tried with (tests/foreign); what `hardware` installs; systemd; a browser, an MQTT broker
 #   hardware  and the two virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
@@ -109,6 +109,24 @@ install_systemd() {
         install -y --no-install-recommends systemd </dev/null >/dev/null || say "failed; going on"
 }
 
+# What the reports, the MQTT publisher, the screens, the completion and the manual page are tried with.
+install_viewers() {
+    PATH=$PATH:/usr/sbin:/sbin
+    wanted=
+    command -v chromium >/dev/null || command -v google-chrome >/dev/null || wanted="$wanted chromium"
+    command -v mosquitto >/dev/null || wanted="$wanted mosquitto"
+    command -v mosquitto_sub >/dev/null || wanted="$wanted mosquitto-clients"
+    for tool in tmux zsh mandoc openssl; do command -v $tool >/dev/null || wanted="$wanted $tool"; done
+    [ -n "$wanted" ] || return 0
+    can_root || { say "tests that need them are left out; they come with:  sudo apt-get install$wanted"; return; }
+    apt_update
+    say "for the tests:$wanted"
+    for package in $wanted; do
+        as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 \
+            install -y --no-install-recommends "$package" </dev/null >/dev/null || say "$package: failed; going on"
+    done
+}
+
 # The faults that set clocks and mount file systems are never tried on the machine itself.
 install_hardware() {
     PATH=$PATH:/usr/sbin:/sbin
@@ -131,6 +149,6 @@ case $what in
     demo) install_project demo . ;;
     lint) install_project test '.[test]' ;;
     hardware) install_project test '.[test]'; install_hardware ;;
-    test) install_project test '.[test]'; install_vcan; install_hardware; install_systemd; tests/foreign/install.sh || say "tests with the masters named above are left out" ;;
+    test) install_project test '.[test]'; install_vcan; install_hardware; install_systemd; install_viewers; tests/foreign/install.sh || say "tests with the masters named above are left out" ;;
     *) die "$what: demo, lint, test or hardware" ;;
 esac
