@@ -290,8 +290,8 @@ class Recording:
             parts.append(f"x{self._speed:g}")
         if self.ended:
             parts.append("END OF FILE")
-        elif self._input.size:
-            parts.append(f"{min(100, 100 * self._input.position // self._input.size)} %")
+        elif self._input.position < self._input.size:  # a small file is read at once
+            parts.append(f"{100 * self._input.position // self._input.size} %")
         if self.paused:
             parts.append("PAUSED")
         return Where(self.name, is_file=True, progress="  ".join(parts), ended=self.ended)

@@ -30,6 +30,11 @@ _ZONES = {Zone.GOOD: GOOD, Zone.WARNING: POOR, Zone.ALARM: "red"}
 _MARKS = {Zone.GOOD: "", Zone.WARNING: "!", Zone.ALARM: "!!"}
 _SEVERITIES = {Severity.ERROR: BAD, Severity.WARNING: POOR, Severity.STATUS: ""}
 _LINKS = {"ok": GOOD, "degraded": POOR}
+_TROUBLES = {
+    "neverseen": "no telemetry yet: is the ESC powered, its cable plugged in?",
+    "searching": "bytes come but no telemetry: right port? Does the ESC send KONTRONIK telemetry?",
+    "porterror": "the gateway cannot open the port: look at its log, or kontronik-can-gw status",
+}
 _FILLERS = {"from", "for", "target", "during", "operation"}
 _LABEL = 23
 """Columns of what a value is called, with its unit."""
@@ -178,7 +183,9 @@ def bar(value: float | None, scale: Scale, width: int, glyphs: Glyphs) -> Line:
 
 
 def _title(monitor: Monitor, where: Where, width: int) -> Line:
-    left: Line = [Piece(f" {printable(where.name)} ", "bold reverse"), Piece(" ")]
+    name = printable(where.name)
+    name = name if len(name) <= width // 2 - 2 else f"...{name[5 - width // 2 :]}"
+    left: Line = [Piece(f" {name} ", "bold reverse"), Piece(" ")]
     if where.progress:
         left.append(Piece(f"{where.progress}  ", "bold cyan"))
     file = monitor.bus.layout.file.rpartition("/")[2]
@@ -275,21 +282,46 @@ def _mark(esc: EscMonitor) -> str:
     return {BAD: " !!", "bold yellow": " !"}.get(_name_style(esc), "")
 
 
+def _trouble(esc: EscMonitor) -> str:
+    """Why there are no values of an ESC though the gateway sends, with the remedy; empty where there are."""
+    link = normalize(esc.link or "")
+    if esc.is_fresh or link in ("", "ok"):
+        return ""
+    age = esc.number("data_age")
+    since = f" for {duration(age / 1000)}" if age is not None else ""
+    return _TROUBLES.get(link, f"no telemetry{since}: is the ESC powered, its cable plugged in?")
+
+
 def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool) -> list[Line]:
-    """What the ESCs report, errors first; what finds no room is counted."""
+    """What the ESCs report, errors first; closer together where there is little room; what finds none is counted."""
     width, room = size
-    lines: list[Line] = []
-    told = [(esc, active) for esc in escs for active in esc.alarms]
-    for esc, active in sorted(told, key=lambda each: list(Severity).index(each[1].severity)):
+    told: list[tuple[Severity, str, str]] = []
+    for esc in escs:
         name = f"{printable(esc.name)} " if named else ""
-        kind = {Severity.STATUS: "note"}.get(active.severity, active.severity.value.upper())
-        text = f"{name}{kind}: {active.meaning}"
-        wrapped = textwrap.wrap(text, width, subsequent_indent="  ")
-        lines += [[Piece(part, _SEVERITIES[active.severity])] for part in wrapped]
+        if trouble := _trouble(esc):
+            told.append((Severity.ERROR, f"{name}LINK: ", trouble))
+        for active in esc.alarms:
+            kind = {Severity.STATUS: "note"}.get(active.severity, active.severity.value.upper())
+            told.append((active.severity, f"{name}{kind}: ", active.meaning))
+    told.sort(key=lambda each: list(Severity).index(each[0]))
+    lines = _wrapped(told, width)
+    if len(lines) > room:
+        joined: dict[tuple[Severity, str], list[str]] = {}
+        for severity, head, meaning in told:
+            joined.setdefault((severity, head), []).append(meaning)
+        lines = _wrapped([(severity, head, "; ".join(texts)) for (severity, head), texts in joined.items()], width)
     if len(lines) > room > 0:
         rest = len(lines) - room + 1
         lines = [*lines[: room - 1], [Piece(f"... and {rest} lines more of errors and warnings", BAD)]]
     return lines[: max(0, room)]
+
+
+def _wrapped(told: Sequence[tuple[Severity, str, str]], width: int) -> list[Line]:
+    return [
+        [Piece(part, _SEVERITIES[severity])]
+        for severity, head, text in told
+        for part in textwrap.wrap(head + text, width, subsequent_indent="  ")
+    ]
 
 
 def _measure(esc: EscMonitor, quantity: Quantity, width: int) -> tuple[str, str]:
@@ -344,9 +376,12 @@ def _rows(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Row]:
 
     def title(esc: EscMonitor, width: int) -> Line:
         state = _short_state(esc, width - len(esc.name) - 5)
+        style = FAINT if state == "-" else "bold cyan"
+        if _trouble(esc):
+            state, style = "no telemetry", BAD
         return [
             Piece(f"{printable(esc.name)}{_mark(esc)}  ", _name_style(esc)),
-            Piece(state, FAINT if state == "-" else "bold cyan"),
+            Piece(state, style),
         ]
 
     def device(esc: EscMonitor, width: int) -> Line:
@@ -495,9 +530,9 @@ def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
         return [Piece(text if rate is None or text != "ok" else f"{text} {rate:.0f} Hz", _link_style(esc))]
 
     def state(esc: EscMonitor) -> Line:
-        text = _short_state(esc, 16)
-        if text == "-" and not esc.is_fresh and _link(esc) not in ("-", "ok"):
+        if _trouble(esc):
             return [Piece("no telemetry", BAD)]
+        text = _short_state(esc, 16)
         return [Piece(text, FAINT if text == "-" else "cyan")]
 
     def throttle(esc: EscMonitor) -> Line:

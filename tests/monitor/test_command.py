@@ -16,8 +16,10 @@ from typing import Any, Self
 
 import can
 import pytest
+from capture_bench import START, Bench, made
 from monitor_tools import Timed, flight, layout_of, with_errors, write_log
 
+from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.cli.monitor import Recording, can_config
 from kontronik_can_gw.config import shipped
@@ -25,7 +27,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.offline.inputs import open_input
 from kontronik_can_gw.offline.layouts import layout_of_dbc
 from kontronik_can_gw.protocol.states import OperatingError
-from kontronik_can_gw.simulator import SECOND_NS
+from kontronik_can_gw.simulator import SECOND_NS, EscOptions, SimulatedEsc
 
 _numbers = itertools.count()
 DBC = shipped("dbc/kontronik_esc.dbc")
@@ -241,6 +243,35 @@ def test_a_log_without_our_frames_is_told_so(tmp_path: Path) -> None:
     assert "x.log holds no frame of kontronik_esc.dbc" in done.err
 
 
+def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path) -> None:
+    bench = Bench(*made(2)).live(3, 8, wild=False)
+    header = bench.setup.header() | {"run": "r", "part": 0, "monotonic_ns": START, "wall_ns": 1_700_000_000 * SECOND_NS}
+    parts = [block(b"H", 0, json_payload(header)), block(b"D", 1, data_payload(bench.entries)), block(b"E", 2, b"")]
+    file = tmp_path / "x.kcap"
+    file.write_bytes(b"".join(parts))
+    found = document(run(file, "--once"))
+    assert [esc["name"] for esc in found["escs"]] == ["e0", "e1"]
+    assert found["time"].startswith("2023-11-14T")
+    assert found["frames"] == len(bench.sent)
+    assert all(20 < esc["values"]["battery_voltage"] < 26 for esc in found["escs"])
+    done = run(file, "--speed", 20, "--interval", 0.1)
+    assert done.code == 0
+    assert "  e1  link " in done.out
+    done = run(file, "--dbc", DBC)
+    assert (done.code, done.out) == (2, "")
+    assert "x.kcap: is a capture, which holds its own DBC. Leave -c and --dbc out." in done.err
+
+
+def test_plain_bytes_of_a_uart_are_watched(tmp_path: Path) -> None:
+    esc = SimulatedEsc(EscOptions(), seed=1)
+    file = tmp_path / "bytes.bin"
+    file.write_bytes(b"".join(sent.wire for sent in esc.frames_until(9 * SECOND_NS)))
+    found = document(run(file, "--once"))
+    assert found["time"] is None
+    assert found["escs"][0]["link"] == "Ok"
+    assert found["escs"][0]["values"]["motor_speed"] > 0
+
+
 class Clock:
     """Time that only passes when it is slept or told to."""
 
@@ -325,19 +356,6 @@ def test_a_mistake_is_one_line_with_the_remedy(
     assert (done.code, done.out) == (code, "")
     assert said in done.err.splitlines()[-1]
     assert "Traceback" not in done.err
-
-
-def test_a_capture_with_another_dbc_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from kontronik_can_gw.offline import inputs
-
-    class Capture(inputs.CaptureInput):
-        def __init__(self) -> None:
-            self._file = None
-
-    monkeypatch.setattr(inputs, "open_input", lambda *_: Capture())
-    done = run(tmp_path / "x.kcap", "--dbc", DBC)
-    assert done.code == 2
-    assert "x.kcap: is a capture, which holds its own DBC" in done.err
 
 
 @pytest.fixture(autouse=True)
