@@ -117,7 +117,7 @@ def main(args: argparse.Namespace) -> int:
             raise
         except OSError as error:
             where = "standard output" if args.output == "-" else str(target)
-            raise RunError(f"{where}: cannot be written: {error.strerror or _first_line(error)}.") from None
+            raise RunError(f"{where}: cannot be written: {_reason(error)}.") from None
         except KeyboardInterrupt:
             _say("stopped: nothing is written" if args.output != "-" else "stopped")
             return 130
@@ -390,8 +390,14 @@ def _many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+def _reason(error: OSError) -> str:
+    """In the system's words; pyarrow says its own, with the number in it."""
+    import os
+    import re
+
+    if number := re.search(r"\[errno (\d+)\]", str(error)):
+        return os.strerror(int(number[1]))
+    return error.strerror or (str(error).strip().splitlines() or ["no reason given"])[0]
 
 
 def _seconds(text: str) -> int:

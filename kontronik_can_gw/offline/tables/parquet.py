@@ -1,6 +1,7 @@
 """Tables as Parquet by pyarrow (an extra): typed columns, units and provenance in the metadata."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,8 @@ class ParquetTable:
 
     def discard(self) -> None:
         """Release the file."""
-        self._writer.close()
+        with suppress(OSError):  # there is no room for its end
+            self._writer.close()
 
     def _flush(self) -> None:
         pa, rows = self._pa, self._rows

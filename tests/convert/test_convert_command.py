@@ -1,0 +1,403 @@
+"""``kontronik-can-gw convert`` as people use it: what it makes, what it says, what it leaves behind when it cannot go on."""
+
+import contextlib
+import os
+import pty
+import re
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import can
+import pytest
+from log_files import READERS, SUFFIX, read_by_library
+from recordings import candump_lines, capture_bytes, convert, dump_bytes, shipped_database, write_candump
+
+from kontronik_can_gw.offline.inputs import open_input
+
+PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
+
+
+def program(*words: object, **options: object) -> "subprocess.CompletedProcess[str]":
+    """Run it as a process of its own."""
+    command = [*PROGRAM, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)  # type: ignore[call-overload, no-any-return]
+
+
+def refused(capsys: pytest.CaptureFixture[str], code: int, *words: object) -> str:
+    """Run it, be refused; the one line."""
+    try:
+        found: object = convert(*words)
+    except SystemExit as end:
+        found = end.code
+    said = capsys.readouterr()
+    assert found == code, said.err
+    assert said.out == ""
+    assert said.err.count("\n") == 1, said.err
+    return said.err.strip()
+
+
+@pytest.fixture
+def dump(tmp_path: Path) -> Path:
+    path = tmp_path / "esc.bytes"
+    path.write_bytes(dump_bytes())
+    return path
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_candump(tmp_path / "bus.log", candump_lines(300))
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    path = tmp_path / "two.kcap"
+    path.write_bytes(capture_bytes())
+    return path
+
+
+# --- CAN logs and bytes
+
+
+@pytest.mark.parametrize("form", ["candump", "asc", "blf", "trc", "mf4-log"])
+@pytest.mark.parametrize("source", ["capture", "log"])
+def test_can_logs_hold_the_frames_of_the_recording(
+    tmp_path: Path, source: str, form: str, request: pytest.FixtureRequest
+) -> None:
+    path = request.getfixturevalue(source)
+    format_ = form.removesuffix("-log")
+    out = tmp_path / f"out{SUFFIX[format_]}"
+    assert convert(path, out, "--to", form) == 0
+    with open_input(path) as opened:
+        expected = [((opened.wall_ns(t) or 0), frame, received) for t, frame, received in opened.frames()]
+    found = read_by_library(out, format_)
+    assert len(found) == len(expected) > 250
+    for (time_ns, frame, received), (wanted_ns, wanted, wanted_received) in zip(found, expected, strict=True):
+        assert abs(time_ns - wanted_ns) <= 1000
+        same = (frame.can_id, frame.data, frame.extended, received)
+        assert same == (wanted.can_id, wanted.data, wanted.extended, wanted_received)
+
+
+def test_a_log_goes_through_every_format_and_comes_back_the_same(tmp_path: Path, log: Path) -> None:
+    before = log
+    for number, format_ in enumerate(["blf", "asc", "mf4", "trc", "candump"]):
+        out = tmp_path / f"{number}{SUFFIX[format_]}"
+        assert convert(before, out, "--to", "mf4-log" if format_ == "mf4" else format_) == 0
+        before = out
+    plain = [line.removesuffix(" T") for line in before.read_text().splitlines()]
+    assert plain == log.read_text().splitlines()
+
+
+def test_the_candump_log_is_read_by_cantools_decode(tmp_path: Path, dump: Path) -> None:
+    out = tmp_path / "out.log"
+    assert convert(dump, out) == 0
+    voltages = [
+        message["BatteryVoltage"]
+        for m in can.CanutilsLogReader(out)
+        if isinstance(message := shipped_database().decode_message(m.arbitration_id, bytes(m.data)), dict)
+        and isinstance(message.get("BatteryVoltage"), float)
+    ]
+    with open_input(dump) as opened:
+        at = [column.name for column in opened.reader.columns].index("BatteryVoltage")
+        rows = [values[at] for _, values in opened.samples()]
+    assert voltages[: len(rows)] == rows[: len(voltages)]
+    assert len(voltages) > 300
+
+
+def test_a_part_of_a_log_keeps_its_times(tmp_path: Path, log: Path) -> None:
+    assert convert(log, tmp_path / "out.log", "--from", "0.5", "--until", "1") == 0
+    lines = log.read_text().splitlines()
+    start = float(lines[0][1:18])
+    wanted = [line for line in lines if 0.5 <= float(line[1:18]) - start <= 1]
+    assert [line[:-2] for line in (tmp_path / "out.log").read_text().splitlines()] == wanted
+    assert 0 < len(wanted) < len(lines)
+
+
+def test_bytes_of_an_esc_come_out_as_they_went_in(
+    tmp_path: Path, dump: Path, capture: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert convert(dump, tmp_path / "out.bin") == 0
+    assert (tmp_path / "out.bin").read_bytes() == dump_bytes()
+    assert convert(capture, tmp_path / "two.bin", "--esc", "e1") == 0
+    with open_input(capture) as opened:
+        assert (tmp_path / "two.bin").read_bytes() == b"".join(opened.esc_bytes(1)) != b""
+    capsys.readouterr()
+    said = refused(capsys, 2, capture, tmp_path / "three.bin")
+    assert said.endswith("bin holds the bytes of one ESC. Give --esc: e0, e1")
+
+
+# --- standard output and talk
+
+
+def test_standard_output_gets_the_data_and_standard_error_the_summary(dump: Path, tmp_path: Path) -> None:
+    done = program(dump, "-", "--to", "csv")
+    assert done.returncode == 0
+    assert convert(dump, tmp_path / "out.csv") == 0
+    assert done.stdout == (tmp_path / "out.csv").read_text()
+    first, second = done.stderr.splitlines()
+    assert first.startswith("kontronik-can-gw convert: standard output: 401 rows of 99 signals, up to 4.000 s, in ")
+    assert second == "kontronik-can-gw convert: times are assumed: 100 live frames a second (--live-rate)"
+
+
+@pytest.mark.parametrize("form", ["csv", "jsonl", "candump", "asc", "trc"])
+def test_text_on_standard_output_is_that_of_a_file(dump: Path, tmp_path: Path, form: str) -> None:
+    done = subprocess.run([*PROGRAM, dump, "-", "--to", form, "-q"], capture_output=True, timeout=60, check=True)
+    assert done.stderr == b""
+    out = tmp_path / "out"
+    assert convert(dump, out, "--to", form) == 0
+    written = out.read_bytes()
+    if form == "trc":  # which has the file's name in its header
+        written = written.replace(b";   out\r\n", b";   \r\n")
+    assert done.stdout == written
+
+
+def test_a_reader_that_goes_away_ends_it_without_a_word(dump: Path) -> None:
+    command = " ".join(map(str, [*PROGRAM, dump, "-", "--to", "jsonl", "|", "head", "-n", "1"]))
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.count("\n") == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_a_rate_for_bytes_without_times(dump: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert convert(dump, tmp_path / "out.csv", "--live-rate", "50") == 0
+    times = [line.partition(",")[0] for line in (tmp_path / "out.csv").read_text().splitlines()[1:4]]
+    assert times == ["0.000000", "0.020000", "0.040000"]
+    assert "times are assumed: 50 live frames a second" in capsys.readouterr().err
+
+
+def _on_terminal(*words: object, data_too: bool = False) -> bytes:
+    """What a person sees on standard error (and output), a terminal."""
+    master, slave = pty.openpty()
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
+    process = subprocess.Popen(
+        [*PROGRAM, *map(str, words)], stderr=slave, stdout=slave if data_too else subprocess.DEVNULL, env=environment
+    )
+    os.close(slave)
+    seen = b""
+    with contextlib.suppress(OSError):  # EIO: the program has gone
+        while data := os.read(master, 65536):
+            seen += data
+    os.close(master)
+    assert process.wait(20) == 0
+    return seen
+
+
+def test_a_terminal_sees_a_bar_with_rate_and_time_left(tmp_path: Path) -> None:
+    source = write_candump(tmp_path / "long.log", candump_lines(60_000))
+    seen = _on_terminal(source, tmp_path / "out.csv").decode()
+    assert "long.log" in seen
+    assert "━" in seen
+    assert re.search(r"[1-9][\d.]* [kM]B/s", seen)
+    assert re.search(r"0:00:0\d", seen)
+    assert re.search(r"out\.csv: \d+ rows of 99 signals", seen.rpartition("━")[2])
+
+
+def test_no_bar_where_the_data_goes_to_the_same_terminal(dump: Path) -> None:
+    assert "━" not in _on_terminal(dump, "-", "--to", "csv", data_too=True).decode()
+    assert "━" in _on_terminal(dump, "-", "--to", "csv").decode()
+
+
+def test_a_pipe_sees_no_bar(dump: Path, tmp_path: Path) -> None:
+    assert "━" not in program(dump, tmp_path / "out.csv").stderr
+
+
+# --- damage
+
+
+def test_of_damaged_input_all_that_is_intact_is_converted_and_the_rest_told(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = log.read_text().splitlines(keepends=True)
+    lines[100] = lines[100][:30] + "\n"
+    lines[200] = "rubbish\n"
+    log.write_text("".join(lines))
+    assert convert(log, tmp_path / "out.log") == 0
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith(f"kontronik-can-gw convert: {tmp_path / 'out.log'}: 298 CAN frames, up to ")
+    assert said[1:] == [f"kontronik-can-gw convert: {log}: damaged: 2 damaged lines: 101, 201"]
+
+
+def test_a_damaged_capture_is_converted_as_far_as_it_goes(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = bytearray(capture_bytes())
+    content[len(content) // 2] ^= 1
+    capture.write_bytes(content)
+    assert convert(capture, tmp_path / "out.csv") == 0
+    assert "two.kcap: damaged: two.kcap: " in capsys.readouterr().err
+    assert len((tmp_path / "out.csv").read_text().splitlines()) > 200
+
+
+@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "mf4", "candump", "blf", "mf4-log"])
+def test_nothing_to_convert_leaves_nothing(tmp_path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> None:
+    source = tmp_path / "other.log"
+    source.write_text("(1700000000.000000) can0 123#00\n" if form in ("csv", "jsonl", "parquet", "mf4") else "\n")
+    said = refused(capsys, 1, source, tmp_path / "out", "--to", form)
+    assert f"{source}: nothing in it can be converted" in said
+    assert "--dbc" in said or form not in ("csv", "jsonl", "parquet", "mf4")
+    assert [path.name for path in tmp_path.iterdir()] == ["other.log"]
+
+
+# --- refusals
+
+
+def test_what_is_wrong_is_told_in_one_line_with_the_remedy(
+    dump: Path, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.csv"
+    there = tmp_path / "there.csv"
+    there.write_text("mine")
+    cases: list[tuple[int, list[object], str]] = [
+        (2, [dump, dump], "its suffix tells no format. Give --to, or one of these suffixes: .csv "),
+        (2, [log, log], "is IN. Give another OUT."),
+        (2, [log, log, "--force"], "is IN. Give another OUT."),
+        (2, [dump, there], "is there already. Give --force to write over it."),
+        (2, [dump, "-"], "give --to: csv, jsonl, candump, asc, trc"),
+        (2, [dump, "-", "--to", "blf"], "blf cannot go to standard output."),
+        (2, [dump, tmp_path, "--to", "csv"], "is a directory. Give a file."),
+        (2, [dump, "/dev/null", "--to", "parquet"], "is no plain file, into which parquet cannot be written"),
+        (1, [dump, tmp_path / "missing" / "out.csv"], "cannot be written: No such file or directory."),
+        (1, [tmp_path / "missing.log", out], "missing.log: there is no such file."),
+        (2, [dump, out, "--signals", "BateryVoltage"], "no such signal. Did you mean BatteryVoltage?"),
+        (2, [dump, out, "--esc", "esc7"], "--esc esc7: there is no such ESC. There are: esc1"),
+        (2, [dump, tmp_path / "o.log", "--signals", "X"], "--signals is for tables"),
+        (2, [dump, tmp_path / "o.log", "--rate", "1"], "--rate is for tables"),
+        (2, [dump, tmp_path / "o.asc", "--esc", "esc1"], "--esc is for tables and bin"),
+        (2, [dump, out, "--units-line"], "--units-line is for jsonl, not for csv"),
+        (2, [dump, tmp_path / "o.bin", "--from", "1"], "not for bin, which has no times"),
+        (2, [log, tmp_path / "o.bin"], "is a log of CAN frames"),
+        (2, [dump, out, "--from", "2", "--until", "1"], "--until is before --from"),
+        (1, [dump, out, "--from", "999"], "nothing in it is between --from and --until"),
+        (2, [dump, out, "--dbc", tmp_path / "no.dbc"], "no.dbc"),
+    ]
+    for code, words, part in cases:
+        said = refused(capsys, code, *words)
+        assert said.startswith("kontronik-can-gw convert: ")
+        assert part in said
+    assert there.read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bus.log", "esc.bytes", "there.csv"]
+
+
+def test_force_writes_over_what_is_there(dump: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv"
+    out.write_text("old")
+    assert convert(dump, out, "--force") == 0
+    assert out.read_text().startswith("Time [s],")
+
+
+@pytest.mark.parametrize(
+    ("module", "form", "extra"),
+    [("pyarrow", "parquet", "parquet"), ("asammdf", "mf4", "mf4"), ("asammdf", "mf4-log", "mf4")],
+)
+def test_a_missing_library_is_named_with_its_extra(
+    dump: Path,
+    tmp_path: Path,
+    module: str,
+    form: str,
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    said = refused(capsys, 2, dump, tmp_path / "out", "--to", form)
+    assert said.endswith(f"needs {module}: pip install 'kontronik-can-gw[{extra}]'")
+    assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
+
+
+@pytest.mark.parametrize("form", ["csv", "candump", "blf", "asc"])
+def test_nothing_heavy_is_imported_where_it_is_not_needed(dump: Path, tmp_path: Path, form: str) -> None:
+    code = (
+        f"import sys; from kontronik_can_gw.cli import main; main(['convert', {str(dump)!r}, {str(tmp_path / 'out')!r}, "
+        f"'--to', {form!r}, '-q']); print([m for m in ('numpy', 'pyarrow', 'asammdf', 'pandas', 'rich') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"
+
+
+# --- when it cannot go on
+
+
+@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "mf4", "candump", "asc", "blf", "trc", "mf4-log", "bin"])
+def test_a_full_disk_is_one_line_and_leaves_nothing(dump: Path, tmp_path: Path, form: str) -> None:
+    def small() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
+
+    done = program(dump, tmp_path / "out", "--to", form, preexec_fn=small)
+    assert done.returncode == 1, done.stderr
+    assert done.stderr == f"kontronik-can-gw convert: {tmp_path / 'out'}: cannot be written: File too large.\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
+
+
+@pytest.mark.parametrize("where", ["-", "/dev/full"])
+def test_a_full_device_is_one_line(dump: Path, where: str) -> None:
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [*PROGRAM, dump, where, "--to", "csv"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert done.returncode == 1
+    name = "standard output" if where == "-" else where
+    assert done.stderr == f"kontronik-can-gw convert: {name}: cannot be written: No space left on device.\n"
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "mf4", "blf"])
+def test_an_interrupt_leaves_no_half_file(tmp_path: Path, form: str) -> None:
+    source = tmp_path / "long.log"
+    write_candump(source, candump_lines(40_000))
+    out = tmp_path / "out"
+    process = subprocess.Popen([*PROGRAM, source, out, "--to", form], stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and not (tmp_path / "out.part").exists() and form != "mf4":
+        pass
+    if form == "mf4":  # which is written at its end: its temporary file tells that it is under way
+        while process.poll() is None and len(list(tmp_path.iterdir())) < 2:
+            pass
+    process.send_signal(signal.SIGINT)
+    assert process.stderr is not None
+    said = process.stderr.read()
+    assert process.wait(30) == 130
+    assert said == "kontronik-can-gw convert: stopped: nothing is written\n"
+    assert not out.exists()
+    assert not (tmp_path / "out.part").exists()
+
+
+# --- streams
+
+
+def _peak(source: Path, out: Path, *options: object) -> int:
+    """Peak memory in kB of a conversion."""
+    code = (
+        "import sys; from kontronik_can_gw.cli import main; code = main(['convert', *sys.argv[1:]]); "
+        "print(next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM'))); sys.exit(code)"
+    )
+    words = [sys.executable, "-c", code, str(source), str(out), "-q", *map(str, options)]
+    return int(subprocess.run(words, capture_output=True, text=True, timeout=120, check=True).stdout)
+
+
+@pytest.mark.parametrize("form", ["csv", "candump", "blf"])
+def test_memory_does_not_grow_with_the_file(tmp_path: Path, form: str) -> None:
+    lines = candump_lines(10_000)
+    small = write_candump(tmp_path / "small.log", lines)
+    large = tmp_path / "large.log"
+    step = lines[-1][0] - lines[0][0] + 10_000
+    text = small.read_text()
+    with large.open("w") as file:
+        for turn in range(8):
+            for line in text.splitlines(keepends=True):
+                us = int(line[1:11]) * 10**6 + int(line[12:18]) + turn * step
+                file.write(f"({us // 10**6}.{us % 10**6:06d}{line[18:]}")
+    before = _peak(small, tmp_path / "small.out", "--to", form)
+    after = _peak(large, tmp_path / "large.out", "--to", form)
+    assert after < before + 4_000
+
+
+def test_the_formats_of_the_help_are_those_that_are_tested() -> None:
+    from kontronik_can_gw.cli.convert import FORMATS, LOGS, SUFFIXES
+
+    assert set(SUFFIXES.values()) | {"mf4-log"} == set(FORMATS)
+    assert set(LOGS.values()) == set(READERS)
