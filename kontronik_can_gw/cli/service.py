@@ -22,6 +22,7 @@ from kontronik_can_gw.cli.service_machine import (
 )
 from kontronik_can_gw.cli.service_removal import uninstall
 from kontronik_can_gw.cli.service_status import status
+from kontronik_can_gw.config import load
 from kontronik_can_gw.errors import RunError, UserError
 
 _INSTANCE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}")
@@ -64,6 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     install_parser.add_argument(
         "--prometheus", action="store_true", help="allow the service loopback IP, for statistics.prometheus"
+    )
+    install_parser.add_argument(
+        "--mqtt", action="store_true", help="a second service that publishes to the broker of the table [mqtt]"
     )
     uninstall_parser.add_argument(
         "--purge", action="store_true", help="remove configurations, stored parameters and the user too"
@@ -120,6 +124,7 @@ def _install(args: argparse.Namespace) -> int:
         args.channel,
         args.network,
         args.prometheus,
+        args.mqtt,
     )
     plan = [(file, file.state(root)) for file in files.planned(choices, root)]
     own = root / files.configuration(args.instance)
@@ -163,9 +168,21 @@ def _enable(args: argparse.Namespace, own: Path, live: bool, root: Path) -> int:
         for line in text:
             say(line)
         return 0
+    _enable_unit(args, unit, live, root, "See: kontronik-can-gw service status")
+    if args.mqtt:
+        unit = files.mqtt_unit(args.instance)
+        if load(own).mqtt.broker is None:
+            say(f"{own}: mqtt.broker is not set. {unit} was not enabled.")
+        else:
+            _enable_unit(args, unit, live, root, f"See: journalctl -u {unit}")
+    return 0
+
+
+def _enable_unit(args: argparse.Namespace, unit: str, live: bool, root: Path, then: str) -> None:
     if not live:
         link = root / WANTS / unit
-        target = f"/{files.UNITS}/{unit if args.instance is None else f'{NAME}@.service'}"
+        template = f"{unit.partition('@')[0]}@.service"
+        target = f"/{files.UNITS}/{unit if args.instance is None else template}"
         try:
             link.parent.mkdir(parents=True, exist_ok=True)
             link.unlink(missing_ok=True)
@@ -173,21 +190,20 @@ def _enable(args: argparse.Namespace, own: Path, live: bool, root: Path) -> int:
         except OSError as error:
             raise RunError(f"{link}: cannot be made: {error.strerror}") from None
         say(f"{unit} is enabled")
-        return 0
+        return
     call("systemctl", "enable", unit)
     if args.now:
         call("systemctl", "restart", unit)
-        say(f"{unit} is enabled and runs. See: kontronik-can-gw service status")
+        say(f"{unit} is enabled and runs. {then}")
     else:
         say(f"{unit} is enabled. Start it now: sudo systemctl restart {unit}")
-    return 0
 
 
 def _not_ready(own: Path) -> list[str]:
     """Why the service must not send yet: its configuration is faulty, or the example that nobody has edited."""
     import tomllib
 
-    from kontronik_can_gw.config import load, parse
+    from kontronik_can_gw.config import parse
 
     try:
         ports = {esc.port for esc in load(own).esc}

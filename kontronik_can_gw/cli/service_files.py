@@ -70,11 +70,17 @@ class Choices:
     bitrate: int | None = None
     """None: the network files are examples only."""
     prometheus: bool = False
+    mqtt: bool = False
 
 
 def unit(instance: str | None) -> str:
     """Name the service of an instance; of the plain one for None."""
     return f"{NAME}.service" if instance is None else f"{NAME}@{instance}.service"
+
+
+def mqtt_unit(instance: str | None) -> str:
+    """Name the service that publishes for an instance, for the plain one for None."""
+    return f"{NAME}-mqtt.service" if instance is None else f"{NAME}-mqtt@{instance}.service"
 
 
 def configuration(instance: str | None) -> str:
@@ -103,6 +109,14 @@ def planned(choices: Choices, root: Path) -> list[PlannedFile]:
     ]
     if choices.prometheus:
         files += [_made(f"{UNITS}/{NAME}{kind}.service.d/prometheus.conf", "prometheus.conf", {}) for kind in ("", "@")]
+    if choices.mqtt:
+        files += [
+            _made(f"{UNITS}/{NAME}-mqtt{kind}.service", "mqtt.service", words | {"DESCRIPTION": text})
+            for kind, words, text in (
+                ("", plain, "KONTRONIK ESC telemetry to MQTT"),
+                ("@", template, "KONTRONIK ESC telemetry to MQTT, %i"),
+            )
+        ]
     for kind in ("network", "link"):
         path = f"{NETWORK}/{_NETWORK_PREFIX}{choices.channel}.{kind}"
         words = {"CHANNEL": choices.channel, "BITRATE": str(choices.bitrate or 500_000), "HOW": ""}
@@ -122,6 +136,8 @@ def installed(root: Path) -> list[Path]:
         f"{UNITS}/{NAME}@.service",
         f"{UNITS}/{NAME}.service.d/prometheus.conf",
         f"{UNITS}/{NAME}@.service.d/prometheus.conf",
+        f"{UNITS}/{NAME}-mqtt.service",
+        f"{UNITS}/{NAME}-mqtt@.service",
         f"etc/udev/rules.d/70-{NAME}.rules",
         *(f"{NETWORK}/{_NETWORK_PREFIX}*.{kind}{end}" for kind in ("network", "link") for end in ("", f".{EXAMPLE}")),
     )

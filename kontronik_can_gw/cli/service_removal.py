@@ -23,9 +23,8 @@ def uninstall(args: argparse.Namespace) -> int:
     if args.instance:
         if args.purge:
             raise UserError("--purge removes everything: not with --instance")
-        return _disable(
-            args, [files.unit(args.instance)], [link for link in links if link.name == files.unit(args.instance)], live
-        )
+        units = [files.unit(args.instance), files.mqtt_unit(args.instance)]
+        return _disable(args, units, [link for link in links if link.name in units], live)
     found = files.installed(root)
     doomed = _kept_data(root) if args.purge else []
     if args.dry_run:
@@ -35,7 +34,7 @@ def uninstall(args: argparse.Namespace) -> int:
     if not found and not links and not doomed:
         say("nothing is installed")
         return 0
-    _disable(args, [*_running(), files.unit(None)] if live else [], links, live)
+    _disable(args, [*_running(), files.unit(None), files.mqtt_unit(None)] if live else [], links, live)
     for path in found:
         _remove_file(path)
     for kind in ("", "@"):
@@ -70,7 +69,9 @@ def _disable(args: argparse.Namespace, units: Sequence[str], links: Sequence[Pat
 
 
 def _running() -> list[str]:
-    listed = output("systemctl", "list-units", "--all", "--plain", "--no-legend", f"{NAME}@*.service")
+    listed = output(
+        "systemctl", "list-units", "--all", "--plain", "--no-legend", f"{NAME}@*.service", f"{NAME}-mqtt@*.service"
+    )
     return [line.split()[0] for line in listed.splitlines() if line.strip()]
 
 

@@ -134,6 +134,11 @@ OPTIONS = {
         *("--info-replaces", "--idle", "--seconds", "--seed", "--link", "--out", "--noise", "--lose-bytes"),
         *("--flip-bits", "--dropout", "--error", "--swap-device"),
     ],
+    "mqtt": [
+        *("FILE", "-c", "--config", "--dbc", "--interface", "--channel", "--broker", "--tls", "--ca-file", "--cert-file"),
+        *("--key-file", "--username", "--password-file", "--gateway", "--topic", "--rate", "--retain", "--discovery"),
+        "--remove-discovery",
+    ],
     "schema": ["-h"],
     "describe": ["-c", "--config", "--dbc", "--format", "-o", "--output"],
     "completion": ["SHELL"],

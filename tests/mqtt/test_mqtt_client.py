@@ -1,0 +1,357 @@
+"""The connection alone: TLS, take-over, old brokers, brokers that speak rubbish, what waits and what is lasting."""
+
+import contextlib
+import logging
+import random
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from mqtt_bench import Mosquitto, Subscriber, free_port, kept, wait_for
+
+from kontronik_can_gw.runtime import mqtt_client
+from kontronik_can_gw.runtime.mqtt_client import Broker, MqttClient, check
+from kontronik_can_gw.telemetry import SECOND
+
+ONLINE = "k/test/online"
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mosquitto]:
+    made = Mosquitto(tmp_path_factory.mktemp("broker"))
+    yield made
+    made.stop()
+
+
+@contextlib.contextmanager
+def connecting(broker: Broker) -> Iterator[MqttClient]:
+    client = MqttClient(broker, ONLINE)
+    client.start()
+    try:
+        yield client
+        assert client.failure is None
+    finally:
+        client.stop(2)
+        assert not client.alive
+
+
+def to(port: int, client_id: str = "test", host: str = "127.0.0.1") -> Broker:
+    return Broker(host, port, client_id)
+
+
+def waits_until(client: MqttClient, text: str, seconds: float = 10) -> None:
+    wait_for(lambda: text in client.problem, seconds, lambda: f"{text!r} in {client.problem!r}")
+
+
+@pytest.fixture
+def said(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
+    with caplog.at_level(logging.INFO, "kontronik_can_gw"):
+        yield caplog
+
+
+# --- what waits, what is lasting
+
+
+def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosquitto) -> None:
+    client = MqttClient(to(broker.port), ONLINE)
+    for number in range(1000):
+        client.offer("k/test/state", b"%d" % number)
+        client.offer("k/test/other", b"%d" % number)
+    client.offer("k/test/known", b"1", lasting=True, retain=True)
+    client.offer("k/test/known", b"2", lasting=True, retain=True)
+    assert client.replaced == 999 * 2 + 1
+    with Subscriber(broker.port, "k/test/#") as heard:
+        client.start()
+        heard.wait("k/test/other", b"999")
+        client.stop(2)
+        heard.wait(ONLINE, b"offline")
+    assert [(m.topic, m.payload) for m in heard.heard if not m.retained] == [
+        (ONLINE, b"online"),
+        ("k/test/known", b"2"),
+        ("k/test/state", b"999"),
+        ("k/test/other", b"999"),
+        (ONLINE, b"offline"),
+    ]
+
+
+def test_after_a_restart_of_the_broker_all_that_is_lasting_is_there_again(tmp_path: Path) -> None:
+    made = Mosquitto(tmp_path)
+    try:
+        with connecting(to(made.port)) as client:
+            client.offer("k/test/a", b"1", lasting=True, retain=True)
+            client.offer("k/test/b", b"1", lasting=True, retain=True)
+            wait_for(lambda: len(kept(made.port, "k/#")) == 3, 10, "messages")
+            made.stop()
+            waits_until(client, "connection")
+            client.offer("k/test/b", b"2", lasting=True, retain=True)
+            made.start()
+            wait_for(lambda: client.connected, 10, "a connection")
+            expected = {ONLINE: b"online", "k/test/a": b"1", "k/test/b": b"2"}
+            wait_for(lambda: kept(made.port, "k/#") == expected, 10, "messages")
+    finally:
+        made.stop()
+
+
+def test_hundreds_of_topics_are_all_published(broker: Mosquitto) -> None:
+    with Subscriber(broker.port, "k/many/#") as heard, connecting(to(broker.port)) as client:
+        wait_for(lambda: client.connected, 10, "a connection")
+        for number in range(500):
+            client.offer(f"k/many/{number}", b"x" * 1000, lasting=number % 2 == 0)
+        wait_for(lambda: len(heard.heard) >= 500, 10, lambda: len(heard.heard))
+    assert sorted(message.topic for message in heard.heard) == sorted(f"k/many/{number}" for number in range(500))
+
+
+def test_a_broker_that_takes_nothing_makes_nothing_pile_up(tmp_path: Path, said: pytest.LogCaptureFixture) -> None:
+    """It stands still for some seconds: that is said, what waits is replaced, what then comes is new, and the end comes in time."""
+    made = Mosquitto(tmp_path)
+    try:
+        with Subscriber(made.port, "k/test/state") as heard, connecting(to(made.port)) as client:
+            wait_for(lambda: client.connected, 10, "a connection")
+            number = 0
+
+            def offer() -> bool:
+                nonlocal number
+                number += 1
+                client.offer("k/test/state", b"%06d" % number + b"x" * 100_000)
+                time.sleep(0.005)
+                return False
+
+            made.freeze(True)
+            wait_for(
+                lambda: offer() or "takes messages too slowly: only the newest are sent" in said.text, 20, "a line"
+            )
+            assert client.replaced > 100
+            assert len(client._waiting) <= 1
+            assert client.published < 120  # what the kernel took, of several hundred
+            made.freeze(False)
+            wait_for(lambda: offer() or "takes messages again" in said.text, 10, "a line")
+            heard.wait("k/test/state", b"%06d" % number + b"x" * 100_000)
+            numbers = [int(message.payload[:6]) for message in heard.heard]
+            assert numbers == sorted(numbers)
+            made.freeze(True)
+            begin = time.monotonic()
+            for _ in range(100):
+                offer()
+            begin = time.monotonic()
+            client.stop(0.3)
+            assert time.monotonic() - begin < 0.4
+            made.freeze(False)
+    finally:
+        made.stop()
+
+
+# --- brokers that end connections
+
+
+def test_two_with_one_client_id_do_not_throw_each_other_out_for_ever(
+    broker: Mosquitto, said: pytest.LogCaptureFixture
+) -> None:
+    """This broker does not say why it ends a connection."""
+    text = "maybe another program uses the client id 'same'. Give each gateway a name of its own (--gateway)."
+    with connecting(to(broker.port, "same")) as first, connecting(to(broker.port, "same")) as second:
+        wait_for(lambda: text in first.problem or text in second.problem, 10, lambda: said.text)
+        time.sleep(1)
+        known = said.text.count("connected")
+        time.sleep(1)
+        assert said.text.count("connected") == known
+        assert first.connected is not second.connected
+    assert 1 <= said.text.count(text) <= 2
+
+
+def test_a_take_over_that_the_broker_tells_of_is_said_once(said: pytest.LogCaptureFixture) -> None:
+    listener, port, got = served(*[b"\x20\x03\x00\x00\x00" + b"\xe0\x02\x8e\x00"] * 10)
+    with listener, connecting(to(port)) as client:
+        waits_until(client, "another program took over the client id 'test'. Give each gateway a name of its own")
+        time.sleep(0.5)
+        assert len(got) == 1
+    assert said.text.count("took over") == 1
+
+
+def served(*answers: bytes, pause_s: float = 0.02) -> tuple[socket.socket, int, list[bytes]]:
+    """A broker of our own making: what it answers to each connection's first bytes; then it ends it. And what it got."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    got: list[bytes] = []
+
+    def serve() -> None:
+        with contextlib.suppress(OSError):
+            for answer in answers:
+                connection, _ = listener.accept()
+                with connection:
+                    got.append(connection.recv(4096))
+                    connection.sendall(answer)
+                    time.sleep(pause_s)
+
+    threading.Thread(target=serve, daemon=True).start()
+    port: int = listener.getsockname()[1]
+    return listener, port, got
+
+
+OLD = b"\x20\x02\x00\x00"
+"""Accepted, in MQTT 3."""
+
+
+@pytest.mark.parametrize("refusal", [b"\x20\x02\x00\x01", b"\x20\x03\x00\x84\x00", b""], ids=["v3", "v5", "closed"])
+def test_a_broker_that_knows_only_mqtt_3_is_spoken_to_in_it(refusal: bytes) -> None:
+    listener, port, got = served(refusal, OLD, pause_s=0.3)
+    with listener, connecting(to(port)) as client:
+        wait_for(lambda: client.connected, 10, lambda: client.problem)
+    assert [greeting[8] for greeting in got[:2]] == [5, 4]  # protocol level of MQTT 5 and 3.1.1
+
+
+def test_one_that_ends_each_connection_at_once_is_left_alone_for_a_while(said: pytest.LogCaptureFixture) -> None:
+    accepted = b"\x20\x03\x00\x00\x00"
+    listener, port, got = served(*[accepted] * 20)
+    with listener, connecting(to(port)) as client:
+        waits_until(client, "ends each connection at once: maybe another program uses the client id 'test'")
+        time.sleep(1)
+        assert len(got) == 3
+
+
+def test_rubbish_instead_of_an_answer_ends_nothing() -> None:
+    rng = random.Random(1)
+    rubbish = [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x00" * 100, b"\x20\x7f\x00", bytes(range(256))]
+    rubbish += [b"\x20" + rng.randbytes(rng.randrange(1, 60)) for _ in range(12)]
+    rubbish += [rng.randbytes(rng.randrange(1, 200)) for _ in range(12)]
+    for answer in rubbish:
+        listener, port, got = served(answer, answer, pause_s=0)
+        with listener, connecting(to(port)):
+            wait_for(lambda got=got: len(got) == 2, 10, answer)  # type: ignore[misc]  # it tries again
+
+
+def test_rubbish_on_a_connection_ends_that_connection_only() -> None:
+    rng = random.Random(2)
+    for _ in range(20):
+        listener, port, got = served(b"\x20\x03\x00\x00\x00" + rng.randbytes(50), b"", pause_s=0)
+        with listener, connecting(to(port)) as client:
+            client.offer("a", b"x", lasting=True)
+            wait_for(lambda got=got: len(got) == 2, 10, "a second attempt")  # type: ignore[misc]
+
+
+def test_a_refusal_says_what_to_do() -> None:
+    for code, text in (
+        (133, "refuses the client id 'test'. Choose another name with --gateway."),
+        (136, "server unavailable"),
+    ):
+        listener, port, _ = served(*[b"\x20\x03\x00" + bytes([code]) + b"\x00"] * 3)
+        with listener, connecting(to(port)) as client:
+            waits_until(client, text)
+
+
+def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_client, "CONNECT_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        client = MqttClient(to(mute.getsockname()[1]), ONLINE)
+        client.start()
+        waits_until(client, "does not answer. Is this the port of an MQTT broker?")
+        begin = time.monotonic()
+        client.stop(0.3)
+        assert time.monotonic() - begin < 0.35
+        wait_for(lambda: not client.alive, 2, "the end of the thread")
+
+
+def test_pauses_grow_and_are_not_all_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fleet that lost its broker does not come back all at once."""
+    client = MqttClient(to(free_port()), ONLINE)
+    pauses = []
+    for _ in range(14):
+        client._failed("x")
+        assert client._retry.due is not None
+        pauses.append(client._retry.due - time.monotonic_ns())
+    assert pauses[0] < 0.13 * SECOND
+    assert max(pauses) <= 1.25 * mqtt_client.LONGEST_PAUSE_NS
+    assert min(pauses[-4:]) > 0.7 * mqtt_client.LONGEST_PAUSE_NS
+    assert len({round(pause / SECOND, 2) for pause in pauses[-4:]}) > 1
+
+
+# --- TLS
+
+
+def openssl(*words: object) -> None:
+    subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True)
+
+
+class Authority:
+    """A certificate authority of our own."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self._folder = folder
+        self.certificate, self._key = folder / f"{name}.pem", folder / f"{name}.key"
+        where = ("-keyout", self._key, "-out", self.certificate)
+        openssl("req", "-x509", *NEW_KEY, "-days", 2, "-subj", f"/CN={name}", *where)
+
+    def issue(self, name: str, days: int = 2) -> tuple[Path, Path]:
+        """A certificate for a name, and its key."""
+        key, request, made, more = (self._folder / f"{name}.{end}" for end in ("key", "csr", "pem", "ext"))
+        more.write_text(f"subjectAltName=DNS:{name}\n")
+        openssl("req", *NEW_KEY, "-subj", f"/CN={name}", "-keyout", key, "-out", request)
+        signing = ("-CA", self.certificate, "-CAkey", self._key, "-CAcreateserial", "-days", days)
+        openssl("x509", "-req", "-in", request, *signing, "-extfile", more, "-out", made)
+        return made, key
+
+
+NEW_KEY = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
+
+
+@pytest.fixture(scope="module")
+def encrypted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Mosquitto, Broker, Authority]]:
+    """A broker that wants TLS and a certificate, how to connect to it, and a stranger's authority."""
+    folder = tmp_path_factory.mktemp("tls")
+    authority, stranger = Authority(folder, "authority"), Authority(folder, "stranger")
+    certificate, key = authority.issue("localhost")
+    lines = f"allow_anonymous true\ncafile {authority.certificate}\ncertfile {certificate}\nkeyfile {key}\n"
+    made = Mosquitto(folder, lines + "require_certificate true\n")
+    shown, shown_key = authority.issue("boat")
+    yield (
+        made,
+        Broker("localhost", made.port, "tls", True, authority.certificate, shown, shown_key),
+        stranger,
+    )
+    made.stop()
+
+
+def test_tls_with_an_authority_of_ones_own(encrypted: tuple[Mosquitto, Broker, Authority]) -> None:
+    _, right, _ = encrypted
+    assert check(right) == []
+    with connecting(right) as client:
+        wait_for(lambda: client.connected, 10, lambda: client.problem)
+        client.offer("k/tls/big", b"x" * 300_000)  # more than a record of TLS, and than the kernel takes at once
+        wait_for(lambda: client.published >= 2, 10, "the message")
+
+
+def test_a_certificate_of_another_authority_is_refused(encrypted: tuple[Mosquitto, Broker, Authority]) -> None:
+    _, right, stranger = encrypted
+    with connecting(replace(right, ca_file=stranger.certificate)) as client:
+        waits_until(client, "its certificate is not accepted: ")
+    with connecting(replace(right, ca_file=None)) as client:
+        waits_until(client, "its certificate is not accepted: ")
+
+
+def test_a_certificate_for_another_name_is_refused(encrypted: tuple[Mosquitto, Broker, Authority]) -> None:
+    _, right, _ = encrypted
+    with connecting(replace(right, host="127.0.0.1")) as client:
+        waits_until(client, "and that --broker is the name in the certificate.")
+
+
+def test_without_the_certificate_that_the_broker_wants_there_is_no_connection(
+    encrypted: tuple[Mosquitto, Broker, Authority],
+) -> None:
+    _, right, _ = encrypted
+    with connecting(replace(right, cert_file=None, key_file=None)) as client:
+        wait_for(lambda: client.problem, 10, "a problem")
+        assert not client.connected
+
+
+def test_plain_text_to_a_port_of_tls_and_tls_to_a_plain_one_are_told_so(
+    encrypted: tuple[Mosquitto, Broker, Authority], broker: Mosquitto
+) -> None:
+    made, _, _ = encrypted
+    with connecting(to(made.port)) as client:
+        waits_until(client, "closed the connection instead of answering. Does it want TLS (--tls)?")
+    with connecting(replace(to(broker.port), tls=True)) as client:
+        wait_for(lambda: client.problem, 10, "a problem")
+        assert "Is this the port for TLS?" in client.problem or "connection reset" in client.problem

@@ -1,0 +1,453 @@
+"""What is published and when, without a broker: JSON against cantools, times handed in, discovery by Home Assistant's rules."""
+
+import json
+import re
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from cantools.database.can import Database
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mqtt_bench import SECOND_NS, START_S, STEP_NS, Timed, flight, layout_of
+
+from kontronik_can_gw.dbc_output.unpacker import SignalReader
+from kontronik_can_gw.offline.mqtt_messages import (
+    IDENTITY_NS,
+    KIND_OF_STATE,
+    LEAST_PAUSE_NS,
+    MOST_CHANGES,
+    Message,
+    Publisher,
+    Topics,
+    entity,
+    is_ours,
+    iso,
+)
+from kontronik_can_gw.protocol.states import OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults, Phase
+from kontronik_can_gw.sources import Group, sources
+from kontronik_can_gw.telemetry import EscSettings
+
+TOPICS = Topics("fleet", "boat")
+MS = 1_000_000
+OWN_KEYS = {"time", "available", "age", "motor", "errors", "problem", "selftest", "link_state", "firmware"}
+QUIET = EscOptions(profile=(Phase("off", 1000, 0, OperatingState.MotorOff, 0),))
+
+
+def publisher(*names: str, rate: float = 1, **options: Any) -> Publisher:
+    return Publisher(layout_of(*names), TOPICS, rate, **options)
+
+
+Published = list[tuple[int, Message]]
+
+
+def run(made: Publisher, frames: Timed, until_s: float, step_ns: int = STEP_NS) -> Published:
+    """Hand the frames over in their time, asking for messages at each step."""
+    published: Published = []
+    waiting = iter([*frames, (1 << 62, frames[-1][1])] if frames else [])
+    following = next(waiting, None)
+    for now in range(0, round(until_s * SECOND_NS), step_ns):
+        while following is not None and following[0] <= now:
+            made.take(following[1].key, following[1].data, following[0])
+            following = next(waiting, None)
+        published += [(now, message) for message in made.messages(now, START_S * SECOND_NS + now)]
+    return published
+
+
+def states(published: Published, esc: str | None = "esc1") -> list[tuple[int, dict[str, Any]]]:
+    return [(now, json.loads(m.payload)) for now, m in published if m.topic == TOPICS.state(esc)]
+
+
+def payloads(published: Published, topic: str) -> list[bytes]:
+    return [message.payload for _, message in published if message.topic == topic]
+
+
+def snake(signal: str, prefix: str) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", signal.removeprefix(prefix).removesuffix("Percent")).lower()
+
+
+def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any]:
+    """Source and value after these frames, as cantools reads them; not available is None."""
+    found: dict[str, Any] = {}
+    for _, frame in frames:
+        decoded = database.decode_message(frame.can_id, frame.data)
+        assert isinstance(decoded, dict)
+        for name, value in decoded.items():
+            if name.startswith(prefix):
+                text = str(value)
+                found[snake(name, prefix)] = (
+                    None if text in ("NotAvailable", "Error") else value if isinstance(value, (int, float)) else text
+                )
+    return found
+
+
+# --- what is in it
+
+
+@pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
+def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str, ...]) -> None:
+    bus = layout_of(*names)
+    frames = flight(bus, 12)
+    made = Publisher(bus, TOPICS, 1)
+    last = run(made, frames, 12)
+    flags = {bit.text for bits in (OperatingError, SelfTestError) for bit in bits}
+    for index, name in enumerate(names):
+        when, found = states(last, name)[-1]
+        prefix = name.capitalize() if len(names) > 1 else ""
+        wanted = by_cantools(bus.database, [(t, f) for t, f in frames if t <= when], prefix)
+        compared = 0
+        for source, value in found.items():
+            if source in OWN_KEYS - {"link_state"}:
+                continue
+            assert source in wanted
+            if isinstance(value, float):
+                assert value == pytest.approx(wanted[source])
+            else:
+                assert value == wanted[source], source
+            compared += 1
+        # every signal is there, but for flags (they are lists) and what is none of the ESC's values
+        signals = {c.source for c in SignalReader(bus.layout).columns if c.esc == index}
+        assert signals - set(found) == flags & signals
+        assert compared == len(signals - flags)
+        assert found["electrical_speed"] > 0
+        assert found["firmware"] == "4.17"
+
+
+def test_the_gateways_own_values_have_a_topic_of_their_own() -> None:
+    bus = layout_of("esc1")
+    frames = flight(bus, 3)
+    found = states(run(Publisher(bus, TOPICS, 1), frames, 3), None)[-1][1]
+    assert (found["gateway_state"], found["esc_count"], found["escs_ok"]) == ("Running", 1, 1)
+    assert found["available"] is True
+    assert not found.keys() & {"battery_voltage", "errors", "motor"}
+
+
+def test_the_time_is_iso_8601_in_utc() -> None:
+    assert iso(START_S * SECOND_NS + 7 * MS) == "2026-09-21T14:13:20.007Z"
+    assert iso(0) == "1970-01-01T00:00:00.000Z"
+    found = states(run(publisher("esc1"), flight(layout_of("esc1"), 2), 2))
+    assert found[0][1]["time"] == iso(START_S * SECOND_NS + found[0][0])
+
+
+def test_without_any_frame_all_is_null_and_not_available() -> None:
+    published = run(publisher("esc1"), [], 3)
+    for esc in ("esc1", None):
+        _, found = states(published, esc)[-1]
+        assert found.pop("available") is False
+        assert found.pop("time")
+        assert set(found.values()) == {None}
+        assert payloads(published, TOPICS.available(esc)) == [b"offline"]
+
+
+def test_errors_have_name_severity_and_meaning_and_make_a_problem() -> None:
+    bits = (OperatingError.UNDERVOLTAGE, OperatingError.POWER_STAGE_OVERTEMP_WARNING, SelfTestError.TEST_UNDERVOLTAGE)
+    options = EscOptions(faults=Faults(errors=tuple(ErrorWindow(bit, 0) for bit in bits)))
+    found = states(run(publisher("esc1"), flight(layout_of("esc1"), 4, options), 4))[-1][1]
+    named = {error["name"]: (error["severity"], error["meaning"]) for error in found["errors"]}
+    assert named["undervoltage"] == ("error", "battery voltage too low")
+    assert named["power_stage_overtemp_warning"] == ("warning", "power stage hot")
+    assert [error["name"] for error in found["selftest"]] == ["test_undervoltage"]
+    assert found["problem"] is True
+
+
+def test_a_status_or_a_warning_is_no_problem() -> None:
+    options = EscOptions(
+        profile=QUIET.profile,
+        faults=Faults(errors=(ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_WARNING, 0),)),
+    )
+    found = states(run(publisher("esc1"), flight(layout_of("esc1"), 3, options), 3))[-1][1]
+    severities = {error["severity"] for error in found["errors"]}
+    assert severities == {"status", "warning"}  # programming is allowed while the motor is off
+    assert found["problem"] is False
+
+
+def test_no_error_is_an_empty_list_and_not_known_is_null() -> None:
+    bus = layout_of("esc1")
+    frames = flight(bus, 12, silent_from=10)
+    published = states(run(publisher("esc1"), frames, 12))
+    before = [found for now, found in published if 7 * SECOND_NS < now < 10 * SECOND_NS][-1]
+    assert (before["errors"], before["selftest"], before["problem"]) == ([], [], False)
+    after = published[-1][1]
+    assert (after["errors"], after["problem"], after["motor"], after["battery_voltage"]) == (None, None, None, None)
+    assert after["available"] is False
+    assert after["link_state"] == "Lost"
+    assert 1000 < after["age"] < 2000
+
+
+def test_every_operating_state_has_a_kind() -> None:
+    assert set(KIND_OF_STATE) == set(OperatingState)
+
+
+@pytest.mark.parametrize("state", list(OperatingState))
+def test_the_kind_is_that_of_the_state_that_the_esc_sends(state: OperatingState) -> None:
+    options = EscOptions(profile=(Phase("x", 1000, 0, state, 0),))
+    found = states(run(publisher("esc1"), flight(layout_of("esc1"), 2.6, options), 2.6))[-1][1]
+    assert found["operating_state_raw"] == state
+    assert found["motor"] == KIND_OF_STATE[state]
+
+
+def test_a_recording_is_marked_as_one() -> None:
+    frames = flight(layout_of("esc1"), 1)
+    assert states(run(publisher("esc1", replay=True), frames, 1))[0][1]["replay"] is True
+    assert "replay" not in states(run(publisher("esc1"), frames, 1))[0][1]
+
+
+# --- when
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rate=st.one_of(st.floats(0.01, 20), st.sampled_from([0.01, 0.5, 1.0, 3.0, 20.0])),
+    steps=st.lists(st.integers(1, 3000), min_size=30, max_size=200),
+)
+def test_the_rate_is_held_whenever_it_is_asked(rate: float, steps: list[int]) -> None:
+    """Nothing changes: one message in each period in which it is asked, at the first time."""
+    made = publisher("esc1", rate=rate)
+    period, first = round(SECOND_NS / rate), SECOND_NS // 2
+    now, told = 0, []
+    expected: dict[int, int] = {}
+    for step in [0, *steps]:
+        now += step * MS
+        told += [now for message in made.messages(now, now) if message.topic == TOPICS.state("esc1")]
+        if now >= first:
+            expected.setdefault((now - first) // period, now)
+    assert told == list(expected.values())
+
+
+def test_due_tells_when_to_ask_again() -> None:
+    made = publisher("esc1", rate=0.5)
+    made.messages(0, 0)
+    assert made.due(0) == SECOND_NS // 2
+    assert made.messages(SECOND_NS // 2, 0)
+    assert made.due(SECOND_NS // 2) == SECOND_NS // 2 + 2 * SECOND_NS
+
+
+def changes(published: Published, key: str) -> list[tuple[int, Any]]:
+    """When a value became another one in what was published."""
+    found: list[tuple[int, Any]] = []
+    for now, state in states(published):
+        if not found or found[-1][1] != state[key]:
+            found.append((now, state[key]))
+    return found
+
+
+def test_an_error_is_told_at_once_however_slow_the_rate() -> None:
+    window = ErrorWindow(OperatingError.OVERVOLTAGE, 3 * SECOND_NS, SECOND_NS)
+    options = EscOptions(profile=QUIET.profile, faults=Faults(errors=(window,)))
+    frames = flight(layout_of("esc1"), 6, options)
+    published = run(publisher("esc1", rate=0.01), frames, 6)
+    times = [now for now, value in changes(published, "problem")]
+    assert len(times) == 3  # the first state, the error, its end
+    for told, happened in zip(times[1:], (3 * SECOND_NS, 4 * SECOND_NS), strict=True):
+        assert 0 <= told - happened <= 0.2 * SECOND_NS + 2 * STEP_NS
+
+
+def test_a_new_kind_of_state_and_a_lost_link_are_told_at_once_and_a_new_speed_is_not() -> None:
+    options = EscOptions(
+        profile=(Phase("off", 2, 0, OperatingState.MotorOff, 0), Phase("go", 90, 60, OperatingState.Forward, 5))
+    )
+    frames = flight(layout_of("esc1"), 8, options, silent_from=6)
+    published = run(publisher("esc1", rate=0.01), frames, 8)
+    kinds = changes(published, "motor")
+    assert [kind for _, kind in kinds] == ["idle", "run", None]
+    assert abs(kinds[1][0] - 3 * SECOND_NS) <= 0.25 * SECOND_NS  # a second of power-up first
+    lost = next(now for now, found in states(published) if found["link_state"] == "Lost")
+    assert lost - 6 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway itself waits for the time-out
+    assert len(states(published)) <= 8
+    available = [(now, m.payload) for now, m in published if m.topic == TOPICS.available("esc1")]
+    assert [payload for _, payload in available] == [b"online", b"offline"]
+
+
+def test_what_comes_and_goes_is_bounded() -> None:
+    windows = tuple(
+        ErrorWindow(OperatingError.OVERVOLTAGE, start, 30 * MS) for start in range(0, 60 * SECOND_NS, 60 * MS)
+    )
+    options = EscOptions(profile=QUIET.profile, faults=Faults(errors=windows))
+    frames = flight(layout_of("esc1"), 60, options)
+    times = [now for now, _ in states(run(publisher("esc1", rate=0.01), frames, 60))]
+    gaps = [b - a for a, b in pairwise(times)]
+    assert min(gaps) >= LEAST_PAUSE_NS
+    assert MOST_CHANGES <= len(times) <= MOST_CHANGES + 60 + 2
+    assert max(gaps) <= 1.3 * SECOND_NS
+
+
+def test_a_gateway_that_says_nothing_any_more_is_offline_after_three_seconds() -> None:
+    bus = layout_of("esc1")
+    frames = [entry for entry in flight(bus, 10) if not 4 * SECOND_NS < entry[0] < 9 * SECOND_NS]
+    published = run(publisher("esc1"), frames, 10)
+    for esc in (None, "esc1"):
+        told = [(now, m.payload) for now, m in published if m.topic == TOPICS.available(esc)]
+        assert [payload for _, payload in told] == [b"online", b"offline", b"online"]
+    told = [(now, m.payload) for now, m in published if m.topic == TOPICS.available(None)]
+    assert 7 * SECOND_NS <= told[1][0] <= 7.3 * SECOND_NS
+    assert 9 * SECOND_NS <= told[2][0] <= 9.3 * SECOND_NS
+    silent = [found for now, found in states(published) if 7 * SECOND_NS < now < 9 * SECOND_NS][-1]
+    assert {silent[key] for key in silent if key not in ("time", "available", "age")} == {None}
+
+
+def test_lasting_is_what_must_be_known_later_and_it_comes_before_the_state() -> None:
+    published = run(publisher("esc1", discovery="ha"), flight(layout_of("esc1"), 3), 3)
+    for _, message in published:
+        assert message.lasting is message.retain is not message.topic.endswith("/state")
+    topics = [message.topic for _, message in published]
+    assert topics.index(TOPICS.available("esc1")) < topics.index(TOPICS.state("esc1"))
+    kept = run(publisher("esc1", retain=True), [], 1)
+    assert all(message.retain for _, message in kept)
+
+
+# --- Home Assistant
+
+# From Home Assistant's documentation of sensors: units and state classes that go with a device class.
+ANY = {"measurement", "total", "total_increasing"}
+DEVICE_CLASSES: dict[str | None, tuple[set[str | None], set[str | None]]] = {
+    "voltage": ({"V", "mV", "µV"}, {"measurement"}),
+    "current": ({"A", "mA"}, {"measurement"}),
+    "power": ({"W", "kW", "mW"}, {"measurement"}),
+    "energy": ({"Wh", "kWh", "J"}, {"total", "total_increasing"}),
+    "temperature": ({"°C", "°F", "K"}, {"measurement"}),
+    "frequency": ({"Hz", "kHz"}, {"measurement"}),
+    "duration": ({"d", "h", "min", "s", "ms"}, {*ANY}),
+    "enum": ({None}, {None}),
+    None: ({"rpm", "%", "mAh", "µs", None}, {*ANY, None}),
+}
+COMPONENT_KEYS = {
+    *("platform", "name", "unique_id", "value_template", "device_class", "state_class", "unit_of_measurement"),
+    *("options", "entity_category", "suggested_display_precision", "availability", "availability_mode"),
+}
+
+
+def discovered(*names: str) -> dict[str, dict[str, Any]]:
+    """Topic and content of the discovery, after a flight."""
+    bus = layout_of(*names)
+    published = run(Publisher(bus, TOPICS, 1, discovery="homeassistant"), flight(bus, 3), 3)
+    return {m.topic: json.loads(m.payload) for _, m in published if m.topic.startswith("homeassistant/")}
+
+
+def components(found: dict[str, dict[str, Any]]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    for topic, device in found.items():
+        for key, component in device["components"].items():
+            yield topic, key, component
+
+
+def test_each_esc_and_the_gateway_is_a_device() -> None:
+    found = discovered("left", "right")
+    assert set(found) == {
+        f"homeassistant/device/{name}/config"
+        for name in ("kontronik_boat", "kontronik_boat_left", "kontronik_boat_right")
+    }
+    left = found["homeassistant/device/kontronik_boat_left/config"]
+    assert left["device"] == {
+        "identifiers": ["kontronik_boat_left"],
+        "name": "boat left",
+        "manufacturer": "KONTRONIK",
+        "model": "KOSMIK",
+        "sw_version": "4.17",
+        "via_device": "kontronik_boat",
+    }
+    assert left["availability"] == [{"topic": "fleet/boat/online"}, {"topic": "fleet/boat/left/available"}]
+    assert left["availability_mode"] == "all"
+    assert left["state_topic"] == "fleet/boat/left/state"
+    assert left["origin"]["name"] == "kontronik-can-gw"
+    assert re.fullmatch(r"\w+/(?:[a-zA-Z0-9_-]+/)?[a-zA-Z0-9_-]+/config", "device/kontronik_boat_left/config")
+
+
+def test_every_entity_keeps_to_the_rules_of_home_assistant() -> None:
+    found = discovered("left", "right")
+    ids = [component["unique_id"] for _, _, component in components(found)]
+    assert len(ids) == len(set(ids)) > 100
+    for topic, key, component in components(found):
+        assert set(component) <= COMPONENT_KEYS, key
+        assert component["unique_id"] == f"{topic.split('/')[2]}_{key}"
+        assert component["name"]
+        assert component["platform"] in ("sensor", "binary_sensor")
+        assert component.get("entity_category") in (None, "diagnostic")
+        if component["platform"] == "binary_sensor":
+            assert component["device_class"] == "problem"
+            continue
+        units, classes = DEVICE_CLASSES[component.get("device_class")]
+        assert component.get("unit_of_measurement") in units, key
+        assert component.get("state_class") in classes, key
+        if component.get("device_class") == "enum":
+            assert len(component["options"]) == len(set(component["options"])) > 1
+        else:
+            assert "options" not in component
+
+
+def test_every_unit_of_ours_has_a_place() -> None:
+    """No source comes to Home Assistant with a unit that it does not know."""
+    known = {unit for units, _ in DEVICE_CLASSES.values() for unit in units}
+    reader = SignalReader(layout_of("esc1").layout)
+    for column in reader.columns:
+        component = entity(column.source, column)
+        assert component is None or component.get("unit_of_measurement") in known
+
+
+def test_what_an_entity_shows_is_in_the_state() -> None:
+    bus = layout_of("esc1")
+    published = run(Publisher(bus, TOPICS, 1, discovery="homeassistant"), flight(bus, 3), 3)
+    found = {m.topic: json.loads(m.payload) for _, m in published if m.topic.startswith("homeassistant/")}
+    for topic, key, component in components(found):
+        esc = "esc1" if "esc1" in topic else None
+        shown = re.findall(r"value_json\.(\w+)", component["value_template"])
+        assert shown
+        for _, state in states(published, esc):
+            assert set(shown) <= set(state), key
+            value = state[shown[0]]
+            if component.get("device_class") == "enum" and value is not None:
+                assert value in component["options"]
+            if component.get("unit_of_measurement") and value is not None:
+                assert isinstance(value, (int, float))
+
+
+def test_what_the_link_says_is_shown_while_the_esc_is_not_heard() -> None:
+    found = discovered("left", "right")["homeassistant/device/kontronik_boat_left/config"]["components"]
+    own = [{"topic": "fleet/boat/online"}, {"topic": "fleet/boat/available"}]
+    assert found["link_state"]["availability"] == own
+    assert found["link_state"]["availability_mode"] == "all"
+    assert "availability" not in found["battery_voltage"]
+    assert all(
+        ("availability" in component) == (sources(EscSettings())[key].group is Group.LINK)
+        for key, component in found.items()
+        if key in sources(EscSettings())
+    )
+
+
+def discoveries(published: Iterable[tuple[int, Message]]) -> list[tuple[int, dict[str, Any]]]:
+    topic = TOPICS.discovery("ha", "esc1")
+    return [(now, json.loads(m.payload)) for now, m in published if m.topic == topic]
+
+
+def test_an_esc_is_told_of_once_when_it_is_known() -> None:
+    told = discoveries(run(publisher("esc1", discovery="ha"), flight(layout_of("esc1"), 20), 20))
+    assert [found["device"]["model"] for _, found in told] == ["KOSMIK"]
+
+
+def test_an_esc_that_does_not_tell_what_it_is_is_told_of_all_the_same() -> None:
+    """Info frames are missing; what was published before a restart is not overwritten too soon."""
+    bus = layout_of("esc1")
+    info = {c.key for c in SignalReader(bus.layout).columns if c.source in ("device", "firmware_main")}
+    frames = [entry for entry in flight(bus, 10) if entry[1].key not in info]
+    ((now, found),) = discoveries(run(publisher("esc1", discovery="ha"), frames, 10))
+    assert found["device"]["model"] == "ESC"
+    assert "sw_version" not in found["device"]
+    assert IDENTITY_NS <= now <= IDENTITY_NS + 1.6 * SECOND_NS
+    assert discoveries(run(publisher("esc1", discovery="ha"), [], 10)) == []
+
+
+def test_an_esc_that_goes_away_stays_what_it_is() -> None:
+    options = EscOptions(faults=Faults(dropout=Dropout(15 * SECOND_NS, 20 * SECOND_NS)))
+    frames = flight(layout_of("esc1"), 25, options)
+    told = discoveries(run(publisher("esc1", discovery="ha"), frames, 25))
+    assert [found["device"].get("sw_version") for _, found in told] == ["4.17"]
+
+
+def test_only_the_discovery_of_this_gateway_is_ours() -> None:
+    (mine, other) = (json.dumps(d).encode() for d in list(discovered("left", "right").values())[:2])
+    assert is_ours(mine, TOPICS)
+    assert is_ours(other, TOPICS)
+    assert not is_ours(mine, Topics("fleet", "boat2"))
+    assert not is_ours(mine, Topics("fleet2", "boat"))
+    for text in (b"", b"{}", b"[]", b"3", b"x", b'{"origin": 3}', b'{"origin": {"name": "x"}, "availability": []}'):
+        assert not is_ours(text, TOPICS)
