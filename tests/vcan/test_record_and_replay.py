@@ -197,3 +197,29 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
     numbers = [round(float(value) * 100) for value in values if isinstance(value, (int, float))]
     assert len(numbers) > 200
     assert set(numbers) <= sent
+
+
+def test_a_full_disk_stops_recording_and_nothing_else(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+    folder = tmp_path / "small"
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", str(folder)], check=True)
+    try:
+        with bench(EscOptions()) as run, Candump(vcan) as live:
+            toml = configuration(vcan, [run.ports[0].path], "[record]\nmin_free_mb = 0")
+            gateway = recorded_run(run, start_gateway, toml, folder, 2)
+            gateway.wait_for_line("captures: ", 40)
+            assert "No space left on device. Trying again." in gateway.log
+            before = len(live.frames)
+            time.sleep(1)
+            assert len(live.frames) - before > 150, "the bus goes on"
+            subprocess.run(["mount", "-o", "remount,size=20m", str(folder)], check=True)
+            gateway.wait_for_line("is written", 20)
+            time.sleep(2)
+            assert gateway.end() == 0
+        with open_input(folder) as found:
+            assert isinstance(found, CaptureInput)
+            kinds = [entry.kind for entry in found.entries()]
+        assert Kind.LOST in kinds
+        assert kinds[-1] == Kind.STOP
+    finally:
+        subprocess.run(["umount", str(folder)], check=False)
