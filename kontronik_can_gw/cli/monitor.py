@@ -388,7 +388,7 @@ def _lines(source: Source, monitor: "Monitor", interval: float, stopped: Callabl
         monitor.advance(source.now())
         if time.monotonic() < due and not source.ended:
             continue
-        due += interval
+        due = max(due + interval, time.monotonic())  # what was slept through is not made up for
         said = [text for text, _ in notices(monitor, source.where())]
         for text in said:
             if _news_of(text) not in told:

@@ -300,6 +300,8 @@ def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool)
         name = f"{printable(esc.name)} " if named else ""
         if trouble := _trouble(esc):
             told.append((Severity.ERROR, f"{name}LINK: ", trouble))
+        elif normalize(esc.link or "") == "degraded":
+            told.append((Severity.WARNING, f"{name}LINK: ", "degraded, frames are damaged: look at cable and ground"))
         for active in esc.alarms:
             kind = {Severity.STATUS: "note"}.get(active.severity, active.severity.value.upper())
             told.append((active.severity, f"{name}{kind}: ", active.meaning))

@@ -22,7 +22,7 @@ from kontronik_can_gw.cli.monitor_screen import (
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.monitor import CELL, TEMPERATURE, Monitor, Scale
 from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError
-from kontronik_can_gw.simulator import SECOND_NS, EscOptions
+from kontronik_can_gw.simulator import SECOND_NS, EscOptions, Faults
 
 SIZES = [(80, 24), (60, 20), (120, 40)]
 LIVE = Where("can0", hints=("Is the gateway running?",))
@@ -214,6 +214,20 @@ def test_no_telemetry_is_said_with_the_remedy(count: int) -> None:
     assert any(re.match(rf"{name}LINK: no telemetry for [01] s: is the ESC powered, its cable", line) for line in lines)
     assert sum("lost" in line for line in lines) >= 1
     assert "".join(lines).count("no telemetry") >= 2
+
+
+def test_a_degraded_link_is_told() -> None:
+    bus = layout_of(["esc1"])
+    monitor = Monitor(bus)
+    monitor.advance(0)
+    for now, frame in flight(bus, 3, [EscOptions(faults=Faults(flipped_bits=0.0005))]):
+        monitor.take(frame, now)
+    monitor.advance(3 * SECOND_NS)
+    assert monitor.escs[0].link == "Degraded"
+    lines = texts(monitor, (80, 24))
+    assert "LINK: degraded, frames are damaged: look at cable and ground" in lines
+    assert any(re.match(r"link +degraded, \d+ Hz", line) for line in lines)
+    assert any(re.match(r"on the line +CRC errors [1-9]", line) for line in lines)
 
 
 def test_a_port_that_cannot_be_opened_is_told_too() -> None:
