@@ -285,12 +285,16 @@ class _Out:
 def _cut(
     frames: "Iterator[TimedFrame]", origin_ns: int, start_ns: int | None, end_ns: int | None
 ) -> "Iterator[TimedFrame]":
+    from kontronik_can_gw.offline.tables import DISORDER_NS
+
     for frame in frames:
         since = frame.time_ns - origin_ns
         if start_ns is not None and since < start_ns:
             continue
         if end_ns is not None and since > end_ns:
-            return
+            if since > end_ns + DISORDER_NS:
+                return
+            continue
         yield frame
 
 

@@ -12,6 +12,7 @@ from kontronik_can_gw.offline.can_logs.text import (
     ASC_HEAD,
     ASC_LINE,
     CANDUMP_LINE,
+    CANDUMP_SCREEN_LINE,
     TRC_HEAD,
     AscReader,
     CandumpReader,
@@ -29,6 +30,8 @@ SUFFIXES = {
     ".mdf": "mf4",
 }
 _HEAD = 1 << 16
+UART_MAGIC = b"KOD"
+"""What a telemetry frame begins with."""
 _BACK_NS = 10 * SECOND_NS
 _AHEAD_NS = 86_400 * SECOND_NS
 """A step of time that is larger must be confirmed by the frame after it, or it is a damaged time."""
@@ -47,7 +50,7 @@ def log_format(path: Path) -> str | None:
         return "mf4"
     lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 2000)[:2000]
     for line in lines:
-        if CANDUMP_LINE.fullmatch(line) is not None:
+        if CANDUMP_LINE.fullmatch(line) is not None or CANDUMP_SCREEN_LINE.fullmatch(line) is not None:
             return "candump"
         if ASC_HEAD.match(line) is not None or ASC_LINE.match(line) is not None:
             return "asc"
@@ -55,6 +58,8 @@ def log_format(path: Path) -> str | None:
             return "trc"
     if b"LOBJ" in head:
         return "blf"
+    if UART_MAGIC in head:  # bytes of an ESC, whatever they are called
+        return None
     return SUFFIXES.get(path.suffix.lower())
 
 

@@ -28,6 +28,11 @@ CANDUMP_LINE = re.compile(
     rb"(?:[ \t]+([RTrt]))?[ \t\r\n]*"
 )
 _CANDUMP_END = re.compile(CANDUMP_LINE.pattern + rb"\Z")
+CANDUMP_SCREEN_LINE = re.compile(
+    rb"[ \t]*\((\d{1,12})\.(\d{1,9})\)[ \t]+([\x21-\x7e]{1,64})[ \t]+(?:(RX|TX) [B-] [E-][ \t]+)?([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"
+    rb"[ \t]+\[(\d{1,2})\](?:((?:[ \t]+[0-9A-Fa-f]{2})*)(?:[ \t]+'.*'|[ \t]+ERRORFRAME)?|[ \t]+(remote request))[ \t\r\n]*"
+)
+"""What ``candump -ta`` shows; a length of two digits is one of CAN FD."""
 _ERROR_FLAG = 0x20000000
 
 ASC_LINE = re.compile(
@@ -72,14 +77,14 @@ def lines_of(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 
 
 class CandumpReader:
-    """``candump -L`` and ``-l``: ``(1700000000.123456) can0 681#0011223344556677 R``."""
+    """``candump -L`` and ``-l``: ``(1700000000.123456) can0 681#0011223344556677 R``; also what ``candump -ta`` shows."""
 
     def __init__(self, file: BinaryIO, damage: Damage) -> None:
         self._file = file
         self._damage = damage
         self.wall_start_ns: int | None = None
         for _, line in zip(range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False):
-            if (match := CANDUMP_LINE.fullmatch(line)) is not None:
+            if (match := CANDUMP_LINE.fullmatch(line) or CANDUMP_SCREEN_LINE.fullmatch(line)) is not None:
                 self.wall_start_ns = 0 if int(match[1]) >= OLDEST_WALL_S else None
                 break
         file.seek(0)
@@ -89,7 +94,12 @@ class CandumpReader:
         channels: dict[bytes, str] = {}
         for number, line in lines_of(self._file):
             match = whole(line)
-            if match is None:
+            if match is None and (shown := CANDUMP_SCREEN_LINE.fullmatch(line)) is not None:
+                match = whole(_as_logged(*shown.groups()))
+                if match is None or (match[7] is None and len(match[6]) != 2 * int(shown[6])):
+                    damage.line(number)
+                    continue
+            elif match is None:
                 if not line.strip():
                     continue
                 damage.line(number)
@@ -116,6 +126,28 @@ class CandumpReader:
                 channel = channels[name] = name.decode("ascii")
             time_ns = int(seconds) * SECOND_NS + int(fraction.ljust(9, b"0"))
             yield LogFrame(time_ns, CanFrame(can_id, data, extended, fd), direction in (b"R", b"r"), channel)
+
+
+def _as_logged(
+    seconds: bytes,
+    fraction: bytes,
+    name: bytes,
+    direction: bytes | None,
+    can_id: bytes,
+    length: bytes,
+    data: bytes | None,
+    remote: bytes | None,
+) -> bytes:
+    """The line of a log for one of the screen."""
+    content = b"R" if remote else (b"#1" if len(length) == 2 else b"") + b"".join((data or b"").split())
+    return b"(%b.%b) %b %b#%b%b" % (
+        seconds,
+        fraction,
+        name,
+        can_id,
+        content,
+        b" " + direction[:1] if direction else b"",
+    )
 
 
 class AscReader:

@@ -16,6 +16,8 @@ from kontronik_can_gw.offline.samples import Sample
 from kontronik_can_gw.offline.tables.fields import Table, field_of, frame_fields
 
 SECOND_NS = 1_000_000_000
+DISORDER_NS = SECOND_NS
+"""Frames of several interfaces may stand in a log a little out of order."""
 T = TypeVar("T")
 
 
@@ -148,7 +150,9 @@ def _cut(rows: Iterator[Row], start_ns: int | None, end_ns: int | None) -> Itera
         if start_ns is not None and row.time_ns < start_ns:
             continue
         if end_ns is not None and row.time_ns > end_ns:
-            return
+            if row.time_ns > end_ns + DISORDER_NS:
+                return
+            continue
         yield row
 
 
