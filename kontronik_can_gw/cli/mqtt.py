@@ -380,8 +380,12 @@ class _Run:
             try:
                 while not self._stopping and self._turn():
                     pass
-                if not self._stopping:
-                    self._client.flush(_LAST_S)
+                end = time.monotonic() + _LAST_S
+                while self._client.waiting and not self._stopping and time.monotonic() < end:
+                    time.sleep(0.01)
+                if self._client.waiting and not self._stopping:
+                    why = self._client.problem or f"{self._client.broker}: not fast enough"
+                    raise RunError(f"the end of the recording was not published. {why}")
             finally:
                 self._notifier.stopping("ending")
                 self._client.stop(_STOP_S)

@@ -341,11 +341,10 @@ class MqttClient:
         """What is wrong with the connection, in a line; empty while it is up."""
         return self._conditions.reason("broker")
 
-    def flush(self, seconds: float) -> None:
-        """Wait until all that was offered is sent; for so long at most."""
-        end = time.monotonic() + seconds
-        while self._waiting and time.monotonic() < end and self.alive:
-            time.sleep(0.01)
+    @property
+    def waiting(self) -> int:
+        """So many messages were offered and not sent yet."""
+        return len(self._waiting)
 
     def stop(self, seconds: float) -> None:
         """Publish "offline" and end the connection; for so long at most."""

@@ -182,6 +182,15 @@ def test_states_are_kept_if_that_is_wanted(tmp_path: Path, broker: Mosquitto) ->
     }
 
 
+def test_a_recording_that_nobody_takes_fails(tmp_path: Path) -> None:
+    file = write_log(tmp_path / "a.log", flight(layout_of("esc1"), 1))
+    code, said = inside("mqtt", file, "--broker", f"127.0.0.1:{free_port()}", "--gateway", "nobody")
+    assert code == 1
+    last = said.splitlines()[-1]
+    assert last.startswith("kontronik-can-gw mqtt: the end of the recording was not published. MQTT broker 127.0.0.1:")
+    assert last.endswith(": connection refused. Does it run, and is the port right?")
+
+
 def test_several_escs_come_by_their_names_from_a_configuration(tmp_path: Path, broker: Mosquitto) -> None:
     toml = tmp_path / "gateway.toml"
     toml.write_text(

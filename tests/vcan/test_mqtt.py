@@ -1,0 +1,107 @@
+"""The whole chain on a real CAN interface: simulated ESCs, their gateway, vcan, the publisher beside it, a real broker, a subscriber."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from vcan_tools import GatewayProcess, bench, configuration, ip, wait_for
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "mqtt"))
+
+from mqtt_bench import Mosquitto, Process, Subscriber, kept
+
+from kontronik_can_gw.protocol.fields import LiveData, rows
+from kontronik_can_gw.protocol.states import OperatingState
+from kontronik_can_gw.simulator import EscOptions, Phase
+
+FLIES = EscOptions(
+    profile=(
+        Phase("up", 2, 80, OperatingState.Forward, 2),
+        Phase("down", 2, 20, OperatingState.Forward, 2),
+    )
+)
+FIELDS = ("electrical_speed", "battery_voltage", "battery_current", "throttle", "power_stage_temperature")
+
+
+def loopback_up() -> None:
+    """A machine that was only booted for tests has no loopback yet."""
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=False, capture_output=True)
+
+
+def as_published(data: LiveData) -> dict[str, float]:
+    return {name: rows(LiveData)[name].physical(getattr(data, name)) for name in FIELDS}
+
+
+def test_what_escs_send_arrives_at_a_subscriber(
+    vcan: str, tmp_path: Path, start_gateway: Callable[..., GatewayProcess]
+) -> None:
+    loopback_up()
+    broker = Mosquitto(tmp_path)
+    try:
+        with bench(FLIES, FLIES) as run, Subscriber(broker.port, "kontronik/chain/#") as heard:
+            toml = configuration(vcan, [port.path for port in run.ports])
+            gateway = start_gateway(toml)
+            gateway.wait_for_line("esc2: /dev/pts")
+            file = tmp_path / "mqtt.toml"
+            file.write_text(f'[mqtt]\nbroker = "{broker.address}"\ngateway = "chain"\nrate = 5\n{toml}')
+            with Process("-c", file, "--discovery") as program:
+                program.wait_for_line("connected as kontronik-can-gw-chain")
+                run.start()
+                for esc in ("esc1", "esc2"):
+                    heard.wait(f"kontronik/chain/{esc}/available", b"online", 20)
+                known = len(heard.of("kontronik/chain/esc2/state"))
+                heard.wait("kontronik/chain/esc2/state", seconds=20, count=known + 10)
+                for index, esc in enumerate(("esc1", "esc2")):
+                    sent = [(when, as_published(data)) for when, data in run.live(index)]
+                    offset = time.time() - time.monotonic()
+                    for state in heard.of(f"kontronik/chain/{esc}/state")[known + 2 : known + 9]:
+                        found, when = state.json, state.when + offset
+                        shortly = [values for at, values in sent if when - 0.6 < at < when + 0.1]
+                        # each value is one that this ESC sent shortly before: they come in several CAN frames
+                        for name in FIELDS:
+                            assert any(abs(values[name] - found[name]) < 1e-6 for values in shortly), (esc, name, found)
+                        assert (found["motor"], found["available"]) == ("run", True)
+                run.stop()
+                heard.wait("kontronik/chain/esc1/available", b"offline", 10)
+                wait_for(
+                    lambda: heard.of("kontronik/chain/esc1/state")[-1].json["link_state"] == "Lost", 10, "a lost link"
+                )
+                assert heard.of("kontronik/chain/available")[-1].payload == b"online"
+                gateway.end()
+                heard.wait("kontronik/chain/available", b"offline", 10)
+                code, lasted = program.end()
+                assert code == 0
+                assert lasted < 1
+            devices = {topic.split("/")[2] for topic in kept(broker.port, "homeassistant/#")}
+            assert devices == {"kontronik_chain", "kontronik_chain_esc1", "kontronik_chain_esc2"}
+            assert "Traceback" not in program.log
+    finally:
+        broker.stop()
+
+
+def test_an_interface_that_goes_down_is_said_and_comes_back(vcan: str, tmp_path: Path) -> None:
+    loopback_up()
+    broker = Mosquitto(tmp_path)
+    try:
+        words = ("--channel", vcan, "--broker", broker.address, "--gateway", "down")
+        with Subscriber(broker.port, "kontronik/down/#") as heard, Process(*words) as program:
+            heard.wait("kontronik/down/available", b"offline", 20)
+            ip("link", "set", vcan, "down")
+            program.wait_for_line(f"CAN interface {vcan}", 10)
+            ip("link", "set", vcan, "up")
+            program.wait_for_line("the CAN interface works, after", 10)
+            subprocess.run(["cansend", vcan, "6D8#1102010000000000"], check=True)
+            heard.wait("kontronik/down/available", b"online", 10)
+            assert heard.of("kontronik/down/online")[-1].payload == b"online"
+            assert program.end()[0] == 0
+    finally:
+        broker.stop()
+
+
+def test_a_missing_interface_is_one_line_with_the_remedy(vcan: str) -> None:
+    with Process("--channel", "missing0", "--broker", "127.0.0.1:1", "--gateway", vcan) as program:
+        assert program.process.wait(30) == 1
+    assert len(program.lines) == 1
+    assert "missing0" in program.log
