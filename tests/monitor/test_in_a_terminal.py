@@ -116,12 +116,13 @@ def test_one_esc_is_drawn_and_follows_the_size_of_the_terminal(terminal: Open, l
     assert re.search(r"\x1b\[(?:\d+;)*31m(?:\x1b\[[\d;]*m)*ERROR: battery", screen.coloured())
     for width, height in ((120, 40), (60, 20), (80, 24), (40, 10)):
         screen.resize(width, height)
-        lines = screen.until(
-            lambda lines, w=width, h=height: len(lines) == h and is_drawn(lines) and len(lines[0]) == w,  # type: ignore[misc]
-            f"{width}x{height}",
-        )
-        assert "ERROR: battery voltage too low" in lines
-        assert sum(bool(re.match(r"battery voltage +V +\d\d\.\d\d", line)) for line in lines) == 1
+
+        def follows(lines: list[str], width: int = width, height: int = height) -> bool:
+            voltage = sum(bool(re.match(r"battery voltage +V +\d\d\.\d\d", line)) for line in lines)
+            fits = len(lines) == height and len(lines[0]) == width
+            return is_drawn(lines) and fits and voltage == 1 and "ERROR: battery voltage too low" in lines
+
+        screen.until(follows, f"{width}x{height}")
 
 
 def test_values_move_and_keys_are_obeyed(terminal: Open, logs: Path) -> None:
