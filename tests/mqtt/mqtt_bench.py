@@ -294,13 +294,19 @@ def write_log(path: Path, frames: Timed) -> Path:
 class Slcan:
     """A CAN adapter of the slcan kind on a pseudo terminal: what is put on its bus is received; what is sent is remembered."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
         import tty
 
         self._master, slave = os.openpty()
         tty.setraw(slave)
         self.path = os.ttyname(slave)
         self._slave = slave
+        self.configuration = folder / "slcan.toml"
+        """Of a gateway on this bus. python-can would wait for two seconds with a real adapter."""
+        self.configuration.write_text(
+            f'[can]\ninterface = "slcan"\nchannel = "{self.path}"\n[can.options]\nsleep_after_open = 0\n'
+            '[[esc]]\nport = "/dev/ttyS0"\npole_pairs = 7\n'
+        )
         self.commands = b""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, daemon=True)
@@ -331,8 +337,8 @@ class Slcan:
 
 
 @contextmanager
-def slcan() -> Iterator[Slcan]:
-    made = Slcan()
+def slcan(folder: Path) -> Iterator[Slcan]:
+    made = Slcan(folder)
     try:
         yield made
     finally:

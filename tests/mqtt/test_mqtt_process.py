@@ -49,16 +49,14 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mosquitto]:
 
 
 @pytest.fixture
-def adapter() -> Iterator[Slcan]:
-    with slcan() as made:
+def adapter(tmp_path: Path) -> Iterator[Slcan]:
+    with slcan(tmp_path) as made:
         yield made
 
 
 def live(adapter: Slcan, broker: Mosquitto, name: str, *words: object) -> Process:
     """The program on the adapter's bus."""
-    return Process(
-        "--interface", "slcan", "--channel", adapter.path, "--broker", broker.address, "--gateway", name, *words
-    )
+    return Process("-c", adapter.configuration, "--broker", broker.address, "--gateway", name, *words)
 
 
 def inside(*words: object) -> tuple[int, str]:
@@ -260,7 +258,7 @@ def test_removing_the_discovery_of_a_gateway_that_is_online_leaves_it_online(ada
 
 def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path, adapter: Slcan) -> None:
     port = free_port()
-    words = ("--interface", "slcan", "--channel", adapter.path, "--gateway", "late", "--rate", 20)
+    words = ("-c", adapter.configuration, "--gateway", "late", "--rate", 20)
     with Process(*words, "--broker", f"127.0.0.1:{port}") as program:
         program.wait_for_line(f"MQTT broker 127.0.0.1:{port}: connection refused. Does it run, and is the port right?")
         wait_for(lambda: adapter.is_open, 20, lambda: program.log)
@@ -369,7 +367,7 @@ def test_a_password_without_tls_to_another_machine_is_warned_of(tmp_path: Path, 
     secret = tmp_path / "password"
     secret.write_text("x")
     secret.chmod(0o600)
-    bus = ("--interface", "slcan", "--channel", adapter.path, "--username", "a", "--password-file", secret)
+    bus = ("-c", adapter.configuration, "--username", "a", "--password-file", secret)
     with Process(*bus, "--broker", "broker.invalid") as program:
         program.wait_for_line("without TLS the password can be read by all on the way. Use --tls.")
         program.wait_for_line("MQTT broker broker.invalid:1883: the host's name is not known", 30)
@@ -386,7 +384,7 @@ def test_the_service_manager_is_told_and_the_watchdog_fed(tmp_path: Path, adapte
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(path)
         manager.settimeout(10)
-        words = ("--interface", "slcan", "--channel", adapter.path, "--broker", broker.address, "--gateway", "sd")
+        words = ("-c", adapter.configuration, "--broker", broker.address, "--gateway", "sd")
         with Process(*words, environment={"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "1000000"}) as program:
             while not any("STATUS=connected" in text for text in told) or sum("WATCHDOG=1" in t for t in told) < 5:
                 told.append(manager.recv(4096).decode())
