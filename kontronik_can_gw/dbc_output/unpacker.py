@@ -1,7 +1,8 @@
 """CAN frames of a layout -> values: what a logger with the DBC sees. The other way round of packer.py, from the same plans.
 
 One function a message (and multiplexer page) is generated from its plan. A value is an int or a float in the signal's unit, a text
-where the signal is an enumeration, None where it is not available (or could not be sent: the Error code).
+where the signal is an enumeration, None where it is not available (or could not be sent: the Error code). A flag, which has no code for
+that, is not available where the other values of its message are not.
 """
 
 import struct
@@ -12,6 +13,7 @@ from fractions import Fraction
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SignalPlan
 from kontronik_can_gw.dbc_output.packer import take
 from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.sources import Group
 
 Value = int | float | str | None
 Chunk = tuple[int, list[Value]]
@@ -124,9 +126,27 @@ def compile_unpack(signals: Sequence[SignalPlan], name: str) -> Callable[[int], 
         if signal.numbers is not None:
             names[f"texts{index}"] = dict(signal.texts)
         lines += [f"    {line}" for line in _lines(signal, index)]
+    lines += [f"    {line}" for line in _lost_flags(signals)]
     lines.append(f"    return [{', '.join(f'v{index}' for index in range(len(signals)))}]")
     exec(compile("\n".join(lines), f"<unpacker of {name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
     return names["unpack"]  # type: ignore[return-value]
+
+
+def _lost_flags(signals: Sequence[SignalPlan]) -> list[str]:
+    """A flag has no code for not available: it is that where all other values of the same ESC's frame are, in the same message."""
+    groups: dict[tuple[int | None, Group], tuple[list[str], list[str]]] = {}
+    for index, signal in enumerate(signals):
+        source = signal.source
+        if source is None or source.group not in (Group.LIVE, Group.INFO) or source.supplied is not None:
+            continue
+        flags, others = groups.setdefault((signal.esc, source.group), ([], []))
+        (flags if source.bit is not None else others).append(f"v{index}")
+    lines = []
+    for flags, others in groups.values():
+        if flags and others:
+            lines.append(f"if {' is None and '.join(others)} is None:")
+            lines.append(f"    {' = '.join(flags)} = None")
+    return lines
 
 
 def float_value(bits: int, length: int, codes: tuple[int, ...], factor: float, offset: float) -> float | None:

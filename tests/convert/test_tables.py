@@ -147,6 +147,13 @@ def test_every_format_reads_back_equal(tmp_path: Path, recording: Path, form: st
 _US = pd.Timedelta(microseconds=2)
 
 
+_BESIDE_FLAGS = {
+    "EscStatus": ("OperatingState", "OperatingStateRaw", "PowerStageTemperature"),
+    "EscInfo": ("Variant", "FirmwareMain", "FirmwareSub", "Device", "DeviceRaw"),
+}
+"""A flag has no code for not available: it is that where all that is of the same ESC's frame in its message is."""
+
+
 def decoded(lines: list[tuple[int, int, bytes]]) -> Cells:
     """A row for each frame, by cantools."""
     database = shipped_database()
@@ -164,6 +171,9 @@ def decoded(lines: list[tuple[int, int, bytes]]) -> Cells:
             elif set(choices.values()) - {"NotAvailable", "Error"}:
                 value = None  # a number that the DBC has no text for
             cells[signal.name] = value
+        witnesses = _BESIDE_FLAGS.get(message.name)
+        if witnesses and all(cells[name] is None for name in witnesses):
+            cells |= {signal.name: None for signal in message.signals if signal.length == 1}
         rows.append(cells)
     return rows
 
