@@ -93,6 +93,7 @@ def test_an_unknown_option_is_named(command: str) -> None:
         "doctor": ["-c", "x"],
         "decode": ["-"],
         "convert": ["x", "y.csv"],
+        "report": ["x"],
         "replay": ["x", "--to", "log"],
         "service": ["status"],
         "completion": ["bash"],
@@ -123,6 +124,9 @@ OPTIONS = {
     "convert": [
         *("IN", "OUT", "--to", "--force", "-q", "--quiet", "-c", "--config", "--dbc", "--from", "--until", "--esc"),
         *("--signals", "--rate", "--frames", "--units-line", "--live-rate"),
+    ],
+    "report": [
+        *("IN", "-o", "--output", "--png", "-c", "--config", "--dbc", "--points", "--title", "--from", "--to", "--until"),
     ],
     "decode": ["FILE", "--csv", "--stats"],
     "replay": [

@@ -1,0 +1,144 @@
+"""``kontronik-can-gw report``: a recorded flight as one page for a browser, and its plots as pictures."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.cli.bus_layout import add_layout_arguments
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.offline.inputs import Input
+    from kontronik_can_gw.offline.report.analysis import Analysis
+
+EPILOG = """\
+IN is a capture (.kcap; a folder, or the beginning of the names of one run's, for all its parts), a file of plain UART bytes,
+or a CAN log (candump, ASC, BLF, TRC, MF4). Of a CAN log, say with -c or --dbc what the frames mean.
+
+The page is one file that needs no network: a summary (energy, charge, extremes with their time, cell voltage sag, quality
+of the data), plots with zoom, the operating states, errors with meaning and remedy. Several ESCs lie over each other.
+Numbers and events are of every row. Lines are thinned to --points points in a way that keeps every peak and every gap.
+The same recording gives the same page, byte for byte.
+
+examples:
+  kontronik-can-gw report flight.kcap -o flight.html
+  kontronik-can-gw report bus.log -c gateway.toml -o flight.html --title "Climb with 6S"
+  kontronik-can-gw report flight.kcap --png pictures --from 60 --to 90
+
+exit codes: 0 done, 1 something cannot be read or written, or has no values; 2 wrong usage, or a file that is no recording
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare IN and the options."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes")
+    parser.add_argument("-o", "--output", metavar="FILE", help="page to write, or - for standard output")
+    parser.add_argument("--png", type=Path, metavar="FOLDER", help="write each plot as a PNG into FOLDER")
+    add_layout_arguments(parser)
+    parser.add_argument(
+        "--points", type=_points, default=20_000, metavar="N", help="points of a line, 100 to 1000000 (default 20000)"
+    )
+    parser.add_argument("--title", metavar="TEXT", help="the page's title (default: the name of IN)")
+    parser.add_argument("--from", dest="start", type=_seconds, metavar="S", help="from so many seconds after the start")
+    parser.add_argument(
+        "--to", "--until", dest="end", type=_seconds, metavar="S", help="up to so many seconds after the start"
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Report on args.input. UserError for wrong usage, RunError where something cannot be read or written."""
+    import sys
+
+    from kontronik_can_gw.cli.bus_layout import bus_layout
+    from kontronik_can_gw.cli.common import say, write_output
+    from kontronik_can_gw.errors import RunError, UserError
+    from kontronik_can_gw.offline.inputs import open_input
+    from kontronik_can_gw.offline.report.analysis import Analysis
+
+    if args.output is None and args.png is None:
+        raise UserError("give -o FILE for the page, --png FOLDER for pictures, or both")
+    if args.start is not None and args.end is not None and args.end <= args.start:
+        raise UserError(f"--to {args.end:g}: must be greater than --from {args.start:g}")
+    source = Path(args.input)
+    if (
+        args.output not in (None, "-")
+        and Path(args.output).exists()
+        and source.exists()
+        and Path(args.output).samefile(source)
+    ):
+        raise UserError(f"-o {args.output}: is the input. Give another file.")
+    if args.png is not None:
+        from kontronik_can_gw.offline.report.plots_png import check_matplotlib
+
+        check_matplotlib()
+    layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
+    with open_input(source, layout) as recording:
+        analysis = Analysis(recording.bus, args.points, (args.start, args.end))
+        if not analysis.has_anything:
+            raise UserError(f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc.")
+        if not _read(recording, analysis, source.name, args.output == "-"):
+            return 130
+        flight = analysis.finish()
+        if not flight.rows:
+            where = "in this part of it" if args.start or args.end else "by this DBC. Is -c or --dbc the right one?"
+            raise RunError(
+                *(f"{args.input}: damaged: {line}" for line in recording.damage), f"{args.input}: no values {where}"
+            )
+        title = args.title if args.title is not None else source.name
+        damage = list(recording.damage)
+        if args.output is not None:
+            from kontronik_can_gw.offline.report.page import render
+
+            page = render(
+                flight,
+                title=title,
+                source=source.name,
+                provenance=recording.provenance,
+                wall_ns=recording.wall_ns(flight.origin_ns),
+                damage=damage,
+            )
+            write_output(args.output, page, "utf-8")
+        if args.png is not None:
+            from kontronik_can_gw.offline.report.plots_png import write_pngs
+
+            written = write_pngs(flight, args.png, title)
+            say(f"{args.png}: {', '.join(file.name for file in written)} written")
+    for line in damage:
+        print(f"kontronik-can-gw report: {args.input}: damaged: {line}", file=sys.stderr)
+    return 0
+
+
+def _read(recording: "Input", analysis: "Analysis", name: str, data_on_screen: bool) -> bool:
+    """All rows into the analysis; False where a person stopped it."""
+    from kontronik_can_gw.cli.common import say
+    from kontronik_can_gw.cli.progress import Progress
+
+    take = analysis.take
+    try:
+        with Progress(name, recording.size or None, data_on_screen) as progress:
+            for count, (time_ns, values) in enumerate(recording.samples()):
+                if not take(time_ns, values):
+                    break
+                if not count & 1023:
+                    progress.reach(recording.position)
+    except KeyboardInterrupt:
+        say("stopped: nothing is written")
+        return False
+    return True
+
+
+def _points(text: str) -> int:
+    if not text.isdecimal() or not 100 <= int(text) <= 1_000_000:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of points, 100 to 1000000")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value < 1e9:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds")
+    return value

@@ -1,0 +1,197 @@
+"""A headless Chromium, driven over the DevTools protocol through a pair of pipes: no driver, no port, no library."""
+
+import base64
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any, Self
+
+PROGRAM = (
+    os.environ.get("CHROMIUM")
+    or shutil.which("chromium")
+    or shutil.which("chromium-browser")
+    or shutil.which("google-chrome")
+)
+MISSING = "no Chromium: apt-get install chromium, or give its path in the variable CHROMIUM"
+_TIMEOUT_S = 60
+
+
+class Browser:
+    """One page of one browser. ``errors``: what scripts threw or the console told as error; ``requests``: addresses asked for."""
+
+    def __init__(self, profile: Path) -> None:
+        assert PROGRAM is not None, MISSING
+        to_browser, self._out = os.pipe()
+        self._in, from_browser = os.pipe()
+        self._log = (profile.parent / f"{profile.name}.log").open("wb")
+        fds = (to_browser, from_browser)
+
+        def arrange() -> None:  # the browser reads from 3 and writes to 4
+            high = [os.dup(fd) for fd in fds]
+            moved = [os.dup2(fd, 40 + i) for i, fd in enumerate(high)]
+            os.dup2(moved[0], 3)
+            os.dup2(moved[1], 4)
+
+        self._process = subprocess.Popen(
+            [
+                PROGRAM,
+                *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+                *(
+                    "--disable-background-networking",
+                    "--disable-component-update",
+                    "--disable-sync",
+                    "--disable-dev-shm-usage",
+                ),
+                *("--hide-scrollbars", "--remote-debugging-pipe", f"--user-data-dir={profile}", "about:blank"),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=self._log,
+            close_fds=False,
+            preexec_fn=arrange,
+        )
+        for fd in fds:
+            os.close(fd)
+        self._number = 0
+        self._buffer = b""
+        self._session: str | None = None
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        self._loaded = False
+        targets = self.call("Target.getTargets")["targetInfos"]
+        page = next(t["targetId"] for t in targets if t["type"] == "page")
+        self._session = self.call("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._out)
+        self._process.terminate()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        os.close(self._in)
+        self._log.close()
+
+    def call(self, method: str, **params: object) -> dict[str, Any]:
+        """One command of the protocol; its result."""
+        self._number += 1
+        message: dict[str, object] = {"id": self._number, "method": method, "params": params}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._out, json.dumps(message).encode() + b"\0")
+        number = self._number
+        while True:
+            answer = self._receive()
+            if answer.get("id") == number:
+                assert "error" not in answer, f"{method}: {answer['error']}"
+                result: dict[str, Any] = answer["result"]
+                return result
+
+    def _receive(self) -> dict[str, Any]:
+        end = time.monotonic() + _TIMEOUT_S
+        while b"\0" not in self._buffer:
+            assert select.select([self._in], [], [], max(0.0, end - time.monotonic()))[0], "the browser does not answer"
+            data = os.read(self._in, 1 << 20)
+            assert data, "the browser has gone"
+            self._buffer += data
+        text, _, self._buffer = self._buffer.partition(b"\0")
+        message: dict[str, Any] = json.loads(text)
+        self._notice(message)
+        return message
+
+    def _notice(self, message: dict[str, Any]) -> None:
+        params = message.get("params", {})
+        match message.get("method"):
+            case "Runtime.exceptionThrown":
+                details = params["exceptionDetails"]
+                self.errors.append(details.get("exception", {}).get("description") or details["text"])
+            case "Log.entryAdded" if params["entry"]["level"] == "error":
+                self.errors.append(params["entry"]["text"])
+            case "Runtime.consoleAPICalled" if params["type"] in ("error", "assert"):
+                self.errors.append(str(params["args"]))
+            case "Network.requestWillBeSent":
+                self.requests.append(params["request"]["url"])
+            case "Page.loadEventFired":
+                self._loaded = True
+
+    def open(
+        self, page: Path, width: int = 1280, height: int = 900, *, dark: bool = False, phone: bool = False
+    ) -> None:
+        """Show a file in a window of this size, and wait until it is loaded and drawn."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=2 if phone else 1,
+            mobile=phone,
+        )
+        self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self.errors.clear()
+        self.requests.clear()
+        self._loaded = False
+        self.call("Page.navigate", url=page.resolve().as_uri())
+        while not self._loaded:
+            self._receive()
+        self.settle()
+
+    def settle(self) -> None:
+        """Two frames are drawn."""
+        self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(0))))")
+
+    def run(self, script: str) -> Any:
+        """The value of an expression (of a promise: what it becomes)."""
+        found = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in found, found["exceptionDetails"].get("exception", found)
+        return found["result"].get("value")
+
+    def mouse(self, kind: str, x: float, y: float, *, buttons: int = 0, clicks: int = 1) -> None:
+        """One event: ``Moved``, ``Pressed`` or ``Released``."""
+        button = "left" if kind != "Moved" else "none"
+        self.call(
+            "Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, button=button, buttons=buttons, clickCount=clicks
+        )
+
+    def drag(self, x0: float, x1: float, y: float) -> None:
+        """Press, move in some steps, release."""
+        self.mouse("Moved", x0, y)
+        self.mouse("Pressed", x0, y, buttons=1)
+        for step in range(1, 9):
+            self.mouse("Moved", x0 + (x1 - x0) * step / 8, y, buttons=1)
+        self.mouse("Released", x1, y)
+        self.settle()
+
+    def click(self, x: float, y: float, clicks: int = 1) -> None:
+        """``clicks`` 2: a double click."""
+        self.mouse("Moved", x, y)
+        for number in range(1, clicks + 1):
+            self.mouse("Pressed", x, y, buttons=1, clicks=number)
+            self.mouse("Released", x, y, clicks=number)
+        self.settle()
+
+    def key(self, key: str, *, shift: bool = False) -> None:
+        """Press and release."""
+        modifiers = 8 if shift else 0
+        text = {"text": key} if len(key) == 1 else {}
+        self.call("Input.dispatchKeyEvent", type="keyDown", key=key, modifiers=modifiers, **text)
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key, modifiers=modifiers)
+        self.settle()
+
+    def picture(self, file: Path, *, full: bool = False) -> None:
+        """A screenshot as PNG."""
+        more: dict[str, object] = {}
+        if full:
+            size = self.call("Page.getLayoutMetrics")["cssContentSize"]
+            more = {"captureBeyondViewport": True, "clip": {**size, "scale": 1}}
+        file.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png", **more)["data"]))

@@ -1,0 +1,272 @@
+"""The summary's numbers against pandas and numpy on simulated flights; events against what the simulator was told to do."""
+
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd  # type: ignore[import-untyped]
+import pytest
+from report_flights import Row, column, dbc_bus, shipped_bus, simulated
+
+from kontronik_can_gw.dbc_output.unpacker import SignalReader, Value
+from kontronik_can_gw.offline.layouts import BusLayout
+from kontronik_can_gw.offline.report.analysis import Analysis, Event, Flight
+from kontronik_can_gw.offline.report.fit import ResistanceFit
+from kontronik_can_gw.offline.report.quantities import PLOTS
+from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError
+from kontronik_can_gw.simulator import FLIGHT, Dropout, ErrorWindow, EscOptions, Faults, Swap
+from kontronik_can_gw.telemetry import SECOND as S
+
+GAP_NS = 500_000_000
+FAULTS = Faults(
+    dropout=Dropout(2 * S, 31 * S),
+    flipped_bits=1e-5,
+    errors=(
+        ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_WARNING, 18 * S, 5 * S),
+        ErrorWindow(OperatingError.UNDERVOLTAGE, 20 * S, S // 2),
+        ErrorWindow(SelfTestError.TEST_EEPROM_SIZE, 40 * S),
+    ),
+    swaps=(Swap(70 * S, Device.KOLIBRI),),
+)
+OPTIONS = (EscOptions(faults=FAULTS), EscOptions(device=Device.JIVEPRO, max_current=80))
+
+
+def analysed(bus: BusLayout, rows: list[Row], points: int = 2000, **more: tuple[float | None, float | None]) -> Flight:
+    analysis = Analysis(bus, points, **more)
+    for time_ns, values in rows:
+        if not analysis.take(time_ns, values):
+            break
+    return analysis.finish()
+
+
+@pytest.fixture(scope="module")
+def bus() -> BusLayout:
+    return shipped_bus(("left", "right"))
+
+
+@pytest.fixture(scope="module")
+def rows(bus: BusLayout) -> list[Row]:
+    return list(simulated(bus, 110, OPTIONS))
+
+
+@pytest.fixture(scope="module")
+def flight(bus: BusLayout, rows: list[Row]) -> Flight:
+    return analysed(bus, rows)
+
+
+def table(bus: BusLayout, rows: list[Row], esc: int, *sources: str) -> pd.DataFrame:
+    """Rows by source, with the time that each holds (0 in front of a gap)."""
+    places = {source: column(bus, source, esc) for source in sources}
+    frame = pd.DataFrame({source: [values[at] for _, values in rows] for source, at in places.items()})
+    times = np.array([time_ns for time_ns, _ in rows])
+    held = np.append(np.diff(times), 0)
+    return frame.assign(time_ns=times, held=np.where(held > GAP_NS, 0, held))
+
+
+@pytest.mark.parametrize("esc", [0, 1])
+def test_time_and_energy_are_those_of_pandas(bus: BusLayout, rows: list[Row], flight: Flight, esc: int) -> None:
+    data = table(
+        bus, rows, esc, "battery_power", "battery_voltage", "electrical_speed", "energy_used", "consumed_charge"
+    )
+    summary = flight.summaries[esc]
+    live = data[data.battery_voltage.notna()]
+    assert summary.telemetry_ns == live.held.sum()
+    turning = live[live.electrical_speed.fillna(0) > 0]
+    assert summary.turning_ns == turning.held.sum()
+    power = live.battery_power.fillna(0).to_numpy(float)
+    assert summary.energy_drawn == pytest.approx((power.clip(min=0) * live.held).sum() / 3.6e12)
+    assert summary.energy_returned == pytest.approx((-power.clip(max=0) * live.held).sum() / 3.6e12)
+    assert summary.power_turning == pytest.approx((turning.battery_power * turning.held).sum() / turning.held.sum())
+    counter = data.energy_used.dropna().to_numpy(float)
+    assert summary.energy_counter == pytest.approx(counter[-1] - counter[0])
+    assert summary.energy == summary.energy_counter
+    assert summary.energy_drawn == pytest.approx(
+        summary.energy_counter, abs=0.4
+    )  # the counter knows no rows, and no coarser power
+
+
+@pytest.mark.parametrize("esc", [0, 1])
+def test_charge_goes_on_over_resets(bus: BusLayout, rows: list[Row], flight: Flight, esc: int) -> None:
+    data = table(bus, rows, esc, "consumed_charge")
+    counter = data.consumed_charge.dropna().to_numpy(float)
+    steps = np.diff(counter)
+    expected = steps[steps > 0].sum() + counter[1:][steps < 0].sum()
+    assert flight.summaries[esc].charge == pytest.approx(expected)
+    assert flight.summaries[esc].charge_resets == (steps < 0).sum()
+    assert expected > 100
+
+
+@pytest.mark.parametrize("esc", [0, 1])
+def test_extremes_are_those_of_pandas_with_their_time(
+    bus: BusLayout, rows: list[Row], flight: Flight, esc: int
+) -> None:
+    found = flight.summaries[esc].extremes
+    assert {"max battery_power", "max motor_current", "min battery_voltage", "min bec_voltage"} <= found.keys()
+    for key, extreme in found.items():
+        which, source = key.split()
+        data = table(bus, rows, esc, source).dropna()
+        values = data[source].to_numpy(float)
+        at = values.argmax() if which == "max" else values.argmin()
+        assert (extreme.value, extreme.time_ns) == (values[at], data.time_ns.iloc[at]), key
+
+
+def test_extremes_survive_in_the_lines(flight: Flight) -> None:
+    assert flight.rows_in_bucket > 1
+    for plot in flight.plots:
+        for line in plot.lines:
+            found = flight.summaries[line.esc].extremes.get(f"max {line.source}")
+            if found is not None:
+                assert max(v for v in line.values if v is not None) == found.value
+
+
+def test_sag_and_resistance(bus: BusLayout, rows: list[Row], flight: Flight) -> None:
+    data = table(bus, rows, 1, "battery_voltage", "battery_current").dropna()
+    summary = flight.summaries[1]
+    loaded = data[data.battery_current >= 5]
+    assert summary.load_voltage is not None
+    assert summary.load_voltage.value == loaded.battery_voltage.min()
+    before = data[data.time_ns < loaded.time_ns.iloc[0]]
+    rest = before[before.battery_current.abs() <= 1].battery_voltage
+    assert rest.min() <= (summary.rest_voltage or 0) <= rest.max()
+    assert summary.cells == 6
+    found = summary.resistance
+    assert found is not None
+    truth = 6 * 0.3 / 80  # of the simulated battery
+    assert found.value == pytest.approx(truth, rel=0.1)
+    assert found.spread < truth / 4
+
+
+def test_the_fit_is_that_of_numpy() -> None:
+    random = np.random.default_rng(3)
+    fit = ResistanceFit()
+    slopes = []
+    for stretch in range(7):
+        current = random.uniform(0, 80, 200).round(1)
+        voltage = (25 - 0.1 * stretch - 0.02 * current + random.normal(0, 0.05, 200)).round(2)
+        for i in range(200):
+            fit.take(stretch * 10 * S + i * 50_000_000, float(voltage[i]), float(current[i]))
+        slopes.append(-np.polyfit(current, voltage, 1)[0])
+    found = fit.finish()
+    assert found is not None
+    assert found.value == pytest.approx(np.median(slopes))
+    assert found.spread == pytest.approx((np.quantile(slopes, 0.75) - np.quantile(slopes, 0.25)) / 2)
+    assert found.stretches == 7
+
+
+def test_no_resistance_without_enough_current() -> None:
+    fit = ResistanceFit()
+    for i in range(5000):
+        fit.take(i * 10_000_000, 25.0 - i % 2 * 0.01, 10 + i % 2)
+    assert fit.finish() is None
+
+
+def test_errors_begin_and_end_when_they_did(flight: Flight) -> None:
+    def of(name: str, esc: int = 0) -> list[Event]:
+        return [e for e in flight.events if e.kind == "error" and e.name == name and e.esc == esc]
+
+    start = flight.origin_ns
+    (warning,) = of("power_stage_overtemp_warning")
+    assert (warning.begin_ns - start) / S == pytest.approx(18, abs=0.05)
+    assert warning.end_ns is not None
+    assert (warning.end_ns - start) / S == pytest.approx(23, abs=0.05)
+    assert (warning.severity, warning.text) == ("warning", "power stage hot")
+    (error,) = of("undervoltage")
+    assert (error.severity, error.end_ns is not None) == ("error", True)
+    selftest = of("test_eeprom_size")  # set for ever: it comes again after each loss and with each info frame
+    assert len(selftest) >= 2
+    assert selftest[0].note == "until telemetry was lost"
+    assert selftest[-1].text == "self-test: EEPROM size"
+    assert not [e for e in flight.events if e.kind == "error" and e.esc == 1]
+    assert not [e for e in flight.events if e.name == "programming_allowed"]
+
+
+def test_losses_are_gaps_in_lines_and_events(bus: BusLayout, rows: list[Row], flight: Flight) -> None:
+    lost = [e for e in flight.events if e.name == "telemetry_lost"]
+    assert {e.esc for e in lost} == {0}
+    assert [round((e.begin_ns - flight.origin_ns) / S, 1) for e in lost] == [29.2, 60.2, 91.2]
+    summary = flight.summaries[0]
+    assert summary.gaps == 3
+    assert summary.longest_gap_ns / S == pytest.approx(1.75, abs=0.05)
+    assert summary.losses == rows[-1][1][column(bus, "losses")] == 3
+    assert (summary.crc_errors or 0) > 0
+    power = next(p for p in flight.plots if PLOTS[p.plot].key == "power")
+    line = next(li for li in power.lines if li.esc == 0)
+    for event in lost:
+        assert event.end_ns is not None
+        inside = [v for t, v in zip(flight.times, line.values, strict=True) if event.begin_ns < t < event.end_ns]
+        assert None in inside
+        assert all(v is None for v in inside[5:-5])
+
+
+def test_a_device_that_changes_is_told(flight: Flight) -> None:
+    (event,) = [e for e in flight.events if e.kind == "device"]
+    assert event.text == "Device changed from Kosmik 120 firmware 4.17 to Kolibri 120 firmware 4.17"
+    assert 70 < (event.begin_ns - flight.origin_ns) / S < 72
+    assert (flight.facts[0].device, flight.facts[0].firmware, flight.facts[0].layout) == ("Kolibri", "4.17", "V4")
+    assert (flight.facts[1].device, flight.facts[1].layout) == ("JivePro", "Legacy")
+
+
+def test_the_band_holds_the_states_that_were_flown(flight: Flight) -> None:
+    names = [int(s.state) for s in flight.segments[1]]
+    profile = [int(phase.state) for phase in FLIGHT]
+    flown = [state for state, before in zip(profile, [0, *profile], strict=False) if state != before]
+    assert names[3 : 3 + len(flown)] == flown  # behind self-test, waiting and beep
+    assert all(a.end_ns == b.begin_ns for a, b in pairwise(flight.segments[1]))
+    assert flight.segments[1][-1].end_ns == flight.end_ns
+
+
+def test_a_window_is_cut_out_with_the_times_of_the_whole(bus: BusLayout, rows: list[Row]) -> None:
+    part = analysed(bus, rows, window=(10.0, 20.0))
+    assert part.origin_ns == rows[0][0]
+    assert 10 <= (part.start_ns - part.origin_ns) / S < 10.02
+    assert 19.98 < (part.end_ns - part.origin_ns) / S <= 20
+    assert part.rows == sum(10 * S <= t - rows[0][0] <= 20 * S for t, _ in rows)
+
+
+def test_speeds_that_are_one_and_the_same_are_shown_once() -> None:
+    plain = shipped_bus()
+    flight = analysed(plain, list(simulated(plain, 12)))
+    speed = next(p for p in flight.plots if PLOTS[p.plot].key == "speed")
+    assert [line.source for line in speed.lines] == ["electrical_speed"]
+    geared = dbc_bus(plain.layout.file, pole_pairs=7, gear=Fraction(2))
+    flight = analysed(geared, list(simulated(geared, 12)))
+    speed = next(p for p in flight.plots if PLOTS[p.plot].key == "speed")
+    assert [line.source for line in speed.lines] == ["output_speed", "motor_speed", "electrical_speed"]
+    found = flight.summaries[0].extremes
+    assert found["max electrical_speed"].value == pytest.approx(7 * found["max motor_speed"].value, rel=0.01)
+
+
+def test_counters_that_roll_go_on_and_those_that_begin_again_too() -> None:
+    bus = shipped_bus()
+    at = column(bus, "losses")
+    blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
+    top = int(SignalReader(bus.layout).columns[at].high)
+
+    def total(*counts: int) -> int | None:
+        made = []
+        for number, count in enumerate(counts):
+            values = list(blank)
+            values[at] = count
+            made.append((number * 10_000_000, values))
+        return analysed(bus, made).summaries[0].losses
+
+    assert total(3, 5, 9) == 6
+    assert total(top - 1, top, 0, 2) == 4
+    assert total(100, 104, 0, 2) == 6
+
+
+def test_many_events_and_states_stay_bounded() -> None:
+    bus = shipped_bus()
+    state, flag, live = (column(bus, s) for s in ("operating_state", "undervoltage", "battery_voltage"))
+    blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
+    analysis = Analysis(bus, 1000)
+    for number in range(60_000):
+        values = list(blank)
+        values[live], values[flag] = 24.0, number & 1
+        values[state] = ("Forward", "Brake")[number & 1]
+        analysis.take(number * 10_000_000, values)
+    flight = analysis.finish()
+    assert flight.left_out == {"error": 25_000, "state": 55_000}
+    assert len(flight.events) == 10_000
+    assert len(flight.segments[0]) <= 4000
+    assert len(flight.times) <= 1000

@@ -1,0 +1,286 @@
+"""The page in a real browser (headless Chromium): nothing fails, everything is drawn, and it does what it is told."""
+
+import bisect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from report_browser import MISSING, PROGRAM, Browser
+from report_flights import shipped_bus, simulated
+
+from kontronik_can_gw.offline.report.analysis import Analysis, Flight
+from kontronik_can_gw.offline.report.page import render
+from kontronik_can_gw.offline.report.quantities import PLOTS
+from kontronik_can_gw.protocol.states import OperatingError
+from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults
+from kontronik_can_gw.telemetry import SECOND as S
+
+pytestmark = pytest.mark.skipif(PROGRAM is None, reason=MISSING)
+
+EVIL = "</script><script>window.hit = 1</script><img src=x onerror='window.hit = 2'>"
+FAULTS = Faults(
+    dropout=Dropout(2 * S, 31 * S),
+    errors=(
+        ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_WARNING, 18 * S, 5 * S),
+        ErrorWindow(OperatingError.UNDERVOLTAGE, 20 * S, S // 2),
+    ),
+)
+# Pixels of a plot's data area that are (nearly) of one colour.
+COUNT = """((key, colour) => {
+  const plot = flight.plots.find((p) => p.key === key), { left, top, width, height } = plot.u.bbox;
+  const data = plot.u.ctx.getImageData(left, top, width, height).data;
+  const want = [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
+  let count = 0;
+  for (let i = 0; i < data.length; i += 4) {
+    if (data[i + 3] > 200 && want.every((w, k) => Math.abs(w - data[i + k]) < 24)) count++;
+  }
+  return count;
+})"""
+
+# Share of the height in which a red line stands at a time.
+RED_AT = """((key, t) => {
+  const { u } = flight.plots.find((p) => p.key === key), { top, height } = u.bbox;
+  const data = u.ctx.getImageData(Math.round(u.valToPos(t, "x", true)) - 1, top, 3, height).data;
+  let count = 0;
+  for (let i = 0; i < data.length; i += 4) {
+    if (data[i] > 150 && data[i] - data[i + 1] > 60 && data[i] - data[i + 2] > 60) count++;
+  }
+  return count / height;
+})"""
+
+
+def flown(names: tuple[str, ...]) -> Flight:
+    bus = shipped_bus(names)
+    analysis = Analysis(bus, 2000)
+    for time_ns, values in simulated(bus, 60, [EscOptions(faults=FAULTS), EscOptions(max_current=80)]):
+        analysis.take(time_ns, values)
+    return analysis.finish()
+
+
+@pytest.fixture(scope="module")
+def one() -> Flight:
+    return flown(("esc1",))
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory, one: Flight) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("pages")
+    written = {}
+    for name, flight, title in (("one", one, "One"), ("two", flown(("left", "right")), EVIL)):
+        written[name] = folder / f"{name}.html"
+        html = render(flight, title=title, source="flight.kcap", provenance={EVIL: EVIL}, wall_ns=1_763_751_137 * S)
+        written[name].write_text(html, encoding="utf-8")
+    return written
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("browser") / "profile") as found:
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def nothing_fails(browser: Browser) -> Iterator[None]:
+    """After each test: no script threw, and nothing but the page was asked for."""
+    yield
+    assert browser.errors == []
+    assert len(browser.requests) == 1
+    assert browser.requests[0].startswith("file://")
+
+
+def centre(browser: Browser, key: str, share: float = 0.5) -> tuple[float, float]:
+    """A point in a plot's data area, on the screen."""
+    browser.run(f"document.getElementById('plot-{key}').scrollIntoView({{behavior: 'instant', block: 'center'}})")
+    browser.settle()
+    box: dict[str, float] = browser.run(
+        f"(() => {{ const r = flight.plots.find((p) => p.key === '{key}').u.over.getBoundingClientRect(); "
+        "return {x: r.left, y: r.top, w: r.width, h: r.height}; })()"
+    )
+    return box["x"] + share * box["w"], box["y"] + box["h"] / 2
+
+
+def ranges(browser: Browser) -> list[list[float]]:
+    found: list[list[float]] = browser.run("flight.plots.map(({u}) => [u.scales.x.min, u.scales.x.max])")
+    return found
+
+
+@pytest.mark.parametrize("name", ["one", "two"])
+@pytest.mark.parametrize("look", ["light", "dark", "phone"])
+def test_every_plot_is_drawn_and_the_page_fits(
+    browser: Browser, pages: dict[str, Path], one: Flight, name: str, look: str
+) -> None:
+    width, height = (390, 844) if look == "phone" else (1280, 900)
+    browser.open(pages[name], width, height, dark=look == "dark", phone=look == "phone")
+    keys = browser.run("flight.plots.map((p) => p.key)")
+    assert keys == ["states", *(PLOTS[p.plot].key for p in one.plots)]
+    theme = "dark" if look == "dark" else "light"
+    for key in keys[1:]:
+        colours = browser.run(f"flight.data.styles.slice(0, {1 if name == 'one' else 2}).map((s) => s.{theme})")
+        drawn = [browser.run(f"{COUNT}('{key}', '{colour}')") for colour in colours]
+        assert sum(drawn) > 100, (key, drawn)
+    bands = [browser.run(f"{COUNT}('states', flight.data.classes[{group}].{theme})") for group in (0, 3, 4, 5)]
+    assert min(bands) > 100, bands
+    assert browser.run("document.documentElement.scrollWidth") == width
+    ground = browser.run("getComputedStyle(document.body).backgroundColor")
+    assert ground == ("rgb(16, 19, 23)" if look == "dark" else "rgb(246, 247, 249)")
+    assert browser.run("window.hit") is None
+
+
+def test_the_legend_tells_the_values_at_the_cursor(browser: Browser, pages: dict[str, Path], one: Flight) -> None:
+    browser.open(pages["one"])
+    x, y = centre(browser, "current", 0.35)
+    browser.mouse("Moved", x, y)
+    browser.settle()
+    t = browser.run(
+        "(() => { const {u} = flight.plots.find((p) => p.key === 'current'); return u.data[0][u.cursor.idx]; })()"
+    )
+    assert t == pytest.approx(0.35 * 60, abs=0.2)
+    at = bisect.bisect_left([(time_ns - one.origin_ns) / S for time_ns in one.times], t - 1e-6)
+    for plot in one.plots:  # the cursor is in all of them
+        spec = PLOTS[plot.plot]
+        shown = browser.run(f"[...document.querySelectorAll('#plot-{spec.key} .legend td')].map((c) => c.textContent)")
+        told = [float(text.replace("\u202f", "").replace("−", "-")) for text in shown]
+        assert told == [pytest.approx(line.values[at], abs=0.51 * 10**-spec.digits) for line in plot.lines], spec.key
+    now = browser.run("document.getElementById('now').textContent")
+    assert now.startswith("0:2")
+    assert "18:52:" in now
+    assert "power stage hot" in now
+    assert "RPMControl" in browser.run("document.querySelector('#plot-states .band').textContent")
+
+
+def test_a_drag_zooms_all_plots_and_a_double_click_resets(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["one"])
+    whole = ranges(browser)
+    (x0, y), (x1, _) = centre(browser, "power", 0.25), centre(browser, "power", 0.5)
+    browser.drag(x0, x1, y)
+    zoomed = ranges(browser)
+    assert all(r == zoomed[0] for r in zoomed)
+    assert zoomed[0] == [pytest.approx(15, abs=0.2), pytest.approx(30, abs=0.2)]
+    browser.click(x0 + 20, y, clicks=2)
+    assert ranges(browser) == whole
+
+
+def test_wheel_keys_and_buttons_move_the_range(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["one"])
+    x, y = centre(browser, "power")
+
+    def span() -> float:
+        low, high = ranges(browser)[0]
+        return high - low
+
+    whole = span()
+    browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=-50, modifiers=2)
+    browser.settle()
+    wheel = span()
+    assert wheel < 0.9 * whole
+    browser.run("document.querySelector('#plot-power .plot').focus({preventScroll: true})")
+    browser.key("+")
+    assert span() == pytest.approx(0.6 * wheel)
+    before = ranges(browser)[0]
+    browser.key("ArrowRight", shift=True)
+    assert ranges(browser)[0][0] > before[0]
+    browser.key("ArrowRight")
+    assert "·" in browser.run("document.getElementById('now').textContent")
+    browser.key("0")
+    assert span() == whole
+    browser.run("document.getElementById('in').click()")
+    assert span() == pytest.approx(whole / 2)
+    browser.run("document.getElementById('all').click()")
+    assert span() == whole
+    browser.run("flight.setRange(-100, 1e6)")
+    assert span() == whole
+
+
+def test_events_can_be_searched_sorted_filtered_and_gone_to(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["one"])
+
+    def texts(column: int = 5) -> list[str]:
+        found: list[str] = browser.run(
+            f"[...document.querySelectorAll('#events tbody td:nth-child({column})')].map((c) => c.textContent)"
+        )
+        return found
+
+    everything = texts()
+    assert {"power stage hot", "battery voltage too low", "No telemetry"} <= set(everything)
+    browser.run("document.querySelector('[data-sort=text]').click()")
+    assert texts() == sorted(everything, key=lambda text: [ord(c) for c in text])
+    browser.run("document.querySelector('[data-kind=state]').click()")
+    assert set(texts(4)) == {"Error", "Warning", "Link"}
+    browser.run(
+        "(() => { const s = document.getElementById('search'); s.value = 'voltage'; s.dispatchEvent(new Event('input')); })()"
+    )
+    assert texts() == ["battery voltage too low"]
+    assert "battery" in texts(6)[0]  # a remedy
+    browser.run("document.querySelector('#events tbody tr').scrollIntoView({behavior: 'instant', block: 'center'})")
+    box = browser.run(
+        "(() => { const r = document.querySelector('#events tbody .at').getBoundingClientRect(); return [r.x + 5, r.y + 5]; })()"
+    )
+    browser.click(*box)
+    low, high = ranges(browser)[3]
+    assert low == pytest.approx(17.5, abs=0.2)
+    assert high == pytest.approx(23, abs=0.2)
+    browser.run("document.querySelector('.tiles [data-at]').click()")
+    assert ranges(browser)[0] != [low, high]
+
+
+def test_marks_of_errors_are_drawn_over_all_plots(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["one"])
+    browser.run("flight.setRange(17, 22)")
+    browser.settle()
+    for key in browser.run("flight.plots.map((p) => p.key)"):
+        column = browser.run(f"{RED_AT}('{key}', 20)")
+        assert column > 0.5, key
+
+
+def test_an_esc_can_be_switched_off_and_on(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["two"])
+    colours = browser.run("flight.data.styles.slice(0, 2).map((s) => s.light)")
+
+    def drawn() -> list[Any]:
+        return [browser.run(f"{COUNT}('battery_voltage', '{colour}')") for colour in colours]
+
+    both = drawn()
+    assert min(both) > 50
+    browser.run("document.querySelector('#escs [data-esc=\"1\"]').click()")
+    browser.settle()
+    alone = drawn()
+    assert alone[0] >= both[0]
+    assert alone[1] == 0
+    assert browser.run("document.querySelector('#escs [data-esc=\"1\"]').getAttribute('aria-pressed')") == "false"
+    assert "right" not in browser.run("document.querySelector('#events tbody').textContent")
+    browser.run("document.querySelector('#escs [data-esc=\"1\"]').click()")
+    browser.settle()
+    assert drawn() == both
+
+
+def test_the_theme_can_be_switched_and_printing_is_light(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["one"], dark=True)
+    browser.run("document.getElementById('theme').click()")
+    assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(246, 247, 249)"
+    browser.settle()
+    assert browser.run(f"{COUNT}('power', flight.data.styles[0].light)") > 100
+    browser.run("document.getElementById('theme').click()")
+    pdf = browser.call("Page.printToPDF", printBackground=True)["data"]
+    assert len(pdf) > 50_000
+    browser.settle()
+    assert browser.run("document.documentElement.className") == "dark"
+    assert browser.run("flight.plots[0].u.width") > 1000
+
+
+def test_two_fingers_zoom(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["one"], 390, 844, phone=True)
+    x, y = centre(browser, "power")
+
+    def touch(kind: str, *xs: float) -> None:
+        points = [{"x": at, "y": y, "id": i} for i, at in enumerate(xs)]
+        browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
+    touch("touchStart", x - 40)
+    touch("touchStart", x - 40, x + 40)
+    for step in range(1, 5):
+        touch("touchMove", x - 40 - 10 * step, x + 40 + 10 * step)
+    touch("touchEnd")
+    browser.settle()
+    low, high = ranges(browser)[0]
+    assert high - low == pytest.approx(30, rel=0.1)

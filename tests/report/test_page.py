@@ -1,0 +1,211 @@
+"""The page as a file: self-contained, escaped, the same bytes each time, values exact."""
+
+import base64
+import hashlib
+import json
+import re
+from array import array
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from report_flights import dbc_bus, shipped_bus, simulated
+
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.offline.report import page as page_module
+from kontronik_can_gw.offline.report.analysis import Analysis, Flight
+from kontronik_can_gw.offline.report.decimate import Number
+from kontronik_can_gw.offline.report.page import clock, duration, encode, number, render, wall_clock
+from kontronik_can_gw.telemetry import SECOND as S
+
+EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u2028{{data}}"
+
+
+def flown(seconds: float = 12, points: int = 500) -> Flight:
+    bus = shipped_bus()
+    analysis = Analysis(bus, points)
+    for time_ns, values in simulated(bus, seconds):
+        analysis.take(time_ns, values)
+    return analysis.finish()
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return flown()
+
+
+class Tags(HTMLParser):
+    """All tags with their attributes, and the text of scripts and styles."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.raw: list[tuple[str, dict[str, str | None], str]] = []
+        self.text = ""
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag in ("script", "style"):
+            self.raw.append((tag, dict(attrs), ""))
+
+    def handle_data(self, data: str) -> None:
+        if self.cdata_elem and self.raw:
+            tag, attributes, text = self.raw[-1]
+            self.raw[-1] = tag, attributes, text + data
+        else:
+            self.text += data
+
+
+def data_of(html: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(next(t for _, a, t in Tags(html).raw if a.get("id") == "data"))
+    return found
+
+
+def test_the_page_asks_for_nothing_and_its_policy_names_what_may_run(flight: Flight) -> None:
+    html = render(flight, title="x", source="y")
+    tags = Tags(html)
+    for tag, attributes in tags.found:
+        assert tag not in ("link", "img", "iframe", "object", "embed", "base", "form"), tag
+        assert not {"src", "href", "style"} & attributes.keys(), (tag, attributes)
+        assert not any(name.startswith("on") for name in attributes), (tag, attributes)
+    policy = next(a["content"] or "" for t, a in tags.found if a.get("http-equiv") == "Content-Security-Policy")
+    assert policy.startswith("default-src 'none';")
+    assert "unsafe" not in policy
+    for tag, attributes, text in tags.raw:
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert (f"'sha256-{digest}'" in policy) == (attributes.get("type") != "application/json"), tag
+    assert "@import" not in html
+    assert "url(" not in html
+
+
+def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
+    flight = flown(3)
+    flight.names[0] = EVIL
+    flight.facts[0].device = EVIL
+    flight.missing.append(EVIL)
+    flight.events[0].text = flight.events[0].remedy = EVIL
+    html = render(
+        flight, title=EVIL, source=EVIL, provenance={EVIL: EVIL, "program": EVIL}, wall_ns=1, damage=[f"{EVIL} damaged"]
+    )
+    tags = Tags(html)
+    assert [t for t, _ in tags.found].count("script") == 3
+    assert "img" not in [t for t, _ in tags.found]
+    assert "alert(1)" in tags.text
+    found = data_of(html)
+    assert found["escs"] == [EVIL]
+    assert found["events"][0]["text"] == EVIL
+    title = next(i for i, (t, _) in enumerate(tags.found) if t == "title")
+    assert tags.found[title + 1][0] == "style"
+
+
+def test_the_same_input_gives_the_same_bytes(flight: Flight) -> None:
+    assert render(flown(), title="x", source="y", wall_ns=5) == render(flown(), title="x", source="y", wall_ns=5)
+
+
+def test_the_data_in_the_page_are_those_of_the_lines(flight: Flight) -> None:
+    found = data_of(render(flight, title="x", source="y"))
+    times = array("d", base64.b64decode(found["times"]))
+    assert list(times) == [round((t - flight.origin_ns) / S, 6) for t in flight.times]
+    for plot, written in zip(flight.plots, found["plots"], strict=True):
+        for line, packed in zip(plot.lines, written["series"], strict=True):
+            assert decode(packed) == line.values
+    assert any(packed["type"] == "i16" for plot in found["plots"] for packed in plot["series"])
+
+
+def decode(packed: Any) -> list[Number]:
+    code, none = {"i16": ("h", -32768), "i32": ("i", -(2**31)), "f64": ("d", None)}[packed["type"]]
+    values = array(code, base64.b64decode(packed["data"]))
+    scale = packed.get("scale", 1)
+    return [None if v == none or v != v else v / scale for v in values]
+
+
+@given(
+    st.lists(
+        st.one_of(
+            st.none(),
+            st.integers(-(10**10), 10**10),
+            st.integers(-(10**6), 10**6).map(lambda n: n / 1000),
+            st.floats(-1e9, 1e9, allow_nan=False),
+        ),
+        max_size=20,
+    )
+)
+def test_encoding_is_exact(values: list[Number]) -> None:
+    assert decode(encode(values)) == values
+
+
+def test_what_the_dbc_does_not_have_is_left_out_and_told(tmp_path: Path) -> None:
+    text = shipped("dbc/kontronik_esc.dbc").read_text(encoding="utf-8")
+    for gone in ("EscEnergy", "EscBec"):  # the messages with energy, charge, power, and of the BEC
+        text = re.sub(rf"^BO_ \d+ {gone}:.*\n( SG_ .*\n)+", "", text, flags=re.MULTILINE)
+    kept = {found[1] for found in re.finditer(r"^BO_ (\d+) ", text, re.MULTILINE)}
+    lines = []
+    for line in text.splitlines():
+        about = re.match(r"(?:CM_|BA_ \"\w+\"|VAL_|SIG_VALTYPE_) ?(?:BO_|SG_)? ?(\d+) ", line)
+        if about is None or about[1] in kept:
+            lines.append(line)
+    file = tmp_path / "lean.dbc"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    bus = dbc_bus(str(file))
+    analysis = Analysis(bus, 500)
+    for time_ns, values in simulated(bus, 12):
+        analysis.take(time_ns, values)
+    found = analysis.finish()
+    assert found.missing == ["BEC current", "BEC voltage", "PWM input"]
+    summary = found.summaries[0]
+    assert summary.energy_counter is None
+    assert summary.charge is None
+    assert (summary.energy or 0) > 0.5  # of voltage and current
+    html = render(found, title="x", source="y")
+    assert "power integrated" in html
+    assert "Charge used</th>" not in html
+    assert "Not in the DBC, so not here: BEC current, BEC voltage, PWM input." in html
+
+
+def test_values_come_in_the_sources_units_whatever_the_dbc_has(tmp_path: Path) -> None:
+    text = shipped("dbc/kontronik_esc.dbc").read_text(encoding="utf-8")
+    text, changed = re.subn(r'( SG_ BatteryVoltage .*)\(0\.01,0\) \[.*?\] "V"', r'\1(10,0) [0|655330] "mV"', text)
+    assert changed == 1
+    file = tmp_path / "millivolts.dbc"
+    file.write_text(text, encoding="utf-8")
+    plain, other = shipped_bus(), dbc_bus(str(file))
+    found = []
+    for bus in (plain, other):
+        analysis = Analysis(bus, 500)
+        for time_ns, values in simulated(bus, 12):
+            analysis.take(time_ns, values)
+        found.append(analysis.finish())
+    assert found[0].summaries[0].extremes == found[1].summaries[0].extremes
+    assert found[0].summaries[0].rest_voltage == pytest.approx(found[1].summaries[0].rest_voltage)
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (clock(0), "0:00.0"),
+        (clock(59_960_000_000), "1:00.0"),
+        (clock(3_661_500_000_000), "1:01:01.5"),
+        (clock(-1_500_000_000), "−0:01.5"),
+        (clock(61_999_000_000, 0), "1:02"),
+        (duration(1_540_000_000), "1.5 s"),
+        (duration(61 * S), "1 min 01 s"),
+        (duration(3725 * S), "1 h 02 min 05 s"),
+        (number(-1234567.891, 1), "−1\u202f234\u202f567.9"),
+        (wall_clock(1_763_751_137 * S), "2025-11-21 18:52:17 UTC"),
+        (wall_clock(10**30), "1000000000000000000000 s of Unix time"),
+    ],
+)
+def test_times_and_numbers_read_well(shown: str, expected: str) -> None:
+    assert shown == expected
+
+
+def test_the_library_comes_with_its_licence_and_version() -> None:
+    folder = Path(page_module.__file__).parent / "vendor"
+    version = re.search(r"uPlot \(v([\d.]+)\)", (folder / "uPlot.iife.min.js").read_text(encoding="utf-8"))
+    assert version is not None
+    assert f"| {version[1]} |" in (folder / "README.md").read_text(encoding="utf-8")
+    assert "MIT License" in (folder / "uPlot.LICENSE").read_text(encoding="utf-8")
