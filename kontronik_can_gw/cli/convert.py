@@ -3,20 +3,12 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.offline.convert import BYTES, FORMATS, LOGS, ON_SCREEN, TABLES
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-    from typing import IO, Self
-
-    from kontronik_can_gw.cli.progress import Progress
+    from kontronik_can_gw.offline.convert import Conversion
     from kontronik_can_gw.offline.inputs import Input
-    from kontronik_can_gw.offline.replay import TimedFrame
-    from kontronik_can_gw.offline.tables import Choice
 
-TABLES = ("csv", "jsonl", "parquet", "mf4")
-LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
-BYTES = "bin"
-FORMATS = (*TABLES, *LOGS, BYTES)
 SUFFIXES = {
     ".csv": "csv",
     ".jsonl": "jsonl",
@@ -30,9 +22,6 @@ SUFFIXES = {
     ".trc": "trc",
     ".bin": BYTES,
 }
-ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
-"""What may go to standard output: it is text, and is written from its beginning to its end."""
-
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
 BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
@@ -101,6 +90,7 @@ def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.progress import Progress
     from kontronik_can_gw.errors import RunError
+    from kontronik_can_gw.offline.convert import Output
     from kontronik_can_gw.offline.inputs import LIVE_RATE, open_input
 
     form = _format(args)
@@ -109,10 +99,13 @@ def main(args: argparse.Namespace) -> int:
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     begun = time.monotonic()
     with open_input(source, layout, args.live_rate or LIVE_RATE) as recording:
-        work = _work_of(args, form, recording)
+        conversion = _conversion(args, form, recording)
         try:
-            with Progress(source.name, recording.size or None, args.output == "-") as progress:
-                told = work(progress)
+            with (
+                Progress(source.name, recording.size or None, args.output == "-") as progress,
+                Output(None if args.output == "-" else target, form) as out,
+            ):
+                told = conversion(recording, out, progress.reach)
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -135,167 +128,18 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _work_of(args: argparse.Namespace, form: str, recording: "Input") -> "Callable[[Progress], str | None]":
-    """What does the conversion and tells what it wrote; None where there was nothing. UserError before anything is written."""
-    if form == BYTES:
-        esc = _esc(args, recording, needed=True)
-        assert esc is not None
-        return lambda progress: _write_bytes(args, recording, esc, progress)
-    if form in LOGS:
-        return lambda progress: _write_log(args, form, recording, progress)
+def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Conversion":
+    """What is to be done. UserError for what the recording has not."""
+    from kontronik_can_gw.offline.convert import BytesConversion, LogConversion, TableConversion
     from kontronik_can_gw.offline.tables import Choice
 
-    choice = Choice.of(
-        recording.reader.columns,
-        args.signals,
-        _esc(args, recording),
-        start_ns=args.start,
-        end_ns=args.end,
-        rate=args.rate,
-    )
-    return lambda progress: _write_table(args, form, recording, choice, progress)
-
-
-def _write_table(
-    args: argparse.Namespace, form: str, recording: "Input", choice: "Choice", progress: "Progress"
-) -> str | None:
-    from kontronik_can_gw.offline.tables import Rows, open_table
-
-    rows = Rows(recording, choice, args.frames)
-    table = rows.table
-    if table is None:
-        return None
-    count = 0
-    with _Out(args) as out:
-        with open_table(out.part if form in ("parquet", "mf4") else out.file, form, table, args.units_line) as writer:
-            write = writer.write
-            for row in rows:
-                write(row)
-                count += 1
-                if not count & 255:
-                    progress.reach(recording.position)
-            last_ns = row.time_ns
-            progress.reach(recording.position)
-        out.is_whole = True
-    signals = len(table.fields) - 2 * args.frames
-    return f"{_many(count, 'row')} of {_many(signals, 'signal')}, up to {last_ns / 1e9:.3f} s"
-
-
-def _write_log(args: argparse.Namespace, form: str, recording: "Input", progress: "Progress") -> str | None:
-    from kontronik_can_gw.offline.can_logs import CanLogWriter
-    from kontronik_can_gw.offline.tables import first_of
-
-    first, frames = first_of(recording.frames())
-    if first is None:
-        return None
-    origin_ns = first.time_ns
-    wall_ns = recording.wall_ns(origin_ns)
-    last, frames = first_of(_cut(frames, origin_ns, args.start, args.end))
-    if last is None:
-        return None
-    count = 0
-    with _Out(args) as out:
-        writer = CanLogWriter(
-            out.part if form == "mf4-log" else out.file,
-            LOGS[form],
-            wall_ns,
-            last.time_ns - origin_ns,
-            name=out.name,
-            comment="\n".join(f"{key}: {value}" for key, value in recording.provenance.items()),
-        )
-        try:
-            for last in frames:
-                writer.write(last.time_ns - origin_ns, last.frame, last.received)
-                count += 1
-                if not count & 255:
-                    progress.reach(recording.position)
-            progress.reach(recording.position)
-            writer.close()
-        except BaseException:
-            writer.discard()
-            raise
-        out.is_whole = True
-    told = (
-        f"{_many(count - sum(writer.left_out.values()), 'CAN frame')}, up to {(last.time_ns - origin_ns) / 1e9:.3f} s"
-    )
-    for what, number in writer.left_out.items():
-        told += f"; {number} {what} left out, which {form} does not know"
-    moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - (last.time_ns - origin_ns)
-    if abs(moved) > 1_000_000_000:
-        told += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
-    return told
-
-
-def _write_bytes(args: argparse.Namespace, recording: "Input", esc: int, progress: "Progress") -> str | None:
-    count = 0
-    with _Out(args) as out:
-        for data in recording.esc_bytes(esc):
-            out.file.write(data)
-            count += len(data)
-            progress.reach(recording.position)
-        if not count:
-            return None
-        out.is_whole = True
-    return f"{_many(count, 'byte')} of {recording.bus.escs[esc].name}"
-
-
-class _Out:
-    """Where the data goes: a file that takes its name when ``is_whole`` was set, or standard output."""
-
-    def __init__(self, args: argparse.Namespace) -> None:
-        import sys
-        from pathlib import Path
-
-        from kontronik_can_gw.offline.part_file import PartFile
-
-        self.is_whole = False
-        self.name = "" if args.output == "-" else Path(args.output).name
-        self._part = None if args.output == "-" else PartFile(Path(args.output))
-        self._screen = sys.stdout.buffer if self._part is None else None
-
-    @property
-    def file(self) -> "IO[bytes]":
-        """Open for bytes."""
-        if self._screen is not None:
-            return self._screen
-        assert self._part is not None
-        return self._part.file or self._part.open()
-
-    @property
-    def part(self) -> "Path":
-        """For libraries that open the file themselves."""
-        assert self._part is not None
-        return self._part.path
-
-    def __enter__(self) -> "Self":
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if self._screen is not None:
-            if kind is None:
-                self._screen.flush()
-            return
-        assert self._part is not None
-        if kind is None and self.is_whole:
-            self._part.finish()
-        else:
-            self._part.discard()
-
-
-def _cut(
-    frames: "Iterator[TimedFrame]", origin_ns: int, start_ns: int | None, end_ns: int | None
-) -> "Iterator[TimedFrame]":
-    from kontronik_can_gw.offline.tables import DISORDER_NS
-
-    for frame in frames:
-        since = frame.time_ns - origin_ns
-        if start_ns is not None and since < start_ns:
-            continue
-        if end_ns is not None and since > end_ns:
-            if since > end_ns + DISORDER_NS:
-                return
-            continue
-        yield frame
+    if form == BYTES:
+        return BytesConversion(_esc(args, recording, needed=True) or 0)
+    if form in LOGS:
+        return LogConversion(LOGS[form], args.start, args.end)
+    times = {"start_ns": args.start, "end_ns": args.end, "rate": args.rate}
+    choice = Choice.of(recording.reader.columns, args.signals, _esc(args, recording), **times)
+    return TableConversion(form, choice, args.frames, args.units_line)
 
 
 def _format(args: argparse.Namespace) -> str:
@@ -388,10 +232,6 @@ def _say(text: str) -> None:
     import sys
 
     print(f"kontronik-can-gw convert: {text}", file=sys.stderr)
-
-
-def _many(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _reason(error: OSError) -> str:

@@ -32,7 +32,7 @@ def _is_part(found: list[Item], items: list[Item]) -> bool:
 
 @pytest.mark.parametrize("format_", OWN)
 def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(tmp_path: Path, format_: str) -> None:
-    path, items, content = _log(tmp_path, format_, 12)
+    path, items, content = _log(tmp_path, format_, 8)
     most = 0
     for cut in range(len(content) - 1, 0, -1):
         path.write_bytes(content[:cut])

@@ -1,0 +1,178 @@
+"""A recording to a table, a log of CAN frames or plain bytes: the work of ``convert``, without its talk.
+
+A conversion is called with the recording, the output and what is to be told of the bytes read so far. It returns what it wrote, in
+words; None where the recording has nothing of it, and then nothing was written.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Protocol, Self
+
+from kontronik_can_gw.offline.part_file import PartFile
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.offline.inputs import Input
+    from kontronik_can_gw.offline.replay import TimedFrame
+    from kontronik_can_gw.offline.tables import Choice
+
+TABLES = ("csv", "jsonl", "parquet", "mf4")
+LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
+BYTES = "bin"
+FORMATS = (*TABLES, *LOGS, BYTES)
+ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
+"""What may go to standard output: it is text, and is written from its beginning to its end."""
+_BY_PATH = ("parquet", "mf4", "mf4-log")
+"""What a library writes that opens the file itself."""
+_TURN = 256
+_CLOCK_SET_NS = 1_000_000_000
+
+
+class Output:
+    """Where the data goes: a file that takes its name when all is well and ``is_whole`` was set, or standard output (``target`` None)."""
+
+    def __init__(self, target: Path | None, form: str) -> None:
+        self.is_whole = False
+        self.name = "" if target is None else target.name
+        self._part = None if target is None else PartFile(target)
+        self._by_path = form in _BY_PATH
+
+    def open(self) -> "IO[bytes] | Path":
+        """What to write to: open for bytes, or a path. RunError where it cannot be opened."""
+        if self._part is None:
+            return sys.stdout.buffer
+        return self._part.path if self._by_path else self._part.open()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if self._part is None:
+            if kind is None:
+                sys.stdout.flush()
+        elif kind is None and self.is_whole:
+            self._part.finish()
+        else:
+            self._part.discard()
+
+
+class Conversion(Protocol):
+    """One kind of conversion."""
+
+    def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None: ...
+
+
+@dataclass(frozen=True)
+class TableConversion:
+    """To a table."""
+
+    form: str
+    choice: "Choice"
+    by_frame: bool = False
+    units_line: bool = False
+
+    def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
+        from kontronik_can_gw.offline.tables import Rows, open_table
+
+        rows = Rows(recording, self.choice, self.by_frame)
+        table = rows.table
+        if table is None:
+            return None
+        count, last_ns = 0, 0
+        with open_table(out.open(), self.form, table, self.units_line) as writer:
+            write = writer.write
+            for row in rows:
+                write(row)
+                count += 1
+                if not count % _TURN:
+                    reached(recording.position)
+            last_ns = row.time_ns
+            reached(recording.position)
+        out.is_whole = True
+        signals = len(self.choice.columns)
+        return f"{_many(count, 'row')} of {_many(signals, 'signal')}, up to {last_ns / 1e9:.3f} s"
+
+
+@dataclass(frozen=True)
+class LogConversion:
+    """To a log of CAN frames (a format of can_logs), from ``start_ns`` to ``end_ns`` after the recording's first frame."""
+
+    format: str
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
+        from kontronik_can_gw.offline.can_logs import CanLogWriter
+        from kontronik_can_gw.offline.tables import first_of
+
+        first, frames = first_of(recording.frames())
+        if first is None:
+            return None
+        origin_ns = first.time_ns
+        wall_ns = recording.wall_ns(origin_ns)
+        last, frames = first_of(self._cut(frames, origin_ns))
+        if last is None:
+            return None
+        comment = "\n".join(f"{key}: {value}" for key, value in recording.provenance.items())
+        begins = last.time_ns - origin_ns
+        writer = CanLogWriter(out.open(), self.format, wall_ns, begins, name=out.name, comment=comment)
+        count = 0
+        try:
+            for last in frames:
+                writer.write(last.time_ns - origin_ns, last.frame, last.received)
+                count += 1
+                if not count % _TURN:
+                    reached(recording.position)
+            reached(recording.position)
+            writer.close()
+        except BaseException:
+            writer.discard()
+            raise
+        out.is_whole = True
+        lasted = last.time_ns - origin_ns
+        told = f"{_many(count - sum(writer.left_out.values()), 'CAN frame')}, up to {lasted / 1e9:.3f} s"
+        for what, number in writer.left_out.items():
+            told += f"; {number} {what} left out, which {self.format} does not know"
+        moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - lasted
+        if abs(moved) > _CLOCK_SET_NS:
+            told += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
+        return told
+
+    def _cut(self, frames: "Iterator[TimedFrame]", origin_ns: int) -> "Iterator[TimedFrame]":
+        from kontronik_can_gw.offline.tables import DISORDER_NS
+
+        start_ns, end_ns = self.start_ns, self.end_ns
+        for frame in frames:
+            since = frame.time_ns - origin_ns
+            if start_ns is not None and since < start_ns:
+                continue
+            if end_ns is not None and since > end_ns:
+                if since > end_ns + DISORDER_NS:
+                    return
+                continue
+            yield frame
+
+
+@dataclass(frozen=True)
+class BytesConversion:
+    """To the plain bytes of one ESC."""
+
+    esc: int
+
+    def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
+        file = out.open()
+        assert not isinstance(file, Path)
+        count = 0
+        for data in recording.esc_bytes(self.esc):
+            file.write(data)
+            count += len(data)
+            reached(recording.position)
+        if not count:
+            return None
+        out.is_whole = True
+        return f"{_many(count, 'byte')} of {recording.bus.escs[self.esc].name}"
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
