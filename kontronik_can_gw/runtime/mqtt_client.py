@@ -269,8 +269,7 @@ class _Link:
         self._answer = reason
 
     def _disconnected(self, _client: object, _data: object, _flags: object, reason: Any, _properties: object) -> None:
-        if self.end is None:  # a reason that the broker gave is followed by one of paho's
-            self.end = reason
+        self.end = reason
 
     def _message(self, _client: object, _data: object, message: Any) -> None:
         if message.retain:
