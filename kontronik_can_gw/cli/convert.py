@@ -102,7 +102,7 @@ def main(args: argparse.Namespace) -> int:
         conversion = _conversion(args, form, recording)
         try:
             with (
-                Progress(source.name, recording.size or None, args.output == "-") as progress,
+                Progress(source.name or recording.name, recording.size or None, args.output == "-") as progress,
                 Output(None if args.output == "-" else target, form) as out,
             ):
                 told = conversion(recording, out, progress.reach)

@@ -42,7 +42,11 @@ class Output:
         """What to write to: open for bytes, or a path. RunError where it cannot be opened."""
         if self._part is None:
             return sys.stdout.buffer
-        return self._part.path if self._by_path else self._part.open()
+        file = self._part.open()
+        if not self._by_path:
+            return file
+        file.close()  # it can be written: a library would tell it otherwise, or make folders
+        return self._part.path
 
     def __enter__(self) -> Self:
         return self

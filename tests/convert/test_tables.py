@@ -27,9 +27,10 @@ from recordings import (
     write_candump,
 )
 
+from kontronik_can_gw.dbc_output.unpacker import Column
 from kontronik_can_gw.offline.inputs import Input, open_input
 from kontronik_can_gw.offline.tables import Field, Row, Table, open_table
-from kontronik_can_gw.offline.tables.fields import Kind
+from kontronik_can_gw.offline.tables.fields import Kind, fields_of
 from kontronik_can_gw.offline.tables.rows import thinned
 
 Cells = list[dict[str, Any]]
@@ -338,6 +339,14 @@ def test_a_first_line_with_the_units(tmp_path: Path) -> None:
     rows = _rows(tmp_path, "--units-line", "--signals", "BatteryVoltage,OperatingState")
     assert rows[0] == {"units": {"Time": "s", "BatteryVoltage": "V"}}
     assert rows[1]["Time"] == 0
+
+
+def test_names_that_are_there_twice_get_their_message_in_front() -> None:
+    columns = [
+        Column(name, "V", message, 1, "battery_voltage", 0) for message, name in (("A", "X"), ("B", "X"), ("B", "Y"))
+    ]
+    columns.append(Column("Time", "", "B", 1, "firmware", 0))
+    assert [field.name for field in fields_of(columns)] == ["A.X", "B.X", "Y", "B.Time"]
 
 
 # --- the writers alone

@@ -95,8 +95,13 @@ class Mf4Reader:
                         times = signal.timestamps
                     stamps = np.rint(times * 1e9).astype(np.int64).tolist()
                     ids = (columns["ID"].astype(np.int64)).tolist()
-                    rows = [bytes(row) for row in np.asarray(columns["DataBytes"], dtype=np.uint8)]
-                    size = columns["DataBytes"].shape[1]
+                    content = columns["DataBytes"]
+                    if content.dtype.kind in "SO":  # of varying length, without the zeros at its end
+                        size = 64
+                        rows = [bytes(row).ljust(size, b"\0") for row in content]
+                    else:
+                        size = content.shape[1]
+                        rows = [bytes(row) for row in content.astype(np.uint8)]
                     lengths = columns["DataLength"].tolist() if "DataLength" in columns else [size] * count
                     extended = columns["IDE"].tolist() if "IDE" in columns else [i > 0x7FF for i in ids]
                     channels = columns["BusChannel"].tolist() if "BusChannel" in columns else [1] * count

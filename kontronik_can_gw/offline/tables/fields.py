@@ -1,5 +1,6 @@
 """What a table has: its fields beside the time, and what is told of where it came from."""
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -8,6 +9,8 @@ from kontronik_can_gw.dbc_output.unpacker import Column
 
 TIME = "Time"
 UTC = "Utc"
+ID, MESSAGE = "Id", "Message"
+_OWN = (TIME, UTC, ID, MESSAGE)
 
 
 class Kind(Enum):
@@ -35,17 +38,22 @@ class Field:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
-def field_of(column: Column) -> Field:
-    """The field of a signal."""
-    kind = Kind.TEXT if column.texts else Kind.FLAG if column.is_flag else Kind.WHOLE if column.is_whole else Kind.FLOAT
-    return Field(column.name, column.unit, kind, column.message, column.texts)
+def fields_of(columns: Sequence[Column]) -> list[Field]:
+    """The fields of signals. A name that several of them have, or that a table itself uses, gets its message in front: ``Message.Name``."""
+    counts = Counter(column.name for column in columns)
+    fields = []
+    for one in columns:
+        kind = Kind.TEXT if one.texts else Kind.FLAG if one.is_flag else Kind.WHOLE if one.is_whole else Kind.FLOAT
+        name = one.name if counts[one.name] == 1 and one.name not in _OWN else f"{one.message}.{one.name}"
+        fields.append(Field(name, one.unit, kind, one.message, one.texts))
+    return fields
 
 
 def frame_fields(names: Collection[tuple[str, str]]) -> tuple[Field, Field]:
     """``Id`` and ``Message`` of a table of CAN frames. ``names``: each id and its message."""
     ids = tuple(enumerate(dict.fromkeys(name for name, _ in names)))
     messages = tuple(enumerate(dict.fromkeys(message for _, message in names)))
-    return Field("Id", "", Kind.TEXT, "", ids), Field("Message", "", Kind.TEXT, "", messages)
+    return Field(ID, "", Kind.TEXT, "", ids), Field(MESSAGE, "", Kind.TEXT, "", messages)
 
 
 @dataclass(frozen=True)

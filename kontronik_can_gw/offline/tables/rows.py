@@ -13,7 +13,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.offline.replay import TimedFrame
 from kontronik_can_gw.offline.samples import Sample
-from kontronik_can_gw.offline.tables.fields import Table, field_of, frame_fields
+from kontronik_can_gw.offline.tables.fields import Table, fields_of, frame_fields
 
 SECOND_NS = 1_000_000_000
 DISORDER_NS = SECOND_NS
@@ -86,7 +86,7 @@ class Rows:
         self._choice = choice
         self._names = _frame_names(recording.reader, choice)
         columns = recording.reader.columns
-        fields = [field_of(columns[index]) for index in choice.columns]
+        fields = fields_of([columns[index] for index in choice.columns])
         items: Iterator[Row]
         if by_frame:
             first_frame, frames = first_of(recording.frames())
