@@ -22,7 +22,7 @@ from kontronik_can_gw.cli.node_setup import (
     read_stored,
     with_stored,
 )
-from kontronik_can_gw.config import Config, load
+from kontronik_can_gw.config import Config, MqttConfig, load
 from kontronik_can_gw.dbc_output.layout import Layout, load_database
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
 from kontronik_can_gw.errors import RunError, UserError
@@ -71,8 +71,8 @@ def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) 
 
 
 def fingerprint(config: Config) -> bytes:
-    """What a configuration is made of, in short: its keys and the content of its DBC and EDS."""
-    digest = sha256(repr(replace(config, file="")).encode())
+    """What a configuration is made of, in short: its keys and the content of its DBC and EDS. [mqtt] is another process's."""
+    digest = sha256(repr(replace(config, file="", mqtt=MqttConfig())).encode())
     for path, used in ((config.dbc_path, config.dbc.enabled), (config.eds_path, config.canopen.enabled)):
         if used:
             with suppress(OSError):  # removed since

@@ -6,6 +6,8 @@ import threading
 
 import pytest
 
+from kontronik_can_gw.cli.common import fingerprint
+from kontronik_can_gw.config import parse
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.reload import Reloader
 
@@ -70,3 +72,12 @@ def test_a_reading_that_ends_behind_the_gateway_does_no_harm() -> None:
     assert reloader._thread is not None
     reloader._thread.join(5)
     assert not reloader._thread.is_alive()
+
+
+def test_what_belongs_to_another_process_changes_nothing() -> None:
+    def of(**tables: object) -> bytes:
+        return fingerprint(parse({"esc": [{"port": "/dev/ttyUSB0"}], **tables}, "a.toml"))
+
+    assert of() == of(mqtt={"broker": "b", "rate": 2})
+    assert of() != of(record={"directory": "c"})
+    assert of() != of(can={"channel": "can1"})
