@@ -10,8 +10,9 @@ from report_flights import Row, column, dbc_bus, shipped_bus, simulated
 
 from kontronik_can_gw.dbc_output.unpacker import SignalReader, Value
 from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.offline.report.analysis import Analysis, Event, Flight
+from kontronik_can_gw.offline.report.analysis import Analysis
 from kontronik_can_gw.offline.report.fit import ResistanceFit
+from kontronik_can_gw.offline.report.flight import Event, Flight
 from kontronik_can_gw.offline.report.quantities import PLOTS
 from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError
 from kontronik_can_gw.simulator import FLIGHT, Dropout, ErrorWindow, EscOptions, Faults, Swap

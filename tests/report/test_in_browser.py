@@ -9,7 +9,8 @@ import pytest
 from report_browser import MISSING, PROGRAM, Browser
 from report_flights import shipped_bus, simulated
 
-from kontronik_can_gw.offline.report.analysis import Analysis, Flight
+from kontronik_can_gw.offline.report.analysis import Analysis
+from kontronik_can_gw.offline.report.flight import Flight
 from kontronik_can_gw.offline.report.page import render
 from kontronik_can_gw.offline.report.quantities import PLOTS
 from kontronik_can_gw.protocol.states import OperatingError

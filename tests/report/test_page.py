@@ -16,8 +16,9 @@ from report_flights import dbc_bus, shipped_bus, simulated
 
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.offline.report import page as page_module
-from kontronik_can_gw.offline.report.analysis import Analysis, Flight
+from kontronik_can_gw.offline.report.analysis import Analysis
 from kontronik_can_gw.offline.report.decimate import Number
+from kontronik_can_gw.offline.report.flight import Flight
 from kontronik_can_gw.offline.report.page import clock, duration, encode, number, render, wall_clock
 from kontronik_can_gw.telemetry import SECOND as S
 

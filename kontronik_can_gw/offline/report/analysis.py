@@ -5,19 +5,28 @@ not have is left out and named in ``missing``. A value holds until the next row;
 between them. Times are ns of the recording's clock.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from enum import IntEnum
 from operator import itemgetter
-from typing import Literal, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 from kontronik_can_gw.dbc_output import units
 from kontronik_can_gw.dbc_output.layout import normalize
 from kontronik_can_gw.dbc_output.unpacker import Column, SignalReader, Value
 from kontronik_can_gw.offline.layouts import BusLayout
 from kontronik_can_gw.offline.report.decimate import Decimator, Number, Points
-from kontronik_can_gw.offline.report.fit import Resistance, ResistanceFit
+from kontronik_can_gw.offline.report.flight import (
+    Event,
+    Extreme,
+    Facts,
+    Flight,
+    Kind,
+    Line,
+    PlotData,
+    Segment,
+    Summary,
+)
+from kontronik_can_gw.offline.report.ledger import Counter, Ledger
 from kontronik_can_gw.offline.report.quantities import PLOTS, STATE_CLASSES, UNKNOWN_CLASS, class_of
 from kontronik_can_gw.protocol.states import (
     ErrorBit,
@@ -30,150 +39,12 @@ from kontronik_can_gw.protocol.states import (
 from kontronik_can_gw.sources import GatewayState, sources
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, LinkState
 
-HOUR_NS = 3600 * SECOND
 CHUNK = 4096
 """Rows that are looked at together."""
 MOST_EVENTS = 5000
 """Of one kind (errors, states, link): more are only counted."""
 MOST_SEGMENTS = 4000
 """Of one ESC's band of states: beyond it, the shorter of two neighbours is left out."""
-REST_CURRENT = 1.0
-"""A: below it, either way, the battery is at rest."""
-LOAD_CURRENT = 5.0
-"""A: from it on, the battery is under load."""
-REST_NS = 2 * SECOND
-"""The rest voltage is the mean of at most so long before the first load."""
-
-Kind = Literal["error", "state", "link", "device"]
-
-
-class Extreme(NamedTuple):
-    """A value and when it stood first."""
-
-    value: float
-    time_ns: int
-
-
-@dataclass(slots=True)
-class Event:
-    """Something that began, and ended or was still so at the end (``end_ns`` None). ``esc`` None: of the gateway."""
-
-    kind: Kind
-    esc: int
-    begin_ns: int
-    end_ns: int | None
-    name: str
-    """As signals are bound to it, or a state's name."""
-    text: str
-    """In words."""
-    severity: str = ""
-    remedy: str = ""
-    note: str = ""
-    """How it ended, where that is not plain."""
-    momentary: bool = False
-    """It has no length."""
-
-
-class Segment(NamedTuple):
-    """A stretch of one operating state; ``state`` is its number."""
-
-    begin_ns: int
-    end_ns: int
-    state: int
-
-
-@dataclass
-class Summary:
-    """Numbers of one ESC. None: the recording does not tell."""
-
-    telemetry_ns: int = 0
-    """With telemetry."""
-    turning_ns: int | None = None
-    """With the motor turning."""
-    energy_counter: float | None = None
-    """Wh, by the source energy_used."""
-    energy_drawn: float | None = None
-    """Wh, the positive power integrated."""
-    energy_returned: float | None = None
-    """Wh, given back to the battery."""
-    charge: float | None = None
-    """mAh by the ESC's counter."""
-    charge_resets: int = 0
-    power_turning: float | None = None
-    """W, mean while the motor turns."""
-    extremes: dict[str, Extreme] = field(default_factory=dict)
-    """By "max SOURCE" and "min SOURCE"."""
-    cells: int | None = None
-    rest_voltage: float | None = None
-    """V of the battery before the first load."""
-    load_voltage: Extreme | None = None
-    """V of the battery, least under load."""
-    resistance: Resistance | None = None
-    losses: int | None = None
-    crc_errors: int | None = None
-    dropped_bytes: int | None = None
-    gaps: int = 0
-    longest_gap_ns: int = 0
-
-    @property
-    def energy(self) -> float | None:
-        """Wh: the counter's, integrated where there is none."""
-        return self.energy_drawn if self.energy_counter is None else self.energy_counter
-
-
-@dataclass
-class Facts:
-    """What an ESC is, by its info frames: newest known."""
-
-    device: str | None = None
-    variant: int | None = None
-    firmware: str | None = None
-    layout: str | None = None
-
-
-@dataclass
-class Line:
-    """A line of a plot."""
-
-    esc: int
-    quantity: int
-    """Index among the plot's quantities that there are."""
-    source: str
-    values: list[Number]
-
-
-@dataclass
-class PlotData:
-    """``plot``: index in PLOTS."""
-
-    plot: int
-    lines: list[Line]
-    labels: list[str]
-    """Of the quantities that there are; a line's ``quantity`` is an index of it."""
-
-
-@dataclass
-class Flight:
-    """All that a report shows. Times count from ``start_ns``'s clock."""
-
-    origin_ns: int
-    """The recording's first row: time 0."""
-    start_ns: int
-    end_ns: int
-    rows: int
-    names: list[str]
-    summaries: list[Summary]
-    facts: list[Facts]
-    times: list[int]
-    plots: list[PlotData]
-    segments: list[list[Segment]]
-    events: list[Event]
-    left_out: dict[Kind, int]
-    """Events that were only counted."""
-    missing: list[str]
-    """What the DBC does not have, in words."""
-    rows_in_bucket: int
-    replayed: bool = False
 
 
 class Analysis:
@@ -458,9 +329,9 @@ class _Esc:
             self.missing.append("Operating states")
         if not self._flags and not self._words:
             self.missing.append("Errors")
-        self._ledger = _Ledger(self.summary)
+        self._ledger = Ledger(self.summary)
         self._counters = {
-            source: _Counter(self._inputs[source].column) for source in _NUMBERS[:5] if source in self._inputs
+            source: Counter(self._inputs[source].column) for source in _NUMBERS[:5] if source in self._inputs
         }
         self.segments: list[Segment] = []
         self._shortest_ns = 0
@@ -749,117 +620,3 @@ def _device_words(facts: Facts) -> str:
     if facts.firmware is not None:
         words.append(f"firmware {facts.firmware}")
     return " ".join(words)
-
-
-class _Counter:
-    """What a counter went up by in all, over resets and over the end of its range."""
-
-    def __init__(self, column: Column) -> None:
-        self._top = column.high
-        self._last: Number = None
-        self.total = 0.0
-        self.resets = 0
-        self.seen = False
-
-    def take(self, values: Sequence[Number]) -> None:
-        last = self._last
-        if last is not None and values.count(last) == len(values):
-            return
-        for value in values:
-            if value is None or value == last:
-                continue
-            if last is not None:
-                if value > last:
-                    self.total += value - last
-                elif self._rolls(last, value):
-                    self.total += self._top + 1 - last + value
-                else:
-                    self.total += value
-                    self.resets += 1
-            self.seen = True
-            last = value
-        self._last = last
-
-    def _rolls(self, last: float, value: float) -> bool:
-        """From the last eighth of its range to the first."""
-        return last > self._top * 7 / 8 and value < self._top / 8
-
-
-class _Ledger:
-    """Time, energy, load and resistance of one ESC, from the values that hold between two rows."""
-
-    def __init__(self, summary: Summary) -> None:
-        self._summary = summary
-        self._last: tuple[Value, Number, Number, Number, Number] | None = None
-        self._since = 0
-        self._turning_ns = 0
-        self._drawn = 0.0
-        self._returned = 0.0
-        self._turning_power = 0.0
-        self._rest: deque[tuple[int, float]] = deque()
-        self._loaded = False
-        self._fit = ResistanceFit()
-
-    def take(
-        self,
-        times: Sequence[int],
-        present: Sequence[Value],
-        voltage: Sequence[Number],
-        current: Sequence[Number],
-        power: Sequence[Number],
-        speed: Sequence[Number],
-    ) -> None:
-        last, since = self._last, self._since
-        for time_ns, now in zip(times, zip(present, voltage, current, power, speed, strict=True), strict=True):
-            if now == last:
-                continue
-            if last is not None:
-                self._account(time_ns - since, last)
-            last, since = now, time_ns
-            v, i = now[1], now[2]
-            if v is not None and i is not None:
-                self._load(time_ns, v, i)
-        self._last, self._since = last, since
-
-    def finish(self, end_ns: int, *, has_power: bool, has_speed: bool) -> None:
-        if self._last is not None:
-            self._account(end_ns - self._since, self._last)
-        summary = self._summary
-        if has_speed:
-            summary.turning_ns = self._turning_ns
-        if has_power:
-            summary.energy_drawn = self._drawn / HOUR_NS
-            summary.energy_returned = self._returned / HOUR_NS
-            if self._turning_ns:
-                summary.power_turning = self._turning_power / self._turning_ns
-        summary.resistance = self._fit.finish()
-
-    def _account(self, length_ns: int, state: tuple[Value, Number, Number, Number, Number]) -> None:
-        present, _, _, power, speed = state
-        if present is None:
-            return
-        self._summary.telemetry_ns += length_ns
-        if power is not None:
-            if power > 0:
-                self._drawn += power * length_ns
-            else:
-                self._returned -= power * length_ns
-        if speed:
-            self._turning_ns += length_ns
-            self._turning_power += (power or 0) * length_ns
-
-    def _load(self, time_ns: int, voltage: float, current: float) -> None:
-        self._fit.take(time_ns, voltage, current)
-        if current >= LOAD_CURRENT:
-            if not self._loaded:
-                self._loaded = True
-                if self._rest:
-                    self._summary.rest_voltage = sum(v for _, v in self._rest) / len(self._rest)
-                    self._rest.clear()
-            least = self._summary.load_voltage
-            if least is None or voltage < least.value:
-                self._summary.load_voltage = Extreme(voltage, time_ns)
-        elif not self._loaded and abs(current) <= REST_CURRENT and voltage > 0:
-            self._rest.append((time_ns, voltage))
-            while self._rest[0][0] < time_ns - REST_NS:
-                self._rest.popleft()

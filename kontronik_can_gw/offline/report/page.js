@@ -9,6 +9,7 @@
   const whole = [data.from, Math.max(data.to, data.from + 0.1)];
   const LEAST_SPAN = 0.05;
   const AXIS = 58;
+  const TEXTS = 32; // height of two rows of text above a plot
   const WIDTHS = [2, 1.2, 0.8]; // of a plot's lines, where colours and dashes tell ESCs apart
 
   // --- small tools
@@ -141,7 +142,8 @@
     let lastLine = -Infinity;
     ctx.save();
     ctx.beginPath();
-    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+    const above = withText ? TEXTS * ratio : 0; // the texts stand above the data, never over them
+    ctx.rect(bbox.left, bbox.top - above, bbox.width, bbox.height + above);
     ctx.clip();
     ctx.font = `${11 * ratio}px system-ui, sans-serif`;
     ctx.textBaseline = "top";
@@ -162,35 +164,29 @@
       }
       ctx.globalAlpha = 0.8;
       if (x - lastLine >= ratio) {
-        line(ctx, x, bbox, event.severity === "error" ? [] : [6 * ratio, 3 * ratio]);
+        line(ctx, x, bbox, above, event.severity === "error" ? [] : [6 * ratio, 3 * ratio]);
         lastLine = x;
       }
       if (event.to !== null) {
         ctx.globalAlpha = 0.45;
-        line(ctx, xEnd, bbox, [ratio, 3 * ratio]);
+        line(ctx, xEnd, bbox, 0, [ratio, 3 * ratio]);
       }
       const text = (several ? data.escs[event.esc] + ": " : "") + event.text;
       const at = Math.max(x, bbox.left) + 4 * ratio;
       const row = labelEnds.findIndex((used) => at > used);
       if (withText && row >= 0) {
-        const width = ctx.measureText(text).width;
-        const top = bbox.top + (2 + 15 * row) * ratio;
-        ctx.globalAlpha = 0.8;
-        ctx.fillStyle = ink("--card");
-        ctx.fillRect(at - 2 * ratio, top, width + 4 * ratio, 14 * ratio);
         ctx.globalAlpha = 1;
-        ctx.fillStyle = tone;
-        ctx.fillText(text, at, top + ratio);
-        labelEnds[row] = at + width + 8 * ratio;
+        ctx.fillText(text, at, bbox.top - above + 15 * row * ratio);
+        labelEnds[row] = at + ctx.measureText(text).width + 8 * ratio;
       }
     }
     ctx.restore();
   }
 
-  function line(ctx, x, bbox, dash) {
+  function line(ctx, x, bbox, above, dash) {
     ctx.setLineDash(dash);
     ctx.beginPath();
-    ctx.moveTo(x, bbox.top);
+    ctx.moveTo(x, bbox.top - above);
     ctx.lineTo(x, bbox.top + bbox.height);
     ctx.stroke();
   }
@@ -236,7 +232,7 @@
       width: Math.max(200, box.clientWidth),
       height,
       legend: { show: false },
-      padding: [8, 10, 0, 0],
+      padding: [more.draw || !errors.length ? 8 : TEXTS + 4, 10, 0, 0],
       scales: { x: { time: false, range: (u, from, to) => [from, to] }, ...more.scales },
       axes: more.axes ?? axes(),
       series: [{}, ...series],
@@ -289,11 +285,11 @@
         range: (u, low, high) => {
           if (low === null || low === undefined || low === Infinity) return [0, 1];
           const pad = (high - low || Math.max(Math.abs(high), 1) * 0.1) * 0.08;
-          return [low - pad < 0 && low >= 0 && low < high / 3 ? 0 : low - pad, high + pad * 2];
+          return [low - pad < 0 && low >= 0 && low < high / 3 ? 0 : low - pad, high + pad];
         },
       },
     };
-    const plot = addPlot(figure, spec.title, innerWidth < 720 ? 180 : 220, series, columns, { scales });
+    const plot = addPlot(figure, spec.title, (innerWidth < 720 ? 180 : 220) + (errors.length ? TEXTS : 0), series, columns, { scales });
     plot.key = spec.key;
 
     // legend: a row for each line, of several ESCs a column for each

@@ -10,8 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from kontronik_can_gw.offline.report.analysis import Extreme, Facts, Flight, Summary, state_name
+from kontronik_can_gw.offline.report.analysis import state_name
 from kontronik_can_gw.offline.report.decimate import Number
+from kontronik_can_gw.offline.report.flight import Extreme, Facts, Flight, Summary
 from kontronik_can_gw.offline.report.quantities import PLOTS, STATE_CLASSES, STYLES, class_of
 from kontronik_can_gw.telemetry import SECOND
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.offline.report.analysis import Flight, PlotData
+from kontronik_can_gw.offline.report.flight import Flight, PlotData
 from kontronik_can_gw.offline.report.page import clock
 from kontronik_can_gw.offline.report.quantities import PLOTS, STATE_CLASSES, STYLES, class_of
 from kontronik_can_gw.telemetry import SECOND
