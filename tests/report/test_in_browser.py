@@ -102,6 +102,8 @@ def centre(browser: Browser, key: str, share: float = 0.5) -> tuple[float, float
 
 
 def ranges(browser: Browser) -> list[list[float]]:
+    browser.run("flight.followAll()")  # those off the screen wait until they are scrolled to
+    browser.settle()
     found: list[list[float]] = browser.run("flight.plots.map(({u}) => [u.scales.x.min, u.scales.x.max])")
     return found
 
@@ -160,6 +162,12 @@ def test_a_drag_zooms_all_plots_and_a_double_click_resets(browser: Browser, page
     assert zoomed[0] == [pytest.approx(15, abs=0.2), pytest.approx(30, abs=0.2)]
     browser.click(x0 + 20, y, clicks=2)
     assert ranges(browser) == whole
+    browser.run("flight.setRange(10, 10.1)")
+    browser.settle()
+    browser.drag(x0, x0 + 40, y)  # less than can be shown
+    low, high = ranges(browser)[0]
+    assert all(r == [low, high] for r in ranges(browser))
+    assert high - low == pytest.approx(0.05)
 
 
 def test_wheel_keys_and_buttons_move_the_range(browser: Browser, pages: dict[str, Path]) -> None:
@@ -191,6 +199,17 @@ def test_wheel_keys_and_buttons_move_the_range(browser: Browser, pages: dict[str
     assert span() == whole
     browser.run("flight.setRange(-100, 1e6)")
     assert span() == whole
+
+
+def test_a_plot_off_the_screen_takes_the_range_when_it_is_scrolled_to(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["one"])
+    browser.run("scrollTo({top: 0, behavior: 'instant'})")
+    browser.settle()
+    browser.run("flight.setRange(10, 20)")
+    centre(browser, "bec_current")
+    browser.settle()
+    last: list[float] = browser.run("(({u}) => [u.scales.x.min, u.scales.x.max])(flight.plots.at(-1))")
+    assert last == [10, 20]
 
 
 def test_events_can_be_searched_sorted_filtered_and_gone_to(browser: Browser, pages: dict[str, Path]) -> None:
@@ -228,7 +247,7 @@ def test_events_can_be_searched_sorted_filtered_and_gone_to(browser: Browser, pa
 def test_marks_of_errors_are_drawn_over_all_plots(browser: Browser, pages: dict[str, Path]) -> None:
     browser.open(pages["one"])
     browser.run("flight.setRange(17, 22)")
-    browser.settle()
+    assert all(r == [17, 22] for r in ranges(browser))
     for key in browser.run("flight.plots.map((p) => p.key)"):
         column = browser.run(f"{RED_AT}('{key}', 20)")
         assert column > 0.5, key

@@ -100,16 +100,33 @@
   const visible = data.escs.map(() => true);
   let range = [...whole];
   let cursorTime = null;
-  let following = false;
 
   function setRange(from, to) {
     const span = Math.min(Math.max(to - from, LEAST_SPAN), whole[1] - whole[0]);
     const begin = Math.min(Math.max((from + to - span) / 2, whole[0]), whole[1] - span);
-    range = [begin, begin + span];
-    following = true;
-    for (const { u } of plots) u.setScale("x", { min: range[0], max: range[1] });
-    following = false;
+    const fits = span === to - from && from >= whole[0] && to <= whole[1]; // then not a bit of it is changed
+    range = fits ? [from, to] : [begin, begin + span];
+    for (const plot of plots) {
+      plot.isStale = true;
+      if (plot.isNear) follow(plot);
+    }
   }
+
+  // Plots far off the screen take the range when they come near: many ESCs would be slow to draw otherwise.
+  function follow(plot) {
+    if (!plot.isStale) return;
+    plot.isStale = false;
+    plot.u.setScale("x", { min: range[0], max: range[1] });
+  }
+
+  const followAll = () => plots.forEach(follow);
+  const nearness = new IntersectionObserver((entries) => {
+    for (const entry of entries) {
+      const plot = plots.find(({ box }) => box === entry.target);
+      plot.isNear = entry.isIntersecting;
+      if (plot.isNear) follow(plot);
+    }
+  }, { rootMargin: "400px" });
 
   const zoom = (factor, about = (range[0] + range[1]) / 2) =>
     setRange(about - (about - range[0]) * factor, about + (range[1] - about) * factor);
@@ -176,7 +193,7 @@
       const row = labelEnds.findIndex((used) => at > used);
       if (withText && row >= 0) {
         ctx.globalAlpha = 1;
-        ctx.fillText(text, at, bbox.top - above + 15 * row * ratio);
+        ctx.fillText(text, at, bbox.top - (16 + 15 * row) * ratio);
         labelEnds[row] = at + ctx.measureText(text).width + 8 * ratio;
       }
     }
@@ -227,7 +244,7 @@
   function addPlot(figure, label, height, series, columns, more) {
     const box = make("div", { class: "plot", tabindex: "0", role: "group", "aria-label": `${label} over time` });
     figure.append(box);
-    const plot = { u: null, box, height, showCursor: () => {} };
+    const plot = { u: null, box, height, isNear: true, isStale: false, showCursor: () => {} };
     const options = {
       width: Math.max(200, box.clientWidth),
       height,
@@ -245,7 +262,9 @@
       },
       hooks: {
         setScale: [(u, key) => {
-          if (key === "x" && !following && plots.includes(plot)) setRange(u.scales.x.min, u.scales.x.max);
+          const { min, max } = u.scales.x;
+          const isOurs = plot.isStale || (min === range[0] && max === range[1]);
+          if (key === "x" && !isOurs && plots.includes(plot)) queueMicrotask(() => setRange(min, max));
         }],
         setCursor: [(u) => {
           plot.showCursor(u);
@@ -257,6 +276,7 @@
     plot.u = new uPlot(options, [times, ...columns], box);
     plot.u.setScale("x", { min: whole[0], max: whole[1] });
     plots.push(plot);
+    nearness.observe(box);
     listen(plot);
     return plot;
   }
@@ -641,6 +661,7 @@
   let before = null;
   addEventListener("beforeprint", () => {
     before = dark();
+    followAll();
     setTheme(false);
     fit(680);
   });
@@ -650,5 +671,5 @@
   });
 
   // For who wants to look at the data from the console, and for the tests.
-  globalThis.flight = { data, plots, setRange, setCursor, goTo, range: () => [...range] };
+  globalThis.flight = { data, plots, setRange, setCursor, goTo, followAll, range: () => [...range] };
 })();
