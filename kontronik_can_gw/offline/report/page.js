@@ -150,13 +150,15 @@
 
   const errors = data.events.filter((event) => event.kind === "error");
 
+  const bySeverity = ["error", "warning", "status"].flatMap((kind) => errors.filter((event) => event.severity === kind));
+  const toneOf = (event) => ink({ error: "--error", warning: "--warning" }[event.severity] ?? "--soft");
+
   function drawMarks(u, withText) {
     const { ctx, bbox } = u;
     const ratio = devicePixelRatio || 1;
     const right = bbox.left + bbox.width;
-    const labelEnds = [-Infinity, -Infinity]; // of two rows of text
     const shadedTo = {}; // by severity: where several overlap it is not darker
-    let lastLine = -Infinity;
+    const lastLine = {}; // by severity
     ctx.save();
     ctx.beginPath();
     const above = withText ? TEXTS * ratio : 0; // the texts stand above the data, never over them
@@ -171,7 +173,7 @@
       if (!visible[event.esc] || end < range[0] || event.from > range[1]) continue;
       const x = u.valToPos(event.from, "x", true);
       const xEnd = u.valToPos(end, "x", true);
-      const tone = ink(event.severity === "error" ? "--error" : event.severity === "warning" ? "--warning" : "--soft");
+      const tone = toneOf(event);
       ctx.strokeStyle = ctx.fillStyle = tone;
       const shade = Math.max(x, bbox.left, shadedTo[event.severity] ?? 0);
       if (withText && xEnd > shade) {
@@ -180,24 +182,36 @@
         shadedTo[event.severity] = xEnd;
       }
       ctx.globalAlpha = 0.8;
-      if (x - lastLine >= ratio) {
+      if (!(x - lastLine[event.severity] < ratio)) {
         line(ctx, x, bbox, above, event.severity === "error" ? [] : [6 * ratio, 3 * ratio]);
-        lastLine = x;
+        lastLine[event.severity] = x;
       }
       if (event.to !== null) {
         ctx.globalAlpha = 0.45;
         line(ctx, xEnd, bbox, 0, [ratio, 3 * ratio]);
       }
-      const text = (several ? data.escs[event.esc] + ": " : "") + event.text;
-      const at = Math.max(x, bbox.left) + 4 * ratio;
-      const row = labelEnds.findIndex((used) => at > used);
-      if (withText && row >= 0) {
-        ctx.globalAlpha = 1;
-        ctx.fillText(text, at, bbox.top - (16 + 15 * row) * ratio);
-        labelEnds[row] = at + ctx.measureText(text).width + 8 * ratio;
-      }
     }
+    if (withText) drawTexts(u, ratio);
     ctx.restore();
+  }
+
+  // In two rows, errors before warnings; what finds no room is told at the cursor and in the list.
+  function drawTexts(u, ratio) {
+    const { ctx, bbox } = u;
+    const taken = [[], []];
+    ctx.globalAlpha = 1;
+    for (const event of bySeverity) {
+      const end = event.to ?? whole[1];
+      if (!visible[event.esc] || end < range[0] || event.from > range[1]) continue;
+      const text = (several ? data.escs[event.esc] + ": " : "") + event.text;
+      const left = Math.max(u.valToPos(event.from, "x", true), bbox.left) + 4 * ratio;
+      const right = left + ctx.measureText(text).width + 8 * ratio;
+      const row = taken.findIndex((spans) => spans.every(([from, to]) => right <= from || left >= to));
+      if (row < 0) continue;
+      taken[row].push([left, right]);
+      ctx.fillStyle = toneOf(event);
+      ctx.fillText(text, left, bbox.top - (16 + 15 * row) * ratio);
+    }
   }
 
   function line(ctx, x, bbox, above, dash) {
