@@ -1,0 +1,332 @@
+"""A minute of the hour: every format by every command reads back as what was meant; and a mutilated file is found out."""
+
+import json
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+import hour_check
+import numpy as np
+import pytest
+from hour_check import Decoded, Verdict, check_log, check_table, check_table_of_log
+from hour_programme import Result, Step, run, steps_of, table
+from hour_recording import SECOND, record
+from hour_truth import Truth
+
+NAMES = (
+    *(f"convert to {form}" for form in (*hour_check.TABLES, *hour_check.LOGS)),
+    *(f"convert {form} to csv" for form in hour_check.LOGS),
+    *("replay to log", "convert to bin", "decode the bin", "report", "monitor --once"),
+)
+
+
+class Minute:
+    """The files of a minute, and how each compared."""
+
+    def __init__(self, folder: Path, escs: int = 1, only: Collection[str] = ()) -> None:
+        self.folder = folder
+        self.truth = Truth(record(folder / "hour.kcap", 60, escs))
+        self.told: list[str] = []
+        steps = [step for step in steps_of(folder, self.truth, 60) if not only or step.name in only]
+        for step in steps:
+            step.tenth = None
+        self.results = {one.name: one for one in run(steps, folder, self.told.append)}
+        self.decoded = Decoded(self.truth)
+
+    def table_of(self, path: Path) -> Verdict:
+        """Compare a table."""
+        return check_table(path, self.truth, hour_check.TABLE_READERS[path.suffix[1:]][1](path, self.truth))
+
+    def log_of(self, path: Path) -> Verdict:
+        """Compare a log."""
+        return check_log(path, self.truth, self.decoded)[0]
+
+
+@pytest.fixture(scope="module")
+def minute(tmp_path_factory: pytest.TempPathFactory) -> Minute:
+    return Minute(tmp_path_factory.mktemp("minute"))
+
+
+def test_the_minute_has_everything_in_it(minute: Minute) -> None:
+    """What can go wrong is there: losses, a lost port, a swapped device, errors, a return of each."""
+    truth = minute.truth
+    rows = truth.rows()
+    assert 5000 < minute.truth.recording.telemetry_frames < 6000
+    assert len(truth.escs[0].timed_out_ns) == 3
+    assert set(rows["LinkState"].low) == {2, 4, 5}
+    assert set(rows["Layout"].low) == {1, 2}
+    assert {1.0, 3.0} < set(rows["Device"].low)
+    assert np.isnan(rows["BecCurrent"].low).sum() > 1000
+    assert 200 < np.nansum(rows["Undervoltage"].low) < 400
+    assert np.nansum(rows["TestEepromVersion"].low) > 300
+    assert np.nanmax(rows["ElectricalSpeed"].low) > 20_000
+    assert np.nanmin(rows["BatteryCurrent"].low) < -5
+    assert set(rows["CanState"].high) == {1, 2}
+    assert np.nanmax(rows["EnergyUsed"].low) > 5
+    assert np.isnan(rows["BatteryVoltage"].low).sum() == 4  # a row for each loss
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_reads_back_equal(name: str, minute: Minute) -> None:
+    result = minute.results[name]
+    assert result.differences == 0, "\n".join(minute.told)
+    rows = len(minute.truth.row_ns)
+    least = {"report": 5, "monitor --once": 40, "convert to bin": 190_000, "decode the bin": 80_000}
+    frames = 9 * len(minute.truth.sent_ns)
+    assert result.values >= least.get(name, 99 * rows if name[-3:] in ("csv", "onl", "uet", "mf4") else frames)
+
+
+def test_nothing_is_left_out(minute: Minute) -> None:
+    assert set(minute.results) == set(NAMES)
+    shown = table(list(minute.results.values()))
+    assert all(f"| {name} |" in shown for name in NAMES)
+    assert "differ" not in shown
+
+
+def test_three_escs_stand_beside_each_other(tmp_path: Path) -> None:
+    several = Minute(tmp_path, escs=3, only=("convert to csv", "convert to blf", "monitor --once"))
+    assert len(several.results) == 3
+    for name, result in several.results.items():
+        assert result.differences == 0, (name, several.told)
+    assert several.results["convert to csv"].values > 281 * 5000
+
+
+# --- the comparison finds what is wrong
+
+
+def _set(line: str, column: int, text: str) -> str:
+    cells = line.split(",")
+    cells[column] = text
+    return ",".join(cells)
+
+
+def _changed_value(lines: list[str]) -> None:
+    column = lines[0].split(",").index("BatteryVoltage [V]")
+    row = next(n for n in range(3000, len(lines)) if lines[n].split(",")[column])
+    lines[row] = _set(lines[row], column, f"{float(lines[row].split(',')[column]) + 0.01:.2f}")
+
+
+def _changed_text(lines: list[str]) -> None:
+    column = lines[0].split(",").index("OperatingState")
+    lines[3000] = _set(lines[3000], column, "StandBy")
+
+
+def _changed_flag(lines: list[str]) -> None:
+    column = lines[0].split(",").index("LimitCurrentMaximum")
+    lines[3000] = _set(lines[3000], column, "1")
+
+
+def _missing_row(lines: list[str]) -> None:
+    del lines[3000]
+
+
+def _doubled_row(lines: list[str]) -> None:
+    lines.insert(3000, lines[3000])
+
+
+def _missing_end(lines: list[str]) -> None:
+    del lines[-1]
+
+
+def _shifted_time(lines: list[str]) -> None:
+    seconds = float(lines[3000].split(",")[0])
+    lines[3000] = _set(lines[3000], 0, f"{seconds + 0.000001:.6f}")
+
+
+def _shifted_clock(lines: list[str]) -> None:
+    utc = lines[3000].split(",")[1]
+    lines[3000] = _set(lines[3000], 1, utc[:-4] + f"{(int(utc[-4:-1]) + 2) % 1000:03d}Z")
+
+
+def _old_value_in_a_gap(lines: list[str]) -> None:
+    column = lines[0].split(",").index("BatteryVoltage [V]")
+    gap = next(n for n in range(1, len(lines)) if not lines[n].split(",")[column])
+    lines[gap] = _set(lines[gap], column, lines[gap - 1].split(",")[column])
+
+
+def _bec_current_of_a_jivepro(lines: list[str]) -> None:
+    device, column = (lines[0].split(",").index(name) for name in ("Device", "BecCurrent [A]"))
+    row = next(n for n in range(1, len(lines)) if lines[n].split(",")[device] == "JivePro")
+    lines[row] = _set(lines[row], column, "0.0")
+
+
+def _empty_value(lines: list[str]) -> None:
+    lines[3000] = _set(lines[3000], lines[0].split(",").index("ThrottlePercent [%]"), "")
+
+
+def _missing_column(lines: list[str]) -> None:
+    column = lines[0].split(",").index("MotorSpeed [1/min]")
+    for number, line in enumerate(lines):
+        cells = line.split(",")
+        del cells[column]
+        lines[number] = ",".join(cells)
+
+
+TABLE_FAULTS = (
+    *(
+        _changed_value,
+        _changed_text,
+        _changed_flag,
+        _missing_row,
+        _doubled_row,
+        _missing_end,
+        _shifted_time,
+        _shifted_clock,
+    ),
+    *(_old_value_in_a_gap, _bec_current_of_a_jivepro, _empty_value, _missing_column),
+)
+
+
+@pytest.mark.parametrize("fault", TABLE_FAULTS, ids=lambda fault: fault.__name__[1:])
+def test_a_mutilated_table_is_found_out(fault: Callable[[list[str]], None], minute: Minute, tmp_path: Path) -> None:
+    lines = (minute.folder / "hour.csv").read_text().splitlines()
+    fault(lines)
+    path = tmp_path / "bad.csv"
+    path.write_text("\n".join(lines) + "\n")
+    verdict = minute.table_of(path)
+    assert not verdict.ok
+    assert verdict.differences >= 1
+    assert verdict.problems
+
+
+def test_a_wrong_unit_is_found_out(minute: Minute, tmp_path: Path) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text((minute.folder / "hour.csv").read_text().replace("BatteryVoltage [V]", "BatteryVoltage [mV]", 1))
+    with pytest.raises(AssertionError, match="the unit of BatteryVoltage"):
+        minute.table_of(path)
+
+
+def test_a_mutilated_file_of_each_other_format_is_found_out(minute: Minute, tmp_path: Path) -> None:
+    from asammdf import MDF
+    from pyarrow import compute, parquet  # type: ignore[import-untyped]
+
+    lines = (minute.folder / "hour.jsonl").read_text().splitlines()
+    row = json.loads(lines[3000])
+    row["PwmInput"] += 1
+    lines[3000] = json.dumps(row)
+    (tmp_path / "bad.jsonl").write_text("\n".join(lines) + "\n")
+    found = parquet.read_table(minute.folder / "hour.parquet")
+    place = found.schema.names.index("MotorCurrent [A]")
+    parquet.write_table(
+        found.set_column(place, found.schema.field(place), compute.add(found.column(place), 0.1)),
+        tmp_path / "bad.parquet",
+    )
+    with MDF(minute.folder / "hour.mf4") as mdf:
+        mdf.cut(start=10, stop=50).save(tmp_path / "bad.mf4")
+    for name in ("bad.jsonl", "bad.parquet", "bad.mf4"):
+        assert not minute.table_of(tmp_path / name).ok, name
+
+
+def _flip(line: str) -> str:
+    at = line.index("#") + 4
+    return line[:at] + ("0" if line[at] != "0" else "1") + line[at + 1 :]
+
+
+def _later(line: str) -> str:
+    seconds, _, rest = line[1:].partition(")")
+    whole, _, fraction = seconds.partition(".")
+    return f"({whole}.{(int(fraction) + 3) % 1_000_000:06d}){rest}"
+
+
+LOG_FAULTS: dict[str, Callable[[list[str]], Any]] = {
+    "changed byte": lambda lines: lines.__setitem__(9000, _flip(lines[9000])),
+    "missing frame": lambda lines: lines.pop(9000),
+    "doubled frame": lambda lines: lines.insert(9000, lines[9000]),
+    "shifted time": lambda lines: lines.__setitem__(9000, _later(lines[9000])),
+    "another id": lambda lines: lines.__setitem__(9000, lines[9000].replace(" can0 6", " can0 5")),
+    "two frames change places": lambda lines: lines.__setitem__(slice(9000, 9002), [lines[9001], lines[9000]]),
+}
+
+
+@pytest.mark.parametrize("fault", LOG_FAULTS)
+def test_a_mutilated_log_is_found_out(fault: str, minute: Minute, tmp_path: Path) -> None:
+    lines = (minute.folder / "hour.log").read_text().splitlines()
+    LOG_FAULTS[fault](lines)
+    path = tmp_path / "bad.log"
+    path.write_text("\n".join(lines) + "\n")
+    assert not minute.log_of(path).ok
+
+
+@pytest.mark.parametrize(
+    ("can_id", "bit", "name"),
+    [(1672, 24, "BatteryVoltage"), (1696, 0, "BecVoltage"), (1664, 0, "Undervoltage"), (1704, 16, "EnergyUsed")],
+)
+def test_a_value_that_no_esc_meant_is_found_out(
+    can_id: int, bit: int, name: str, minute: Minute, tmp_path: Path
+) -> None:
+    """Where a frame was wrong as it was sent, by one step: signals are compared with the truth, not with what the gateway sent."""
+    sent = minute.truth.recording.sent
+    index = [place for place, one in enumerate(sent.ids) if one == can_id][200]
+    before = sent.data[index]
+    lines = (minute.folder / "hour.log").read_text().splitlines()
+    texts = [bits.to_bytes(8, "little").hex().upper() for bits in (before, before ^ 1 << bit)]
+    assert f"#{texts[0]}" in lines[index]
+    lines[index] = lines[index].replace(*texts)
+    path = tmp_path / "meant.log"
+    path.write_text("\n".join(lines) + "\n")
+    sent.data[index] = before ^ 1 << bit
+    try:
+        verdict = minute.log_of(path)
+    finally:
+        sent.data[index] = before
+    assert verdict.differences == 1
+    assert verdict.problems[0].startswith(f"{name}: 1 values differ")
+
+
+def test_a_mutilated_table_of_a_log_is_found_out(minute: Minute, tmp_path: Path) -> None:
+    _, frames = check_log(minute.folder / "hour.log", minute.truth, minute.decoded)
+    lines = (minute.folder / "of_log.csv").read_text().splitlines()
+    path = tmp_path / "bad.csv"
+    for fault in (_changed_value, _missing_row, _shifted_time_of_a_log, _old_value_in_a_gap):
+        changed = list(lines)
+        fault(changed)
+        path.write_text("\n".join(changed) + "\n")
+        assert not check_table_of_log(path, minute.truth, frames, minute.decoded).ok, fault.__name__
+
+
+def _shifted_time_of_a_log(lines: list[str]) -> None:
+    seconds = float(lines[3000].split(",")[0])
+    lines[3000] = _set(lines[3000], 0, f"{seconds + 0.000005:.6f}")
+
+
+def test_mutilated_bytes_and_records_are_found_out(minute: Minute, tmp_path: Path) -> None:
+    data = bytearray((minute.folder / "esc1.bin").read_bytes())
+    data[5000] ^= 1
+    (tmp_path / "bad.bin").write_bytes(data)
+    assert not hour_check.check_bytes(tmp_path / "bad.bin", minute.truth).ok
+    lines = (minute.folder / "esc1.decoded.jsonl").read_text().splitlines()
+    for change in ("throttle", "operating_errors", "battery_current"):
+        record_ = json.loads(lines[2000])
+        record_[change] = (record_[change] or 0) + 1
+        (tmp_path / "bad.jsonl").write_text("\n".join([*lines[:2000], json.dumps(record_), *lines[2001:]]) + "\n")
+        assert not hour_check.check_decoded(tmp_path / "bad.jsonl", minute.truth).ok, change
+    (tmp_path / "short.jsonl").write_text("\n".join(lines[:-1]) + "\n")
+    assert not hour_check.check_decoded(tmp_path / "short.jsonl", minute.truth).ok
+    last = json.loads((minute.folder / "last.json").read_text())
+    last["escs"][0]["values"]["battery_voltage"] += 0.01
+    assert not hour_check.check_last(json.dumps(last), minute.truth, minute.decoded).ok
+
+
+def test_a_file_without_values_is_no_success(tmp_path: Path) -> None:
+    assert not Verdict().ok
+    output = tmp_path / "nothing"
+    step = Step("nothing", ["schema"], output, "", Verdict, to_output=True)
+    [result] = run([step], tmp_path, lambda _: None)
+    assert isinstance(result, Result)
+    assert result.differences == 1
+
+
+def test_a_command_that_fails_ends_the_programme(tmp_path: Path) -> None:
+    step = Step(
+        "bad", ["convert", str(tmp_path / "none.kcap"), str(tmp_path / "a.csv")], tmp_path / "a.csv", "", Verdict
+    )
+    with pytest.raises(RuntimeError, match=r"exit code 1: .*none\.kcap"):
+        run([step], tmp_path, lambda _: None)
+
+
+def test_times_are_those_of_a_wall_clock_that_was_set(minute: Minute) -> None:
+    recording = minute.truth.recording
+    wall = recording.wall_ns(minute.truth.row_ns)
+    steps = np.diff(wall) - np.diff(minute.truth.row_ns)
+    assert np.count_nonzero(steps) == 1
+    assert steps.max() == 1.50025 * SECOND
