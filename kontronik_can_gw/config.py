@@ -506,8 +506,8 @@ def _value(value: Any, f: Field[Any]) -> Any:
             f"{value!r} is no port on this machine, as 127.0.0.1:9123 or [::1]:9123. The statistics are not for the network."
         )
     if limits["kind"] in _FORMS:
-        pattern, form = _FORMS[limits["kind"]]
-        if len(value) > _LONGEST_TOPIC or not re.fullmatch(pattern, value):
+        shape, form = _FORMS[limits["kind"]]
+        if len(value) > _LONGEST_TOPIC or not re.fullmatch(shape, value):
             raise ValueError(f"{value!r} is not {form}")
     pattern = limits.get("pattern")
     if pattern and not re.fullmatch(pattern, value):

@@ -112,8 +112,8 @@ def _families(document: Document) -> Iterator[Family]:
         yield "store_failed", "gauge", "1 if the last saving of parameters failed.", [({}, failed)]
     if (recording := document["recording"]) is not None:
         yield "recording_bytes_total", "counter", "Bytes of captures written since start.", [({}, recording["bytes"])]
-        lost = [({}, recording["lost"])]
-        yield "recording_lost_total", "counter", "Entries that could not be recorded since start.", lost
+        text = "Entries that could not be recorded since start."
+        yield "recording_lost_total", "counter", text, [({}, recording["lost"])]
         yield "recording_failed", "gauge", "1 while nothing can be recorded.", [({}, int(recording["problem"] != ""))]
 
 

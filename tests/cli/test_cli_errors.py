@@ -126,7 +126,20 @@ OPTIONS = {
         *("--signals", "--rate", "--frames", "--units-line", "--live-rate"),
     ],
     "report": [
-        *("IN", "-o", "--output", "--png", "-c", "--config", "--dbc", "--points", "--title", "--from", "--to", "--until"),
+        *(
+            "IN",
+            "-o",
+            "--output",
+            "--png",
+            "-c",
+            "--config",
+            "--dbc",
+            "--points",
+            "--title",
+            "--from",
+            "--to",
+            "--until",
+        ),
     ],
     "decode": ["FILE", "--csv", "--stats"],
     "replay": [
@@ -139,7 +152,18 @@ OPTIONS = {
         *("--flip-bits", "--dropout", "--error", "--swap-device"),
     ],
     "mqtt": [
-        *("FILE", "-c", "--config", "--dbc", "--interface", "--channel", "--broker", "--tls", "--ca-file", "--cert-file"),
+        *(
+            "FILE",
+            "-c",
+            "--config",
+            "--dbc",
+            "--interface",
+            "--channel",
+            "--broker",
+            "--tls",
+            "--ca-file",
+            "--cert-file",
+        ),
         *("--key-file", "--username", "--password-file", "--gateway", "--topic", "--rate", "--retain", "--discovery"),
         "--remove-discovery",
     ],
@@ -150,7 +174,18 @@ OPTIONS = {
     "doctor": ["-c", "--config", "--json"],
     "status": ["-c", "--config", "--file", "--json", "--once", "--interval"],
     "monitor": [
-        *("FILE", "-c", "--config", "--dbc", "--interface", "--channel", "--speed", "--once", "--timeout", "--interval"),
+        *(
+            "FILE",
+            "-c",
+            "--config",
+            "--dbc",
+            "--interface",
+            "--channel",
+            "--speed",
+            "--once",
+            "--timeout",
+            "--interval",
+        ),
     ],
 }
 

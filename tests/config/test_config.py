@@ -704,7 +704,9 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
         st.sampled_from(["127.0.0.1", "localhost", "[::1]", "127.255.3.200"]),
         st.integers(1, 65_535),
     ),
-    ("mqtt", "broker"): st.sampled_from(["broker", "192.168.1.5", "a.b-c.example:1", "[::1]:65535", "[fe80::1]", "x_y"]),
+    ("mqtt", "broker"): st.sampled_from(
+        ["broker", "192.168.1.5", "a.b-c.example:1", "[::1]:65535", "[fe80::1]", "x_y"]
+    ),
     ("mqtt", "gateway"): st.from_regex(r"\A[A-Za-z0-9_-]{1,64}\Z"),
     ("mqtt", "topic"): st.sampled_from(["k", "fleet/north", "a b/c", "ü/€", "a$"]),
     ("mqtt", "discovery"): st.sampled_from(["homeassistant", "ha/x"]),
