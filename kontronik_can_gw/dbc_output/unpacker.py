@@ -86,10 +86,10 @@ class SignalReader:
         self.columns = tuple(columns)
         self._by_source = {(c.source, c.esc): index for index, c in reversed(list(enumerate(columns)))}
 
-    def read_part(self, part: Part, bits: int) -> list[Value]:
-        """The values of a part from the bits of its message."""
+    def unpack_of(self, part: Part) -> Callable[[int], list[Value]]:
+        """What gives the values of a part from the bits of its message."""
         unpacks = self._messages[part.plan.can_id | (EXTENDED if part.plan.extended else 0)][2]
-        return unpacks[part.page][1](bits)
+        return unpacks[part.page][1]
 
     @property
     def keys(self) -> frozenset[int]:

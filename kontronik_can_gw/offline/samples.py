@@ -5,7 +5,7 @@ frame, and with its loss; from CAN frames with each group of messages that belon
 message, within 5 ms goes into the same row.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 from kontronik_can_gw.capture_setup import CaptureSetup
@@ -28,19 +28,30 @@ class Sample(NamedTuple):
     values: list[Value]
 
 
+_Taken = tuple[int, int | None, slice, Callable[[int], list[Value]]]
+"""A part: index of its message, page, columns, what gives their values."""
+
+
 class SampledGateway(Gateway):
     """A gateway that makes rows beside its frames. They gather in ``rows``, which the owner empties; ``finish`` gives the last."""
 
     def __init__(self, setup: CaptureSetup, layout: Layout, reader: SignalReader, now: int) -> None:
         self.rows: list[Sample] = []
-        self._reader = reader
         self._values: list[Value] = [None] * len(reader.columns)
         self._row_ns: int | None = None
         self._in_row: set[int] = set()
         self._gateway_ns = now - _GATEWAY_NS
-        self._indices = {plan.name: index for index, plan in enumerate(layout.messages)}
-        self._by_esc = [[p for p in reader.parts if esc in p.plan.escs] for esc in range(len(setup.escs))]
-        self._of_gateway = [p for p in reader.parts if not p.plan.escs]
+        indices = {plan.name: index for index, plan in enumerate(layout.messages)}
+
+        def taken(parts: Iterable[Part]) -> list[_Taken]:
+            return [
+                (indices[p.plan.name], p.page, slice(p.first, p.first + p.count), reader.unpack_of(p)) for p in parts
+            ]
+
+        by_esc = [[p for p in reader.parts if esc in p.plan.escs] for esc in range(len(setup.escs))]
+        self._by_esc = [taken(parts) for parts in by_esc]
+        self._with_live = [taken(p for p in parts if {Group.LIVE, Group.LINK} & p.plan.paces) for parts in by_esc]
+        self._of_gateway = taken(p for p in reader.parts if not p.plan.escs)
         super().__init__(setup.escs, layout, now, setup.silent_on_loss, setup.canopen)
 
     def finish(self) -> list[Sample]:
@@ -62,22 +73,19 @@ class SampledGateway(Gateway):
             again = events & Event.LIVE and esc in self._in_row
             if again or when - self._row_ns > SAME_ROW_NS:
                 self._close_row()
-        for part in self._by_esc[esc]:
-            paces = part.plan.paces
-            if events & (Event.LINK | Event.INFO) or Group.LIVE in paces or Group.LINK in paces:
-                self._read(part, when)
+        self._read((self._by_esc if events & (Event.LINK | Event.INFO) else self._with_live)[esc], when)
         if when - self._gateway_ns >= _GATEWAY_NS or events & Event.LINK:
             self._gateway_ns = when
-            for part in self._of_gateway:
-                self._read(part, when)
+            self._read(self._of_gateway, when)
         if events & Event.LIVE:
             self._in_row.add(esc)
             if self._row_ns is None:
                 self._row_ns = when
 
-    def _read(self, part: Part, now: int) -> None:
-        bits = self.message_bits(self._indices[part.plan.name], now, part.page)
-        self._values[part.first : part.first + part.count] = self._reader.read_part(part, bits)
+    def _read(self, parts: list[_Taken], now: int) -> None:
+        values, bits = self._values, self.message_bits
+        for message, page, columns, unpack in parts:
+            values[columns] = unpack(bits(message, now, page))
 
     def _close_row(self) -> None:
         if self._row_ns is not None:

@@ -259,9 +259,9 @@ def test_a_value_that_no_esc_meant_is_found_out(
     index = [place for place, one in enumerate(sent.ids) if one == can_id][200]
     before = sent.data[index]
     lines = (minute.folder / "hour.log").read_text().splitlines()
-    texts = [bits.to_bytes(8, "little").hex().upper() for bits in (before, before ^ 1 << bit)]
-    assert f"#{texts[0]}" in lines[index]
-    lines[index] = lines[index].replace(*texts)
+    old, new = (bits.to_bytes(8, "little").hex().upper() for bits in (before, before ^ 1 << bit))
+    assert f"#{old}" in lines[index]
+    lines[index] = lines[index].replace(old, new)
     path = tmp_path / "meant.log"
     path.write_text("\n".join(lines) + "\n")
     sent.data[index] = before ^ 1 << bit
