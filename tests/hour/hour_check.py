@@ -448,7 +448,7 @@ def check_bytes(path: Path, truth: Truth, esc: int = 0) -> Verdict:
     """The UART bytes of one ESC."""
     verdict = Verdict()
     got, wanted = np.fromfile(path, np.uint8), np.frombuffer(bytes(truth.recording.escs[esc].wire), np.uint8)
-    verdict.rows = verdict.values = len(got)
+    verdict.values = len(got)
     if len(got) != len(wanted):
         verdict.say(1, f"{path.name}: has {len(got)} bytes, must have {len(wanted)}")
     elif len(bad := np.flatnonzero(got != wanted)):

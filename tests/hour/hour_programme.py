@@ -286,7 +286,7 @@ def main() -> int:
         *folder.glob("*.bin"),
         *folder.glob("*.log"),
     ):
-        old.unlink()
+        old.unlink(missing_ok=True)
     try:
         begun = time.monotonic()
         seconds = args.minutes * 60
