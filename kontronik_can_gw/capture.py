@@ -35,7 +35,8 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 SUFFIX = ".kcap"
 MAGIC = b"KCB1"
 FORMAT, VERSION = "kontronik-can-gw capture", 1
-LARGEST_PAYLOAD = 1 << 24
+LARGEST_PAYLOAD = 1 << 23
+_PATIENCE = 1 << 28
 _HEAD = struct.Struct("<4scBHIII")
 _CRC = struct.Struct("<I")
 HEAD_LENGTH = _HEAD.size + _CRC.size
@@ -77,6 +78,10 @@ class Kind(IntEnum):
     """The wall clock at this time: Unix time in ns (u64)."""
     LOST = 17
     """So many entries could not be recorded (u64): what follows does not go on where what came before ended."""
+    NOT_SENT = 18
+    """The frames that were taken last were thrown away: the interface was down, or in bus-off."""
+    STATE = 19
+    """JSON: what a replay that begins here cannot know (energy, run time and losses of the ESCs, state of the bus)."""
 
 
 class Entry(NamedTuple):
@@ -121,7 +126,10 @@ def json_payload(content: Mapping[str, Any]) -> bytes:
 
 def read_json(payload: bytes) -> dict[str, Any]:
     """The content of a header or information block. ValueError for what is none."""
-    content = json.loads(payload.decode("utf-8", "surrogatepass"))
+    try:
+        content = json.loads(payload.decode("utf-8", "surrogatepass"))
+    except RecursionError:
+        raise ValueError("is nested too deep") from None
     if not isinstance(content, dict):
         raise ValueError("is no JSON object")
     return content
@@ -214,6 +222,7 @@ class Scanner:
         self._offset = 0
         """Of the buffer's first byte."""
         self._bad_from: int | None = None
+        self._patience = _PATIENCE
 
     def feed(self, data: bytes) -> list[Block | Damage]:
         """Take the next bytes; what is certain by now."""
@@ -253,7 +262,9 @@ class Scanner:
                 continue
             payload = _payload(buffer, deflated, stored, size)
             if payload is None:
-                self._skip(1)
+                # what only looks like a block costs its length to find out: not more than so much in all
+                self._patience += 64 - stored
+                self._skip(1 if self._patience > 0 else HEAD_LENGTH + stored)
                 continue
             self._close_damage(found)
             found.append(Block(kind, number, payload, self._offset))

@@ -23,11 +23,13 @@ from kontronik_can_gw.cia301.eds import load as eds_of
 from kontronik_can_gw.cia301.node import NodeSettings
 from kontronik_can_gw.cia301.nodes import CanopenSetup
 from kontronik_can_gw.cia301.storage import Stored, decode, encode
+from kontronik_can_gw.config import parse
 from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, parse_database
 from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import Device
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.telemetry import MS, EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -87,9 +89,10 @@ class CaptureSetup:
                 f"capture version {header.get('version')} is unknown, this program knows version {VERSION}"
             )
         try:
+            _check(header)
             return cls._of(header)
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise ValueError(f"the header cannot be used: {error!r}") from None
+        except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, UserError) as error:
+            raise ValueError(f"the header cannot be used: {error}") from None
 
     @classmethod
     def _of(cls, header: Header) -> "CaptureSetup":
@@ -97,7 +100,7 @@ class CaptureSetup:
         settings, file = DbcSettings(), None
         if dbc is not None:
             file = (str(dbc["file"]), dbc["text"].encode("latin-1"))
-            settings = DbcSettings(dbc["bind"], dbc["node"], dbc["base_id"], dbc["id_step"], dbc["data_ids"])
+            settings = _dbc_settings(dbc)
         found = header["canopen"]
         canopen = None
         if found is not None:
@@ -131,17 +134,87 @@ class CaptureSetup:
         return Gateway(self.escs, layout, now, self.silent_on_loss, self.canopen)
 
 
+def _dbc_settings(found: Mapping[str, Any]) -> DbcSettings:
+    """Checked as the configuration's are."""
+    keys = {"bind": found["bind"], "e2e_data_ids": found["data_ids"]}
+    keys |= {key: found[key] for key in ("node", "base_id", "id_step") if found[key] is not None}
+    return parse({"dbc": keys, "esc": [{"port": "-"}]}, "the capture").dbc_settings
+
+
 def _esc_json(esc: EscSettings) -> dict[str, Any]:
     return asdict(esc) | {"gear": str(esc.gear)}
 
 
 def _esc(found: Mapping[str, Any]) -> EscSettings:
-    return EscSettings(**(dict(found) | {"gear": Fraction(found["gear"])}))
+    """Within the ranges of the configuration, or those of a master."""
+    numerator, _, denominator = found["gear"].partition("/")
+    gear = Fraction(_number(numerator, 1, 10**12), _number(denominator or "1", 1, 10**12))
+    return EscSettings(
+        _text(found["name"], 12),
+        _number(found["pole_pairs"], 1, 0xFFFF),
+        gear,
+        _number(found["cell_count"], 0, 255),
+        _number(found["timeout_ns"], MS, 65_536 * MS),
+        _number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
+    )
+
+
+def _number(value: Any, low: int, high: int) -> int:
+    if isinstance(value, str) and len(value) < 20 and value.isdecimal():
+        value = int(value)
+    if type(value) is not int or not low <= value <= high:
+        raise ValueError(f"{str(value)[:40]!r} is not a whole number from {low} to {high}")
+    return value
+
+
+def _text(value: Any, longest: int) -> str:
+    if not isinstance(value, str) or len(value) > longest or not value.isprintable():
+        raise ValueError(f"{str(value)[:40]!r} is not a text of at most {longest} characters")
+    return value
+
+
+_LATEST = 1 << 62
+
+
+def _check(header: Header) -> None:
+    """The parts that readers use as they are. ValueError for what is not as the recorder writes it."""
+    for name in ("monotonic_ns", "wall_ns", "created_ns"):
+        if header.get(name) is not None:
+            _number(header[name], 0, _LATEST)
+    for name in ("run", "file"):
+        _text(header.get(name, ""), 4096)
+    _number(header.get("part", 0), 0, 1 << 32)
+    for name, kind in (("program", dict), ("devices", list), ("escs", list), ("ports", list), ("state", dict)):
+        if not isinstance(header.get(name, kind()), kind):
+            raise ValueError(f"{name} is not as a recorder writes it")
+    if not 1 <= len(header["escs"]) <= 1000 or not isinstance(header["configuration"], str):
+        raise ValueError("escs or configuration is not as a recorder writes it")
+    check_state(header.get("state", {}))
+
+
+def check_state(state: Mapping[str, Any]) -> None:
+    """ValueError for a state that no gateway can have."""
+    for esc in state.get("escs", ()):
+        for name in ("energy", "run_time", "losses"):
+            _number(esc[name], 0, 1 << 100)
+    for name, high in (("started_ns", _LATEST), ("can_state", 5)):
+        if name in state:
+            _number(state[name], 0, high)
 
 
 def _node(found: Mapping[str, Any]) -> NodeSettings:
-    device = found["device"]
-    return NodeSettings(**(dict(found) | {"device": None if device is None else Device(device)}))
+    device, vendor = found["device"], found["vendor_id"]
+    return NodeSettings(
+        _number(found["node_id"], 1, 255),
+        _number(found["serial"], 0, 0xFFFF_FFFF),
+        None if vendor is None else _number(vendor, 0, 0xFFFF_FFFF),
+        bool(found["self_start"]),
+        bool(found["read_only"]),
+        _number(found["bitrate"], 1, 100_000_000),
+        _number(found["segment_ns"], 0, _LATEST),
+        _text(found["version"], 100),
+        None if device is None else Device(device),
+    )
 
 
 def _stored(text: str) -> Stored:

@@ -290,10 +290,10 @@ class RecordConfig:
         "record nothing while fewer megabytes are free on the file system", "integer", 100, low=0, high=10_000_000
     )
     can_log: str = _key(
-        "beside it a log of the CAN frames sent and received; 'mf4' needs the extra mf4",
+        "beside it a log of the CAN frames sent and received (MF4: by `convert`, from the capture)",
         "string",
         "none",
-        choices=("none", "candump", "asc", "blf", "trc", "mf4"),
+        choices=("none", "candump", "asc", "blf", "trc"),
     )
 
 
@@ -634,6 +634,8 @@ def _check_outputs(config: Config, problems: list[str]) -> None:
         for what, other in read.items():
             if normpath(path) == normpath(other):
                 problems.append(f"{file}: statistics.file: {str(path)!r} is {what}, which would be overwritten")
+    if config.record.can_log == "trc" and config.can.fd:
+        problems.append(f"{file}: record.can_log: a TRC log knows no CAN FD frames. Take candump, asc or blf.")
     if not config.dbc.enabled and not canopen.enabled:
         problems.append(f"{file}: dbc.enabled, canopen.enabled: both are false, so nothing would be sent. Enable one.")
     if not canopen.enabled:

@@ -221,6 +221,9 @@ class Gateway:
             self.nodes.frames = []
         return frames
 
+    def not_sent(self, now: int) -> None:
+        """The frames that were taken last were thrown away. The gateway itself need not know; who records it does."""
+
     def take_link_changes(self) -> list[int]:
         """ESCs whose link state, layout or device changed since the last call."""
         changes, self._link_changes = self._link_changes, []

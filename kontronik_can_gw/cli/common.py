@@ -23,7 +23,7 @@ from kontronik_can_gw.cli.node_setup import (
     with_stored,
 )
 from kontronik_can_gw.config import Config, MqttConfig, load
-from kontronik_can_gw.dbc_output.layout import Layout, load_database
+from kontronik_can_gw.dbc_output.layout import Layout, parse_database, read_dbc
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.runtime.can_port import check_interface
@@ -55,6 +55,8 @@ class Loaded:
     """ESCs whose stored parameters cannot be read, and why."""
     store: ParameterStore | None
     warnings: tuple[str, ...] = ()
+    dbc: bytes = b""
+    """The DBC file as it was read."""
 
 
 def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) -> Loaded:
@@ -113,10 +115,11 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
         taken, bits = nodes.cob_ids(), nodes.bits_per_second()
         kept = read_stored(config, store)
         escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
-    database, layout = None, Layout("", "", ())
+    database, layout, dbc = None, Layout("", "", ()), b""
     if config.dbc.enabled:
         file = str(config.dbc_path)
-        found = load_database(config.dbc_path)
+        dbc = read_dbc(config.dbc_path)
+        found = parse_database(dbc, file)
         database, layout = prepare(found, file, escs, config.dbc_settings, config.can.fd, taken)
     bitrate, data_bitrate = config.can.bitrate, config.can.data_bitrate
     warnings = [check_load(layout, bitrate, data_bitrate, bits)]
@@ -128,7 +131,7 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
             bits = canopen.nodes(escs).bits_per_second()
         warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
     damaged = () if kept is None else tuple(kept.damaged)
-    return Loaded(config, escs, database, layout, canopen, damaged, store, tuple(w for w in warnings if w))
+    return Loaded(config, escs, database, layout, canopen, damaged, store, tuple(w for w in warnings if w), dbc)
 
 
 def with_store(loaded: Loaded, store: ParameterStore | None) -> Loaded:

@@ -5,8 +5,6 @@ from pathlib import Path
 from kontronik_can_gw.capture_setup import CaptureSetup
 from kontronik_can_gw.cli.common import Loaded
 from kontronik_can_gw.config import Config, as_toml
-from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.can_log import check_kind
 from kontronik_can_gw.runtime.machine import state_folder
 from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings
 from kontronik_can_gw.telemetry import SECOND
@@ -16,7 +14,7 @@ _STATE = "state"
 
 
 def recorder_of(config: Config, folder: Path | None) -> Recorder | None:
-    """The recorder; ``folder`` wins over the configuration's. None where nothing is to be recorded. UserError for a missing package."""
+    """The recorder; ``folder`` wins over the configuration's. None where nothing is to be recorded."""
     record = config.record
     if folder is None and record.directory is not None:
         folder = Path(config.file).parent / record.directory
@@ -24,7 +22,6 @@ def recorder_of(config: Config, folder: Path | None) -> Recorder | None:
             folder = state_folder() / "captures"
     if folder is None:
         return None
-    check_kind(record.can_log)
     return Recorder(
         RecordSettings(
             folder,
@@ -43,10 +40,7 @@ def setup_of(loaded: Loaded) -> CaptureSetup:
     config = loaded.config
     dbc = None
     if config.dbc.enabled:
-        try:
-            dbc = (config.dbc_path.name, config.dbc_path.read_bytes())
-        except OSError as error:  # it was there a moment ago
-            raise RunError(f"{config.dbc_path}: cannot be read: {error.strerror}") from None
+        dbc = (config.dbc_path.name, loaded.dbc)
     return CaptureSetup(
         tuple(loaded.escs),
         tuple(esc.port for esc in config.esc),

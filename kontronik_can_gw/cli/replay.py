@@ -172,41 +172,46 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
 
 
 def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
+    from kontronik_can_gw.cia305.lss import UNCONFIGURED
     from kontronik_can_gw.cli.common import say
     from kontronik_can_gw.config import CanConfig
+    from kontronik_can_gw.dbc_output.unpacker import SignalReader
     from kontronik_can_gw.offline.inputs import CaptureInput
     from kontronik_can_gw.offline.marking import Marker
     from kontronik_can_gw.runtime.can_port import CanPort, check_interface
-    from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim
+    from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
 
     config = recording.bus.config.can if args.config and recording.bus.config else None
     channel = args.channel or (config.channel if config else None)
     if channel is None:
         raise UserError("--to can needs --channel, as vcan0, or a configuration (-c) that names one")
     interface = args.interface or (config.interface if config else "socketcan")
-    can = CanConfig(interface, channel, fd=any(plan.fd for plan in recording.bus.layout.messages))
+    capture = recording if isinstance(recording, CaptureInput) else None
+    layout = recording.bus.layout if capture is None else capture.sent_layout
+    can = CanConfig(interface, channel, fd=any(plan.fd for plan in layout.messages))
     check_interface(can)
+    marker = Marker(layout)
+    if not args.unmarked and not marker.can_mark:
+        say("warning: no message of this DBC tells the gateway's state: nobody can see that it is a replay")
     claims = Claims()
     if interface != "virtual":
-        for key in sorted(recording.reader.keys)[:1]:
-            for taken in claims.hold([messages_claim(channel, key)]):
-                raise in_use(taken)
-    marker = None if args.unmarked else Marker(recording.bus.layout)
-    if marker is not None and not marker.can_mark:
-        say("warning: no message of this DBC tells the gateway's state: nobody can see that it is a replay")
+        names = [messages_claim(channel, key) for key in sorted(SignalReader(layout).keys)[:1]]
+        nodes = capture.setup.canopen.settings if capture is not None and capture.setup.canopen else ()
+        names += [node_claim(channel, node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
+        for taken in claims.hold(names):
+            raise in_use(taken)
     port = CanPort(can)
     count = 0
     try:
-        frames = (
-            recording.frames(marked=not args.unmarked) if isinstance(recording, CaptureInput) else recording.frames()
-        )
-        sent_only = isinstance(recording, CaptureInput)
+        # a capture's core marks its frames itself, those of a log are changed one by one
+        frames = recording.frames() if capture is None else capture.frames(marked=not args.unmarked)
+        changed = capture is None and not args.unmarked
         for time_ns, frame, received in frames:
-            if received and sent_only:
+            if received and capture is not None:
                 continue
             if not pace.wait(time_ns):
                 break
-            _send(port, marker.mark(frame) if marker is not None else frame, channel, pace)
+            _send(port, marker.mark(frame) if changed else frame, channel, pace)
             count += 1
     finally:
         port.close()
@@ -241,10 +246,11 @@ def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> Non
 def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     from contextlib import ExitStack
 
+    from kontronik_can_gw.offline.inputs import CaptureInput, DumpInput
     from kontronik_can_gw.offline.pty import PtyEsc
 
     chunks = _chunks(recording)
-    names = [esc.name for esc in recording.bus.escs]
+    names = [esc.name for esc in recording.setup.escs] if isinstance(recording, (CaptureInput, DumpInput)) else []
     total = 0
     with ExitStack() as stack:
         terminals = [
@@ -258,8 +264,9 @@ def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
         for time_ns, esc, data in chunks:
             if not pace.wait(time_ns):
                 break
-            terminals[esc].write(data)
-            total += len(data)
+            if esc < len(terminals):
+                terminals[esc].write(data)
+                total += len(data)
         pace.pause(_DRAIN_S)
         for terminal in terminals:
             terminal.check()

@@ -213,11 +213,15 @@ def normalize(name: str) -> str:
 
 def load_database(path: Path) -> "Database":
     """Read a DBC file. UserError with one line for a file that cannot be read or is no DBC."""
+    return parse_database(read_dbc(path), str(path))
+
+
+def read_dbc(path: Path) -> bytes:
+    """The bytes of a DBC file. UserError with one line where it cannot be read."""
     try:
-        raw = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
-    return parse_database(raw, str(path))
 
 
 def parse_database(raw: bytes, path: str) -> "Database":

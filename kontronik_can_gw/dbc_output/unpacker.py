@@ -133,20 +133,30 @@ def compile_unpack(signals: Sequence[SignalPlan], name: str) -> Callable[[int], 
 
 
 def _lost_flags(signals: Sequence[SignalPlan]) -> list[str]:
-    """A flag has no code for not available: it is that where all other values of the same ESC's frame are, in the same message."""
+    """A flag has no code for not available: it is that where all values of the same ESC's frame that have one say so, in its message."""
     groups: dict[tuple[int | None, Group], tuple[list[str], list[str]]] = {}
     for index, signal in enumerate(signals):
         source = signal.source
         if source is None or source.group not in (Group.LIVE, Group.INFO) or source.supplied is not None:
             continue
         flags, others = groups.setdefault((signal.esc, source.group), ([], []))
-        (flags if source.bit is not None else others).append(f"v{index}")
+        if _is_flag(signal):
+            flags.append(f"v{index}")
+        elif signal.is_float or not signal.low <= signal.not_available <= signal.high:
+            raw = " | ".join(_piece(piece.shift, piece.width, piece.at) for piece in signal.pieces)
+            others.append(f"({raw}) == {signal.not_available & (1 << signal.length) - 1}")
     lines = []
     for flags, others in groups.values():
         if flags and others:
-            lines.append(f"if {' is None and '.join(others)} is None:")
+            lines.append(f"if {' and '.join(others)}:")
             lines.append(f"    {' = '.join(flags)} = None")
     return lines
+
+
+def _is_flag(signal: SignalPlan) -> bool:
+    """One bit as it stands; it has no codes."""
+    as_it_stands = signal.numbers is None and signal.factor == 1 and signal.offset == 0
+    return signal.length == 1 and not signal.signed and not signal.is_float and as_it_stands
 
 
 def float_value(bits: int, length: int, codes: tuple[int, ...], factor: float, offset: float) -> float | None:
@@ -165,18 +175,12 @@ def _lines(signal: SignalPlan, index: int) -> list[str]:
         return [
             f"{v} = float_value({raw}, {signal.length}, {codes}, {float(signal.factor)!r}, {float(signal.offset)!r})"
         ]
-    if (
-        signal.length == 1
-        and not signal.signed
-        and signal.numbers is None
-        and signal.factor == 1
-        and signal.offset == 0
-    ):
-        return [f"{v} = {raw}"]  # a flag has no code
+    if _is_flag(signal):
+        return [f"{v} = {raw}"]
     lines = [f"{v} = {raw}"]
     if signal.signed:
         lines.append(f"if {v} >= {1 << signal.length - 1}: {v} -= {1 << signal.length}")
-    # a code amid the values is a value to everyone who does not know better
+    # a code amid the values counts as the code: the packer sends no value that looks like it
     codes = tuple(sorted({signal.not_available, signal.error}))
     if signal.numbers is not None:
         lines.append(f"{v} = None if {v} in {codes} else texts{index}.get({v})")

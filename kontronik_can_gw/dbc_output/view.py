@@ -1,7 +1,8 @@
 """What a participant of the bus knows now: the newest value of each signal, as long as it is fresh. Pure; time is handed in.
 
 A value is None before its first frame, when the gateway says that it is not available, and when its message stays away: a cyclic one for
-three cycles, one that comes with telemetry for a second, one that comes on change only when nothing of the gateway's comes any more.
+three cycles, one that comes with telemetry for a second, one that comes on change only when nothing of the gateway's has come for three of
+the shortest cycles (3 s at least; never where no message has a cycle, because then nobody knows).
 """
 
 from kontronik_can_gw.dbc_output.layout import SendType
@@ -11,7 +12,7 @@ from kontronik_can_gw.telemetry import MS, SECOND
 
 _LEAST_NS = 250 * MS
 _CYCLES = 3
-_SILENCE_NS = 3 * SECOND
+_LEAST_SILENCE_NS = 3 * SECOND
 
 
 class View:
@@ -28,6 +29,8 @@ class View:
         self._life = [_life(part) for part in reader.parts]
         self._seen: list[int | None] = [None] * len(reader.parts)
         self._next_expiry: int | None = None
+        cycles = [part.plan.cycle_ns * len(part.plan.pages) for part in reader.parts if part.plan.cycle_ns]
+        self._silence_ns = max(_LEAST_SILENCE_NS, _CYCLES * min(cycles)) if cycles else None
 
     @property
     def next_expiry(self) -> int | None:
@@ -46,8 +49,8 @@ class View:
             values[first : first + len(new)] = new
             part = self._part_of[first]
             seen[part] = now
-            due = now + (self._life[part] or _SILENCE_NS)
-            if self._next_expiry is None or due < self._next_expiry:
+            due = self._due(part)
+            if due is not None and (self._next_expiry is None or due < self._next_expiry):
                 self._next_expiry = due
         return chunks
 
@@ -55,21 +58,24 @@ class View:
         """Forget what has stayed away for too long; True where something was forgotten."""
         if self._next_expiry is None or now <= self._next_expiry:
             return False
-        silent = self.last_ns is not None and now - self.last_ns > _SILENCE_NS
+        dues = [self._due(index) for index in range(len(self._life))]
         forgotten = False
-        due: list[int] = []
-        for index, (part, life) in enumerate(zip(self.reader.parts, self._life, strict=True)):
-            when = self._seen[index]
-            if when is None:
-                continue
-            if silent or (life is not None and now - when > life):
+        for index, (part, due) in enumerate(zip(self.reader.parts, dues, strict=True)):
+            if due is not None and now > due:
                 self._seen[index] = None
                 self.values[part.first : part.first + part.count] = [None] * part.count
                 forgotten = True
-            else:
-                due.append(when + life if life is not None else (self.last_ns or now) + _SILENCE_NS)
-        self._next_expiry = min(due, default=None)
+        self._next_expiry = min((due for due in dues if due is not None and due >= now), default=None)
         return forgotten
+
+    def _due(self, index: int) -> int | None:
+        """Until when a part's values hold; None: nobody knows, or there are none."""
+        seen, life = self._seen[index], self._life[index]
+        if seen is None:
+            return None
+        if life is not None:
+            return seen + life
+        return None if self._silence_ns is None or self.last_ns is None else self.last_ns + self._silence_ns
 
     def value(self, source: str, esc: int | None = None) -> Value:
         """The value of the signal that is bound to a source; None where the layout has none too."""

@@ -4,8 +4,10 @@ A capture (.kcap) goes through the gateway's core with the recorded clock. Plain
 come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what a file is by its content.
 """
 
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
@@ -30,7 +32,7 @@ from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout
 from kontronik_can_gw.dbc_output.unpacker import SignalReader
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.offline.can_logs import CanLog, log_format
-from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.offline.replay import Replay, TimedFrame, follow_bytes
 from kontronik_can_gw.offline.samples import Sample, SampledGateway, samples_of_frames
 from kontronik_can_gw.protocol.codec import Kind as FrameKind
@@ -41,6 +43,11 @@ CHUNK = 1 << 18
 LIVE_RATE = 100.0
 """Live frames a second that plain bytes are taken to have come at."""
 _LOOK = 1 << 16
+_LOOK_FOR_HEADER = 1 << 25
+_MOST_DAMAGE = 50
+_LATEST_NS = 1 << 62
+_MOST_WAITING = 1 << 16
+_LONGEST_FRAME = 64
 
 
 class Input(Protocol):
@@ -160,35 +167,39 @@ class CaptureInput(_Base):
 
     def __init__(self, paths: Sequence[Path], layout: BusLayout | None = None) -> None:
         self._paths = list(paths)
+        self._headerless: list[str] = []
+        self.damage = []
+        self.position = 0
+        self._file: IO[bytes] | None = None
+        self.header = self._first_header()
         try:
             size = sum(path.stat().st_size for path in self._paths)
         except OSError as error:
             raise RunError(f"{error.filename}: cannot be read: {error.strerror}.") from None
-        self.header = self._first_header()
         try:
             self.setup = CaptureSetup.of(self.header)
-        except ValueError as error:
+            found = self.setup.database()
+        except (ValueError, TypeError, LookupError) as error:
             raise UserError(f"{self._paths[0]}: {error}") from None
-        found = self.setup.database()
-        name = str(self._paths[0]) if len(self._paths) == 1 else f"{self._paths[0].parent}/{self._paths[0].stem[:-5]}"
-        if layout is None:
-            shown = layout_of_dbc(shipped("dbc/kontronik_esc.dbc")) if found is None else None
-            layout = shown or BusLayout(found[0], found[1], self.setup.escs) if found else shown
-            assert layout is not None
-        self._sent = found[1] if found is not None else Layout("", "", ())
+        name = str(self._paths[0])
+        if len(self._paths) > 1:
+            name = f"{self._paths[0].parent}/{self._paths[0].stem.rpartition('-')[0]}"
+        self.sent_layout = Layout("", "", ()) if found is None else found[1]
+        """Of the frames; that of the rows, ``bus``, may be another one."""
+        if layout is not None:
+            layout = shown_by(layout, self.setup.escs)
+        elif found is not None:
+            layout = BusLayout(found[0], found[1], self.setup.escs)
+        else:
+            layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"), self.setup.escs)
         super().__init__(name, layout, size)
-        if len(layout.escs) > len(self.setup.escs):
-            raise UserError(
-                f"{layout.layout.file}: describes {len(layout.escs)} ESCs, the capture has {len(self.setup.escs)}"
-            )
         self._offsets: list[tuple[int, int]] = []
-        self._file: IO[bytes] | None = None
         self._devices: list[Any] = list(self.header.get("devices") or [])
         self._describe()
 
     def frames(self, marked: bool = False) -> Iterator[TimedFrame]:
         """``marked``: the gateway's state in the frames is REPLAY."""
-        gateway = self.setup.gateway(self._sent, self._created_ns)
+        gateway = self.setup.gateway(self.sent_layout, self._created_ns)
         replay = Replay(gateway, self.header.get("state"), marked)
         yield from replay.follow(self.entries())
         self._tell(replay)
@@ -212,31 +223,37 @@ class CaptureInput(_Base):
     def wall_ns(self, time_ns: int) -> int | None:
         offset = next((offset for since, offset in reversed(self._offsets) if since <= time_ns), None)
         if offset is None:
-            offset = int(self.header["wall_ns"]) - int(self.header["monotonic_ns"])
+            offset = int(self.header.get("wall_ns") or 0) - int(self.header.get("monotonic_ns") or 0)
         return time_ns + offset
 
     @property
     def channel(self) -> str:
         """The CAN channel that was sent on."""
         try:
-            return str(tomllib.loads(self.setup.configuration)["can"]["channel"])
-        except (ValueError, KeyError, TypeError):
-            return "can0"
+            channel = str(tomllib.loads(self.setup.configuration)["can"]["channel"])
+        except (ValueError, LookupError, TypeError, RecursionError):
+            channel = ""
+        return channel if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII) else "can0"
 
     def entries(self) -> Iterator[Entry]:
         """All entries of all parts. What is damaged is passed over, and told in ``damage``."""
         self.position = 0
-        self.damage = []
+        self.damage = list(self._headerless)
         self._offsets = []
-        last = 0
+        last, impossible = 0, 0
         for number, path in enumerate(self._paths):
             for entry in self._entries_of(path, number):
+                if entry.time_ns > _LATEST_NS or (entry.kind == Kind.CLOCK and len(entry.data) != 8):
+                    impossible += 1
+                    continue
                 if entry.kind == Kind.CLOCK:
                     self._offsets.append((entry.time_ns, read_number(entry.data) - entry.time_ns))
                 if entry.time_ns < last:
                     entry = entry._replace(time_ns=last)
                 last = entry.time_ns
                 yield entry
+        if impossible:
+            self.damage.append(f"{impossible} entries have no possible time")
 
     def close(self) -> None:
         if self._file is not None:
@@ -249,16 +266,19 @@ class CaptureInput(_Base):
         return int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
 
     def _first_header(self) -> Mapping[str, Any]:
-        self.damage = []
-        self.position = 0
-        self._file = None
-        for found in self._blocks(self._paths[0]):
-            if isinstance(found, Block) and found.kind == b"H":
-                try:
-                    return read_json(found.payload)
-                except ValueError:
+        while True:
+            path = self._paths[0]
+            for found in self._blocks(path):
+                if isinstance(found, Block) and found.kind == b"H":
+                    with suppress(ValueError):
+                        return read_json(found.payload)
+                if self.position > _LOOK_FOR_HEADER:
                     break
-        raise UserError(f"{self._paths[0]}: has no header that could be read, so nothing is known of what was recorded")
+            self.close()
+            if len(self._paths) == 1:
+                raise UserError(f"{path}: has no header that could be read, so nothing is known of what was recorded")
+            self._headerless.append(f"{path.name}: has no header that could be read")
+            del self._paths[0]
 
     def _blocks(self, path: Path) -> Iterator[Block | Damage]:
         scanner = Scanner()
@@ -278,7 +298,7 @@ class CaptureInput(_Base):
                 self.damage.append(f"{path.name}: {found.length} bytes at {found.offset} are damaged")
                 continue
             if found.number > expected:
-                self.damage.append(
+                self._tell_damage(
                     f"{path.name}: {found.number - expected} blocks in front of byte {found.offset} are missing"
                 )
             expected, ended = found.number + 1, found.kind == b"E"
@@ -291,17 +311,24 @@ class CaptureInput(_Base):
                 elif found.kind == b"H":
                     self._check_part(read_json(found.payload), path, part)
             except ValueError as error:
-                self.damage.append(f"{path.name}: the block at {found.offset} {error}")
+                self._tell_damage(f"{path.name}: the block at {found.offset} {error}")
         if not ended:
             self.damage.append(f"{path.name}: was not closed: up to the last second before its end may be missing")
+
+    def _tell_damage(self, text: str) -> None:
+        if len(self.damage) < _MOST_DAMAGE:
+            self.damage.append(text)
+        elif len(self.damage) == _MOST_DAMAGE:
+            self.damage.append("and more of that kind")
 
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
         if header.get("run") != self.header.get("run"):
             raise UserError(f"{path}: is of another run than {self._paths[0]}. Convert each run by itself.")
-        if "monotonic_ns" in header and "wall_ns" in header:
-            self._offsets.append((int(header["monotonic_ns"]), int(header["wall_ns"]) - int(header["monotonic_ns"])))
+        now, wall = header.get("monotonic_ns"), header.get("wall_ns")
+        if isinstance(now, int) and isinstance(wall, int) and 0 <= now <= _LATEST_NS and 0 <= wall <= _LATEST_NS:
+            self._offsets.append((now, wall - now))
         missing = int(header.get("part", part)) - int(self.header.get("part", 0)) - part
-        if missing:
+        if missing > 0:
             self.damage.append(f"{path.name}: {missing} parts of the run in front of it are not given")
 
     def _tell(self, replay: Replay) -> None:
@@ -340,6 +367,8 @@ class DumpInput(_Base):
         esc = replace(layout.escs[0], timeout_ns=max(layout.escs[0].timeout_ns, 3 * self._period_ns))
         self.setup = CaptureSetup((esc,), (str(path),), None, DbcSettings(), False, False, None)
         self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
+        if layout.config is None:
+            self.provenance["motor"] = "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
 
     def frames(self) -> Iterator[TimedFrame]:
         yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self.chunks())
@@ -379,6 +408,12 @@ class DumpInput(_Base):
         for data in chain(self._read(), (None,)):
             if data is not None:
                 waiting += data
+            if len(waiting) > _MOST_WAITING:  # no frame for long: what can belong to none any more goes
+                keep = len(data or b"") + _LONGEST_FRAME
+                if (gone := len(waiting) - keep) > 0:
+                    yield now, bytes(waiting[:gone])
+                    del waiting[:gone]
+                    at += gone
             for frame in deframer.feed(data) if data is not None else deframer.flush():
                 if frame.kind is FrameKind.LIVE:
                     now = lives * self._period_ns

@@ -1,12 +1,13 @@
 """Which DBC describes frames of ours, and whose values they hold."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config import Config
 from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, choose_node, load_database, normalize
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.sources import Group, sources
 from kontronik_can_gw.telemetry import EscSettings
 
@@ -24,15 +25,39 @@ class BusLayout:
     config: Config | None = None
 
 
-def layout_of_dbc(file: Path) -> BusLayout:
-    """A DBC alone: its ESCs are those that the names of its signals begin with. UserError where a signal means nothing."""
+def layout_of_dbc(file: Path, known: Sequence[EscSettings] = ()) -> BusLayout:
+    """A DBC alone. UserError where a signal means nothing.
+
+    Its ESCs are those that the names of its signals begin with; a DBC of one ESC is made one of all that are ``known``. Pole pairs and gear
+    are those of the ``known`` ones, in their order, and 1 otherwise.
+    """
+    database = load_database(file)
+    return _made(database, choose_node(database, None, str(file)), str(file), known)
+
+
+def shown_by(layout: BusLayout, known: Sequence[EscSettings]) -> BusLayout:
+    """A layout that was given for a recording of these ESCs: one of a DBC alone takes their pole pairs and gears.
+
+    UserError where it describes other ESCs than there are.
+    """
+    if layout.config is None:
+        return _made(layout.database, layout.layout.node, layout.layout.file, known)
+    if len(layout.escs) != len(known):
+        raise UserError(f"{layout.config.file}: has {len(layout.escs)} ESCs, the recording {len(known)}")
+    return layout
+
+
+def _made(database: "Database", node: str, file: str, known: Sequence[EscSettings]) -> BusLayout:
     from kontronik_can_gw.dbc_output.prepare import prepare
 
-    database = load_database(file)
-    node = choose_node(database, None, str(file))
-    escs = [EscSettings(name) for name in esc_names(database, node)] or [EscSettings("esc1")]
-    database, layout = prepare(database, str(file), escs, DbcSettings(node=node), fd_allowed=True)
-    return BusLayout(database, layout, escs)
+    names = esc_names(database, node)
+    if names and known and len(names) != len(known):
+        raise UserError(f"{file}: describes {len(names)} ESCs, the recording has {len(known)}")
+    escs = list(known) or [EscSettings(name) for name in names] or [EscSettings("esc1")]
+    if names:
+        escs = [replace(esc, name=name) for esc, name in zip(escs, names, strict=True)]
+    made, layout = prepare(database, file, escs, DbcSettings(node=node), fd_allowed=True)
+    return BusLayout(made, layout, escs)
 
 
 def esc_names(database: "Database", node: str) -> list[str]:

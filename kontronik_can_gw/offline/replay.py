@@ -7,7 +7,7 @@ entry is missing. Nothing here waits or sends.
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.capture import COUNTERS, Entry, Kind, read_counters, read_frame, read_number
+from kontronik_can_gw.capture import COUNTERS, Entry, Kind, read_counters, read_frame, read_json, read_number
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Mailboxes, Sent
@@ -25,7 +25,8 @@ class TimedFrame(NamedTuple):
 class Replay:
     """A gateway that is given entries. ``marked``: its state on the bus is REPLAY, not RUNNING.
 
-    ``state``: of a header, where recording had begun before; without a START entry the gateway starts with the first entry.
+    ``state``: of a header, what had been counted before. Where the beginning of the run is missing, without a START entry, the gateway
+    starts with the first entry and takes up what the next STATE entry tells.
     """
 
     def __init__(self, gateway: Gateway, state: Mapping[str, Any] | None = None, marked: bool = False) -> None:
@@ -36,42 +37,56 @@ class Replay:
         """Entries that make no sense."""
         self._marked = marked
         self._waiting = Mailboxes()
+        self._taken: list[TimedFrame] = []
+        """Of the last turn: whether they were sent, the next entry tells."""
         self._started = False
+        self._midway = False
         self._take_up(state or {})
 
     def follow(self, entries: Iterable[Entry]) -> Iterator[TimedFrame]:
         """The frames received and sent, in order."""
         for entry in entries:
             yield from self.play(entry)
+        yield from self.finish()
 
     def play(self, entry: Entry) -> list[TimedFrame]:
-        """Give one entry to the gateway; the frames that it received or sent with it."""
-        try:
-            return self._play(entry)
-        except (ValueError, IndexError):
-            self.passed_over += 1
+        """Give one entry to the gateway; the frames that it received with it, and those that were sent before."""
+        if entry.kind == Kind.NOT_SENT:
+            self._taken = []
             return []
+        found, self._taken = self._taken, []
+        try:
+            found += self._play(entry)
+        except Exception:  # a damaged or hostile capture: what no gateway was ever given may raise anything
+            self.passed_over += 1
+        return found
+
+    def finish(self) -> list[TimedFrame]:
+        """The entries have ended: the frames of the last turn."""
+        found, self._taken = self._taken, []
+        return found
 
     def _play(self, entry: Entry) -> list[TimedFrame]:
         now, kind, esc, data, flags = entry
         gateway = self.gateway
         if not self._started and kind == Kind.ADVANCE:  # the beginning is missing
+            self._midway = True
             self._start(now, True)
         if kind == Kind.BYTES:
             gateway.receive_bytes(esc, data, now)
         elif kind == Kind.ADVANCE:
             gateway.advance(now)
-            return self._take(now)
+            self._take(now)
         elif kind == Kind.FRAME:
             frame = read_frame(data)
             gateway.receive_frame(frame, now)
             return [TimedFrame(now, frame, True)]
         elif kind == Kind.START:
             self._start(now, bool(flags))
-            return self._take(now)
+            self._take(now)
         elif kind == Kind.STOP:
             gateway.stop(now)
-            return self._take(now)
+            self._take(now)
         elif kind == Kind.COUNTERS:
             for name, value in zip(COUNTERS, read_counters(data), strict=True):
                 setattr(gateway.status, name, value)
@@ -103,6 +118,10 @@ class Replay:
                 gateway.saved(esc, data.decode("utf-8", "replace") if flags else None, now)
             case Kind.DAMAGED:
                 gateway.parameters_damaged(esc, now)
+            case Kind.STATE:
+                if self._midway:
+                    self._midway = False
+                    self._take_up(read_json(data))
             case Kind.CLOCK:
                 pass
             case _:
@@ -114,7 +133,7 @@ class Replay:
         if self._marked:
             self.gateway.status.state = GatewayState.REPLAY
 
-    def _take(self, now: int) -> list[TimedFrame]:
+    def _take(self, now: int) -> None:
         gateway = self.gateway
         gateway.take_saves()  # what nobody fetches would grow
         frames = in_order(gateway.take_frames(), self._waiting)
@@ -122,14 +141,14 @@ class Replay:
         gateway.take_link_changes()
         gateway.take_misfits()
         gateway.take_conflicts()
-        return [TimedFrame(now, frame) for frame in frames]
+        self._taken = [TimedFrame(now, frame) for frame in frames]
 
     def _take_up(self, state: Mapping[str, Any]) -> None:
         """Go on with what was counted before recording began."""
         for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
-            esc.energy, esc.run_time, esc.losses = (int(found[name]) for name in ("energy", "run_time", "losses"))
+            esc.energy, esc.run_time, esc.losses = (found[name] for name in ("energy", "run_time", "losses"))
         if "started_ns" in state:
-            self.gateway.status.started_ns = int(state["started_ns"])
+            self.gateway.status.started_ns = state["started_ns"]
         if "can_state" in state:
             self.gateway.status.can_state = CanState(state["can_state"])
 

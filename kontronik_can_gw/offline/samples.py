@@ -39,6 +39,7 @@ class SampledGateway(Gateway):
         self.rows: list[Sample] = []
         self._values: list[Value] = [None] * len(reader.columns)
         self._row_ns: int | None = None
+        self._last_ns = 0
         self._in_row: set[int] = set()
         self._gateway_ns = now - _GATEWAY_NS
         indices = {plan.name: index for index, plan in enumerate(layout.messages)}
@@ -68,8 +69,8 @@ class SampledGateway(Gateway):
         when = now
         if events & Event.LIVE and state.live is not None and state.live_ns is not None:
             when = min(now, state.live_ns)  # of its last byte on the wire
+        when = self._last_ns = max(when, self._last_ns)
         if self._row_ns is not None:
-            when = max(when, self._row_ns)
             again = events & Event.LIVE and esc in self._in_row
             if again or when - self._row_ns > SAME_ROW_NS:
                 self._close_row()
@@ -99,7 +100,9 @@ def samples_of_frames(frames: Iterable[TimedFrame], reader: SignalReader) -> Ite
     view = View(reader)
     row_ns: int | None = None
     in_row: set[int] = set()
-    for time_ns, frame, _ in frames:
+    last = 0
+    for frame_ns, frame, _ in frames:
+        last = time_ns = max(frame_ns, last)  # a log of several interfaces may not be in order
         key = frame.key
         if key not in reader.keys:
             continue

@@ -1,35 +1,24 @@
-"""A CAN log beside a capture, by python-can's writers, so that every tool reads it. Called by the recorder's thread only."""
+"""A CAN log beside a capture, by python-can's writers, so that every tool reads it. Called by the recorder's thread only.
+
+MF4 is none of them: its writer wants asammdf in the gateway's process and seconds at the end. ``convert`` makes it from a capture.
+"""
 
 import contextlib
 import os
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
-_SUFFIXES = {"candump": ".log", "asc": ".asc", "blf": ".blf", "trc": ".trc", "mf4": ".mf4"}
+SUFFIXES = {"candump": ".log", "asc": ".asc", "blf": ".blf", "trc": ".trc"}
 _WRITERS = {
     "candump": "CanutilsLogWriter",
     "asc": "ASCWriter",
     "blf": "BLFWriter",
     "trc": "TRCWriter",
-    "mf4": "MF4Writer",
 }
-
-
-def suffix_of(kind: str) -> str:
-    """The file name's ending of a kind of log."""
-    return _SUFFIXES[kind]
-
-
-def check_kind(kind: str) -> None:
-    """UserError where a kind needs a package that is missing."""
-    if kind == "mf4" and find_spec("asammdf") is None:
-        raise UserError("record.can_log \"mf4\" needs asammdf: pip install 'kontronik-can-gw[mf4]'")
 
 
 class CanLog:
@@ -38,11 +27,8 @@ class CanLog:
     def __init__(self, path: Path, kind: str, channel: str) -> None:
         # never over something else, nor through a link
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640))
-        if kind == "mf4":
+        with without_asammdf():
             can = import_module("can")
-        else:
-            with without_asammdf():
-                can = import_module("can")
         self._message = can.Message
         writer = getattr(import_module("can.io"), _WRITERS[kind])
         options: dict[str, Any] = {"channel": channel} if kind == "candump" else {}
@@ -67,10 +53,11 @@ class CanLog:
         )
 
     def flush(self) -> None:
-        """Hand to the system what the writer holds, as far as it can."""
+        """Force to the disk what the writer hands over before its end: a candump log line by line, a BLF next to nothing."""
         file = getattr(self._writer, "file", None)
         if file is not None:
             file.flush()
+            os.fdatasync(file.fileno())
 
     def close(self) -> None:
         """Close in good order: a BLF file is readable only then."""

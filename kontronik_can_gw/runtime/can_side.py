@@ -341,9 +341,12 @@ class CanSide:
     def transmit(self, now: int) -> None:
         """Hand what is to be sent to the interface, as far as it takes it."""
         status, waiting = self._gateway.status, self.mailboxes
-        for frame in self._gateway.take_frames():
+        frames = self._gateway.take_frames()
+        for frame in frames:
             waiting.put(frame)
         if self.port is None or self._sends_in_vain:
+            if frames:
+                self._gateway.not_sent(now)
             self.clear()
             self._busy_until = self._busy_since = None
             return

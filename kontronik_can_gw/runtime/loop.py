@@ -23,7 +23,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
-from kontronik_can_gw.runtime.recorder import Recorder, devices_of, state_of
+from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.reload import Reloader
 from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, name_in_words, process_facts, snapshot
@@ -132,7 +132,7 @@ class Loop:
                 esc.open(now, self._wait, self._others(esc))
             self.can.open(now, self._wait)
             if self._recorder is not None:
-                self._recorder.start()
+                self._recorder.start(self._wait)
         except UserError:
             self.close()
             raise
@@ -163,8 +163,8 @@ class Loop:
                 for key, events in ready:
                     key.data(now, events)
                 now = self._reopen(now)
+                self._keep(now)  # in front: what it answers belongs to this turn, in a replay too
                 gateway.advance(now)
-                self._keep(now)
                 self.can.follow_ids()
                 self.can.transmit(now)
                 self._report(now)
@@ -185,6 +185,7 @@ class Loop:
         self._statistics.close()
         if self._recorder is not None:
             self._recorder.close()
+            self._follow_recorder(self._clock())  # the last words
         if self._store is not None:
             self._store.close(_LAST_SAVE_S)
         for fd in (self._wake_read, self._wake_write):
@@ -300,12 +301,14 @@ class Loop:
     def _follow_recorder(self, now: int) -> None:
         if self._recorder is None:
             return
-        self._recorder.note(state_of(self.gateway), devices_of(self.gateway))
-        for begins, text in self._recorder.reports(now):
-            if begins:
-                self.conditions.begin("captures", text, now)
+        self._recorder.note(self.gateway, now)
+        for name, begins, text in self._recorder.reports(now):
+            if name == "losses":
+                self.conditions.event("captures: losses", text, now)
+            elif begins:
+                self.conditions.begin(f"captures: {name}", text, now)
             else:
-                self.conditions.end("captures", text, now)
+                self.conditions.end(f"captures: {name}", text, now)
 
     # --- another configuration
 

@@ -40,14 +40,11 @@ class RecordedGateway(Gateway):
         super().stop(now)
 
     def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
-        errors = self.escs[esc].line_errors
-        if errors != self._line_errors[esc]:
-            self._line_errors[esc] = errors
-            self._put(now, Kind.LINE_ERRORS, esc, number_data(errors), 0)
         self._note(now, Kind.BYTES, esc, data)
         super().receive_bytes(esc, data, now)
 
     def receive_frame(self, frame: CanFrame, now: int) -> None:
+        self._note_line_errors(now)
         self._note(now, Kind.FRAME, data=frame_data(frame))
         super().receive_frame(frame, now)
 
@@ -84,6 +81,7 @@ class RecordedGateway(Gateway):
         super().set_can_state(state, now)
 
     def advance(self, now: int) -> None:
+        self._note_line_errors(now)
         self._note(now, Kind.ADVANCE)
         super().advance(now)
 
@@ -92,6 +90,15 @@ class RecordedGateway(Gateway):
         # as a rule all of them are sent: only what comes otherwise is recorded
         self._counters = (self._counters[0] + len(frames), *self._counters[1:])
         return frames
+
+    def not_sent(self, now: int) -> None:
+        self._put(now, Kind.NOT_SENT, 0, b"", 0)
+
+    def _note_line_errors(self, now: int) -> None:
+        for esc, (state, known) in enumerate(zip(self.escs, self._line_errors, strict=True)):
+            if state.line_errors != known:
+                self._line_errors[esc] = state.line_errors
+                self._put(now, Kind.LINE_ERRORS, esc, number_data(state.line_errors), 0)
 
     def _note(self, now: int, kind: Kind, esc: int = 0, data: bytes = b"", flags: int = 0) -> None:
         counters = self._counters_now()

@@ -3,9 +3,11 @@
 What may touch what: ``put``, ``put_frame``, ``note`` and ``reports`` are called by the loop's thread and never wait; only ``_work`` and
 what it calls touch the disk. Entries go from one to the other by a deque with a bound: what finds no room is counted, and the count is
 recorded when there is room again. Each half second what has come is one block, forced to the disk: a loss of power costs that and no more.
+Whatever goes wrong with the disk is told once, tried again each five seconds, and never ends the gateway nor the recorder.
 """
 
 import contextlib
+import fcntl
 import os
 import threading
 import time
@@ -13,40 +15,44 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from kontronik_can_gw.capture import (
-    SUFFIX,
-    Kind,
-    block,
-    data_payload,
-    json_payload,
-    number_data,
-)
+from kontronik_can_gw.capture import SUFFIX, Kind, block, data_payload, json_payload, number_data
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
-from kontronik_can_gw.runtime.can_log import CanLog, suffix_of
-from kontronik_can_gw.runtime.statistics import Report
+from kontronik_can_gw.runtime.can_log import SUFFIXES, CanLog
 from kontronik_can_gw.runtime.threads import start_beside_the_loop
 from kontronik_can_gw.telemetry import MS, SECOND
 
 CAPACITY = 50_000
 """Entries that may wait to be written: about two minutes of one ESC, 15 seconds of eight."""
 PERIOD_S = 0.5
+_AT_ONCE = 5000
+"""Entries taken together, so that other threads have their turn between."""
 _CLOSE_S = 0.35
 _RETRY_NS = 5 * SECOND
 _LOOK_AT_SPACE_NS = 5 * SECOND
 _CLOCK_NS = 10 * SECOND
+_STATE_NS = 2 * SECOND
 _STEP_NS = MS
+_JUMP_NS = SECOND // 10
 _SLOW_NS = 5 * SECOND
 _MB = 1_000_000
-_LARGEST_BLOCK = 1 << 22
 
 Item = tuple[int, int, int, Any, int]
+"""(time, kind, ESC, data, flags), as of ``capture.Entry``."""
 _SENT, _RECEIVED = 100, 101
 """Kinds of items for the CAN log only; their data is the frame."""
+
+
+class Report(NamedTuple):
+    """What went wrong (``begins``) or is right again. ``name`` tells faults of different kinds apart."""
+
+    name: str
+    begins: bool
+    text: str
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class RecordSettings:
     least_free_bytes: int = 100 * _MB
     """With less than this free nothing is written."""
     can_log: str = "none"
-    """none, candump, asc, blf, trc or mf4."""
+    """none, candump, asc, blf or trc."""
     channel: str = "can0"
     """The interface's name in a candump log."""
 
@@ -80,21 +86,24 @@ class RecorderFacts:
 
 
 class Recorder:
-    """Writes what it is given from ``start`` until ``close``. RunError by ``start`` where the folder cannot be used."""
+    """Writes what it is given from ``start`` until ``close``."""
 
     def __init__(self, settings: RecordSettings, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self.settings = settings
         self.facts = RecorderFacts()
-        self._clock = clock
-        self._entries: deque[Item] = deque()
-        self._lost = 0
-        self._told_lost = 0
-        self._reports: deque[Report] = deque()
         self.header: Mapping[str, Any] = {}
         """What is known of gateway and ESCs, set before ``start``; a part's own numbers are added."""
-        self._state: Mapping[str, Any] = {}
+        self._clock = clock
+        self._entries: deque[Item] = deque()
+        self._overflowed = 0
+        """Entries that found no room: the loop's count."""
+        self._unwritten = 0
+        """Entries that could not be written: the thread's count."""
+        self._told_overflow = 0
+        self._reports: deque[Report] = deque()
+        self._state_ns = 0
         self._devices: list[Any] = []
-        self._news: dict[str, Any] | None = None
+        self._told_devices: list[Any] = []
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self._busy_since: int | None = None
@@ -113,30 +122,27 @@ class Recorder:
 
     # --- the loop's side
 
-    def start(self) -> None:
-        """Begin to write."""
+    def start(self, wait: bool = False) -> None:
+        """Begin to write. RunError where the folder cannot be used, unless ``wait``: then it is tried again and again."""
         folder = self.settings.folder
         try:
-            folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-            if not os.access(folder, os.W_OK | os.X_OK):
-                raise RunError(
-                    f"captures: {folder}: may not be written to. Give another folder (record.directory, --record)."
-                )
+            _make_folder(folder)
         except OSError as error:
-            raise RunError(
-                f"captures: {folder}: {error.strerror}. Give another folder (record.directory, --record)."
-            ) from None
+            if not wait:
+                raise RunError(
+                    f"captures: {folder}: {error.strerror}. Give another folder (record.directory, --record)."
+                ) from None
         thread = threading.Thread(target=self._run_thread, name="recorder", daemon=True)
         if not start_beside_the_loop(thread):
             raise RunError("captures: the system gives no thread to write them")
         self._thread = thread
 
-    def put(self, time_ns: int, kind: int, index: int, data: bytes, flags: int) -> None:
+    def put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int) -> None:
         """Record an entry, as of ``capture.Entry``. Never waits."""
         if len(self._entries) >= CAPACITY:
-            self._lost += 1
+            self._overflowed += 1
         else:
-            self._entries.append((time_ns, kind, index, data, flags))
+            self._entries.append((time_ns, kind, esc, data, flags))
 
     @property
     def wants_frames(self) -> bool:
@@ -145,36 +151,34 @@ class Recorder:
 
     def put_frame(self, frame: CanFrame, time_ns: int, received: bool) -> None:
         """Record a frame that was sent or received, for the CAN log."""
-        if self.settings.can_log != "none" and len(self._entries) < CAPACITY:
+        if len(self._entries) < CAPACITY:
             self._entries.append((time_ns, _RECEIVED if received else _SENT, 0, frame, 0))
 
-    def note(self, state: Mapping[str, Any], devices: list[Any]) -> None:
-        """How the gateway is now (for the header of the next part), and what is known of the devices (told when it changes)."""
-        self._state = state
-        if devices != self._devices:
-            self._devices = devices
-            self._news = {"devices": devices}
+    def note(self, gateway: Gateway, now: int) -> None:
+        """How the gateway is now: what a replay of a later part begins with, and what is known of the devices."""
+        self._devices = devices_of(gateway)
+        if now - self._state_ns >= _STATE_NS:
+            self._state_ns = now
+            self.put(now, Kind.STATE, 0, json_payload(state_of(gateway)), 0)
 
     def reports(self, now: int) -> list[Report]:
         """Take what went wrong, or is right again, since the last call."""
         taken: list[Report] = []
         while self._reports:
             taken.append(self._reports.popleft())
-        if self._lost != self._told_lost and self._lost - self._told_lost >= max(1, self._told_lost):
-            self._told_lost = self._lost
-            taken.append(
-                Report(True, f"captures: {self._lost} entries could not be recorded so far: the disk is too slow")
-            )
-        since = self._busy_since
+        if self._overflowed >= max(1, 2 * self._told_overflow):
+            self._told_overflow = self._overflowed
+            text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
+            taken.append(Report("losses", True, text))
+        since, folder = self._busy_since, self.settings.folder
         if since is not None and now - since > _SLOW_NS and not self._told_slow:
             self._told_slow = True
-            taken.append(
-                Report(True, f"captures: {self.settings.folder}: the disk does not answer; the gateway is not held up.")
-            )
+            text = f"captures: {folder}: the disk does not answer; the gateway is not held up."
+            taken.append(Report("disk", True, text))
         elif since is None and self._told_slow:
             self._told_slow = False
-            taken.append(Report(False, f"captures: {self.settings.folder}: the disk answers again"))
-        self.facts.lost = self._lost
+            taken.append(Report("disk", False, f"captures: {folder}: the disk answers again"))
+        self.facts.lost = self._overflowed + self._unwritten
         return taken
 
     def close(self) -> None:
@@ -187,25 +191,27 @@ class Recorder:
     # --- the thread's side
 
     def _run_thread(self) -> None:
-        try:
-            while not self._ending.wait(PERIOD_S):
-                self._work()
+        while not self._ending.wait(PERIOD_S):
             self._work()
+        self._work()
+        try:
             self._end_part()
-        except Exception as error:  # a mistake of ours in here must not go unsaid
-            self.facts.problem = repr(error)
-            self._reports.append(Report(True, f"captures: recording has ended: {error!r}"))
+        except Exception as error:  # whatever it is, the gateway is ending
+            self._fail(error, self._clock(), [])
 
     def _work(self) -> None:
         """Write what has come."""
         entries = self._entries
-        items = [entries.popleft() for _ in range(len(entries))]
-        now = self._clock()
-        self._busy_since = now
-        try:
-            self._write(items, now)
-        except OSError as error:
-            self._fail(error.strerror or str(error), now, len(items))
+        self._busy_since = self._clock()
+        while True:
+            items = [entries.popleft() for _ in range(min(_AT_ONCE, len(entries)))]
+            now = self._clock()
+            try:
+                self._write(items, now)
+            except Exception as error:  # a mistake of ours, or of python-can's writers, is no reason to end either
+                self._fail(error, now, items)
+            if not entries or self._file is None:
+                break
         self._busy_since = None
 
     def _write(self, items: list[Item], now: int) -> None:
@@ -214,30 +220,34 @@ class Recorder:
             return
         if self._file is None:
             self._begin_part(now)
-        assert self._file is not None
-        if (news := self._news) is not None:
-            self._news = None
-            self._file.write(b"I", json_payload(news))
+        file = self._file
+        assert file is not None
+        if self._devices != self._told_devices:
+            self._told_devices = self._devices
+            file.write(b"I", json_payload({"devices": self._told_devices}))
+        before = self._offset
         if items:
-            self._remark(items, now)
-        self._file.take(items, self._offset)
-        self.facts.bytes += self._file.sync()
-        self.facts.file = str(self._file.path)
+            self._remark(file, items, now)
+        file.take(items, before)
+        self.facts.bytes += file.sync()
+        self.facts.file = str(file.path)
         if self._failed:
             self._failed = False
             self.facts.problem = ""
-            self._reports.append(Report(False, f"captures: {self._file.path} is written"))
+            self._reports.append(Report("folder", False, f"captures: {file.path} is written"))
         settings = self.settings
-        too_large = settings.part_bytes and self._file.size >= settings.part_bytes
-        if too_large or (settings.part_ns and now - self._file.begun >= settings.part_ns):
+        over = [settings.part_bytes and file.size >= settings.part_bytes]
+        over.append(settings.part_ns and now - file.begun >= settings.part_ns)
+        # a log whose clock goes back, or leaps, is read by nobody
+        over.append(self.wants_frames and abs(self._offset - before) > _JUMP_NS)
+        if any(over):
             self._end_part()
 
-    def _remark(self, items: list[Item], now: int) -> None:
+    def _remark(self, file: "_Files", items: list[Item], now: int) -> None:
         """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
-        assert self._file is not None
         last = items[-1][0]
-        if (lost := self._lost - self._file.lost) > 0:
-            self._file.lost += lost
+        if (lost := self._overflowed + self._unwritten - file.lost) > 0:
+            file.lost += lost
             items.append((last, Kind.LOST, 0, number_data(lost), 0))
         if now - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = now
@@ -247,7 +257,10 @@ class Recorder:
                 items.append((last, Kind.CLOCK, 0, number_data(last + offset), 0))
 
     def _may_write(self, now: int) -> bool:
+        if self._file is None and now < self._retry_ns:
+            return False
         if now >= self._space_ns:
+            _make_folder(self.settings.folder)
             self._space_ns = now + _LOOK_AT_SPACE_NS
             self._remove_oldest()
             found = os.statvfs(self.settings.folder)
@@ -257,27 +270,27 @@ class Recorder:
                 self._end_part()
                 least = self.settings.least_free_bytes // _MB
                 self._say_failed(f"{self.settings.folder}: less than {least} MB are free: nothing is recorded")
-        return not self._full and (self._file is not None or now >= self._retry_ns)
+        return not self._full
 
     def _lose(self, items: list[Item]) -> None:
-        self._lost += sum(item[1] < _SENT for item in items)
-        self._told_lost = self._lost  # why, was said
+        self._unwritten += sum(item[1] < _SENT for item in items)
 
-    def _fail(self, reason: str, now: int, count: int) -> None:
-        self._lost += count
-        self._told_lost = self._lost
+    def _fail(self, error: Exception, now: int, items: list[Item]) -> None:
+        self._lose(items)
         file, self._file = self._file, None
         if file is not None:
+            self._recorded_losses = file.lost
             file.abandon()
         self.facts.file = ""
-        self._retry_ns = now + _RETRY_NS
+        self._retry_ns = self._space_ns = now + _RETRY_NS
+        reason = error.strerror or str(error) if isinstance(error, OSError) else repr(error)
         self._say_failed(f"{self.settings.folder}: cannot be written: {reason}. Trying again.")
 
     def _say_failed(self, text: str) -> None:
         self.facts.problem = text
         if not self._failed:
             self._failed = True
-            self._reports.append(Report(True, f"captures: {text}"))
+            self._reports.append(Report("folder", True, f"captures: {text}"))
 
     def _begin_part(self, now: int) -> None:
         wall = time.time_ns()
@@ -285,44 +298,42 @@ class Recorder:
         self._clock_ns = now
         if not self._stamp:
             self._stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(wall // SECOND))
+        part, self._part = self._part, self._part + 1  # a name is tried once
+        self._told_devices = self._devices
         header = dict(self.header) | {
             "run": self._run,
-            "part": self._part,
+            "part": part,
             "monotonic_ns": now,
             "wall_ns": wall,
-            "devices": self._devices,
+            "devices": self._told_devices,
         }
-        if self._part:
-            header["state"] = self._state
-        base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{self._part:04d}"
+        base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{part:05d}"
         self._file = _Files(base, json_payload(header), now, self.settings)
         self._file.lost = self._recorded_losses
-        self._news = None
-        self._part += 1
         self._remove_oldest()
 
     def _end_part(self) -> None:
         file, self._file = self._file, None
         if file is not None:
             self._recorded_losses = file.lost
-            self.facts.bytes += file.close()
             self.facts.file = ""
+            self.facts.bytes += file.close()
 
     def _remove_oldest(self) -> None:
-        """Keep the folder within its bound; what is being written stays."""
+        """Keep the folder within its bound; what is being written, by whomever, stays."""
         if not self.settings.keep_bytes:
             return
-        current = "" if self._file is None else self._file.path.stem
-        found = sorted(
-            (p.stem, p, p.lstat().st_size)
-            for p in self.settings.folder.iterdir()
-            if is_ours(p.name) and not p.is_symlink() and p.is_file()
-        )
-        total = sum(size for _, _, size in found)
-        for stem, path, size in found:
+        found: list[tuple[int, str, int, Path]] = []
+        for path in self.settings.folder.iterdir():
+            with contextlib.suppress(FileNotFoundError):  # another gateway has removed it
+                if is_ours(path.name) and not path.is_symlink() and path.is_file():
+                    status = path.stat()
+                    found.append((status.st_mtime_ns, path.name, status.st_size, path))
+        total = sum(size for _, _, size, _ in found)
+        for _, _, size, path in sorted(found):
             if total <= self.settings.keep_bytes:
                 return
-            if stem != current:
+            if not _is_being_written(path):
                 with contextlib.suppress(OSError):
                     path.unlink()
                     total -= size
@@ -334,97 +345,7 @@ def is_ours(name: str) -> bool:
     stamp, _, rest = stem.partition("-")
     run, _, part = rest.partition("-")
     made = len(stamp) == 16 and stamp.endswith("Z") and len(run) == 6 and part.isdecimal()
-    return made and f".{suffix}" in (SUFFIX, *(suffix_of(kind) for kind in ("candump", "asc", "blf", "trc", "mf4")))
-
-
-class _Files:
-    """One part: the capture, and the CAN log beside it."""
-
-    def __init__(self, base: Path, header: bytes, now: int, settings: RecordSettings) -> None:
-        self.path = base.with_name(base.name + SUFFIX)
-        self.begun = now
-        self.size = 0
-        self.lost = 0
-        self._number = 0
-        self._new = 0
-        self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
-        self._log: CanLog | None = None
-        try:
-            self.write(b"H", header)
-            _sync_folder(base.parent)
-            if settings.can_log != "none":
-                self._log = CanLog(
-                    base.with_name(base.name + suffix_of(settings.can_log)), settings.can_log, settings.channel
-                )
-        except BaseException:
-            os.close(self._fd)
-            raise
-
-    def write(self, kind: bytes, payload: bytes) -> None:
-        """Append a block."""
-        data = memoryview(block(kind, self._number, payload))
-        self._number += 1
-        self.size += len(data)
-        self._new += len(data)
-        while data:
-            data = data[os.write(self._fd, data) :]
-
-    def take(self, items: list[Item], offset: int) -> None:
-        """Append what came; ``offset``: wall clock less monotonic clock."""
-        entries: list[Item] = []
-        room = _LARGEST_BLOCK
-        for item in items:
-            if item[1] >= _SENT:
-                if self._log is not None:
-                    self._log.add(item[3], item[0] + offset, item[1] == _RECEIVED)
-                continue
-            entries.append(item)
-            room -= 16 + len(item[3])
-            if room < 0:
-                self._write_entries(entries)
-                entries, room = [], _LARGEST_BLOCK
-        self._write_entries(entries)
-
-    def _write_entries(self, entries: list[Item]) -> None:
-        if entries:
-            self.write(b"D", data_payload((t, kind, index, data, flags) for t, kind, index, data, flags in entries))
-
-    def sync(self) -> int:
-        """Force to the disk what was written; how many bytes since the last call."""
-        if self._log is not None:
-            self._log.flush()
-        if self._new:
-            os.fdatasync(self._fd)
-        new, self._new = self._new, 0
-        return new
-
-    def close(self) -> int:
-        """Close in good order; how many bytes since the last ``sync``."""
-        try:
-            self.write(b"E", b"")
-            if self._log is not None:
-                self._log.close()
-            os.fdatasync(self._fd)
-        finally:
-            os.close(self._fd)
-        return self._new
-
-    def abandon(self) -> None:
-        """Close without writing any more."""
-        with contextlib.suppress(OSError):
-            os.close(self._fd)
-        if self._log is not None:
-            self._log.abandon()
-
-
-def _sync_folder(folder: Path) -> None:
-    """So that the file's name survives a loss of power too."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        with contextlib.suppress(OSError):  # a file system that cannot
-            os.fsync(fd)
-    finally:
-        os.close(fd)
+    return made and f".{suffix}" in (SUFFIX, *SUFFIXES.values())
 
 
 def state_of(gateway: Gateway) -> dict[str, Any]:
@@ -449,3 +370,110 @@ def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
         }
         for esc in gateway.escs
     ]
+
+
+class _Files:
+    """One part: the capture, locked while it is written, and the CAN log beside it."""
+
+    def __init__(self, base: Path, header: bytes, now: int, settings: RecordSettings) -> None:
+        self.path = base.with_name(base.name + SUFFIX)
+        self.begun = now
+        self.size = 0
+        self.lost = 0
+        self._number = 0
+        self._new = 0
+        self._log: CanLog | None = None
+        self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
+        try:
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self.write(b"H", header)
+            _sync_folder(base.parent)
+            if settings.can_log != "none":
+                self._log = CanLog(
+                    base.with_name(base.name + SUFFIXES[settings.can_log]), settings.can_log, settings.channel
+                )
+        except BaseException:  # nothing is in there yet
+            os.close(self._fd)
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+            raise
+
+    def write(self, kind: bytes, payload: bytes) -> None:
+        """Append a block."""
+        data = memoryview(block(kind, self._number, payload))
+        self._number += 1
+        self.size += len(data)
+        self._new += len(data)
+        while data:
+            data = data[os.write(self._fd, data) :]
+
+    def take(self, items: list[Item], offset: int) -> None:
+        """Append what came; ``offset``: wall clock less monotonic clock."""
+        entries = [item for item in items if item[1] < _SENT]
+        if entries:
+            self.write(b"D", data_payload(entries))
+        if self._log is not None:
+            for time_ns, kind, _, frame, _ in items:
+                if kind >= _SENT:
+                    self._log.add(frame, time_ns + offset, kind == _RECEIVED)
+
+    def sync(self) -> int:
+        """Force to the disk what was written; how many bytes since the last call."""
+        if self._log is not None:
+            self._log.flush()
+        if self._new:
+            os.fdatasync(self._fd)
+        new, self._new = self._new, 0
+        return new
+
+    def close(self) -> int:
+        """Close in good order; how many bytes since the last ``sync``."""
+        try:
+            try:
+                self.write(b"E", b"")
+                os.fdatasync(self._fd)
+            finally:
+                os.close(self._fd)
+        finally:
+            if self._log is not None:
+                self._log.close()
+        return self._new
+
+    def abandon(self) -> None:
+        """Close without writing any more."""
+        with contextlib.suppress(OSError):
+            os.close(self._fd)
+        if self._log is not None:
+            self._log.abandon()
+
+
+def _make_folder(folder: Path) -> None:
+    folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(1, "may not be written to")
+
+
+def _is_being_written(path: Path) -> bool:
+    """True for a capture that a recorder has open, here or in another process, and for the log beside it."""
+    try:
+        fd = os.open(path.with_suffix(SUFFIX), os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:  # a log whose capture has gone
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(fd)
+    return False
+
+
+def _sync_folder(folder: Path) -> None:
+    """So that the file's name survives a loss of power too."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with contextlib.suppress(OSError):  # a file system that cannot
+            os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -50,14 +50,18 @@ class Bench:
         )
         self._waiting = Mailboxes()
         self._saves: list[int] = []
+        self._is_open = True
 
     def _put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int) -> None:
         self.entries.append(Entry(time_ns, kind, esc, data, flags))
 
     def take(self, now: int) -> None:
         frames = in_order(self.gateway.take_frames(), self._waiting)
-        self.gateway.status.sent_frames += len(frames)
-        self.sent += [TimedFrame(now, frame) for frame in frames]
+        if self._is_open:
+            self.gateway.status.sent_frames += len(frames)
+            self.sent += [TimedFrame(now, frame) for frame in frames]
+        elif frames:
+            self.gateway.not_sent(now)
         self._saves += [esc for esc, _ in self.gateway.take_saves()]
 
     def live(self, seed: int, seconds: float, wild: bool = True) -> "Bench":
@@ -110,14 +114,16 @@ class Bench:
             (gateway.port_opened if open_ports[index] else gateway.port_lost)(index, now)
         elif what < 0.006:
             gateway.set_can_state(rng.choice(list(CanState)), now)
-        elif what < 0.008:
+            self._is_open = self._is_open and gateway.status.can_state is not CanState.DOWN
+        elif what < 0.01:
+            self._is_open = True
             gateway.can_opened(now)
             gateway.can_returned(now)
-        elif what < 0.01:
+        elif what < 0.012:
             gateway.status.bus_off_count += 1
             gateway.status.replaced_frames += rng.randrange(5)
             gateway.escs[index].line_errors += 3
-        elif what < 0.012:
+        elif what < 0.014:
             gateway.receive_overrun(now)
         elif what < 0.03 and self._saves:
             gateway.saved(self._saves.pop(0), rng.choice([None, "disk full"]), now)

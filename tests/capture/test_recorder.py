@@ -6,18 +6,20 @@ import stat
 import threading
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import can
 import pytest
-from capture_bench import made
+from capture_bench import Bench, made
 
 from kontronik_can_gw.capture import Entry, Kind, read_number
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.offline.inputs import CaptureInput, open_input
-from kontronik_can_gw.runtime import can_log, recorder
-from kontronik_can_gw.runtime.can_log import check_kind
+from kontronik_can_gw.protocol import InfoData
+from kontronik_can_gw.runtime import recorder
+from kontronik_can_gw.runtime.can_log import CanLog
 from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder, RecordSettings, is_ours
 from kontronik_can_gw.telemetry import SECOND
 
@@ -52,7 +54,7 @@ def put(to: Recorder, listed: list[Entry]) -> None:
 def recorded(folder: Path) -> list[Entry]:
     with open_input(folder) as found:
         assert isinstance(found, CaptureInput)
-        return [entry for entry in found.entries() if entry.kind != Kind.CLOCK]
+        return [entry for entry in found.entries() if entry.kind not in (Kind.CLOCK, Kind.STATE)]
 
 
 def until(condition: Callable[[], bool], seconds: float = 20) -> None:
@@ -87,7 +89,7 @@ def test_parts_by_size_go_on_from_each_other(tmp_path: Path) -> None:
     it.close()
     files = sorted(tmp_path.iterdir())
     assert len(files) > 3
-    assert [f.stem.rpartition("-")[2] for f in files] == [f"{n:04d}" for n in range(len(files))]
+    assert [f.stem.rpartition("-")[2] for f in files] == [f"{n:05d}" for n in range(len(files))]
     assert recorded(tmp_path) == listed
     with open_input(tmp_path) as found:
         assert isinstance(found, CaptureInput)
@@ -128,11 +130,14 @@ def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
 
 def test_the_header_tells_where_it_comes_from(tmp_path: Path) -> None:
     it = begun(tmp_path)
-    it.note({}, [None])
+    bench = Bench(*made(1))
+    it.note(bench.gateway, 0)
     put(it, entries(1))
     until(lambda: it.facts.bytes > 0)
-    it.note({}, [{"device": "KOSMIK", "variant": 160, "firmware": "4.17", "layout": "V4"}])
-    until(lambda: it._news is None)
+    bench.gateway.escs[0].last_info = InfoData(device_and_variant=1 << 10 | 160, firmware_word=4 << 8 | 17)
+    bench.gateway.escs[0].layout = 1
+    it.note(bench.gateway, 1)
+    until(lambda: it._told_devices == it._devices)
     it.close()
     with open_input(tmp_path) as found:
         assert isinstance(found, CaptureInput)
@@ -193,14 +198,33 @@ def test_the_oldest_captures_go_and_nothing_else(tmp_path: Path) -> None:
     put(it, entries(5))
     it.close()
     assert len(list(tmp_path.iterdir())) == 13
-    it = begun(tmp_path, keep_bytes=4_000)
+    it = begun(tmp_path, keep_bytes=22_000)
     put(it, entries(5))
     it.close()
     left = {p.name for p in tmp_path.iterdir()}
     assert "flight.kcap" in left
     assert "20250101T000000Z-abcdef-0000.txt" in left
-    assert names[0] not in left
-    assert sum(p.stat().st_size for p in tmp_path.iterdir() if is_ours(p.name)) <= 40_000
+    assert sum(p.stat().st_size for p in tmp_path.iterdir() if is_ours(p.name)) <= 22_000
+    assert 1 < len([name for name in left if "abcdef" in name]) < 11
+
+
+def test_what_somebody_else_is_writing_stays(tmp_path: Path) -> None:
+    """Two gateways, one folder: the older file is in use, the log beside it too."""
+    first = begun(tmp_path, can_log="candump")
+    put(first, entries(5))
+    first.put_frame(FRAMES[0][0], 1, False)
+    until(lambda: first.facts.bytes > 0 and not first._entries)
+    in_use = {p.name for p in tmp_path.iterdir()}
+    assert len(in_use) == 2
+    closed = tmp_path / "20990101T000000Z-abcdef-00000.kcap"  # a clock that was wrong: newest by name, oldest by age
+    closed.write_bytes(bytes(30_000))
+    os.utime(closed, (1, 1))
+    second = begun(tmp_path, keep_bytes=1)
+    put(second, entries(5))
+    until(lambda: second.facts.bytes > 0 and not closed.exists())
+    assert in_use <= {p.name for p in tmp_path.iterdir()}
+    second.close()
+    first.close()
 
 
 def test_a_disk_that_fails_costs_what_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,7 +323,7 @@ def test_another_file_is_never_overwritten_nor_a_link_followed(tmp_path: Path, m
     target.write_text("precious")
     folder = tmp_path / "captures"
     folder.mkdir()
-    (folder / "20260101T000000Z-000000-0000.kcap").symlink_to(target)
+    (folder / "20260101T000000Z-000000-00000.kcap").symlink_to(target)
     it = begun(folder)
     put(it, entries(3))
     until(lambda: it.facts.problem != "")
@@ -317,9 +341,8 @@ FRAMES = [
 ]
 
 
-@pytest.mark.parametrize("kind", ["candump", "asc", "blf", "trc", "mf4"])
+@pytest.mark.parametrize("kind", ["candump", "asc", "blf", "trc"])
 def test_the_can_log_is_read_by_python_can(kind: str, tmp_path: Path) -> None:
-    check_kind(kind)
     it = begun(tmp_path, can_log=kind, channel="can7")
     start = time.monotonic_ns()
     wall = time.time()
@@ -343,12 +366,6 @@ def test_the_can_log_is_read_by_python_can(kind: str, tmp_path: Path) -> None:
     assert len(recorded(next(p for p in tmp_path.iterdir() if p.suffix == ".kcap"))) == 3
 
 
-def test_mf4_without_its_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(can_log, "find_spec", lambda _name: None)
-    with pytest.raises(UserError, match=r"kontronik-can-gw\[mf4\]"):
-        check_kind("mf4")
-
-
 def test_the_wall_clock_that_is_set_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now, shift = 10 * SECOND, 0
     it = begun(tmp_path, clock=lambda: now)
@@ -369,3 +386,115 @@ def test_the_wall_clock_that_is_set_is_followed(tmp_path: Path, monkeypatch: pyt
     assert first is not None
     assert second is not None
     assert second - first == 3612 * SECOND
+
+
+def test_a_part_that_could_not_be_begun_does_not_stand_in_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 10 * SECOND
+    full = True
+    real = os.write
+
+    def write(fd: int, data: bytes) -> int:
+        if full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(fd, data)
+
+    monkeypatch.setattr(os, "write", write)
+    it = begun(tmp_path, clock=lambda: now)
+    put(it, entries(3))
+    until(lambda: it.facts.problem != "")
+    assert list(tmp_path.iterdir()) == []
+    full = False
+    now += 6 * SECOND
+    until(lambda: it._file is not None)
+    put(it, entries(3, 3))
+    it.close()
+    assert [e for e in recorded(tmp_path) if e.kind == Kind.BYTES] == entries(3, 3)
+
+
+def test_a_folder_that_goes_comes_again(tmp_path: Path) -> None:
+    now = 10 * SECOND
+    folder = tmp_path / "stick" / "captures"
+    it = begun(folder, clock=lambda: now, part_bytes=1)
+    put(it, entries(3))
+    until(lambda: it.facts.bytes > 0 and it._file is None)
+    for file in folder.iterdir():
+        file.unlink()
+    folder.rmdir()
+    folder.parent.rmdir()
+    now += 6 * SECOND
+    put(it, entries(3, 3))
+    until(folder.exists)
+    it.close()
+    assert [e for e in recorded(folder) if e.kind == Kind.BYTES] == entries(3, 3)
+
+
+def test_a_folder_that_is_not_there_yet_is_waited_for_where_devices_are(tmp_path: Path) -> None:
+    now = 10 * SECOND
+    place = tmp_path / "place"
+    place.write_text("")
+    it = Recorder(RecordSettings(place / "captures", least_free_bytes=0), lambda: now)
+    it.header = HEADER
+    it.start(wait=True)
+    put(it, entries(3))
+    until(lambda: it.facts.problem != "")
+    place.unlink()
+    now += 6 * SECOND
+    until(lambda: it._file is not None)
+    put(it, entries(3, 3))
+    it.close()
+    assert [r.begins for r in it.reports(0)] == [True, False]
+    assert [e for e in recorded(place / "captures") if e.kind == Kind.BYTES] == entries(3, 3)
+
+
+def test_a_writer_that_fails_in_a_way_of_its_own_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 10 * SECOND
+
+    def fail(*_: object) -> None:
+        raise ValueError("python-can's own")
+
+    it = begun(tmp_path, clock=lambda: now, can_log="asc")
+    with monkeypatch.context() as patch:
+        patch.setattr(CanLog, "add", fail)
+        it.put_frame(FRAMES[0][0], now, False)
+        until(lambda: it.facts.problem != "")
+    assert "python-can's own" in it.reports(0)[0].text
+    now += 6 * SECOND
+    until(lambda: it._file is not None)
+    put(it, entries(3))
+    it.close()
+    assert [e for e in recorded(tmp_path) if e.kind == Kind.BYTES] == entries(3)
+
+
+@pytest.mark.parametrize("step", [-3600, 3600])
+def test_a_clock_that_leaps_begins_another_log(step: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, shift = 10 * SECOND, 0
+    it = begun(tmp_path, clock=lambda: now, can_log="candump")
+    monkeypatch.setattr(time, "time_ns", lambda: now + 1_700_000_000 * SECOND + shift)
+    for number in range(6):
+        if number == 3:
+            shift = step * SECOND
+        it.put(now, Kind.BYTES, 0, bytes((number,)), 0)
+        it.put_frame(FRAMES[0][0], now, False)
+        until(lambda: not it._entries and it._busy_since is None)
+        now += 11 * SECOND
+    it.close()
+    logs = sorted(tmp_path.glob("*.log"))
+    assert len(logs) == 2
+    for log in logs:
+        times = [float(line.split()[0].strip("()")) for line in log.read_text().splitlines()]
+        assert times == sorted(times)
+        assert all(5 < b - a < 20 for a, b in pairwise(times))
+    assert [e.data[0] for e in recorded(tmp_path)] == list(range(6))
+
+
+def test_entries_without_a_frame_count_as_lost_and_frames_do_not(tmp_path: Path) -> None:
+    it = begun(tmp_path, least_free_bytes=1 << 60)
+    put(it, entries(5))
+    for _ in range(100):
+        it.put_frame(FRAMES[0][0], 1, False)
+    until(lambda: it.facts.problem != "" and not it._entries)
+    it.close()
+    it.reports(0)
+    assert it.facts.lost == 5

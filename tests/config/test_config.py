@@ -680,7 +680,7 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     **{place: st.integers(*ends) for place, ends in RANGES.items()},
     **dict.fromkeys(STRINGS, st.text(min_size=1, max_size=8).map(lambda text: text.strip() or "x")),
     **dict.fromkeys(BOOLEANS, st.booleans()),
-    ("record", "can_log"): st.sampled_from(["none", "candump", "asc", "blf", "trc", "mf4"]),
+    ("record", "can_log"): st.sampled_from(["none", "candump", "asc", "blf"]),
     ("dbc", "on_loss"): st.sampled_from(["not_available", "silent"]),
     ("esc", "device"): st.sampled_from([device.text for device in Device]),
     ("can", "options"): st.dictionaries(
