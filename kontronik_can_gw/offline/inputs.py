@@ -142,6 +142,10 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
     )
 
 
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)[:400]
+
+
 def _parts(path: Path) -> list[Path] | None:
     """The captures that a folder, or the beginning of a name, means; None for a plain file."""
     if path.is_dir():
@@ -179,8 +183,11 @@ class CaptureInput(_Base):
         try:
             self.setup = CaptureSetup.of(self.header)
             found = self.setup.database()
-        except (ValueError, TypeError, LookupError) as error:
-            raise UserError(f"{self._paths[0]}: {error}") from None
+            self.setup.gateway(Layout("", "", ()) if found is None else found[1], 0)
+        except UserError as error:
+            raise UserError(*(f"{self._paths[0]}: {_printable(problem)}" for problem in error.problems)) from None
+        except Exception as error:  # a header may hold anything
+            raise UserError(f"{self._paths[0]}: {_printable(str(error))}") from None
         name = str(self._paths[0])
         if len(self._paths) > 1:
             name = f"{self._paths[0].parent}/{self._paths[0].stem.rpartition('-')[0]}"
@@ -295,7 +302,7 @@ class CaptureInput(_Base):
         expected, ended = 0, False
         for found in self._blocks(path):
             if isinstance(found, Damage):
-                self.damage.append(f"{path.name}: {found.length} bytes at {found.offset} are damaged")
+                self._tell_damage(f"{path.name}: {found.length} bytes at {found.offset} are damaged")
                 continue
             if found.number > expected:
                 self._tell_damage(
@@ -313,7 +320,7 @@ class CaptureInput(_Base):
             except ValueError as error:
                 self._tell_damage(f"{path.name}: the block at {found.offset} {error}")
         if not ended:
-            self.damage.append(f"{path.name}: was not closed: up to the last second before its end may be missing")
+            self._tell_damage(f"{path.name}: was not closed: up to the last second before its end may be missing")
 
     def _tell_damage(self, text: str) -> None:
         if len(self.damage) < _MOST_DAMAGE:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -326,3 +327,41 @@ def test_another_dbc_shows_a_capture_in_its_own_way(tmp_path: Path) -> None:
         assert "battery_voltage" in columns(found)
         assert list(found.samples())[-1].values[columns(found)["battery_voltage"]] is not None
     assert CanFrame(1, b"").key == 1
+
+
+def test_pole_pairs_and_gear_are_those_of_the_capture_whatever_dbc_shows_it(tmp_path: Path) -> None:
+    setup, layout = made(2)
+    escs = (replace(setup.escs[0], pole_pairs=7), replace(setup.escs[1], pole_pairs=5))
+    bench, _ = plain_run(3, escs=2)
+    with_dbc = capture(tmp_path / "a.kcap", replace(setup, escs=escs), bench.entries)
+    without = capture(tmp_path / "b.kcap", replace(setup, escs=escs, dbc=None), bench.entries)
+    shown = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+    assert layout.messages
+    for path, given in ((with_dbc, None), (without, None), (with_dbc, shown), (without, shown)):
+        with open_input(path, given) as found:
+            at = columns(found)
+            row = list(found.samples())[-1].values
+            for index, poles in enumerate((7, 5)):
+                electrical, motor = row[at[f"E{index}ElectricalSpeed"]], row[at[f"E{index}MotorSpeed"]]
+                assert isinstance(electrical, int)
+                assert motor == (2 * electrical + poles) // (2 * poles)
+
+
+def test_a_dbc_of_other_escs_is_refused(tmp_path: Path) -> None:
+    bench, _ = plain_run(1, escs=2)
+    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
+    from kontronik_can_gw.cli import main
+
+    three = tmp_path / "three.dbc"
+    assert main(["dbc", "--esc", "3", "-o", str(three)]) == 0
+    with pytest.raises(UserError, match="describes 3 ESCs, the recording has 2"):
+        open_input(path, layout_of_dbc(three))
+
+
+def test_a_part_without_a_header_is_told_and_the_others_are_read(tmp_path: Path) -> None:
+    bench, _ = plain_run(1)
+    (tmp_path / "20260101T000000Z-aaaaaa-00000.kcap").write_bytes(b"")
+    capture(tmp_path / "20260101T000000Z-aaaaaa-00001.kcap", bench.setup, bench.entries, part=1)
+    with open_input(tmp_path) as found:
+        assert len(list(found.samples())) > 50
+        assert "20260101T000000Z-aaaaaa-00000.kcap: has no header that could be read" in found.damage

@@ -1,0 +1,178 @@
+"""Captures with right checksums and wrong contents: one line, or what makes sense; never another exception, nor a hang."""
+
+import copy
+import itertools
+import json
+import random
+import struct
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from capture_bench import START, Bench, made
+
+from kontronik_can_gw.capture import MAGIC, Block, Entry, Kind, Scanner, block, data_payload, json_payload
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.offline.inputs import CaptureInput, open_input
+
+VALUES: tuple[Any, ...] = (
+    *(None, 0, -1, 10**30, 1.5, 1e308, float("inf"), float("nan"), "", "x", "1/0", "1e9999", "9" * 5000),
+    *([], [1], {}, {"a": 1}, True),
+)
+GONE = object()
+
+
+@pytest.fixture(scope="module")
+def bench() -> Bench:
+    return Bench(*made(2, True)).live(3, 1)
+
+
+@pytest.fixture(scope="module")
+def header(bench: Bench) -> dict[str, Any]:
+    state = {"escs": [{"energy": 1, "run_time": 2, "losses": 3}] * 2, "can_state": 1, "started_ns": START}
+    times = {"monotonic_ns": START, "wall_ns": START, "created_ns": START}
+    more = times | {"run": "r", "part": 0, "devices": [None, None], "state": state}
+    found: dict[str, Any] = json.loads(json_payload(bench.setup.header() | more))
+    return found
+
+
+def places(found: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Every place in a JSON document."""
+    yield path
+    for key in found if isinstance(found, dict) else range(len(found)) if isinstance(found, list) else ():
+        yield from places(found[key], (*path, key))
+
+
+def changed(document: Any, path: tuple[Any, ...], value: Any) -> Any:
+    if not path:
+        return value
+    made_new = copy.deepcopy(document)
+    inner = made_new
+    for key in path[:-1]:
+        inner = inner[key]
+    if value is GONE:
+        del inner[path[-1]]
+    else:
+        inner[path[-1]] = value
+    return made_new
+
+
+def read_all(path: Path) -> None:
+    """Everything that is read of a capture; only our own errors may come."""
+    try:
+        with open_input(path) as found:
+            assert isinstance(found, CaptureInput)
+            for _ in found.frames(marked=True):
+                pass
+            for row in found.samples():
+                found.wall_ns(row.time_ns)
+            list(found.esc_bytes(1))
+            assert found.channel
+            assert found.provenance
+            assert len(found.damage) < 100
+    except (UserError, RunError) as error:
+        lines = error.problems
+    else:
+        return
+    assert lines
+    assert all(line.isprintable() for line in lines)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_wrong_values_in_the_header(seed: int, header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
+    path = tmp_path / "a.kcap"
+    data = block(b"D", 1, data_payload(bench.entries[:60])) + block(b"E", 2, b"")
+    combinations = list(itertools.product(places(header), (*VALUES, GONE)))
+    random.Random(seed).shuffle(combinations)
+    for place, value in combinations[:50]:
+        if not place and value is GONE:
+            continue
+        document = changed(header, place, value)
+        payload = json_payload(document) if isinstance(document, dict) else json.dumps(document).encode()
+        path.write_bytes(block(b"H", 0, payload) + data)
+        begin = time.monotonic()
+        read_all(path)
+        assert time.monotonic() - begin < 20, (place, str(value)[:20])
+
+
+def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
+    path = tmp_path / "a.kcap"
+    rng = random.Random(4)
+    for _ in range(25):
+        entries = list(bench.entries[:150])
+        for _ in range(20):
+            at = rng.randrange(len(entries))
+            entry = entries[at]
+            entries[at] = rng.choice(
+                [
+                    entry._replace(time_ns=rng.choice([0, 2**64 - 1, 2**62 + 1, rng.randrange(2**64)])),
+                    entry._replace(kind=rng.randrange(256)),
+                    entry._replace(esc=rng.randrange(65536)),
+                    entry._replace(data=rng.randbytes(rng.randrange(40))),
+                    entry._replace(flags=rng.randrange(256)),
+                    Entry(entry.time_ns, Kind.START, flags=1),
+                    Entry(entry.time_ns, Kind.STATE, 0, b'{"escs": 7}'),
+                    Entry(entry.time_ns, Kind.SAVED),
+                ]
+            )
+        path.write_bytes(block(b"H", 0, json_payload(header)) + block(b"D", 1, data_payload(entries)))
+        read_all(path)
+
+
+def test_json_that_is_nested_without_end(header: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "a.kcap"
+    deep = b"[" * 200_000
+    path.write_bytes(block(b"H", 0, deep))
+    read_all(path)
+    path.write_bytes(block(b"H", 0, json_payload(header)) + block(b"I", 1, deep))
+    read_all(path)
+
+
+def test_what_only_looks_like_blocks_costs_no_more_than_a_while() -> None:
+    """Heads that promise megabytes, one behind the other: each would have to be read to its end."""
+    head = struct.pack("<4scBHIII", MAGIC, b"D", 0, 0, 8_000_000, 8_000_000, 0) + b"\0\0\0\0"
+    good = block(b"D", 7, b"good")
+    data = head * 3000 + bytes(9_000_000) + good
+    begin = time.monotonic()
+    scanner = Scanner()
+    found = scanner.feed(data) + scanner.flush()
+    assert time.monotonic() - begin < 20
+    assert [b.payload for b in found if isinstance(b, Block)] in ([b"good"], [])
+    few = Scanner()
+    found = few.feed(head * 5 + bytes(9_000_000) + good) + few.flush()
+    assert [b.payload for b in found if isinstance(b, Block)] == [b"good"]
+
+
+def test_a_file_of_nothing_but_damage_is_summed_up(header: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "a.kcap"
+    empty = block(b"D", 1, data_payload([]))
+    path.write_bytes(block(b"H", 0, json_payload(header)) + (empty + b"x") * 20_000)
+    with open_input(path) as found:
+        assert list(found.frames()) == []
+        assert len(found.damage) < 60
+        assert "and more of that kind" in found.damage
+
+
+def test_a_name_from_the_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
+    path = tmp_path / "a.kcap"
+    entries = block(b"D", 1, data_payload(bench.entries))
+    forged = changed(header, ("configuration",), '[can]\nchannel = "can0 123#11\\n(1.0) can0"\n')
+    path.write_bytes(block(b"H", 0, json_payload(forged)) + entries)
+    with open_input(path) as found:
+        assert isinstance(found, CaptureInput)
+        assert found.channel == "can0"
+    path.write_bytes(block(b"H", 0, json_payload(changed(header, ("escs", 0, "name"), "a\nb"))) + entries)
+    with pytest.raises(UserError, match="header cannot be used"):
+        open_input(path)
+
+
+def test_a_bomb_is_not_inflated(header: dict[str, Any]) -> None:
+    packed = zlib.compress(bytes(64_000_000), 9)
+    head = struct.pack("<4scBHIII", MAGIC, b"D", 1, 0, len(packed), 5_000_000, 0)
+    bomb = head + struct.pack("<I", zlib.crc32(packed, zlib.crc32(head))) + packed
+    scanner = Scanner()
+    assert not any(isinstance(b, Block) for b in scanner.feed(bomb) + scanner.flush())
+    assert header

@@ -1,0 +1,170 @@
+"""The unpackers against cantools over random layouts and random frames, and what a listener takes for fresh."""
+
+import math
+import random
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+from packer_oracle import LayoutMaker, bindings, bit_places, dbc_text, get, put
+from test_packer_against_cantools import ESCS, MESSAGES, read
+
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, compile_layout
+from kontronik_can_gw.dbc_output.unpacker import SignalReader
+from kontronik_can_gw.dbc_output.view import View
+from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.offline.layouts import layout_of_dbc
+from kontronik_can_gw.telemetry import MS, SECOND
+
+
+def wanted(plan: Any, raw: Any, bits: int) -> Any:
+    """The value that cantools' raw number means."""
+    if plan.is_float:
+        if bits in (plan.not_available, plan.error) or raw != raw:
+            return None
+        return raw * float(plan.factor) + float(plan.offset)
+    is_flag = plan.length == 1 and not plan.signed and plan.numbers is None and plan.factor == 1 and plan.offset == 0
+    if not is_flag and raw in (plan.not_available, plan.error):
+        return None
+    if plan.numbers is not None:
+        return plan.texts.get(raw)
+    exact = Fraction(raw) * plan.factor + plan.offset
+    whole = plan.factor.denominator == 1 and plan.offset.denominator == 1
+    return int(exact) if whole else float(exact)
+
+
+@pytest.mark.parametrize("seed", range(1000, 1020))
+def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) -> None:
+    rng = random.Random(seed)
+    maker = LayoutMaker(rng, ESCS)
+    messages = [maker.message() for _ in range(MESSAGES)]
+    database = read(dbc_text(messages))
+    layout = compile_layout(database, "random.dbc", ESCS, DbcSettings(bindings(messages)), fd_allowed=True)
+    reader = SignalReader(layout)
+    plans = {plan.name: plan for plan in layout.messages}
+    compared = 0
+    for message in messages:
+        theirs = database.get_message_by_name(message.name)
+        key = message.can_id | (EXTENDED if message.extended else 0)
+        for _ in range(8):
+            data = bytearray(
+                rng.choice([rng.randbytes(message.length), bytes(message.length), b"\xff" * message.length])
+            )
+            page = rng.choice(message.pages)
+            selector = next((s for s in message.signals if s.mux == "M"), None)
+            if selector is not None:
+                for byte, bit in bit_places(selector.start, selector.length, selector.little):
+                    data[byte] &= ~(1 << bit)
+                put(data, page or 0, selector.start, selector.length, selector.little)
+            got = {
+                reader.columns[first + n].name: value
+                for first, values in reader.read(key, bytes(data)) or ()
+                for n, value in enumerate(values)
+            }
+            raws = theirs.decode(bytes(data), decode_choices=False, scaling=False)
+            assert isinstance(raws, dict)
+            lost_flags = {name for name, value in got.items() if value is None}
+            for name, value in got.items():
+                plan = next(s for s in plans[message.name].signals if s.name == name and s.page in (None, page))
+                made = next(s for s in message.signals if s.name == name)
+                bits = get(bytes(data), made.start, made.length, made.little, False)
+                expected = wanted(plan, raws[name], bits)
+                if value is None and plan.length == 1 and expected is not None:
+                    # the others of its ESC's frame say that there was none
+                    beside = [
+                        s
+                        for s in plans[message.name].signals
+                        if s.page == plan.page
+                        and s.source
+                        and plan.source
+                        and (s.esc, s.source.group) == (plan.esc, plan.source.group)
+                    ]
+                    assert any(s.length > 1 and s.name in lost_flags for s in beside)
+                elif isinstance(expected, float) and isinstance(value, float):
+                    assert value == expected or math.isclose(value, expected, rel_tol=1e-12), (message.name, name)
+                else:
+                    assert value == expected, (message.name, name)
+                compared += 1
+    assert compared > 300
+
+
+def shipped_reader() -> SignalReader:
+    return SignalReader(layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout)
+
+
+def test_an_error_code_beside_them_does_not_hide_flags() -> None:
+    """Undervoltage at a voltage that does not fit: the flag is what matters then."""
+    reader = shipped_reader()
+    names = {c.name: i for i, c in enumerate(reader.columns)}
+
+    def status(state: int, raw: int, temperature: int) -> list[Any]:
+        data = bytes((1, 0, 0, state, raw, temperature, 0, 0))
+        values: list[Any] = [None] * len(reader.columns)
+        for first, found in reader.read(1664, data) or ():
+            values[first : first + len(found)] = found
+        return values
+
+    assert status(254, 254, 0x81)[names["Undervoltage"]] == 1
+    assert status(254, 255, 0x80)[names["Undervoltage"]] == 1
+    assert status(255, 255, 0x80)[names["Undervoltage"]] is None
+    assert status(12, 12, 30)[names["Undervoltage"]] == 1
+
+
+def view_of(tmp_path: Path, *messages: tuple[str, int, str]) -> View:
+    """A view of messages with one signal each: name, cycle in ms, send type."""
+    lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: G L"]
+    for number, (name, _, _) in enumerate(messages):
+        lines += [f"BO_ {100 + number} M{number}: 8 G", f' SG_ {name} : 0|16@1+ (1,0) [0|65533] "" L']
+    lines += [
+        'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 100000;',
+        'BA_DEF_ BO_ "GenMsgSendType" STRING ;',
+        'BA_DEF_DEF_ "GenMsgCycleTime" 0;',
+        'BA_DEF_DEF_ "GenMsgSendType" "";',
+    ]
+    for number, (_, cycle, send) in enumerate(messages):
+        lines += [
+            f'BA_ "GenMsgCycleTime" BO_ {100 + number} {cycle};',
+            f'BA_ "GenMsgSendType" BO_ {100 + number} "{send}";',
+        ]
+    path = tmp_path / "v.dbc"
+    path.write_text("\n".join(lines) + "\n")
+    return View(SignalReader(layout_of_dbc(path).layout))
+
+
+def test_a_slow_message_is_fresh_for_three_of_its_cycles_and_no_longer(tmp_path: Path) -> None:
+    view = view_of(tmp_path, ("losses", 5000, "Cyclic"), ("variant", 0, "OnChange"))
+    for when in range(0, 60, 5):
+        view.take(100, b"\1" * 8, when * SECOND)
+        if not when:
+            view.take(101, b"\2" * 8, 0)
+        for later in (1, 3, 4.9):
+            view.expire(int((when + later) * SECOND))
+            assert view.value("losses", 0) == 0x0101
+            assert view.value("variant", 0) == 0x0202
+    view.expire(55 * SECOND + 15 * SECOND + 1)
+    assert view.value("losses", 0) is None
+    assert view.value("variant", 0) is None
+
+
+def test_what_comes_with_telemetry_is_fresh_for_a_second(tmp_path: Path) -> None:
+    view = view_of(tmp_path, ("battery_voltage", 0, "Event"), ("losses", 100, "Cyclic"))
+    view.take(100, b"\1" * 8, 0)
+    for when in range(0, 2000, 100):
+        view.take(101, b"\1" * 8, when * MS)
+        view.expire(when * MS)
+        assert (view.value("battery_voltage", 0) is not None) == (when <= 1000)
+        assert view.value("losses", 0) is not None
+    assert view.expire(2000 * MS + 250 * MS + 1)
+    assert view.value("losses", 0) is None
+    assert view.next_expiry is None
+
+
+def test_without_any_cycle_nobody_knows_and_values_stay(tmp_path: Path) -> None:
+    view = view_of(tmp_path, ("variant", 0, "OnChange"))
+    view.take(100, b"\1" * 8, 0)
+    assert view.next_expiry is None
+    assert not view.expire(3600 * SECOND)
+    assert view.value("variant", 0) == 0x0101
+    assert isinstance(view.reader.layout, Layout)
