@@ -1,0 +1,164 @@
+"""``run --record`` as its own process: captures over a reload and to the end, and a log beside them that a replay repeats to the byte."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.capture import Kind
+from kontronik_can_gw.offline import pty
+from kontronik_can_gw.offline.inputs import CaptureInput, open_input
+from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc
+
+PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
+
+
+def until(condition: Callable[[], bool], what: str, seconds: float = 20) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, what
+        time.sleep(0.01)
+
+
+@contextmanager
+def telemetry(*options: EscOptions) -> Iterator[list[str]]:
+    """ESCs on pseudo terminals; their paths."""
+    terminals = [pty.PtyEsc() for _ in options]
+    stopped = threading.Event()
+    escs = [(SimulatedEsc(o, seed=n), t) for n, (o, t) in enumerate(zip(options, terminals, strict=True))]
+    thread = threading.Thread(target=lambda: pty.run(escs, stop=stopped.is_set), daemon=True)
+    thread.start()
+    try:
+        yield [terminal.path for terminal in terminals]
+    finally:
+        stopped.set()
+        thread.join(5)
+        received = [terminal.received for terminal in terminals]
+        for terminal in terminals:
+            terminal.close()
+    assert received == [0] * len(options), "something was transmitted to an ESC"
+
+
+class Run:
+    """The gateway's process; ``log`` is what it said so far."""
+
+    def __init__(self, config: Path, *words: object) -> None:
+        self._log = config.with_suffix(".err")
+        with self._log.open("w") as file:
+            self.process = subprocess.Popen([*PROGRAM, "run", "-c", str(config), *map(str, words)], stderr=file)
+
+    @property
+    def log(self) -> str:
+        return self._log.read_text()
+
+    def wait_for(self, text: str) -> None:
+        until(lambda: text in self.log or self.process.poll() is not None, f"{text!r} in:\n{self.log}")
+        assert text in self.log
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        self.process.send_signal(number)
+        return self.process.wait(10)
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Run]]:
+    runs: list[Run] = []
+
+    def begin(config: Path, *words: object) -> Run:
+        runs.append(Run(config, *words))
+        return runs[-1]
+
+    yield begin
+    for run in runs:
+        if run.process.poll() is None:
+            run.process.kill()
+            run.process.wait()
+
+
+def configuration(ports: list[str], record: str = "", more: str = "") -> str:
+    text = f'[can]\ninterface = "virtual"\nchannel = "r{os.getpid()}"\n[record]\n{record}\n{more}\n'
+    return text + "".join(f'[[esc]]\nport = "{port}"\npole_pairs = 7\n' for port in ports)
+
+
+def test_the_log_beside_a_capture_is_what_a_replay_gives(start: Callable[..., Run], tmp_path: Path) -> None:
+    config = tmp_path / "gw.toml"
+    noisy = EscOptions(faults=Faults(noise=0.5, lost_bytes=0.002))
+    canopen = f'[canopen]\nenabled = true\nself_start = true\nstore = "{tmp_path}/store"\n'
+    with telemetry(noisy, EscOptions()) as ports:
+        config.write_text(configuration(ports, 'can_log = "candump"', canopen))
+        run = start(config, "--record", tmp_path / "captures")
+        run.wait_for("esc2: telemetry ok")
+        time.sleep(3)
+        assert run.end() == 0
+    [log] = (tmp_path / "captures").glob("*.log")
+    again = tmp_path / "again.log"
+    done = subprocess.run(
+        [*PROGRAM, "replay", str(tmp_path / "captures"), "--to", "log", "-o", str(again)], check=False
+    )
+    assert done.returncode == 0
+    assert again.read_bytes() == log.read_bytes()
+    assert len(log.read_text().splitlines()) > 800
+    with open_input(tmp_path / "captures") as found:
+        list(found.frames())
+        assert found.damage == []
+        assert "KOSMIK 120, firmware 4.17, V4 layout" in found.provenance["esc1"]
+
+
+def test_a_reload_ends_one_capture_and_begins_another(start: Callable[..., Run], tmp_path: Path) -> None:
+    config = tmp_path / "gw.toml"
+    with telemetry(EscOptions()) as ports:
+        config.write_text(configuration(ports, 'directory = "one"'))
+        run = start(config)
+        run.wait_for("esc1: telemetry ok")
+        time.sleep(2.5)
+        config.write_text(configuration(ports, 'directory = "two"'))
+        run.process.send_signal(signal.SIGHUP)
+        until(lambda: (tmp_path / "two").is_dir() and bool(list((tmp_path / "two").iterdir())), "a second capture")
+        time.sleep(2)
+        threads = len(os.listdir(f"/proc/{run.process.pid}/task"))
+        config.write_text(configuration(ports))
+        run.process.send_signal(signal.SIGHUP)
+        until(lambda: len(os.listdir(f"/proc/{run.process.pid}/task")) < threads, "the recorder's thread ends")
+        assert run.end() == 0
+    for name in ("one", "two"):
+        with open_input(tmp_path / name) as found:
+            assert isinstance(found, CaptureInput)
+            kinds = [entry.kind for entry in found.entries()]
+            assert found.damage == [], name
+        assert kinds[-1] in (Kind.STOP, Kind.STATE)
+        assert kinds.count(Kind.START) == kinds.count(Kind.STOP) == 1
+        assert kinds.count(Kind.BYTES) > 100
+    with open_input(tmp_path / "one") as one, open_input(tmp_path / "two") as two:
+        assert isinstance(one, CaptureInput)
+        assert isinstance(two, CaptureInput)
+        list(one.samples())
+        state = two.header["state"]
+        assert state["started_ns"] <= two.header["created_ns"] - 2 * 10**9  # the run goes on
+        assert json.dumps(state)
+
+
+@pytest.mark.parametrize("wait", [False, True])
+def test_a_folder_that_cannot_be_made(wait: bool, start: Callable[..., Run], tmp_path: Path) -> None:
+    """An error at once for a person, no obstacle for a service."""
+    config = tmp_path / "gw.toml"
+    (tmp_path / "file").write_text("")
+    with telemetry(EscOptions()) as ports:
+        config.write_text(configuration(ports))
+        words = ["--wait"] if wait else []
+        run = start(config, "--record", tmp_path / "file" / "captures", *words)
+        if not wait:
+            assert run.process.wait(10) == 1
+            assert run.log.count("\n") == 1
+            assert "Give another folder (record.directory, --record)" in run.log
+            return
+        run.wait_for("esc1: telemetry ok")
+        run.wait_for("cannot be written: Not a directory. Trying again.")
+        assert run.end() == 0
