@@ -8,6 +8,7 @@ from kontronik_can_gw.cia301.nodes import Nodes
 from kontronik_can_gw.cia301.pdo import EVENT_TYPES, Tpdo
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.cli.common import Loaded, load_all
+from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config import as_toml
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
 from kontronik_can_gw.telemetry import MS
@@ -42,6 +43,8 @@ def main(args: argparse.Namespace) -> int:
         print()
         load += nodes.bits_per_second() / config.can.bitrate
         frames += nodes.frames_per_second()
+    if (folder := record_folder(config)) is not None:
+        print(f"# captures: {in_words(config, folder)}")
     print(
         f"# bus load {load:.1%} of {config.can.bitrate // 1000} kbit/s: {frames:.0f} frames/s with each ESC at 100 Hz, "
         "worst stuffing; what is sent on change counted by its cycle, no SDO traffic"

@@ -99,6 +99,7 @@ def _load(path: Path, unit: "Unit | None") -> tuple[Config | None, Loaded | None
 def _configuration(
     system: "System", findings: Findings, config: Config, loaded: Loaded | None, unit: "Unit | None"
 ) -> None:
+    from kontronik_can_gw.cli.recording import record_folder
     from kontronik_can_gw.runtime.doctor.folders import check_folder, check_readable
 
     if loaded is not None:
@@ -111,6 +112,9 @@ def _configuration(
     if config.canopen.enabled:
         folder = str(parameter_folder(config).absolute())
         check_folder(system, findings, "config.store", "stored parameters", folder, unit)
+    if (captures := record_folder(config)) is not None:
+        folder, least = str(captures.absolute()), config.record.min_free_mb * 1_000_000
+        check_folder(system, findings, "config.record", "captures", folder, unit, least)
     if config.statistics_path is not None:
         folder = str(config.statistics_path.absolute().parent)
         check_folder(system, findings, "config.statistics", "statistics", folder, unit)

@@ -13,13 +13,27 @@ _MB = 1_000_000
 _STATE = "state"
 
 
-def recorder_of(config: Config, folder: Path | None) -> Recorder | None:
-    """The recorder; ``folder`` wins over the configuration's. None where nothing is to be recorded."""
+def record_folder(config: Config, given: Path | None = None) -> Path | None:
+    """Where captures go: what was given on the command line, or what the configuration says; None where nothing is recorded."""
+    if given is not None or config.record.directory is None:
+        return given
+    if config.record.directory == _STATE:
+        return state_folder() / "captures"
+    return Path(config.file).parent / config.record.directory
+
+
+def in_words(config: Config, folder: Path) -> str:
+    """Where recordings go and what is written, in a line."""
     record = config.record
-    if folder is None and record.directory is not None:
-        folder = Path(config.file).parent / record.directory
-        if record.directory == _STATE:
-            folder = state_folder() / "captures"
+    words = f"{folder}, parts of {record.part_mb} MB or {record.part_minutes} min"
+    words += f", {record.keep_mb} MB in all" if record.keep_mb else ""
+    return words if record.can_log == "none" else f"{words}, a CAN log ({record.can_log}) beside"
+
+
+def recorder_of(config: Config, given: Path | None) -> Recorder | None:
+    """The recorder; None where nothing is to be recorded."""
+    record = config.record
+    folder = record_folder(config, given)
     if folder is None:
         return None
     return Recorder(

@@ -150,12 +150,16 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
         channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
         place = part.path if part is not None and kind == "mf4" else file
         writer = CanLogWriter(place, kind, None if wall is None else wall - start, start, channel, name)
-        count = 0
+        count, last = 0, start
         with Progress(recording.name, recording.size, name == "-") as progress:
             for item in chain((first,), frames):
                 if pace.stopped:
                     break
-                writer.write(*item)
+                time_ns = item.time_ns
+                if wall is not None:  # by the clock as it was then: it may have been set
+                    time_ns = (recording.wall_ns(time_ns) or wall) - wall + start
+                last = max(last, time_ns)
+                writer.write(last, item.frame, item.received)
                 count += 1
                 if not count & 0x3FF:
                     progress.reach(recording.position)

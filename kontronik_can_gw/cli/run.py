@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--record",
-        type=Path,
+        type=_folder,
         metavar="DIR",
         help="write captures of what comes in to this folder (record.directory)",
     )
@@ -58,6 +58,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Ends by SIGTERM or SIGINT within half a second. SIGHUP reads the configuration again: a faulty one is refused and the old "
         "one stays. The serial ports are only read; nothing is ever transmitted to an ESC."
     )
+
+
+def _folder(text: str) -> Path:
+    if not text.strip():
+        raise argparse.ArgumentTypeError("is empty. Give a folder")
+    return Path(text)
 
 
 def _seconds(text: str) -> float:
@@ -176,7 +182,7 @@ class _Run:
             raise
 
     def _open(self, loaded: Loaded, wait: bool) -> None:
-        from kontronik_can_gw.cli.recording import recorder_of, setup_of
+        from kontronik_can_gw.cli.recording import in_words, record_folder, recorder_of, setup_of
         from kontronik_can_gw.gateway import Gateway
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
@@ -213,7 +219,9 @@ class _Run:
             loop.take_over(self._loop)
             gc.collect()  # what belonged to an old configuration goes in circles
         _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
-        if recorder is not None:
+        folder = record_folder(config, self._record)
+        if recorder is not None and folder is not None:
+            recorder.words = in_words(config, folder)
             recorder.header = setup_of(loaded).header() | {"created_ns": created_ns, "state": state_of(gateway)}
         loop.open()
         for esc, _ in loaded.damaged:

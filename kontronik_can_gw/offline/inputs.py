@@ -254,7 +254,8 @@ class CaptureInput(_Base):
                     impossible += 1
                     continue
                 if entry.kind == Kind.CLOCK:
-                    self._offsets.append((entry.time_ns, read_number(entry.data) - entry.time_ns))
+                    # it stands behind what was written by the clock before
+                    self._offsets.append((entry.time_ns + 1, read_number(entry.data) - entry.time_ns))
                 if entry.time_ns < last:
                     entry = entry._replace(time_ns=last)
                 last = entry.time_ns

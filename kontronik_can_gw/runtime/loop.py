@@ -133,6 +133,7 @@ class Loop:
             self.can.open(now, self._wait)
             if self._recorder is not None:
                 self._recorder.start(self._wait)
+                self.conditions.say(logging.INFO, f"recording to {self._recorder.words}")
         except UserError:
             self.close()
             raise

@@ -93,6 +93,8 @@ class Recorder:
         self.facts = RecorderFacts()
         self.header: Mapping[str, Any] = {}
         """What is known of gateway and ESCs, set before ``start``; a part's own numbers are added."""
+        self.words = str(settings.folder)
+        """What is said of it when it begins."""
         self._clock = clock
         self._entries: deque[Item] = deque()
         self._overflowed = 0
@@ -219,7 +221,7 @@ class Recorder:
             self._lose(items)
             return
         if self._file is None:
-            self._begin_part(now)
+            self._begin_part(items[0][0] if items else now)
         file = self._file
         assert file is not None
         if self._devices != self._told_devices:
@@ -292,10 +294,12 @@ class Recorder:
             self._failed = True
             self._reports.append(Report("folder", True, f"captures: {text}"))
 
-    def _begin_part(self, now: int) -> None:
-        wall = time.time_ns()
-        self._offset = wall - now
+    def _begin_part(self, since: int) -> None:
+        """``since``: time of the part's first entry."""
+        now = self._clock()
+        self._offset = time.time_ns() - now
         self._clock_ns = now
+        wall = since + self._offset
         if not self._stamp:
             self._stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(wall // SECOND))
         part, self._part = self._part, self._part + 1  # a name is tried once
@@ -303,7 +307,7 @@ class Recorder:
         header = dict(self.header) | {
             "run": self._run,
             "part": part,
-            "monotonic_ns": now,
+            "monotonic_ns": since,
             "wall_ns": wall,
             "devices": self._told_devices,
         }

@@ -162,3 +162,29 @@ def test_a_folder_that_cannot_be_made(wait: bool, start: Callable[..., Run], tmp
         run.wait_for("esc1: telemetry ok")
         run.wait_for("cannot be written: Not a directory. Trying again.")
         assert run.end() == 0
+
+
+def test_the_logs_of_several_parts_are_what_a_replay_of_all_gives(start: Callable[..., Run], tmp_path: Path) -> None:
+    config = tmp_path / "gw.toml"
+    with telemetry(EscOptions(period_ns=500_000, faults=Faults(noise=80))) as ports:
+        config.write_text(configuration(ports, 'can_log = "candump"\npart_mb = 1'))
+        run = start(config, "--record", tmp_path / "captures")
+        run.wait_for("esc1: telemetry ok")
+        run.wait_for(f"recording to {tmp_path}/captures, parts of 1 MB")
+        folder = tmp_path / "captures"
+        until(lambda: len(list(folder.glob("*.kcap"))) > 2, "parts", 60)
+        time.sleep(1)
+        assert run.end() == 0
+    logs = b"".join(log.read_bytes() for log in sorted(folder.glob("*.log")))
+    again = tmp_path / "again.log"
+    done = subprocess.run([*PROGRAM, "replay", str(folder), "--to", "log", "-o", str(again)], check=False)
+    assert done.returncode == 0
+
+    def lines(text: bytes) -> list[tuple[int, bytes]]:
+        found = [line.split(b" ", 1) for line in text.splitlines()]
+        return [(round(float(when.strip(b"()")) * 1e6), rest) for when, rest in found]
+
+    live, replayed = lines(logs), lines(again.read_bytes())
+    assert [rest for _, rest in live] == [rest for _, rest in replayed]
+    # the clock is read anew for each part, and may have been adjusted by some microseconds since
+    assert max(abs(a - b) for (a, _), (b, _) in zip(live, replayed, strict=True)) <= 5

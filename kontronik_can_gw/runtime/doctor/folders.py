@@ -1,6 +1,7 @@
 """Files and folders: may the service read its configuration and fill its folders, and is there room."""
 
 from pathlib import Path, PurePath
+from stat import S_ISDIR
 
 from kontronik_can_gw.runtime.doctor.findings import Findings
 from kontronik_can_gw.runtime.doctor.service import Unit
@@ -35,12 +36,23 @@ def check_readable(system: System, findings: Findings, check: str, file: str, un
         findings.error(check, f"{file}: the service's user {who.name} may not read it", "", f"sudo chmod o+r {file}")
 
 
-def check_folder(system: System, findings: Findings, check: str, what: str, folder: str, unit: Unit | None) -> None:
-    """Files can be made in a folder, or it can be made, and there is room. ``what``: for whom, as "stored parameters"."""
+def check_folder(
+    system: System, findings: Findings, check: str, what: str, folder: str, unit: Unit | None, least: int = 0
+) -> None:
+    """Files can be made in a folder, or it can be made, and there is room.
+
+    ``what``: for whom, as "stored parameters". ``least``: with fewer bytes free nothing is written there.
+    """
     there = folder
     while there != "/" and not system.exists(there):
         there = str(PurePath(there).parent)
     made = "" if there == folder else ", will be made"
+    status = system.status(there)
+    if status is not None and not S_ISDIR(status.st_mode):
+        findings.error(
+            check, f"{what}: {folder}: {there} is a file, not a folder", "Choose another folder:", f"ls -l {there}"
+        )
+        return
     left = system.file_system(there)
     if left is not None and left.read_only:
         text = f"{what}: {folder}: the file system is read-only"
@@ -50,7 +62,6 @@ def check_folder(system: System, findings: Findings, check: str, what: str, fold
         text = f"{what}: {folder}: the file system is full"
         findings.error(check, text, "Make room:", f"df -h {there}; df -i {there}")
         return
-    status = system.status(there)
     kept_by_systemd = unit is not None and PurePath(folder).is_relative_to(unit.state_folder)
     owner = unit.user if unit is not None else None
     if kept_by_systemd or (system.exists(folder) and status is None):
@@ -88,6 +99,9 @@ def check_folder(system: System, findings: Findings, check: str, what: str, fold
         return
     else:
         findings.ok(check, f"{what}: {folder}{made}")
-    if left is not None and left.free_bytes < _LOW_BYTES:
+    if left is not None and left.free_bytes < least:
+        text = f"{what}: {left.free_bytes // 1_000_000} MB are free in {there}: nothing is written with less than {least // 1_000_000} MB"
+        findings.error(check, text, "Make room:", f"df -h {there}")
+    elif left is not None and left.free_bytes < _LOW_BYTES:
         text = f"{what}: only {left.free_bytes // 1024} kB are free in {there}"
         findings.warning(check, text, "Make room:", f"df -h {there}")
