@@ -602,3 +602,23 @@ def test_a_reader_that_goes_away_is_not_told_about_it() -> None:
         check=False,
     )
     assert (done.stdout, done.stderr) == ('VERSION ""', "")
+
+
+def test_check_tells_where_captures_go(tmp_path: Path) -> None:
+    file = configuration(tmp_path, record='directory = "captures"\nkeep_mb = 500\ncan_log = "blf"')
+    done = inside("check", "-c", file)
+    assert done.returncode == 0
+    words = "parts of 64 MB or 60 min, 500 MB in all, a CAN log (blf) beside"
+    assert f"# captures: {tmp_path}/captures, {words}\n" in done.stdout
+    assert "# captures" not in inside("check", "-c", configuration(tmp_path)).stdout
+
+
+def test_a_folder_without_a_name_is_refused(tmp_path: Path) -> None:
+    done = inside("run", "-c", configuration(tmp_path), "--record", " ")
+    assert done.returncode == 2
+    assert "--record: is empty. Give a folder" in done.stderr
+    done = inside(
+        "check", "-c", configuration(tmp_path, can='fd = true\ninterface = "virtual"', record='can_log = "trc"')
+    )
+    assert done.returncode == 2
+    assert "record.can_log: a TRC log knows no CAN FD frames" in done.stderr

@@ -205,3 +205,29 @@ def test_colours_are_only_for_a_terminal(tmp_path: Path, esc: PtyEsc) -> None:
     os.close(reader)
     assert b"\x1b[" in text
     assert b"Serial port of esc1" in text
+
+
+@pytest.mark.parametrize(
+    ("record", "said"),
+    [
+        ('directory = "afile/x"', "is a file, not a folder"),
+        ('directory = "captures"\nmin_free_mb = 10000000', "nothing is written with less than 10000000 MB"),
+    ],
+)
+def test_a_folder_of_captures_that_cannot_be_used_is_an_error(
+    record: str, said: str, tmp_path: Path, esc: PtyEsc
+) -> None:
+    (tmp_path / "afile").write_text("")
+    found, code = document(configuration(tmp_path, esc.path, f"[record]\n{record}"))
+    assert code == 1
+    [error] = [f for f in found["findings"] if f["severity"] == "error"]
+    assert error["check"] == "config.record"
+    assert said in error["text"]
+
+
+def test_a_good_folder_of_captures_is_told(tmp_path: Path, esc: PtyEsc) -> None:
+    found, code = document(configuration(tmp_path, esc.path, '[record]\ndirectory = "captures"\nmin_free_mb = 0'))
+    assert code == 0
+    assert [f["text"] for f in found["findings"] if f["check"] == "config.record"] == [
+        f"captures: {tmp_path}/captures, will be made"
+    ]
