@@ -69,8 +69,9 @@ class SampledGateway(Gateway):
         when = now
         if events & Event.LIVE and state.live is not None and state.live_ns is not None:
             when = min(now, state.live_ns)  # of its last byte on the wire
-        when = self._last_ns = max(when, self._last_ns)
+        when = max(when, self._last_ns)  # rows do not go back
         if self._row_ns is not None:
+            when = max(when, self._row_ns)
             again = events & Event.LIVE and esc in self._in_row
             if again or when - self._row_ns > SAME_ROW_NS:
                 self._close_row()
@@ -91,6 +92,7 @@ class SampledGateway(Gateway):
     def _close_row(self) -> None:
         if self._row_ns is not None:
             self.rows.append(Sample(self._row_ns, list(self._values)))
+            self._last_ns = self._row_ns
             self._row_ns = None
             self._in_row.clear()
 
