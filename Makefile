@@ -1,13 +1,14 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-hardware soak lint clean
+.PHONY: help demo test test-hardware soak hour lint clean
 
 help:
 	@echo 'make demo    show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
 	@echo 'make test    all checks: ruff, mypy, tests, tests on real vcan   (ARGS="--only lint|types|unit|vcan|faults")'
 	@echo 'make test-hardware   the fault programme on real drivers in virtual machines   (ARGS="--long --table --keep FOLDER")'
 	@echo 'make soak    random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
+	@echo 'make hour    a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
 	@echo 'make lint    ruff and mypy only'
 	@echo 'make clean   remove .venv and all caches'
 
@@ -26,6 +27,10 @@ test-hardware:
 soak:
 	@tests/bootstrap.sh hardware
 	@.venv/bin/python tests/run.py --only soak $(ARGS)
+
+hour:
+	@tests/bootstrap.sh lint
+	@.venv/bin/python tests/hour/hour_programme.py $(ARGS)
 
 lint:
 	@tests/bootstrap.sh lint
