@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cia301 import heartbeat, nmt, node
 from kontronik_can_gw.cia301.nmt import NmtState
+from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.lean import without_asammdf
@@ -59,23 +60,15 @@ _SHOWN = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seconds", type=_seconds, metavar="N", help="end after N seconds (default: Ctrl-C)")
+    parser.add_argument(
+        "--seconds", type=number_from(0.001, 1e6), metavar="N", help="end after N seconds (default: Ctrl-C)"
+    )
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulated faults (default 1)")
     parser.epilog = (
         "A simulated ESC on a pseudo terminal, the real gateway, python-can's in-process bus, "
         "and on the screen what a logger with the DBC and a CANopen master see. "
         "Exit code: 0 at its end, 1 something in it failed, 2 wrong usage."
     )
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0
-    if not 0 < value <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds")
-    return value
 
 
 @dataclass

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments
 from kontronik_can_gw.errors import RunError, UserError
 
@@ -56,7 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--unmarked", action="store_true", help="--to can: do not mark the frames as replay")
     parser.add_argument("--link", metavar="PATH", help="--to pty: symbolic link; {n} is the ESC's number, from 1")
     parser.add_argument(
-        "--delay", type=_seconds, default=1.0, metavar="S", help="--to pty: time for a gateway to open them (default 1)"
+        "--delay",
+        type=number_from(0, 3600),
+        default=1.0,
+        metavar="S",
+        help="--to pty: time for a gateway to open them (default 1)",
     )
     parser.add_argument(
         "-o", "--output", default="-", metavar="FILE", help="--to log: file (default -: standard output)"
@@ -65,25 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _speed(text: str) -> float | None:
-    if text == "max":
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0
-    if not 0.01 <= value <= 1000:
-        raise argparse.ArgumentTypeError(f"{text!r} is no factor, 0.01 to 1000, and not max")
-    return value
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1
-    if not 0 <= value <= 3600:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds")
-    return value
+    return None if text == "max" else number_from(0.01, 1000, "factor, and not max")(text)
 
 
 _OPTIONS = {

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import (
     Loaded,
     assemble,
@@ -44,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--status",
-        type=_seconds,
+        type=number_from(0.1, 1e6),
         metavar="SECONDS",
         help="log a line about telemetry, CAN, NMT states and PDO traffic every so many seconds (default: changes only)",
     )
@@ -64,16 +65,6 @@ def _folder(text: str) -> Path:
     if not text.strip():
         raise argparse.ArgumentTypeError("is empty. Give a folder")
     return Path(text)
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0
-    if not 0.1 <= value <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, 0.1 or more")
-    return value
 
 
 def main(args: argparse.Namespace) -> int:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
+from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.config import load
 from kontronik_can_gw.errors import RunError
@@ -58,22 +59,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--once", action="store_true", help="show it once, as in a pipe (default on a terminal: live)")
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
     parser.add_argument(
-        "--interval", type=_seconds, default=1.0, metavar="S", help="live: look every so many seconds (default 1)"
+        "--interval",
+        type=number_from(0.1, 3600),
+        default=1.0,
+        metavar="S",
+        help="live: look every so many seconds (default 1)",
     )
     parser.epilog = (
         "Default: all gateways that run as a service. Exit code 0: running and healthy (also at the end of the live display); "
         "1: running, but an ESC is not heard or nothing gets onto the CAN bus; 2: wrong usage; 3: not running, or no answer for 3 s."
     )
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0
-    if not 0.1 <= value <= 3600:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, 0.1 to 3600")
-    return value
 
 
 @dataclass(frozen=True)

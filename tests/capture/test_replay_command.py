@@ -127,7 +127,7 @@ def test_what_fails_is_one_line(words: Sequence[str], message: str, recording: P
 def test_a_speed_that_is_none_is_refused(value: str, recording: Path) -> None:
     code, _, talk = run(recording, "--to", "log", "--speed", value)
     assert code == 2
-    assert "is no factor" in talk
+    assert "is not a factor, and not max, 0.01 to 1000" in talk
 
 
 def test_frames_on_a_bus_are_marked_unless_told_otherwise(bench: Bench, recording: Path) -> None:
