@@ -17,11 +17,11 @@ or a CAN log (candump, ASC, BLF, TRC, MF4). Of a CAN log, say with -c or --dbc w
 The page is one file that needs no network: a summary (energy, charge, extremes with their time, cell voltage sag, quality
 of the data), plots with zoom, the operating states, errors with meaning and remedy. Several ESCs lie over each other.
 Numbers and events are of every row. Lines are thinned to --points points in a way that keeps every peak and every gap.
-The same recording gives the same page, byte for byte.
+The same recording gives the same page, byte for byte. A file that exists is only replaced with --force.
 
 examples:
   kontronik-can-gw report flight.kcap -o flight.html
-  kontronik-can-gw report bus.log -c gateway.toml -o flight.html --title "Climb with 6S"
+  kontronik-can-gw report bus.log -c gateway.toml -o climb.html --title "Climb with 6S"
   kontronik-can-gw report flight.kcap --png pictures --from 60 --to 90
 
 exit codes: 0 done, 1 something cannot be read or written, or has no values; 2 wrong usage, or a file that is no recording
@@ -34,7 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes")
     parser.add_argument("-o", "--output", metavar="FILE", help="page to write, or - for standard output")
-    parser.add_argument("--png", type=Path, metavar="FOLDER", help="write each plot as a PNG into FOLDER")
+    parser.add_argument("--png", metavar="FOLDER", help="write each plot as a PNG into FOLDER")
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
     add_layout_arguments(parser)
     parser.add_argument(
         "--points", type=_points, default=20_000, metavar="N", help="points of a line, 100 to 1000000 (default 20000)"
@@ -61,17 +62,7 @@ def main(args: argparse.Namespace) -> int:
     if args.start is not None and args.end is not None and args.end <= args.start:
         raise UserError(f"--to {args.end:g}: must be greater than --from {args.start:g}")
     source = Path(args.input)
-    if (
-        args.output not in (None, "-")
-        and Path(args.output).exists()
-        and source.exists()
-        and Path(args.output).samefile(source)
-    ):
-        raise UserError(f"-o {args.output}: is the input. Give another file.")
-    if args.png is not None:
-        from kontronik_can_gw.offline.report.plots_png import check_matplotlib
-
-        check_matplotlib()
+    _check_targets(source, args.output, args.png, force=args.force)
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     with open_input(source, layout) as recording:
         analysis = Analysis(recording.bus, args.points, (args.start, args.end))
@@ -102,11 +93,38 @@ def main(args: argparse.Namespace) -> int:
         if args.png is not None:
             from kontronik_can_gw.offline.report.plots_png import write_pngs
 
-            written = write_pngs(flight, args.png, title)
+            written = write_pngs(flight, Path(args.png), title)
             say(f"{args.png}: {', '.join(file.name for file in written)} written")
     for line in damage:
         print(f"kontronik-can-gw report: {args.input}: damaged: {line}", file=sys.stderr)
     return 0
+
+
+def _check_targets(source: Path, output: str | None, png: str | None, *, force: bool) -> None:
+    """UserError where something cannot be written, or is there."""
+    from kontronik_can_gw.errors import UserError
+
+    if output == "":
+        raise UserError("-o: is empty. Give a file, or - for standard output.")
+    if png == "":
+        raise UserError("--png: is empty. Give a folder.")
+    try:
+        if output is not None and output != "-" and (target := Path(output)).exists():
+            if source.exists() and target.samefile(source):
+                raise UserError(f"-o {output}: is the input. Give another file.")
+            if target.is_dir():
+                raise UserError(f"-o {output}: is a folder. Give a file.")
+            if target.is_file() and not force:
+                raise UserError(f"{output}: exists. Give another -o, or --force.")
+        if png is not None:
+            from kontronik_can_gw.offline.report.plots_png import check_matplotlib, names_of_pngs
+
+            check_matplotlib()
+            for file in (Path(png) / name for name in names_of_pngs()):
+                if file.exists() and not force:
+                    raise UserError(f"{file}: exists. Give another --png, or --force.")
+    except (OSError, ValueError) as error:  # a name too long, or with a null byte
+        raise UserError(f"{output or png}: cannot be written: {getattr(error, 'strerror', None) or error}.") from None
 
 
 def _read(recording: "Input", analysis: "Analysis", name: str, data_on_screen: bool) -> bool:

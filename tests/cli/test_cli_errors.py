@@ -131,6 +131,7 @@ OPTIONS = {
             "-o",
             "--output",
             "--png",
+            "--force",
             "-c",
             "--config",
             "--dbc",

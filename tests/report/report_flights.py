@@ -5,6 +5,9 @@ from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
+from capture_bench import START, Bench, made
+
+from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.dbc_output.expand import expand
 from kontronik_can_gw.dbc_output.layout import DbcSettings, choose_node, load_database
@@ -14,7 +17,7 @@ from kontronik_can_gw.dbc_output.view import View
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
-from kontronik_can_gw.telemetry import SECOND, EscSettings
+from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 
 Row = tuple[int, list[Value]]
 
@@ -65,6 +68,39 @@ def simulated(
         view.expire(now)
         yield now, list(view.values)
         heapq.heapreplace(due, (escs[index].next_ns, index))
+
+
+def write_capture(path: Path, seconds: float, options: Sequence[EscOptions]) -> Path:
+    """A recording as ``run --record`` makes it, of simulated ESCs e0, e1, …; its time 0 is theirs."""
+    bench = Bench(*made(len(options)))
+    gateway, now = bench.gateway, START
+    escs = [SimulatedEsc(option, seed=3 + index, start_ns=now) for index, option in enumerate(options)]
+    for index in range(len(escs)):
+        gateway.port_opened(index, now)
+    gateway.start(now)
+    bench.take(now)
+    end = now + round(seconds * SECOND)
+    while now < end:
+        now = max(now + 1, min(gateway.next_deadline(), now + 10 * MS))
+        for index, esc in enumerate(escs):
+            if data := b"".join(sent.wire for sent in esc.frames_until(now)):
+                gateway.receive_bytes(index, data, now)
+        gateway.advance(now)
+        bench.take(now)
+    gateway.stop(now)
+    bench.take(now)
+    header = bench.setup.header() | {
+        "run": "r",
+        "part": 0,
+        "created_ns": START,
+        "monotonic_ns": START,
+        "wall_ns": 1_700_000_000 * SECOND,
+    }
+    parts = [block(b"H", 0, json_payload(header))]
+    for number, at in enumerate(range(0, len(bench.entries), 300)):
+        parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
+    path.write_bytes(b"".join([*parts, block(b"E", len(parts), b"")]))
+    return path
 
 
 def column(bus: BusLayout, source: str, esc: int | None = 0) -> int:

@@ -1,5 +1,6 @@
 """Decimation keeps every extreme exactly and never joins over a gap, however the rows are cut into chunks."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 from hypothesis import given
@@ -49,28 +50,104 @@ def test_times_never_fall_and_span_the_whole(
     rows: list[tuple[Number, Number]], steps: list[int], points: int, cuts: list[int]
 ) -> None:
     times = times_of(rows, steps)
-    found, bucket = decimated(rows, times, points, cuts)
+    found, _ = decimated(rows, times, points, cuts)
     assert all(a <= b for a, b in pairwise(found.times))
     assert (found.times[0], found.times[-1]) == (times[0], times[-1])
     assert all(len(column) == len(found.times) for column in found.columns)
-    most = max(points, LEAST_POINTS)
-    assert len(found.times) <= (most if bucket == 1 else 2 * most)
+    runs = 1 + sum([v is None for v in a] != [v is None for v in b] for a, b in pairwise(rows))
+    assert len(found.times) <= max(points, LEAST_POINTS) + 2 * runs
 
 
-@given(ROWS, STEPS, st.integers(1, 64), st.lists(st.integers(0, 40), max_size=10))
-def test_a_gap_is_never_joined(
-    rows: list[tuple[Number, Number]], steps: list[int], points: int, cuts: list[int]
-) -> None:
-    """Wherever rows have a None, the points have one between the values before and behind it, at most a bucket beside its place."""
-    times = list(range(len(rows)))
-    found, bucket = decimated(rows, times, points, cuts)
+def assert_gaps_are_kept(rows: Sequence[Sequence[Number]], times: list[int], found: Points) -> None:
+    """No line is drawn over, from or to the time of a row without value; each value that is drawn is one of its rows."""
     for before, after in zip(zip(*rows, strict=True), found.columns, strict=True):
-        gaps = [at for at, value in enumerate(after) if value is None]
-        for at, value in enumerate(before):
+        lines = [
+            (found.times[at], found.times[at + 1])
+            for at, (a, b) in enumerate(pairwise(after))
+            if a is not None and b is not None
+        ]
+        for time, value in zip(times, before, strict=True):
             if value is None:
-                assert any(abs(found.times[gap] - times[at]) < bucket for gap in gaps), at
+                assert not [line for line in lines if line[0] <= time <= line[1]], time
         if None not in before:
             assert None not in after
+        known = [value for value in before if value is not None]
+        kept = [value for value in after if value is not None]
+        assert set(kept) <= set(known)
+        if known:
+            assert (min(kept), max(kept)) == (min(known), max(known))
+
+
+SPARSE = st.lists(st.tuples(st.integers(0, 3999), st.integers(0, 2)), max_size=60)
+
+
+@given(ROWS, st.integers(1, 64), st.lists(st.integers(0, 40), max_size=10))
+def test_a_gap_is_never_joined(rows: list[tuple[Number, Number]], points: int, cuts: list[int]) -> None:
+    times = list(range(len(rows)))
+    found, _ = decimated(rows, times, points, cuts)
+    assert_gaps_are_kept(rows, times, found)
+    for before, after in zip(zip(*rows, strict=True), found.columns, strict=True):  # each gap stands where it was
+        gaps = {found.times[at] for at, value in enumerate(after) if value is None}
+        for at, value in enumerate(before):
+            around = before[max(0, at - 1) : at + 2]
+            assert value is not None or at in gaps or around == (None,) * 3
+
+
+@given(SPARSE, st.integers(1, 400), st.integers(1, 4000))
+def test_a_single_row_without_a_value_is_a_gap_among_thousands(
+    gaps: list[tuple[int, int]], points: int, chunk: int
+) -> None:
+    """Telemetry that is lost is one row with None: the next comes when it is back, seconds later."""
+    columns: list[list[Number]] = [[(at * step) % 977 for at in range(4000)] for step in (1, 0, 7)]
+    times, now = [], 0
+    rows_lost = {at for at, _ in gaps}
+    for at in range(4000):
+        times.append(now)
+        now += 2_800_000_000 if at in rows_lost else 10_000_000
+    for at, column in gaps:
+        columns[column][at] = None
+    decimator = Decimator(3, points)
+    for at in range(0, 4000, chunk):
+        decimator.feed(times[at : at + chunk], [column[at : at + chunk] for column in columns])
+    found = decimator.finish()
+    assert_gaps_are_kept(list(zip(*columns, strict=True)), times, found)
+    assert len(found.times) <= max(points, LEAST_POINTS) + 4 * len(gaps) + 2
+
+
+@given(ROWS, st.integers(1, 64), st.integers(2, 40), st.lists(st.integers(0, 40), max_size=10))
+def test_more_gaps_than_can_be_told_apart_are_wider_and_never_joined(
+    rows: list[tuple[Number, Number]], points: int, most: int, cuts: list[int]
+) -> None:
+    times = [at * 1_000_000 for at in range(len(rows))]
+    decimator = Decimator(2, points, most)
+    at = 0
+    for cut in [*cuts, len(rows)]:
+        if part := rows[at : at + cut]:
+            decimator.feed(times[at : at + len(part)], list(zip(*part, strict=True)))
+        at += len(part)
+    found = decimator.finish()
+    assert_gaps_are_kept(rows, times, found)
+    assert all(a <= b for a, b in pairwise(found.times))
+    assert len(found.times) <= max(points, LEAST_POINTS) + 5 * most
+    whole = Decimator(2, points, most)
+    whole.feed(times, list(zip(*rows, strict=True)))
+    assert (whole.finish().times, whole.finish().columns) == (found.times, found.columns)
+
+
+def test_short_gaps_are_blurred_before_long_ones() -> None:
+    """Of a line that flickers, most becomes single points; a line in front of it, and a long gap there, stay as they were."""
+    values: list[Number] = [*range(1000), None, *range(1000)]
+    times = [at * 10_000_000 + (3_000_000_000 if at > 1000 else 0) for at in range(2001)]
+    for at in range(5000):
+        values.append(None if at % 2 else 5)
+        times.append(times[-1] + 1_000_000)
+    decimator = Decimator(1, 100, 200)
+    decimator.feed(times, [values])
+    found = decimator.finish()
+    assert_gaps_are_kept([(value,) for value in values], times, found)
+    at = found.columns[0].index(None)
+    assert (found.times[at - 1 : at + 2], found.columns[0][at + 1]) == (times[999:1002], 0)
+    assert len(found.times) < 1200
 
 
 @given(ROWS, STEPS, st.integers(1, 64), st.lists(st.integers(0, 40), max_size=10))

@@ -152,6 +152,18 @@ def test_the_legend_tells_the_values_at_the_cursor(browser: Browser, pages: dict
     assert "RPMControl" in browser.run("document.querySelector('#plot-states .band').textContent")
 
 
+def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Path]) -> None:
+    """Telemetry is lost from 29 to 31 s: what came before and comes after is not the value of the time between."""
+    browser.open(pages["one"])
+    for share, is_known in ((28.5 / 60, True), (30.4 / 60, False), (30.9 / 60, False), (40 / 60, True)):
+        x, y = centre(browser, "battery_voltage", share)
+        browser.mouse("Moved", x, y)
+        browser.settle()
+        shown = browser.run("[...document.querySelectorAll('.legend td')].map((c) => c.textContent)")
+        assert len(shown) >= 10
+        assert all((text != "–") == is_known for text in shown), (share, shown)
+
+
 def test_a_drag_zooms_all_plots_and_a_double_click_resets(browser: Browser, pages: dict[str, Path]) -> None:
     browser.open(pages["one"])
     whole = ranges(browser)
@@ -251,6 +263,105 @@ def test_marks_of_errors_are_drawn_over_all_plots(browser: Browser, pages: dict[
     for key in browser.run("flight.plots.map((p) => p.key)"):
         column = browser.run(f"{RED_AT}('{key}', 20)")
         assert column > 0.5, key
+
+
+MARKS = """flight.plots.filter((p) => p.key !== "states").map((p) => ({
+  key: p.key, told: p.below.hidden ? "" : p.below.textContent, shown: !p.below.hidden && p.below.offsetHeight > 0,
+  left: p.u.bbox.left, right: p.u.bbox.left + p.u.bbox.width,
+  marks: p.marks.map(({event, x, text, number}) => ({esc: event.esc, what: event.text, from: event.from, x, text, number})),
+}))"""
+# Pixels of a mark's text that are in the colour of errors.
+INK = """((key, at) => {
+  const { u, marks } = flight.plots.find((p) => p.key === key), { left, right, row } = marks[at].text, r = devicePixelRatio;
+  const data = u.ctx.getImageData(left, u.bbox.top - 15 * (row + 1) * r, right - left, 14 * r).data;
+  let count = 0;
+  for (let i = 0; i < data.length; i += 4) if (data[i] > 150 && data[i] - data[i + 1] > 60) count++;
+  return count;
+})"""
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    """Pages of two ESCs by the number of errors in all; the first ones as a user met them, both ESCs at the same time."""
+    windows = (
+        ErrorWindow(OperatingError.UNDERVOLTAGE, 8 * S, 3 * S),
+        ErrorWindow(OperatingError.BEC_OVERCURRENT, 13 * S, 2 * S),
+        ErrorWindow(OperatingError.OVERCURRENT_INTEGRAL_ERROR, 14 * S, 2 * S),
+        ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_ERROR, 38 * S, 2 * S),
+        *(ErrorWindow(OperatingError.UNDERVOLTAGE, (16 + 2 * n) * S, S) for n in range(10)),
+    )
+    written = {}
+    for number, each in ((2, windows[:1]), (4, windows[:2]), (6, windows[:3]), (28, windows)):
+        bus = shipped_bus(("left", "right"))
+        analysis = Analysis(bus, 2000)
+        for time_ns, values in simulated(bus, 40, [EscOptions(faults=Faults(errors=each))] * 2):
+            analysis.take(time_ns, values)
+        written[number] = tmp_path_factory.mktemp("faulty") / f"{number}.html"
+        written[number].write_text(render(analysis.finish(), title="x", source="x"), encoding="utf-8")
+    return written
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+@pytest.mark.parametrize("number", [2, 4, 6, 28])
+def test_every_error_is_told_at_its_mark_or_by_its_number(
+    browser: Browser, faulty: dict[int, Path], number: int, width: int
+) -> None:
+    browser.open(faulty[number], width, 900, phone=width < 500)
+    found = browser.run(MARKS)
+    assert len(found) >= 8
+    for plot in found:
+        marks = plot["marks"]
+        assert len(marks) == number
+        if width == 1400 and number <= 4:
+            assert all(mark["text"] for mark in marks)
+            assert plot["told"] == ""
+        for at, mark in enumerate(marks):
+            if mark["text"]:
+                assert plot["left"] <= mark["text"]["left"] < mark["text"]["right"] <= plot["right"]
+                assert mark["text"]["left"] - mark["x"] < 10
+                assert browser.run(f"{INK}('{plot['key']}', {at})") > 60
+            else:
+                assert plot["shown"]
+                assert f"{('left', 'right')[mark['esc']]}: {mark['what']}" in plot["told"]
+                assert str(at + 1) in plot["told"] or "…" in plot["told"]
+                assert mark["number"] or number == 28
+        boxes = [box for mark in marks for box in (mark["text"], mark["number"]) if box]
+        for at, a in enumerate(boxes):  # nothing stands over anything else
+            for b in boxes[:at]:
+                assert a["row"] != b["row"] or a["right"] <= b["left"] or b["right"] <= a["left"]
+        for mark in marks:  # no line runs through a text
+            for box in boxes if mark["text"] else ():
+                assert box["row"] >= mark["text"]["row"] or not box["left"] < mark["x"] < box["right"]
+
+
+def test_zooming_in_gives_room_to_the_texts(browser: Browser, faulty: dict[int, Path]) -> None:
+    browser.open(faulty[6], 390, 900, phone=True)
+    assert any(mark["number"] for mark in browser.run(MARKS)[0]["marks"])
+    browser.run("flight.setRange(7, 10)")
+    browser.run("flight.followAll()")
+    browser.settle()
+    for plot in browser.run(MARKS):
+        assert [mark["what"] for mark in plot["marks"] if mark["text"]] == ["battery voltage too low"] * 2
+        assert plot["told"] == ""
+
+
+def test_on_a_phone_nothing_of_several_escs_is_cut(browser: Browser, pages: dict[str, Path]) -> None:
+    browser.open(pages["two"], 390, 844, phone=True)
+    assert browser.run("document.documentElement.scrollWidth") == 390
+    cut = browser.run(
+        "[...document.querySelectorAll('.groups, .groups *, .scroll, .legend td, .legend th')].filter((node) => { "
+        "const r = node.getBoundingClientRect(); return r.right > 390 || r.left < 0 || "
+        "(node.clientWidth && node.scrollWidth > node.clientWidth + 1); }).map((node) => node.outerHTML.slice(0, 200))"
+    )
+    assert cut == []
+    rows = browser.run(
+        "[...document.querySelectorAll('.numbers tbody tr')].map((row) => [...row.cells].slice(1).map((cell) => "
+        "[getComputedStyle(cell, '::before').content, cell.getBoundingClientRect().top, cell.offsetHeight]))"
+    )
+    assert len(rows) > 15
+    for (left, top, height), (right, below, _) in rows:
+        assert (left, right) == ('"left"', '"right"')
+        assert below > top + height - 1 > top
 
 
 def test_an_esc_can_be_switched_off_and_on(browser: Browser, pages: dict[str, Path]) -> None:

@@ -1,20 +1,25 @@
 """``kontronik-can-gw report`` from a file to the page and the pictures."""
 
+import base64
 import re
 import sys
+from array import array
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from report_flights import shipped_bus, simulated
+from report_flights import shipped_bus, simulated, write_capture
+from test_page import data_of, decode
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.offline.report.analysis import Analysis
 from kontronik_can_gw.offline.report.plots_png import write_pngs
-from kontronik_can_gw.protocol.states import OperatingError
-from kontronik_can_gw.simulator import ErrorWindow, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.protocol.states import Device, OperatingError
+from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc, Swap
 from kontronik_can_gw.telemetry import SECOND as S
 
 
@@ -97,11 +102,119 @@ def colours(png: Path) -> set[tuple[int, ...]]:
     return {(n >> 16, n >> 8 & 255, n & 255) for n in np.unique(pixels @ [1 << 16, 1 << 8, 1]).tolist()}
 
 
+DROPOUTS = (Dropout(2 * S, 6 * S), Dropout(S, 5 * S))
+"""Of two ESCs: at 4 and 24 s both are lost, else one alone."""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of two ESCs that are lost again and again; each has two errors, and one is changed for another."""
+    errors = (
+        ErrorWindow(OperatingError.UNDERVOLTAGE, 8_200_000_000, S),
+        ErrorWindow(OperatingError.BEC_OVERCURRENT, 12_500_000_000, S),
+    )
+    options = [
+        EscOptions(faults=Faults(dropout=lost, errors=errors, swaps=swaps))
+        for lost, swaps in zip(DROPOUTS, ((), (Swap(21 * S, Device.KOLIBRI),)), strict=True)
+    ]
+    return write_capture(tmp_path_factory.mktemp("capture") / "flight.kcap", 60, options)
+
+
+@pytest.mark.parametrize("points", [100, 1000, 20000, 1000000])
+def test_no_line_is_drawn_over_a_dropout(recording: Path, points: int) -> None:
+    """Against what the simulator was told to do: from the time-out on until telemetry is back there is no line."""
+    code, html, _ = report(recording, "-o", "-", "--points", points)
+    assert code == 0
+    found = data_of(html)
+    times = list(array("d", base64.b64decode(found["times"])))
+    drawn = 0
+    for plot in found["plots"]:
+        for series in plot["series"]:
+            values = decode(series)
+            lost = DROPOUTS[series["esc"]]
+            for (t0, t1), (a, b) in zip(pairwise(times), pairwise(values), strict=True):
+                if a is None or b is None:
+                    continue
+                drawn += 1
+                for end in range(lost.interval_ns, 61 * S, lost.interval_ns):
+                    low, high = (end - lost.duration_ns) / S + 0.3, end / S - 0.05
+                    assert t1 <= low or t0 >= high, (plot["key"], series["esc"], t0, t1)
+    assert drawn > 100
+    for esc, lost in enumerate(DROPOUTS):
+        gaps = [e for e in found["events"] if e["esc"] == esc and e["text"] == "No telemetry"]
+        assert len(gaps) == 60 * S // lost.interval_ns
+
+
+def test_all_devices_that_there_were_are_named_with_their_time(recording: Path) -> None:
+    _, html, _ = report(recording, "-o", "-")
+    found = re.search(r"<dt>e1</dt><dd>(.*?)</dd>", html)
+    assert found is not None
+    assert re.match(
+        r"Kosmik 120 firmware 4\.17; from 0:2[12]\.\d: Kolibri 120 firmware 4\.17, at /dev/ttyUSB1$", found[1]
+    ), found[1]
+
+
+def test_pictures_tell_the_text_of_every_error(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matplotlib = pytest.importorskip("matplotlib.figure", reason="pip install 'kontronik-can-gw[plot]'")
+    texts: dict[str, list[str]] = {}
+
+    def keep(figure: Any, file: Path, **_: object) -> None:
+        from matplotlib.text import Text
+
+        found: list[Any] = figure.findobj(Text)
+        texts[file.name] = [text.get_text() for text in found]
+        figure.draw_without_rendering()
+        width, height = figure.canvas.get_width_height()
+        for text in found:
+            if ":" in text.get_text() and text.get_text()[0] == "e":  # nothing of a label is cut
+                box = text.get_window_extent()
+                assert box.x0 >= 0, text
+                assert box.x1 <= width, text
+                assert box.y1 <= height, text
+
+    monkeypatch.setattr(matplotlib.Figure, "savefig", keep)
+    assert report(recording, "--png", tmp_path / "pictures")[0] == 0
+    assert len(texts) == 11
+    for name, found in texts.items():
+        if name != "states.png":
+            for text in ("battery voltage too low", "BEC current too high"):
+                for esc in ("e0", "e1"):
+                    assert any(f"{esc}: {text}" in line for line in found), (name, found)
+
+
+def test_nothing_is_written_over_without_force(dump: Path, tmp_path: Path) -> None:
+    page, folder = tmp_path / "flight.html", tmp_path / "pictures"
+    page.write_text("mine")
+    folder.mkdir()
+    (folder / "power.png").write_text("mine")
+    assert report(dump, "-o", page) == (
+        2,
+        "",
+        f"kontronik-can-gw report: {page}: exists. Give another -o, or --force.\n",
+    )
+    assert report(dump, "--png", folder) == (
+        2,
+        "",
+        f"kontronik-can-gw report: {folder}/power.png: exists. Give another --png, or --force.\n",
+    )
+    assert (page.read_text(), (folder / "power.png").read_text()) == ("mine", "mine")
+    assert report(dump, "-o", page, "--png", folder, "--force")[0] == 0
+    assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
+    assert (folder / "power.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.parametrize(
     ("words", "code", "expected"),
     [
         (["{dump}"], 2, "give -o FILE for the page, --png FOLDER for pictures, or both"),
         (["{dump}", "-o", "{dump}"], 2, "is the input. Give another file."),
+        (["{dump}", "-o", ""], 2, "-o: is empty. Give a file, or - for standard output."),
+        (["{dump}", "--png", ""], 2, "--png: is empty. Give a folder."),
+        (["{dump}", "-o", "{tmp}"], 2, "is a folder. Give a file."),
+        (["{dump}", "-o", "{tmp}/" + 300 * "x"], 2, "cannot be written: File name too long."),
+        (["{dump}", "--png", "{tmp}/" + 300 * "x"], 2, "cannot be written: File name too long."),
         (["{dump}", "-o", "{tmp}/no/x.html"], 1, "cannot be written: No such file or directory"),
         (["{dump}", "-o", "-", "--from", "9", "--to", "3"], 2, "--to 3: must be greater than --from 9"),
         (["{dump}", "-o", "-", "--from", "900"], 1, "no values in this part of it"),

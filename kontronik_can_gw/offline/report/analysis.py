@@ -58,7 +58,7 @@ class Analysis:
         low, high = window
         self._from_ns = None if low is None else round(low * SECOND)
         self._to_ns = None if high is None else round(high * SECOND)
-        self._gap_ns = max(500 * MS, *(2 * settings.timeout_ns for settings in bus.escs))
+        self._gap_ns = max(500 * MS, *(settings.timeout_ns + 250 * MS for settings in bus.escs))
         self._origin_ns: int | None = None
         self._start_ns = 0
         self._last_ns: int | None = None
@@ -472,6 +472,8 @@ class _Esc:
             self.facts.device = str(device)
             self.facts.variant = variant if isinstance(variant, int) else None
             self.facts.firmware = f"{main}.{sub}" if isinstance(main, int) and isinstance(sub, int) else None
+            self.facts.devices.append((time_ns, _device_words(self.facts)))
+            del self.facts.devices[MOST_EVENTS:]
             if was is not None:
                 text = f"Device changed from {before} to {_device_words(self.facts)}"
                 self._events.add(Event("device", self.index, time_ns, None, "device", text, momentary=True))

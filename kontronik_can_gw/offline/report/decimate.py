@@ -4,15 +4,22 @@ Rows that follow each other share a bucket; a bucket keeps, of each column, its 
 came. When there are too many buckets, neighbours are merged and each holds twice as many rows. So every extreme survives exactly, its time
 to within a bucket, and as long as there are not more rows than points nothing is changed at all.
 
-A bucket in which a column is partly None is set off by gaps on both sides: what was not available is never joined by a line, though
-the gap may be drawn as much as one bucket beside its place.
+A bucket never holds rows of which a column has a value in one and none in another: where a column begins or ceases to be available a new
+bucket begins, however few rows that leaves in one. So each line ends at its last value in front of a gap and begins again at its first
+behind it, and a gap of one row is as safe as a long one. Only beyond MOST_RUNS such places the closest of them are blurred: merged into
+mixed buckets, in which the values of a column that has gaps stand alone, joined with nothing.
 """
 
 from array import array
 from collections.abc import Sequence
+from itertools import pairwise
 
 Number = int | float | None
 LEAST_POINTS = 8
+MOST_RUNS = 4000
+"""Stretches of rows with the same columns available that are told apart, whatever the number of points."""
+_MIXED = -1
+_LEAST_BLUR_NS = 1_000_000
 
 
 class Points:
@@ -24,14 +31,18 @@ class Points:
 
 
 class Decimator:
-    """Rows of ``width`` columns in, at most ``points`` points out (and up to as many again where gaps must be shown)."""
+    """Rows of ``width`` columns in, at most ``points`` points out, and a few more for each gap."""
 
-    def __init__(self, width: int, points: int) -> None:
+    def __init__(self, width: int, points: int, most_runs: int = MOST_RUNS) -> None:
         self._points = max(points, LEAST_POINTS) // 4 * 4
+        self._most_runs = max(most_runs, 2)
         self._rows = 1  # of a full bucket
-        self._fill = 0  # rows in the last bucket
+        self._runs = 0
+        self._blur_ns = _LEAST_BLUR_NS
         self._begin = array("q")
         self._end = array("q")
+        self._count = array("q")  # rows in it
+        self._gaps: list[int] = []  # a bit for each column that has no value in the bucket, or _MIXED
         self._first: list[list[Number]] = [[] for _ in range(width)]
         self._second: list[list[Number]] = [[] for _ in range(width)]
         self._mixed = [bytearray() for _ in range(width)]
@@ -43,123 +54,184 @@ class Decimator:
 
     def feed(self, times: Sequence[int], columns: Sequence[Sequence[Number]]) -> None:
         """Take rows, given as columns; ``times`` in ns, never falling."""
-        at, count = 0, len(times)
-        while at < count:
-            room = self._room()
-            if not room:
-                self._merge()
-                continue
-            stop = min(count, at + room)
-            self._take(times, columns, at, stop)
-            at = stop
+        for begin, end, gaps in _runs(columns, len(times)):
+            if not self._gaps or self._gaps[-1] != gaps:
+                self._runs += 1
+                if self._runs > self._most_runs:
+                    self._blur()
+            at = begin
+            while at < end:
+                room = self._room(gaps)
+                if room <= 0:
+                    self._merge()
+                    continue
+                stop = min(end, at + room)
+                self._take(times, columns, at, stop, gaps)
+                at = stop
 
     def finish(self) -> Points:
         """The points of all rows so far."""
-        if self._rows == 1:
-            return Points(list(self._begin), [list(column) for column in self._first])
         times: list[int] = []
-        columns: list[list[Number]] = [[] for _ in self._first]
-        mixed_any = bytes(map(max, *self._mixed)) if len(self._mixed) > 1 else bytes(self._mixed[0])
-        for index, (begin, end) in enumerate(zip(self._begin, self._end, strict=True)):
-            times += (begin, begin, end, end) if mixed_any[index] else (begin, end)
-        for column, first, second, mixed in zip(columns, self._first, self._second, self._mixed, strict=True):
+        for begin, end, count, gaps in zip(self._begin, self._end, self._count, self._gaps, strict=True):
+            if gaps == _MIXED:
+                times += (begin, begin, begin, end, end)
+            elif count == 1:
+                times.append(begin)
+            else:
+                times += (begin, end)
+        columns: list[list[Number]] = []
+        for first, second, mixed in zip(self._first, self._second, self._mixed, strict=True):
+            column: list[Number] = []
             for index, (a, b) in enumerate(zip(first, second, strict=True)):
                 if mixed[index]:
-                    column += (None, a, b, None)
-                elif mixed_any[index]:
-                    column += (a, a, b, b)
+                    column += (None, a, None, b, None)
+                elif self._gaps[index] == _MIXED:
+                    column += (a, a, a, b, b)
+                elif self._count[index] == 1:
+                    column.append(a)
                 else:
                     column += (a, b)
+            columns.append(column)
         return Points(times, columns)
 
-    def _room(self) -> int:
-        """Rows that can be taken before buckets must be merged."""
-        most = self._points if self._rows == 1 else self._points // 2
-        open_rows = self._rows - self._fill if self._begin else 0
-        return (most - len(self._begin)) * self._rows + open_rows
+    def _room(self, gaps: int) -> int:
+        """Rows of the same kind that can be taken before buckets must be merged."""
+        most = (self._points if self._rows == 1 else self._points // 2) + self._runs - 1
+        is_open = self._gaps and self._gaps[-1] == gaps
+        return (most - len(self._begin)) * self._rows + (max(0, self._rows - self._count[-1]) if is_open else 0)
 
-    def _take(self, times: Sequence[int], columns: Sequence[Sequence[Number]], at: int, stop: int) -> None:
+    def _take(self, times: Sequence[int], columns: Sequence[Sequence[Number]], at: int, stop: int, gaps: int) -> None:
+        """Rows that all have the same gaps, as many as there is room for."""
         rows = self._rows
         if rows == 1:
             self._begin.extend(times[at:stop])
             self._end.extend(times[at:stop])
-            self._fill = 1
+            self._count.extend([1] * (stop - at))
+            self._gaps += [gaps] * (stop - at)
             for first, second, mixed, values in zip(self._first, self._second, self._mixed, columns, strict=True):
                 part = values[at:stop]
                 first += part
                 second += part
                 mixed += bytes(len(part))
             return
-        if self._begin and self._fill < rows:
-            end = min(stop, at + rows - self._fill)
+        if self._gaps and self._gaps[-1] == gaps and self._count[-1] < rows:
+            end = min(stop, at + rows - self._count[-1])
             self._end[-1] = times[end - 1]
-            self._fill += end - at
-            for first, second, mixed, values in zip(self._first, self._second, self._mixed, columns, strict=True):
-                a, b, m = _join(first[-1], second[-1], mixed[-1], *_reduce(values[at:end]))
-                first[-1], second[-1], mixed[-1] = a, b, m
+            self._count[-1] += end - at
+            for first, second, values in zip(self._first, self._second, columns, strict=True):
+                if first[-1] is not None:
+                    first[-1], second[-1], _ = _join(first[-1], second[-1], 0, *_reduce(values[at:end]), 0)
             at = end
         if at == stop:
             return
         starts = range(at, stop, rows)
         self._begin.extend([times[start] for start in starts])
         self._end.extend([times[min(start + rows, stop) - 1] for start in starts])
-        self._fill = stop - starts[-1]
+        self._count.extend([min(start + rows, stop) - start for start in starts])
+        self._gaps += [gaps] * len(starts)
         for first, second, mixed, values in zip(self._first, self._second, self._mixed, columns, strict=True):
+            mixed += bytes(len(starts))
             part = values[at:stop]
             if part.count(part[0]) == len(part):  # nothing moves: most columns, most of the time
                 first += [part[0]] * len(starts)
                 second += [part[0]] * len(starts)
-                mixed += bytes(len(starts))
-            elif None in part:
-                for start in range(0, len(part), rows):
-                    a, b, m = _reduce(part[start : start + rows])
-                    first.append(a)
-                    second.append(b)
-                    mixed.append(m)
-            else:
-                for start in range(0, len(part), rows):
-                    bucket = part[start : start + rows]
-                    low, high = min(bucket), max(bucket)  # type: ignore[type-var]  # no None here
-                    if low == high or bucket.index(low) < bucket.index(high):
-                        first.append(low)
-                        second.append(high)
-                    else:
-                        first.append(high)
-                        second.append(low)
-                mixed += bytes(len(starts))
+                continue
+            for start in range(0, len(part), rows):
+                a, b = _reduce(part[start : start + rows])
+                first.append(a)
+                second.append(b)
 
     def _merge(self) -> None:
-        """Two neighbours each become one. Called when all buckets are full and their number is even."""
+        """Twice as many rows to a bucket: neighbours with the same gaps become one."""
         self._rows *= 2
-        self._fill = self._rows
-        self._begin = self._begin[::2]
-        self._end = self._end[1::2]
-        for index, (first, second, mixed) in enumerate(zip(self._first, self._second, self._mixed, strict=True)):
-            joined = [
-                _join(first[i], second[i], mixed[i], first[i + 1], second[i + 1], mixed[i + 1])
-                for i in range(0, len(first), 2)
-            ]
-            self._first[index] = [a for a, _, _ in joined]
-            self._second[index] = [b for _, b, _ in joined]
-            self._mixed[index] = bytearray(m for _, _, m in joined)
+        groups: list[list[int]] = []
+        rows = 0
+        for index, count in enumerate(self._count):
+            gaps = self._gaps[index]
+            if groups and gaps != _MIXED and gaps == self._gaps[index - 1] and rows + count <= self._rows:
+                groups[-1].append(index)
+                rows += count
+            else:
+                groups.append([index])
+                rows = count
+        self._regroup(groups)
+
+    def _blur(self) -> None:
+        """Too many runs: neighbours become one where together they are short, whatever their gaps, until half as many are left."""
+        while True:
+            groups: list[list[int]] = []
+            for index, end in enumerate(self._end):
+                if groups and end - self._begin[groups[-1][0]] <= self._blur_ns:
+                    groups[-1].append(index)
+                else:
+                    groups.append([index])
+            self._regroup(groups)
+            self._rows = max(self._rows, 2)
+            self._runs = 2 + sum(a != b or b == _MIXED for a, b in pairwise(self._gaps))  # with the one that comes
+            if self._runs <= self._most_runs // 2 or len(self._begin) == 1:
+                return
+            self._blur_ns *= 2
+
+    def _regroup(self, groups: Sequence[Sequence[int]]) -> None:
+        """Each group of neighbours becomes one bucket."""
+        self._begin = array("q", [self._begin[group[0]] for group in groups])
+        self._end = array("q", [self._end[group[-1]] for group in groups])
+        count, gaps = self._count, self._gaps
+        self._count = array("q", [sum(count[index] for index in group) for group in groups])
+        self._gaps = [
+            gaps[group[0]] if all(gaps[index] == gaps[group[0]] for index in group) else _MIXED for group in groups
+        ]
+        for column, (first, second, mixed) in enumerate(zip(self._first, self._second, self._mixed, strict=True)):
+            joined = []
+            for group in groups:
+                index = group[0]
+                found = first[index], second[index], mixed[index]
+                for index in group[1:]:
+                    found = _join(*found, first[index], second[index], mixed[index])
+                joined.append(found)
+            self._first[column] = [a for a, _, _ in joined]
+            self._second[column] = [b for _, b, _ in joined]
+            self._mixed[column] = bytearray(m for _, _, m in joined)
 
 
-def _reduce(part: Sequence[Number]) -> tuple[Number, Number, int]:
-    """Least and greatest in the order in which they came, and whether some but not all are None."""
-    known = [value for value in part if value is not None]
-    if not known:
-        return None, None, 0
-    low, high = min(known), max(known)
-    mixed = len(known) != len(part)
-    if known.index(low) <= known.index(high):
-        return low, high, mixed
-    return high, low, mixed
+def _runs(columns: Sequence[Sequence[Number]], count: int) -> list[tuple[int, int, int]]:
+    """Stretches of rows with the same columns without a value: from, to, a bit for each such column."""
+    if not count:
+        return []
+    gaps = 0
+    changes: dict[int, int] = {}
+    for index, values in enumerate(columns):
+        bit = 1 << index
+        if values[0] is None:
+            gaps |= bit
+        if None not in values or values.count(None) == count:
+            continue
+        for at, (before, value) in enumerate(pairwise(values), 1):
+            if (before is None) is not (value is None):
+                changes[at] = changes.get(at, 0) ^ bit
+    found = []
+    begin = 0
+    for at in sorted(changes):
+        found.append((begin, at, gaps))
+        begin, gaps = at, gaps ^ changes[at]
+    found.append((begin, count, gaps))
+    return found
+
+
+def _reduce(part: Sequence[Number]) -> tuple[Number, Number]:
+    """Least and greatest in the order in which they came, of values only or of None only."""
+    if part[0] is None:
+        return None, None
+    low, high = min(part), max(part)  # type: ignore[type-var]  # no None here
+    if low == high or part.index(low) < part.index(high):
+        return low, high
+    return high, low
 
 
 def _join(a1: Number, a2: Number, a_mixed: int, b1: Number, b2: Number, b_mixed: int) -> tuple[Number, Number, int]:
-    """The same for two that follow each other."""
+    """The same for two buckets that follow each other, and whether the column has values and gaps in them."""
     if a1 is None or a2 is None:
-        return b1, b2, b_mixed or b1 is not None
+        return b1, b2, b_mixed or int(b1 is not None)
     if b1 is None or b2 is None:
         return a1, a2, 1
     mixed = a_mixed or b_mixed

@@ -91,6 +91,8 @@ class Facts:
     variant: int | None = None
     firmware: str | None = None
     layout: str | None = None
+    devices: list[tuple[int, str]] = field(default_factory=list)
+    """Each that there was, in words, and since when; one where none was changed."""
 
 
 @dataclass

@@ -9,7 +9,7 @@
   const whole = [data.from, Math.max(data.to, data.from + 0.1)];
   const LEAST_SPAN = 0.05;
   const AXIS = 58;
-  const TEXTS = 32; // height of two rows of text above a plot
+  const ROW = 15; // height of a row of text above a plot
   const WIDTHS = [2, 1.2, 0.8]; // of a plot's lines, where colours and dashes tell ESCs apart
 
   // --- small tools
@@ -150,7 +150,12 @@
 
   const errors = data.events.filter((event) => event.kind === "error");
 
-  const bySeverity = ["error", "warning", "status"].flatMap((kind) => errors.filter((event) => event.severity === kind));
+  const numberOf = new Map(errors.map((event, index) => [event, index + 1]));
+  const ROWS = Math.min(4, errors.length);
+  const TEXTS = ROWS * ROW + 2;
+  const MOST_MARKS = 60; // with a text or a number
+  const MOST_TOLD = 12; // lines below a plot
+  const textOf = (event) => (several ? data.escs[event.esc] + ": " : "") + event.text;
   const toneOf = (event) => ink({ error: "--error", warning: "--warning" }[event.severity] ?? "--soft");
 
   function drawMarks(u, withText) {
@@ -183,41 +188,114 @@
       }
       ctx.globalAlpha = 0.8;
       if (!(x - lastLine[event.severity] < ratio)) {
-        line(ctx, x, bbox, above, event.severity === "error" ? [] : [6 * ratio, 3 * ratio]);
+        line(ctx, x, bbox, event.severity === "error" ? [] : [6 * ratio, 3 * ratio]);
         lastLine[event.severity] = x;
       }
       if (event.to !== null) {
         ctx.globalAlpha = 0.45;
-        line(ctx, xEnd, bbox, 0, [ratio, 3 * ratio]);
+        line(ctx, xEnd, bbox, [ratio, 3 * ratio]);
       }
     }
-    if (withText) drawTexts(u, ratio);
+    if (withText) drawLabels(u, ratio);
     ctx.restore();
   }
 
-  // In two rows, errors before warnings; what finds no room is told at the cursor and in the list.
-  function drawTexts(u, ratio) {
-    const { ctx, bbox } = u;
-    const taken = [[], []];
-    ctx.globalAlpha = 1;
-    for (const event of bySeverity) {
-      const end = event.to ?? whole[1];
-      if (!visible[event.esc] || end < range[0] || event.from > range[1]) continue;
-      const text = (several ? data.escs[event.esc] + ": " : "") + event.text;
-      const left = Math.max(u.valToPos(event.from, "x", true), bbox.left) + 4 * ratio;
-      const right = left + ctx.measureText(text).width + 8 * ratio;
-      const row = taken.findIndex((spans) => spans.every(([from, to]) => right <= from || left >= to));
-      if (row < 0) continue;
-      taken[row].push([left, right]);
-      ctx.fillStyle = toneOf(event);
-      ctx.fillText(text, left, bbox.top - (16 + 15 * row) * ratio);
+  // Where the texts of the marks in sight stand, in rows above the plot: each begins at its mark, and no mark's line runs through
+  // a text. Where not all find room each mark has a number, and what still finds room its text; who is without is told below.
+  function layOut(marks, from, to, rows, step) {
+    const taken = Array.from({ length: rows }, () => []);
+    const lines = Array.from({ length: rows }, () => []); // that lead from a mark up to its text
+    const isFree = (row, left, right) => taken[row].every((span) => right <= span[0] || left >= span[1]);
+    const put = (mark, first) => {
+      const [left, right] = [mark.left + 4 * step, mark.left + mark.width + 10 * step];
+      for (let row = first; right <= to && row < rows; row++) {
+        if (!isFree(row, left, right) || lines[row].some((x) => x > left && x < right)) continue;
+        for (let at = 0; at < row && mark.x >= from; at++) if (!isFree(at, mark.x - step, mark.x + step)) return false;
+        taken[row].push([left, right]);
+        for (let at = 0; at < row && mark.x >= from; at++) lines[at].push(mark.x);
+        mark.text = { row, left, right };
+        return true;
+      }
+      return false;
+    };
+    const backwards = [...marks].reverse(); // an earlier text that has no room beside a later one stands above it
+    if (backwards.map((mark) => put(mark, 0)).every(Boolean)) return;
+    for (const found of [...taken, ...lines]) found.splice(0);
+    for (const mark of marks) {
+      mark.text = null;
+      let left = Math.min(mark.left + 2 * step, to - mark.badge);
+      const last = left + 3 * mark.badge;
+      while (left <= last && !isFree(0, left, left + mark.badge)) left += step;
+      if (left > last || left + mark.badge > to) continue;
+      mark.number = { row: 0, left, right: left + mark.badge };
+      taken[0].push([left, left + mark.badge]);
+    }
+    for (const kind of ["error", "warning", "status"]) {
+      for (const mark of backwards) if (mark.event.severity === kind) put(mark, 1);
     }
   }
 
-  function line(ctx, x, bbox, above, dash) {
+  function drawLabels(u, ratio) {
+    const { ctx, bbox } = u;
+    const [from, to] = [bbox.left, bbox.left + bbox.width];
+    const seen = errors.filter((event) => visible[event.esc] && (event.to ?? whole[1]) >= range[0] && event.from <= range[1]);
+    const rank = (event) => ["error", "warning", "status"].indexOf(event.severity);
+    const chosen = seen.length <= MOST_MARKS ? seen
+      : [...seen].sort((a, b) => rank(a) - rank(b)).slice(0, MOST_MARKS).sort((a, b) => a.from - b.from);
+    const marks = chosen.map((event) => {
+      const x = u.valToPos(event.from, "x", true);
+      const number = String(numberOf.get(event));
+      return {
+        event, x, left: Math.max(x, from), width: ctx.measureText(textOf(event)).width,
+        badge: ctx.measureText(number).width + 6 * ratio, text: null, number: null,
+      };
+    });
+    layOut(marks, from, to, ROWS, ratio);
+    ctx.globalAlpha = 1;
+    ctx.setLineDash([]);
+    for (const { event, x, text, number } of marks) {
+      ctx.fillStyle = ctx.strokeStyle = toneOf(event);
+      if (number) {
+        ctx.fillRect(number.left, bbox.top - ROW * ratio, number.right - number.left - ratio, (ROW - 1) * ratio);
+        ctx.fillStyle = ink("--card");
+        ctx.fillText(numberOf.get(event), number.left + 2.5 * ratio, bbox.top - (ROW - 1) * ratio);
+        ctx.fillStyle = toneOf(event);
+      }
+      if (text) {
+        ctx.fillText(textOf(event), text.left, bbox.top - (ROW * (text.row + 1) - 1) * ratio);
+        if (x >= from) ctx.fillRect(x - ratio / 2, bbox.top - ROW * (text.row + 1) * ratio, ratio, ROW * (text.row + 1) * ratio);
+      }
+    }
+    const plot = plots.find((found) => found.u === u);
+    if (!plot) return; // its first drawing: it is drawn again when it takes the range
+    plot.marks = marks.map(({ event, x, text, number }) => ({ event, x, text, number }));
+    tellBelow(plot, marks.filter((mark) => !mark.text).map((mark) => mark.event), seen.length - marks.length);
+  }
+
+  // What has no text at its mark: the numbers, and the text.
+  function tellBelow(plot, events, more) {
+    const groups = new Map();
+    for (const event of events) {
+      const key = `${event.severity} ${textOf(event)}`;
+      groups.set(key, [...(groups.get(key) ?? []), event]);
+    }
+    const told = [...groups.values()].slice(0, MOST_TOLD);
+    const left = more + events.length - told.flat().length;
+    const key = JSON.stringify([told.map((group) => group.map((event) => numberOf.get(event))), left]);
+    if (plot.told === key) return;
+    plot.told = key;
+    plot.below.hidden = !told.length && !left;
+    const lines = told.map((group) => make("li", { class: group[0].severity },
+      make("b", {}, group.slice(0, 8).map((event) => numberOf.get(event)).join(", ") + (group.length > 8 ? " …" : "")),
+      ` ${textOf(group[0])} (${clock(group[0].from)}${group.length > 1 ? " …" : ""})`));
+    if (left > 0) lines.push(make("li", {}, `${left} more: zoom in, or see the events`));
+    plot.below.replaceChildren(...lines);
+  }
+
+  function line(ctx, x, bbox, dash) {
     ctx.setLineDash(dash);
     ctx.beginPath();
-    ctx.moveTo(x, bbox.top - above);
+    ctx.moveTo(x, bbox.top);
     ctx.lineTo(x, bbox.top + bbox.height);
     ctx.stroke();
   }
@@ -247,6 +325,13 @@
     ];
   }
 
+  // Whether the cursor stands between the point next to it and one without a value: the former is not for its time.
+  function inGap(u, column, index) {
+    const t = u.posToVal(u.cursor.left, "x");
+    if (Math.abs(u.valToPos(times[index], "x") - u.cursor.left) <= 3) return false;
+    return (column[t < times[index] ? index - 1 : index + 1] ?? null) === null;
+  }
+
   function isolated(line) {
     const found = [];
     line.forEach((v, i) => {
@@ -257,8 +342,9 @@
 
   function addPlot(figure, label, height, series, columns, more) {
     const box = make("div", { class: "plot", tabindex: "0", role: "group", "aria-label": `${label} over time` });
-    figure.append(box);
-    const plot = { u: null, box, height, isNear: true, isStale: false, showCursor: () => {} };
+    const below = make("ul", { class: "marks", hidden: "" });
+    figure.append(box, below);
+    const plot = { u: null, box, below, marks: [], height, isNear: true, isStale: false, showCursor: () => {} };
     const options = {
       width: Math.max(200, box.clientWidth),
       height,
@@ -288,8 +374,8 @@
       },
     };
     plot.u = new uPlot(options, [times, ...columns], box);
-    plot.u.setScale("x", { min: whole[0], max: whole[1] });
     plots.push(plot);
+    plot.u.setScale("x", { min: whole[0], max: whole[1] });
     nearness.observe(box);
     listen(plot);
     return plot;
@@ -367,7 +453,7 @@
     plot.showCursor = (u) => {
       const index = u.cursor.left >= 0 ? u.cursor.idx : null;
       cells.forEach((cell, i) => {
-        cell.textContent = index === null || index === undefined ? "–" : shown(columns[i][index], spec.digits);
+        cell.textContent = index === null || index === undefined || inGap(u, columns[i], index) ? "–" : shown(columns[i][index], spec.digits);
       });
     };
   }
@@ -548,8 +634,7 @@
     const reach = (range[1] - range[0]) / 400;
     for (const event of errors) {
       if (!visible[event.esc] || event.from - reach > t || (event.to ?? whole[1]) + reach < t) continue;
-      const text = (several ? data.escs[event.esc] + ": " : "") + event.text;
-      parts.push(" · ", make("span", { class: event.severity }, text));
+      parts.push(" · ", make("span", { class: event.severity }, textOf(event)));
       if (parts.length > 10) break;
     }
     now.replaceChildren(...parts);

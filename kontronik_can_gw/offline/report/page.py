@@ -17,6 +17,8 @@ from kontronik_can_gw.offline.report.quantities import PLOTS, STATE_CLASSES, STY
 from kontronik_can_gw.telemetry import SECOND
 
 HERE = Path(__file__).parent
+MOST_DEVICES = 8
+"""Of one ESC, that the head names."""
 Json = dict[str, "Json"] | list["Json"] | str | int | float | bool | None
 
 
@@ -185,7 +187,7 @@ def _head(
     if wall_ns is not None:
         facts.append(("Begin", wall_clock(wall_ns + flight.start_ns - flight.origin_ns)))
     for name, fact in zip(flight.names, flight.facts, strict=True):
-        words, told = fact_words(fact), provenance.get(name, "")
+        words, told = fact_words(fact, flight.origin_ns), provenance.get(name, "")
         if words or told:
             facts.append((name, ", at ".join(filter(None, (words, told.rpartition(", at ")[2]))) if words else told))
     if flight.replayed:
@@ -202,9 +204,17 @@ def _head(
     return html
 
 
-def fact_words(facts: Facts) -> str:
-    """What an ESC is, in a few words; empty where nothing is known."""
+def fact_words(facts: Facts, origin_ns: int) -> str:
+    """What an ESC is, in a few words; where it was changed all that there were, with their times; empty where nothing is known."""
     words = []
+    if len(facts.devices) > 1:
+        shown = facts.devices[:MOST_DEVICES]
+        first, *others = (text for _, text in shown)
+        since = [clock(time_ns - origin_ns) for time_ns, _ in shown[1:]]
+        words.append("; ".join([first, *(f"from {at}: {text}" for at, text in zip(since, others, strict=True))]))
+        if len(facts.devices) > len(shown):
+            words[-1] += f"; and {len(facts.devices) - len(shown)} more changes"
+        return words[-1]
     if facts.device:
         words.append(facts.device + (f" {facts.variant}" if facts.variant is not None else ""))
     if facts.firmware:
@@ -341,7 +351,12 @@ def _summary(flight: Flight) -> str:
         for label, cell in lines:
             cells = [cell(summary) for summary in flight.summaries]
             if any(text is not None for text in cells):
-                tds = "".join(f"<td>{text or '–'}</td>" for text in cells)
+                tds = "".join(
+                    f'<td data-esc="{escape(name)}"><span>{text or "–"}</span></td>'
+                    if several
+                    else f"<td>{text or '–'}</td>"
+                    for name, text in zip(flight.names, cells, strict=True)
+                )
                 rows.append(f'<tr><th scope="row">{escape(label)}</th>{tds}</tr>')
         if rows:
             head = f"<thead><tr><td></td>{names}</tr></thead>" if several else ""
