@@ -271,3 +271,28 @@ def test_many_events_and_states_stay_bounded() -> None:
     assert len(flight.events) == 10_000
     assert len(flight.segments[0]) <= 4000
     assert len(flight.times) <= 1000
+
+
+@pytest.mark.parametrize("points", [100, 20_000])
+def test_rows_far_apart_are_not_joined_even_without_a_row_that_tells_the_loss(points: int) -> None:
+    """As in a log that was stopped for a while: 2 s of rows, nothing for 1.1 s, and so on."""
+    bus = shipped_bus()
+    live = column(bus, "battery_voltage")
+    blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
+    analysis = Analysis(bus, points)
+    times = [part * 3_100_000_000 + at * 10_000_000 for part in range(40) for at in range(201)]
+    for number, time_ns in enumerate(times):
+        values = list(blank)
+        values[live] = 20 + number % 7
+        analysis.take(time_ns, values)
+    flight = analysis.finish()
+    (line,) = [line for plot in flight.plots for line in plot.lines if line.source == "battery_voltage"]
+    drawn = [
+        (t0, t1)
+        for (t0, t1), (a, b) in zip(pairwise(flight.times), pairwise(line.values), strict=True)
+        if a is not None and b is not None
+    ]
+    assert len(drawn) >= 40
+    assert max(t1 - t0 for t0, t1 in drawn) <= 2 * S
+    assert all(t0 // 3_100_000_000 == t1 // 3_100_000_000 for t0, t1 in drawn)
+    assert flight.summaries[0].gaps == 39
