@@ -1,13 +1,18 @@
 """``kontronik-can-gw convert``: recordings to tables, CAN logs and plain bytes."""
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.offline.convert import BYTES, FORMATS, LOGS, ON_SCREEN, TABLES
+from kontronik_can_gw.offline.convert import BYTES, FORMATS, LOGS, ON_SCREEN, STREAMS, TABLES
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from kontronik_can_gw.offline.convert import Conversion
     from kontronik_can_gw.offline.inputs import Input
+    from kontronik_can_gw.offline.layouts import BusLayout
 
 SUFFIXES = {
     ".csv": "csv",
@@ -25,10 +30,12 @@ SUFFIXES = {
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
 BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
+IN may be a pipe, or - for standard input: it is first read to its end, into a temporary file (in TMPDIR, else /tmp).
 
 OUT is a table of all values (csv, jsonl, parquet, mf4), a log of the CAN frames (candump, asc, blf, trc, mf4-log), or the plain UART
 bytes of one ESC (bin). Its suffix tells which: .csv .jsonl .ndjson .parquet .mf4 .log .candump .asc .blf .trc .bin; --to where it
-does not. - is standard output, for text. Parquet needs pyarrow, MF4 needs asammdf; they are named where they are missing.
+does not. - is standard output, for text, and through a pipe for bin. Parquet needs pyarrow, MF4 needs asammdf; they are named
+where they are missing.
 
 Tables have a row at each telemetry frame, or at each group of CAN frames that belong together. Values hold while they are fresh.
 Time [s] counts from the recording's first row, with --frames from its first frame; Utc is there where the recording knows
@@ -38,8 +45,8 @@ Flags are 0 and 1.
 Of a damaged recording everything that is intact is converted, and a summary says what is not.
 OUT takes its name only when it is whole; until then it is called OUT.part.
 
-exit codes: 0 converted, also where a part of IN is damaged; 1 there is nothing to convert, or something cannot be read or written;
-2 wrong usage
+exit codes: 0 converted, also where a part of IN is damaged; 1 there is nothing to convert, something cannot be read or written, or a
+library is missing; 2 wrong usage, or IN is no recording
 """
 
 
@@ -49,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
-    parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes")
+    parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes; - for standard input")
     parser.add_argument("output", metavar="OUT", help="file to write, or - for standard output")
     parser.add_argument("--to", metavar="FORMAT", choices=FORMATS, help=", ".join(FORMATS))
     parser.add_argument("--force", action="store_true", help="write over OUT if it is there")
@@ -83,22 +90,60 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Convert args.input. UserError for wrong usage, RunError where something cannot be read or written."""
+    form = _format(args)
+    _check(args, form)
+    try:
+        with _ended_by_signals():
+            _convert(args, form)
+    except KeyboardInterrupt as end:
+        _say("stopped: nothing is written" if args.output != "-" else "stopped")
+        return 143 if isinstance(end, _Ended) else 130
+    return 0
+
+
+class _Ended(KeyboardInterrupt):
+    """SIGTERM, or the terminal was closed: it ends as by Ctrl-C."""
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP leave no half file either; what is ignored (nohup) stays ignored."""
+    import signal
+    import threading
+
+    def end(_number: int, _frame: object) -> None:
+        raise _Ended
+
+    numbers = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    changed = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    for number in changed:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in changed:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _convert(args: argparse.Namespace, form: str) -> None:
     import sys
     import time
     from pathlib import Path
 
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.errors import RunError
+    from kontronik_can_gw.errors import RunError, UserError
     from kontronik_can_gw.offline.convert import Output
-    from kontronik_can_gw.offline.inputs import LIVE_RATE, open_input
+    from kontronik_can_gw.offline.inputs import LIVE_RATE, CanLogInput
 
-    form = _format(args)
-    _check(args, form)
     source, target = Path(args.input), Path(args.output)
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     begun = time.monotonic()
-    with open_input(source, layout, args.live_rate or LIVE_RATE) as recording:
+    with _opened(args, source, layout) as recording:
+        if args.live_rate is not None and not recording.times_assumed:
+            raise UserError(
+                f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
+            )
         conversion = _conversion(args, form, recording)
         try:
             with (
@@ -111,21 +156,35 @@ def main(args: argparse.Namespace) -> int:
         except OSError as error:
             where = "standard output" if args.output == "-" else str(target)
             raise RunError(f"{where}: cannot be written: {_reason(error)}.") from None
-        except KeyboardInterrupt:
-            _say("stopped: nothing is written" if args.output != "-" else "stopped")
-            return 130
-        damage = list(recording.damage)
+        damage = [line for line in recording.damage if line not in recording.notes]
         if told is None:
             raise RunError(*_nothing(args, recording, damage))
+        notes = recording.notes if form in TABLES else []
         if not args.quiet:
+            if form in TABLES and not notes and isinstance(recording, CanLogInput) and recording.others:
+                told += f", {recording.others} other frames passed over"
             _say(
                 f"{'standard output' if args.output == '-' else args.output}: {told}, in {time.monotonic() - begun:.1f} s"
             )
             if recording.times_assumed and form != BYTES:
                 _say(f"times are assumed: {args.live_rate or LIVE_RATE:g} live frames a second (--live-rate)")
+        for line in notes:
+            _say(f"{args.input}: {line}")
         for line in damage:
             print(f"kontronik-can-gw convert: {args.input}: damaged: {line}", file=sys.stderr)
-    return 0
+
+
+def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None") -> "Input":
+    """The recording; of a pipe with a bar while it is read into a file."""
+    from kontronik_can_gw.cli.progress import Progress
+    from kontronik_can_gw.offline.inputs import LIVE_RATE, open_input
+    from kontronik_can_gw.offline.spool import is_stream
+
+    rate = args.live_rate or LIVE_RATE
+    if not is_stream(source):
+        return open_input(source, layout, rate)
+    with Progress(f"reading {source}", None, args.output == "-") as progress:
+        return open_input(source, layout, rate, progress.reach)
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Conversion":
@@ -150,7 +209,7 @@ def _format(args: argparse.Namespace) -> str:
     if args.to:
         return str(args.to)
     if args.output == "-":
-        raise UserError(f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}")
+        raise UserError(f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}; bin through a pipe")
     suffix = Path(args.output).suffix.lower()
     if suffix not in SUFFIXES:
         raise UserError(
@@ -161,12 +220,15 @@ def _format(args: argparse.Namespace) -> str:
 
 def _check(args: argparse.Namespace, form: str) -> None:
     """Wrong usage that is known before anything is opened. UserError."""
+    import sys
     from pathlib import Path
 
     from kontronik_can_gw.errors import UserError
 
-    if args.output == "-" and form not in ON_SCREEN:
-        raise UserError(f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(ON_SCREEN)}")
+    if args.output == "-" and form not in STREAMS:
+        raise UserError(f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}")
+    if args.output == "-" and form == BYTES and sys.stdout.isatty():
+        raise UserError("bin cannot go to a terminal. Give a file, or a pipe behind it.")
     given = {"--signals": args.signals, "--rate": args.rate, "--frames": args.frames}
     if form not in TABLES:
         for option, value in given.items():
@@ -178,6 +240,8 @@ def _check(args: argparse.Namespace, form: str) -> None:
         raise UserError(f"--esc is for tables and bin: {form} holds the frames as they are")
     if form == BYTES and (args.start is not None or args.end is not None):
         raise UserError("--from and --until are not for bin, which has no times")
+    if form == BYTES and args.live_rate is not None:
+        raise UserError("--live-rate is not for bin, which has no times")
     if args.start is not None and args.end is not None and args.end < args.start:
         raise UserError("--until is before --from")
     if args.output == "-":
@@ -218,10 +282,14 @@ def _esc(args: argparse.Namespace, recording: "Input", needed: bool = False) -> 
 
 def _nothing(args: argparse.Namespace, recording: "Input", damage: list[str]) -> list[str]:
     """Why there is nothing to convert."""
+    from kontronik_can_gw.offline.inputs import CanLogInput
+
     told = [f"{args.input}: damaged: {line}" for line in damage]
     if args.start is not None or args.end is not None:
         return [*told, f"{args.input}: nothing in it is between --from and --until"]
     file = recording.bus.layout.file
+    if isinstance(recording, CanLogInput) and not recording.others:
+        return [*told, f"{args.input}: nothing in it can be converted: it has no CAN frame."]
     return [
         *told,
         f"{args.input}: nothing in it can be converted: no frame of {file}. Give the right DBC by --dbc or -c.",

@@ -8,7 +8,7 @@ import os
 import select
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -35,11 +35,14 @@ _PLAIN_LINE_S = 1.0
 _ONCE_S = 3.0
 _AT_MOST_BEHIND_S = 0.5
 _SUFFIX_OF_UTF8 = "utf-8"
+_LOOK_BACK = 1 << 20
+"""Bytes of a capture's end: a block is far shorter."""
 
 EPILOG = """\
 Without FILE it listens on the CAN bus, anywhere on it: it only needs the DBC (-c, --dbc) and never sends a frame.
 With -c the interface and the channel are those of the configuration unless they are given.
 FILE is a capture (.kcap), a file of UART bytes or a CAN log (candump .log, .asc, .blf, .trc, .mf4); it is played in real time.
+It may be a pipe, or - for standard input, which is first read to its end, into a temporary file (in TMPDIR, else /tmp).
 
 keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it, a all, n and p pages, space pause (FILE)
 bars: power stage and BEC 0..110 degC, yellow from 80, red from 100; cell voltage 3.0..4.2 V, yellow from 3.5, red from 3.3 down;
@@ -163,8 +166,27 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
         if given is not None and isinstance(opened, CaptureInput):
             raise UserError(f"{args.file}: is a capture, which holds its own DBC. Leave -c and --dbc out.")
         yield Recording(opened, args.speed or 1.0, at_once=args.once)
-        for line in opened.damage:
+        for line in dict.fromkeys([*opened.damage, *opened.notes]):
             say(f"warning: {printable(line)}")
+
+
+def last_ns(opened: "Input") -> int | None:
+    """When the last entry of a capture comes; None where a look at its end does not tell."""
+    from kontronik_can_gw.capture import Block, Scanner, read_entries
+    from kontronik_can_gw.offline.inputs import CaptureInput
+
+    if not isinstance(opened, CaptureInput) or opened.last_path is None:
+        return None
+    last = None
+    with contextlib.suppress(OSError, ValueError):
+        with opened.last_path.open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - _LOOK_BACK))
+            data = file.read(_LOOK_BACK)
+        scanner = Scanner()
+        for found in (*scanner.feed(data), *scanner.flush()):
+            if isinstance(found, Block) and found.kind == b"D":
+                last = max((entry.time_ns for entry in read_entries(found.payload)), default=last)
+    return last
 
 
 def can_config(bus: "BusLayout", interface: str | None, channel: str | None) -> "CanConfig":
@@ -250,6 +272,7 @@ class Recording:
         self._next = next(self._frames, None)
         self._ended_at = 0 if self._next is None else self._next.time_ns
         self._first_ns = self._ended_at
+        self._last_ns = None if at_once else last_ns(opened)
         self._last_pump = time.monotonic()
         self._clock = self._ended_at
         self.ended = self._next is None
@@ -290,8 +313,8 @@ class Recording:
             parts.append(f"x{self._speed:g}")
         if self.ended:
             parts.append("END OF FILE")
-        elif self._input.position < self._input.size:  # a small file is read at once
-            parts.append(f"{100 * self._input.position // self._input.size} %")
+        elif self._last_ns is not None and self._last_ns > self._first_ns:
+            parts.append(f"{min(99, 100 * (self._clock - self._first_ns) // (self._last_ns - self._first_ns))} %")
         if self.paused:
             parts.append("PAUSED")
         return Where(self.name, is_file=True, progress="  ".join(parts), ended=self.ended)
@@ -413,7 +436,7 @@ def _live(console: "Console", source: Source, monitor: "Monitor", interval: floa
 
     from kontronik_can_gw.cli.monitor_screen import ASCII, UNICODE, Choice, screen
 
-    glyphs: Glyphs = UNICODE if _is_utf8(console.encoding) else ASCII
+    glyphs: Glyphs = UNICODE if _is_utf8(console.encoding) and not is_c_locale(_environment()) else ASCII
     choice = Choice()
     with Keys() as keys:
 
@@ -445,6 +468,21 @@ def _live(console: "Console", source: Source, monitor: "Monitor", interval: floa
                         return
                 if pressed:
                     due = time.monotonic()
+
+
+def is_c_locale(environment: Mapping[str, str]) -> bool:
+    """True where the person's locale has ASCII alone, though Python itself then works in UTF-8."""
+    name = next((environment[key] for key in ("LC_ALL", "LC_CTYPE", "LANG") if environment.get(key)), "C")
+    return name in ("C", "POSIX")
+
+
+def _environment() -> dict[str, str]:
+    """As the process was given it: Python gives itself another LC_CTYPE where the locale is C."""
+    try:
+        lines = Path("/proc/self/environ").read_bytes().split(b"\0")
+    except OSError:
+        return dict(os.environ)
+    return {key: value for key, _, value in (os.fsdecode(line).partition("=") for line in lines)}
 
 
 def _retake(console: "Console") -> None:

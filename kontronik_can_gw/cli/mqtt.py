@@ -73,7 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = (
         "The password is never given on the command line, where everybody could read it. A broker that is missing, goes away or does "
-        "not want us is told of once, and tried again for ever. SIGTERM and SIGINT publish 'offline' and end it within half a second."
+        "not want us is told of once, and tried again for ever. SIGTERM and SIGINT publish 'offline' and end it within half a second. "
+        "link_state is as the bus last told it, in a message of its own: behind a gap it may still say Lost for up to that message's "
+        "cycle while available is already true."
     )
 
 

@@ -23,6 +23,8 @@ BYTES = "bin"
 FORMATS = (*TABLES, *LOGS, BYTES)
 ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """What may go to standard output: it is text, and is written from its beginning to its end."""
+STREAMS = (*ON_SCREEN, BYTES)
+"""What may go through a pipe."""
 _BY_PATH = ("parquet", "mf4", "mf4-log")
 """What a library writes that opens the file itself."""
 _TURN = 256
@@ -108,6 +110,7 @@ class LogConversion:
 
     def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
         from kontronik_can_gw.offline.can_logs import CanLogWriter
+        from kontronik_can_gw.offline.inputs import CaptureInput
         from kontronik_can_gw.offline.tables import first_of
 
         first, frames = first_of(recording.frames())
@@ -120,7 +123,8 @@ class LogConversion:
             return None
         comment = "\n".join(f"{key}: {value}" for key, value in recording.provenance.items())
         begins = last.time_ns - origin_ns
-        writer = CanLogWriter(out.open(), self.format, wall_ns, begins, name=out.name, comment=comment)
+        channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
+        writer = CanLogWriter(out.open(), self.format, wall_ns, begins, channel, out.name, comment)
         count = 0
         try:
             for last in frames:

@@ -6,7 +6,7 @@ come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -31,10 +31,12 @@ from kontronik_can_gw.config import shipped
 from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout
 from kontronik_can_gw.dbc_output.unpacker import SignalReader
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.offline.can_logs import CanLog, log_format
+from kontronik_can_gw.offline.can_logs import NAMES, SUFFIXES, CanLog, log_format
 from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc, shown_by
+from kontronik_can_gw.offline.more_escs import more_escs
 from kontronik_can_gw.offline.replay import Replay, TimedFrame, follow_bytes
 from kontronik_can_gw.offline.samples import Sample, SampledGateway, samples_of_frames
+from kontronik_can_gw.offline.spool import is_stream, spooled
 from kontronik_can_gw.protocol.codec import Kind as FrameKind
 from kontronik_can_gw.protocol.deframer import Deframer
 from kontronik_can_gw.telemetry import SECOND
@@ -48,6 +50,7 @@ _MOST_DAMAGE = 50
 _LATEST_NS = 1 << 62
 _MOST_WAITING = 1 << 16
 _LONGEST_FRAME = 64
+_MOST_IDS = 4096
 
 
 class Input(Protocol):
@@ -61,7 +64,9 @@ class Input(Protocol):
     position: int
     """Bytes read so far, of ``size``."""
     damage: list[str]
-    """What was not intact, a line each; complete when it was read to the end."""
+    """What was not intact, a line each; complete when it was read to the end. Behind ``samples`` the ``notes`` are in it too."""
+    notes: list[str]
+    """What the person should know of how it was read, a line each; complete when it was read to the end."""
     times_assumed: bool
     """True where the recording has no times."""
 
@@ -92,6 +97,9 @@ class Input(Protocol):
 class _Base:
     """What all of them have."""
 
+    last_path: Path | None = None
+    """Of captures: the last part."""
+
     def __init__(self, name: str, bus: BusLayout, size: int) -> None:
         self.name = name
         self.bus = bus
@@ -99,6 +107,7 @@ class _Base:
         self.position = 0
         self.provenance: dict[str, str] = {}
         self.damage: list[str] = []
+        self.notes: list[str] = []
         self.times_assumed = False
 
     @cached_property
@@ -115,15 +124,23 @@ class _Base:
         self.close()
 
 
-def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE) -> Input:
+def open_input(
+    path: Path,
+    layout: BusLayout | None = None,
+    live_rate: float = LIVE_RATE,
+    reached: Callable[[int], None] | None = None,
+) -> Input:
     """Open a recording. UserError for what is none, RunError for what cannot be read.
 
-    ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run. ``layout``: of CAN
-    logs and plain bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
+    ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run; a pipe, or ``-`` for
+    standard input, which is read to its end first (``reached`` is told how far that is). ``layout``: of CAN logs and plain bytes, the
+    shipped one of one ESC if None; for a capture it replaces the recorded one.
     """
+    if is_stream(path):
+        path = spooled(path, reached)
     parts = _parts(path)
     if parts is not None:
-        return CaptureInput(parts, layout)
+        return _captures(parts, layout)
     try:
         with path.open("rb") as file:
             head = file.read(_LOOK)
@@ -132,14 +149,22 @@ def open_input(path: Path, layout: BusLayout | None = None, live_rate: float = L
     if not head:
         raise UserError(f"{path}: is empty")
     if MAGIC in head or path.suffix == SUFFIX:
-        return CaptureInput([path], layout)
+        return _captures([path], layout)
     if log_format(path) is not None:
         return CanLogInput(path, layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc")))
     if b"KOD" in head:
         return DumpInput(path, layout, live_rate)
+    if (called := SUFFIXES.get(path.suffix.lower())) is not None:
+        raise UserError(f"{path}: is no {NAMES[called]}, whatever its name says, and no other recording")
     raise UserError(
         f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_LOOK // 1024} kB"
     )
+
+
+def _captures(paths: Sequence[Path], layout: BusLayout | None) -> "CaptureInput":
+    made = CaptureInput(paths, layout)
+    made.last_path = paths[-1]
+    return made
 
 
 def _printable(text: str) -> str:
@@ -448,18 +473,35 @@ class CanLogInput(_Base):
         self._log = CanLog(path)
         super().__init__(str(path), layout, self._log.size)
         self._path = path
+        self.others = 0
+        """Frames that the layout does not have; complete when it was read to the end."""
 
     def frames(self) -> Iterator[TimedFrame]:
         self._log.close()
         self._log = CanLog(self._path)
+        ours = self.reader.keys
+        seen: set[int] = set()
+        others: dict[int, int] = {}
+        self.others = 0
+        self.notes = []
         for time_ns, frame, received in self._log.frames():
             self.position = self._log.position
+            key = frame.key
+            if key in ours:
+                seen.add(key)
+            else:
+                self.others += 1
+                if key in others or len(others) < _MOST_IDS:
+                    others[key] = others.get(key, 0) + 1
             yield TimedFrame(time_ns, frame, received)
         self.position = self.size
         self.damage = list(self._log.damage)
+        if note := more_escs(self.bus, seen, others):
+            self.notes.append(note)
 
     def samples(self) -> Iterator[Sample]:
         yield from samples_of_frames(self.frames(), self.reader)
+        self.damage += self.notes
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")

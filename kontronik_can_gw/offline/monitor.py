@@ -6,7 +6,7 @@ the sources, whatever units the DBC has. A value that is not available is None, 
 
 import re
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -30,6 +30,8 @@ from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, LinkState
 
 SILENCE_NS = 5 * SECOND
 """So long without a frame it is said in words what may be wrong."""
+_WORKING = ("ok", "degraded")
+_BELIEVED = 2
 _RATE_NS = 2 * SECOND
 _RATE_STEP_NS = 100 * MS
 
@@ -162,6 +164,10 @@ class EscMonitor:
             if name not in {*flags, "operating_errors", "selftest_errors"}
         }
         """Unit of each source that the DBC has, in the order of the sources; without flags and words of flags."""
+        link = self._columns.get("link_state", -1)
+        self._link_part = next((p.first for p in view.reader.parts if p.first <= link < p.first + p.count), None)
+        self._told = 0
+        """How often the link's state came behind the first values after a gap."""
 
     def has(self, source: str) -> bool:
         """True where the DBC has a signal for a source."""
@@ -204,11 +210,24 @@ class EscMonitor:
 
     @property
     def link(self) -> str | None:
-        """The link state's name; None where it is not available."""
+        """The link state's name; None where it is not available.
+
+        It has a message of its own, which comes up to a cycle behind the first values after a gap, and may have been on its way when
+        they came: until its second time the values tell that the link is good.
+        """
         value = self.value("link_state")
         if isinstance(value, (int, float)):
-            return _enumerated(LinkState, value)
-        return value
+            value = _enumerated(LinkState, value)
+        if value is None or normalize(value) in _WORKING or self._told >= _BELIEVED or not self.is_fresh:
+            return value
+        return _enumerated(LinkState, LinkState.OK)
+
+    def note(self, firsts: Collection[int], was_fresh: bool) -> None:
+        """A frame came, with the parts that begin at these columns."""
+        if not was_fresh and self.is_fresh:
+            self._told = 0
+        elif self._link_part is not None and self._link_part in firsts:
+            self._told += 1
 
     @property
     def is_link_ok(self) -> bool:
@@ -297,7 +316,12 @@ class Monitor:
             return
         self._now = now = max(now, self._now)
         self.view.expire(now)
+        fresh = [esc.is_fresh for esc in self.escs]
         chunks = self.view.take(frame.key, frame.data, now)
+        if chunks is not None:
+            firsts = [first for first, _ in chunks]
+            for esc, was_fresh in zip(self.escs, fresh, strict=True):
+                esc.note(firsts, was_fresh)
         for first, values in chunks or ():
             self._missing.discard(first)
             for offset, spread, factor in self._tracked[first]:

@@ -320,7 +320,7 @@ def test_a_missing_library_is_named_with_its_extra(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    said = refused(capsys, 2, dump, tmp_path / "out", "--to", form)
+    said = refused(capsys, 1, dump, tmp_path / "out", "--to", form)
     assert said.endswith(f"needs {module}: pip install 'kontronik-can-gw[{extra}]'")
     assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
 

@@ -163,9 +163,12 @@ def decoded(lines: list[tuple[int, int, bytes]]) -> Cells:
         message = database.get_message_by_frame_id(can_id)
         values = message.decode(data, decode_choices=True)
         assert isinstance(values, dict)
+        gone: set[str] = set()
         cells: dict[str, Any] = {"Time": (us - lines[0][0]) / 1e6, "Id": f"{can_id:03X}", "Message": message.name}
         for signal in message.signals:
             value: Any = values[signal.name]
+            if str(value) == "NotAvailable":
+                gone.add(signal.name)
             choices = {number: str(text) for number, text in (signal.choices or {}).items()}
             if isinstance(value, cantools.database.namedsignalvalue.NamedSignalValue):
                 value = None if str(value) in ("NotAvailable", "Error") else str(value)
@@ -173,7 +176,7 @@ def decoded(lines: list[tuple[int, int, bytes]]) -> Cells:
                 value = None  # a number that the DBC has no text for
             cells[signal.name] = value
         witnesses = _BESIDE_FLAGS.get(message.name)
-        if witnesses and all(cells[name] is None for name in witnesses):
+        if witnesses and gone.issuperset(witnesses):
             cells |= {signal.name: None for signal in message.signals if signal.length == 1}
         rows.append(cells)
     return rows

@@ -1,5 +1,6 @@
 """A log of CAN frames, whatever its format: its frames in order, as a stream, and an account of what is damaged."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Self
@@ -13,7 +14,9 @@ from kontronik_can_gw.offline.can_logs.text import (
     ASC_LINE,
     CANDUMP_LINE,
     CANDUMP_SCREEN_LINE,
+    LONGEST_LINE,
     TRC_HEAD,
+    TRC_LINE,
     AscReader,
     CandumpReader,
     TrcReader,
@@ -29,16 +32,21 @@ SUFFIXES = {
     ".mf4": "mf4",
     ".mdf": "mf4",
 }
+NAMES = {"candump": "CAN log (candump)", "asc": "ASC log", "blf": "BLF file", "trc": "TRC file", "mf4": "MF4 file"}
+"""What people call the formats."""
 _HEAD = 1 << 16
+_FAR = 1 << 20
+"""So far into a file whose beginning is damaged something of its format must come."""
 UART_MAGIC = b"KOD"
 """What a telemetry frame begins with."""
+_SHORT = 64
 _BACK_NS = 10 * SECOND_NS
 _AHEAD_NS = 86_400 * SECOND_NS
 """A step of time that is larger must be confirmed by the frame after it, or it is a damaged time."""
 
 
 def log_format(path: Path) -> str | None:
-    """The format of a log: what its first 64 KiB look like, else what its suffix says; None where both say nothing. RunError."""
+    """The format of a log by its first 64 KiB; by its suffix where they are damaged but more of that comes. None: no log. RunError."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)
@@ -60,7 +68,41 @@ def log_format(path: Path) -> str | None:
         return "blf"
     if UART_MAGIC in head:  # bytes of an ESC, whatever they are called
         return None
-    return SUFFIXES.get(path.suffix.lower())
+    called = SUFFIXES.get(path.suffix.lower())
+    if called is None or _is_blank(head):
+        return called
+    try:
+        with path.open("rb") as file:
+            far = file.read(_FAR)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
+    return called if _has_any(called, far) else None
+
+
+def _is_blank(head: bytes) -> bool:
+    """Nothing is in it, or a first line that was cut: the name is all there is to go by."""
+    return not head.strip() or (
+        len(head) < _SHORT and b"\n" not in head and head.rstrip().isascii() and b"\0" not in head
+    )
+
+
+def _has_any(format_: str, content: bytes) -> bool:
+    """True where the beginning of a file holds anything of a format."""
+    if format_ == "mf4":
+        return False  # what has no beginning cannot be read
+    if format_ == "blf":
+        return b"LOBJ" in content
+    looks: dict[str, tuple[re.Pattern[bytes], ...]] = {
+        "candump": (CANDUMP_LINE, CANDUMP_SCREEN_LINE),
+        "asc": (ASC_HEAD, ASC_LINE),
+        "trc": (TRC_HEAD, TRC_LINE),
+    }
+    patterns = looks[format_]
+    return any(
+        any(pattern.match(line) is not None for pattern in patterns)
+        for line in content.split(b"\n")
+        if line[:1] and len(line) <= LONGEST_LINE
+    )
 
 
 _READERS: dict[str, Callable[[BinaryIO, Damage], Reader]] = {
@@ -74,7 +116,7 @@ _READERS: dict[str, Callable[[BinaryIO, Damage], Reader]] = {
 class CanLog:
     """An open log. ``channel``: only frames of this interface (candump: ``can0``, else the number in the log, from 1); None: all.
 
-    UserError where it is no log that is known, or MF4 and asammdf is missing; RunError where it cannot be opened.
+    UserError where it is no log that is known, or a table; RunError where it cannot be opened, or is MF4 and asammdf is missing.
     """
 
     def __init__(self, path: Path, channel: str | None = None) -> None:

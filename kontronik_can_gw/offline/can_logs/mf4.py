@@ -3,6 +3,7 @@
 import contextlib
 import gc
 import heapq
+import os
 import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -29,11 +30,11 @@ _ERRORS, _REMOTES = "CAN_ErrorFrame", "CAN_RemoteFrame"
 
 
 def asammdf_module() -> "ModuleType":
-    """asammdf. UserError where it is not installed."""
+    """asammdf. RunError where it is not installed."""
     try:
         import asammdf
     except ImportError:
-        raise UserError("MF4 needs asammdf: pip install 'kontronik-can-gw[mf4]'") from None
+        raise RunError("MF4 needs asammdf: pip install 'kontronik-can-gw[mf4]'") from None
     import logging
 
     logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)  # what it says is said again by us, in one line
@@ -51,11 +52,22 @@ class Mf4Reader:
         self.position = 0
         self.wall_start_ns: int | None = None
         self._mdf = _opened(module, path)
+        if not self._is_bus_log():
+            self.close()
+            raise UserError(
+                f"{path}: is a table of values (an MF4 measurement), no log of a CAN bus. Give the recording it was made of."
+            )
         start: datetime = self._mdf.header.start_time
         stored = int(self._mdf.header.abs_time)
         if start.timestamp() >= OLDEST_WALL_S:
             # a file may say local time, which asammdf works out; the exact fraction of a second is in the number
             self.wall_start_ns = _seconds(start, stored) * SECOND_NS + stored % SECOND_NS
+
+    def _is_bus_log(self) -> bool:
+        """False where it holds values, but nothing of a bus."""
+        bus = (_GROUP, f"{_GROUP}.ID", _ERRORS, _REMOTES)
+        groups = [group for group in self._mdf.groups if int(group.channel_group.cycles_nr)]
+        return not groups or any(channel.name in bus for group in groups for channel in group.channels)
 
     def __iter__(self) -> Iterator[LogFrame]:
         groups = []
@@ -204,7 +216,7 @@ def _opened(module: "ModuleType", path: Path) -> Any:
     try:
         with quiet():
             try:
-                mdf = module.MDF(path)
+                mdf = module.MDF(os.fspath(path))
                 mdf.header.start_time.timestamp()
                 return mdf
             except Exception as error:  # whatever a damaged file makes of it

@@ -56,6 +56,11 @@ _GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez"
 _RELATIVE = b"relative"
 
 TRC_HEAD = re.compile(rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE)
+TRC_LINE = re.compile(
+    rb"\s*\d{1,10}\)?[ \t]+\d{1,12}(?:\.\d{1,6})?[ \t]+"
+    rb"(?:(?:DT|FD|FB|FE|BI|RR|ST|EC|ER|EV|Rx|Tx|\d{1,2})[ \t]+)*(?:[0-9A-Fa-f]{8}|[0-9A-Fa-f]{4})[ \t]"
+)
+"""How a line of any version begins."""
 _TRC_COLUMNS = {"1.0": "N,O,I,l,D", "1.1": "N,O,d,I,l,D", "1.3": "N,O,B,d,I,R,l,D", "2.0": "N,O,T,I,d,l,D"}
 _TRC_NEWEST = "N,O,T,B,I,d,R,L,D"
 _TRC_FRAMES = {"DT": False, "FD": True, "FB": True, "FE": True, "BI": True}

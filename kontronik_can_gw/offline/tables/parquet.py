@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.offline.tables.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.offline.tables.rows import SECOND_NS, Row
 
@@ -21,7 +21,7 @@ class ParquetTable:
             import pyarrow as pa  # type: ignore[import-untyped]
             from pyarrow import parquet
         except ImportError:
-            raise UserError("Parquet needs pyarrow: pip install 'kontronik-can-gw[parquet]'") from None
+            raise RunError("Parquet needs pyarrow: pip install 'kontronik-can-gw[parquet]'") from None
         self._pa: Any = pa
         self._table = table
         self._codes = [{text: code for code, (_, text) in enumerate(one.texts)} for one in table.fields]

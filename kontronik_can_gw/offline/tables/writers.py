@@ -29,7 +29,7 @@ class TableWriter(Protocol):
 def open_table(target: IO[bytes] | Path, form: str, table: Table, units_line: bool = False) -> Iterator[TableWriter]:
     """A writer, closed at the end. ``target``: a file that is open for bytes, of Parquet and MF4 a path.
 
-    UserError where a library is missing. ``units_line``: of JSON lines, a first line with the units.
+    RunError where a library is missing. ``units_line``: of JSON lines, a first line with the units.
     """
     writer: TableWriter
     if isinstance(target, Path):
