@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 FILE is a capture (.kcap; a folder, or the beginning of the names of one run's, for all its parts), a file of plain UART
-bytes, or a CAN log (candump, ASC, BLF, TRC, MF4). A capture goes through the gateway's core with the recorded clock:
-frames and times are those that the live gateway sent, bit for bit.
+bytes, or a CAN log (candump, ASC, BLF, TRC, MF4); a pipe, or - for standard input, is read to its end first. A capture
+goes through the gateway's core with the recorded clock: frames and times are those that the live gateway sent, bit for
+bit.
 
 --to can  sends the frames on a CAN bus. They are old: the message with the gateway's state says Replay (GatewayState),
           unless --unmarked says that they are to be exactly as recorded. Refused where a gateway of this machine sends the same
