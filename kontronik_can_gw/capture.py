@@ -13,7 +13,8 @@ only what is in it. All numbers are little-endian. A block::
     u32      CRC-32 (zlib) of the 20 bytes above and the payload as stored
     payload
 
-A file begins with a header block. The payload of a data block is a table, then the data of its entries one behind the other::
+A file begins with a header block, which comes once more behind the first data, in case the first is damaged. The payload of a data block
+is a table, then the data of its entries one behind the other::
 
     u32      number of entries
     entries  16 bytes each: u64 time in ns of the recording machine's monotonic clock, u8 kind (``Kind``), u8 flags, u16 index (of the ESC),

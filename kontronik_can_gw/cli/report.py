@@ -95,6 +95,8 @@ def main(args: argparse.Namespace) -> int:
 
             written = write_pngs(flight, Path(args.png), title)
             say(f"{args.png}: {', '.join(file.name for file in written)} written")
+    for line in recording.notes:
+        print(f"kontronik-can-gw report: {args.input}: {line}", file=sys.stderr)
     for line in damage:
         print(f"kontronik-can-gw report: {args.input}: damaged: {line}", file=sys.stderr)
     return 0

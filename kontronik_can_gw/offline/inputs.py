@@ -64,7 +64,7 @@ class Input(Protocol):
     position: int
     """Bytes read so far, of ``size``."""
     damage: list[str]
-    """What was not intact, a line each; complete when it was read to the end. Behind ``samples`` the ``notes`` are in it too."""
+    """What was not intact, a line each; complete when it was read to the end."""
     notes: list[str]
     """What the person should know of how it was read, a line each; complete when it was read to the end."""
     times_assumed: bool
@@ -501,7 +501,6 @@ class CanLogInput(_Base):
 
     def samples(self) -> Iterator[Sample]:
         yield from samples_of_frames(self.frames(), self.reader)
-        self.damage += self.notes
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")

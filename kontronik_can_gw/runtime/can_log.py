@@ -25,6 +25,7 @@ class CanLog:
     """One log. OSError where it cannot be written."""
 
     def __init__(self, path: Path, kind: str, channel: str) -> None:
+        self._path = path
         # never over something else, nor through a link
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640))
         with without_asammdf():
@@ -35,6 +36,11 @@ class CanLog:
         self._writer = writer(str(path), **options)
         # candump names the interface, the others count channels from 1
         self._channel: str | int = channel if kind == "candump" else 0
+
+    @property
+    def exists(self) -> bool:
+        """False where somebody removed the file."""
+        return self._path.exists()
 
     def add(self, frame: CanFrame, unix_ns: int, received: bool) -> None:
         """A frame at a Unix time; it is kept to the microsecond."""

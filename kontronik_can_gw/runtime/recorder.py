@@ -7,6 +7,7 @@ Whatever goes wrong with the disk is told once, tried again each five seconds, a
 """
 
 import contextlib
+import errno
 import fcntl
 import os
 import threading
@@ -102,6 +103,8 @@ class Recorder:
         self._unwritten = 0
         """Entries that could not be written: the thread's count."""
         self._told_overflow = 0
+        self._frames_lost = self._told_frames = 0
+        """For the CAN log only; they are no entries."""
         self._reports: deque[Report] = deque()
         self._state_ns = 0
         self._devices: list[Any] = []
@@ -153,7 +156,9 @@ class Recorder:
 
     def put_frame(self, frame: CanFrame, time_ns: int, received: bool) -> None:
         """Record a frame that was sent or received, for the CAN log."""
-        if len(self._entries) < CAPACITY:
+        if len(self._entries) >= CAPACITY:
+            self._frames_lost += 1
+        else:
             self._entries.append((time_ns, _RECEIVED if received else _SENT, 0, frame, 0))
 
     def note(self, gateway: Gateway, now: int) -> None:
@@ -171,6 +176,10 @@ class Recorder:
         if self._overflowed >= max(1, 2 * self._told_overflow):
             self._told_overflow = self._overflowed
             text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
+            taken.append(Report("losses", True, text))
+        if self._frames_lost >= max(1, 2 * self._told_frames):
+            self._told_frames = self._frames_lost
+            text = f"captures: {self._frames_lost} CAN frames are missing in the log so far: the disk is too slow"
             taken.append(Report("losses", True, text))
         since, folder = self._busy_since, self.settings.folder
         if since is not None and now - since > _SLOW_NS and not self._told_slow:
@@ -387,6 +396,7 @@ class _Files:
         self._number = 0
         self._new = 0
         self._log: CanLog | None = None
+        self._header: bytes | None = header
         self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
         try:
             with contextlib.suppress(OSError):  # a file system without locks
@@ -417,13 +427,18 @@ class _Files:
         entries = [item for item in items if item[1] < _SENT]
         if entries:
             self.write(b"D", data_payload(entries))
+            if self._header is not None:  # once more, elsewhere: without it nothing can be made of the rest
+                self.write(b"H", self._header)
+                self._header = None
         if self._log is not None:
             for time_ns, kind, _, frame, _ in items:
                 if kind >= _SENT:
                     self._log.add(frame, time_ns + offset, kind == _RECEIVED)
 
     def sync(self) -> int:
-        """Force to the disk what was written; how many bytes since the last call."""
+        """Force to the disk what was written; how many bytes since the last call. OSError where somebody removed a file."""
+        if os.fstat(self._fd).st_nlink == 0 or (self._log is not None and not self._log.exists):
+            raise OSError(errno.ENOENT, "what was being written was removed")
         if self._log is not None:
             self._log.flush()
         if self._new:
