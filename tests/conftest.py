@@ -3,7 +3,14 @@
 On a vcan neither is wanted so early.
 """
 
+import gc
 import os
 
 if not os.environ.get("KCG_VCAN"):
     import can  # noqa: F401
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: a collection that walks through pandas and its like holds a gateway in this process up for long."""
+    gc.collect()
+    gc.freeze()

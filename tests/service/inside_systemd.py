@@ -99,6 +99,7 @@ def trial(facts: Facts) -> None:
     write_configuration(CONFIGURATION, "vcan0", LINK)
     facts["install now"] = service("install", "--now")
     facts["fresh after"] = fresh(20)
+    until(lambda: "telemetry ok" in shown()["StatusText"], 5)  # which is told once a second
     facts["running"] = shown()
     facts["status"] = service("status")
     pid = facts["running"]["MainPID"]
