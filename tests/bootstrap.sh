@@ -116,6 +116,7 @@ install_viewers() {
     command -v chromium >/dev/null || command -v google-chrome >/dev/null || wanted="$wanted chromium"
     command -v mosquitto >/dev/null || wanted="$wanted mosquitto"
     command -v mosquitto_sub >/dev/null || wanted="$wanted mosquitto-clients"
+    command -v groff >/dev/null || wanted="$wanted groff-base"
     for tool in tmux zsh mandoc openssl; do command -v $tool >/dev/null || wanted="$wanted $tool"; done
     [ -n "$wanted" ] || return 0
     can_root || { say "tests that need them are left out; they come with:  sudo apt-get install$wanted"; return; }
