@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
+from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
 from kontronik_can_gw.cli.common import check_devices, say, stopping_on_signals
 from kontronik_can_gw.cli.status import printable
@@ -65,36 +66,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--interface", metavar="NAME", help="python-can interface (default socketcan)")
     parser.add_argument("--channel", metavar="NAME", help="channel of the interface (default can0)")
     parser.add_argument(
-        "--speed", type=_factor, metavar="FACTOR", help="play FILE so many times as fast (0.01 to 1000, default 1)"
+        "--speed",
+        type=number_from(0.01, 1000, "factor"),
+        metavar="FACTOR",
+        help="play FILE so many times as fast (0.01 to 1000, default 1)",
     )
     parser.add_argument("--once", action="store_true", help="one line of JSON with everything, then end")
     parser.add_argument(
-        "--timeout", type=_seconds, metavar="S", help=f"--once: wait at most so long (default {_ONCE_S:g})"
+        "--timeout",
+        type=number_from(0.1, 3600),
+        metavar="S",
+        help=f"--once: wait at most so long (default {_ONCE_S:g})",
     )
     parser.add_argument(
         "--interval",
-        type=_seconds,
+        type=number_from(0.1, 3600),
         metavar="S",
         help=f"draw every so many seconds (default {_REFRESH_S:g}; lines: {_PLAIN_LINE_S:g})",
     )
-
-
-def _number(text: str, low: float, high: float, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a {what}, {low:g} to {high:g}")
-    return value
-
-
-def _seconds(text: str) -> float:
-    return _number(text, 0.1, 3600, "number of seconds")
-
-
-def _factor(text: str) -> float:
-    return _number(text, 0.01, 1000, "factor")
 
 
 def main(args: argparse.Namespace) -> int:
