@@ -74,6 +74,7 @@ class Loop:
         self._status_due = 0 if status_ns else None
         self._status_before: tuple[int, list[int]] = (0, [])
         self._notifier = notifier or Notifier({})
+        self._now = 0
         self._look_due = 0
         self._alive_due = 0 if self._notifier.watchdog_ns is not None else None
         self._notify_due = 0
@@ -146,36 +147,48 @@ class Loop:
 
     def run(self) -> None:
         """Until ``stop``, or until there is another configuration. Then a last status is sent and everything is closed."""
-        gateway, clock = self.gateway, self._clock
-        now = clock()
-        gateway.start(now, self.can.is_open)
+        self.begin()
+        try:
+            while not self._stopping:
+                self.turn()
+        finally:
+            self.end()
+
+    def begin(self) -> None:
+        """The gateway starts: what is said once."""
+        now = self._now = self._clock()
+        self.gateway.start(now, self.can.is_open)
         self.can.follow_ids()  # before the boot-up message: a master may ask as soon as it sees it
         self.can.transmit(now)
         self._notifier.ready(self._status_words())
-        try:
-            while not self._stopping:
-                last = now
-                pause = max(0, self._next_deadline() - clock())
-                ready = self._selector.select(pause / SECOND)
-                now = clock()
-                if now - last - pause > LEAST_SUSPENDED_NS and now - last - pause > self._suspended_ns():
-                    self._discard_input(now - last - pause, now)
-                    ready = []  # what they announced is gone; a hang-up comes again
-                for key, events in ready:
-                    key.data(now, events)
-                now = self._reopen(now)
-                self._keep(now)  # in front: what it answers belongs to this turn, in a replay too
-                gateway.advance(now)
-                self.can.follow_ids()
-                self.can.transmit(now)
-                self._report(now)
-                if now >= self._look_due:
-                    self._look_round(now)
-        finally:
-            now = clock()
-            gateway.stop(now)
-            self.can.transmit(now)
-            self.close()
+
+    def turn(self) -> None:
+        """Wait until something has come or is due, and do it."""
+        gateway, clock = self.gateway, self._clock
+        last = self._now
+        pause = max(0, self._next_deadline() - clock())
+        ready = self._selector.select(pause / SECOND)
+        now = clock()
+        if now - last - pause > LEAST_SUSPENDED_NS and now - last - pause > self._suspended_ns():
+            self._discard_input(now - last - pause, now)
+            ready = []  # what they announced is gone; a hang-up comes again
+        for key, events in ready:
+            key.data(now, events)
+        now = self._now = self._reopen(now)
+        self._keep(now)  # in front: what it answers belongs to this turn, in a replay too
+        gateway.advance(now)
+        self.can.follow_ids()
+        self.can.transmit(now)
+        self._report(now)
+        if now >= self._look_due:
+            self._look_round(now)
+
+    def end(self) -> None:
+        """A last status is sent and everything is closed."""
+        now = self._clock()
+        self.gateway.stop(now)
+        self.can.transmit(now)
+        self.close()
 
     def close(self) -> None:
         """Close everything."""
