@@ -1,7 +1,7 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-hardware soak hour lint clean
+.PHONY: help demo test test-hardware soak hour bench lint clean
 
 help:
 	@echo 'make demo    show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
@@ -9,6 +9,7 @@ help:
 	@echo 'make test-hardware   the fault programme on real drivers in virtual machines   (ARGS="--long --table --keep FOLDER")'
 	@echo 'make soak    random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
 	@echo 'make hour    a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
+	@echo 'make bench   speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
 	@echo 'make lint    ruff and mypy only'
 	@echo 'make clean   remove .venv and all caches'
 
@@ -31,6 +32,10 @@ soak:
 hour:
 	@tests/bootstrap.sh lint
 	@.venv/bin/python tests/hour/hour_programme.py $(ARGS)
+
+bench:
+	@tests/bootstrap.sh lint
+	@.venv/bin/python tests/benchmarks/bench.py $(ARGS)
 
 lint:
 	@tests/bootstrap.sh lint
