@@ -154,7 +154,8 @@ def table(results: list[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         cells = [
-            f"{cell:>{width}}" if i == 1 else f"{cell:{width}}" for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+            f"{cell:>{width}}" if i == 1 else f"{cell:{width}}"
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
         ]
         lines.append("  ".join(cells).rstrip())
     missed = sum(figure["reached"] is False for result in results for figure in result["figures"])

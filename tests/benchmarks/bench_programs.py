@@ -1,0 +1,253 @@
+"""Starts feeder and gateways, and measures the CPU time of a gateway while telemetry flows.
+
+with programs.session(context, escs=8) as feeder:            # the pseudo terminals are there
+    with Gateway(context, "c", feeder) as gateway:            # "c", "ours" or "obvious"
+        measured = feeder.measure(gateway)
+"""
+
+import contextlib
+import ctypes
+import json
+import os
+import select
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from registry import HERE, Context
+
+FIVE = HERE / "five.dbc"
+STANDIN = HERE / "standin.py"
+PROGRAMS = ("c", "ours", "obvious")
+_PRIORITY = 80
+"""Of the feeder, where we may: what it measures is not to be its own delay."""
+
+
+@dataclass
+class Measured:
+    """What one run gave. ``cpu_us``: of all threads of the gateway, for each live frame."""
+
+    cpu_us: float
+    cpu_share: float
+    sent: int
+    lost: int
+    result: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def delay(self) -> dict[str, float]:
+        """count, p50, p90, p99, p999, max in microseconds."""
+        found: dict[str, float] = self.result["delay_us"]
+        return found
+
+    @property
+    def lost_share(self) -> float:
+        """Of the CAN frames."""
+        return self.lost / (5 * self.sent) if self.sent else 0.0
+
+
+def cpu_ns(pid: int) -> int:
+    """CPU time of all threads of a process."""
+    total = 0
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # it has just ended
+            total += int((thread / "schedstat").read_text().split()[0])
+    return total
+
+
+def _die_with_us() -> None:
+    """In a child: end when the benchmark does, however it ends."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
+def start(command: Sequence[str], **further: Any) -> "subprocess.Popen[str]":
+    """A child that ends with us."""
+    return subprocess.Popen(command, text=True, preexec_fn=_die_with_us, **further)
+
+
+def end(process: "subprocess.Popen[str]", patience_s: float = 3.0) -> None:
+    """End it, one way or the other."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+    process.wait()
+    for stream in (process.stdin, process.stdout, process.stderr):
+        if stream is not None:
+            with contextlib.suppress(OSError):
+                stream.close()
+
+
+class Feeder:
+    """The ESCs, and the other end of the bus."""
+
+    def __init__(self, context: Context, escs: int, *options: str, seconds: float | None = None) -> None:
+        self.escs = escs
+        self.bus = f"can:{context.vcan}" if context.vcan else f"unix:kontronik-bench-{uuid.uuid4().hex[:12]}"
+        program = context.compiled("feeder.c", "-pthread")
+        length = context.seconds if seconds is None else seconds
+        warmup = 0.5 if context.quick else 2.0
+        self._limit_s = length + warmup + 30
+        command = [
+            str(program),
+            "--bus",
+            self.bus,
+            "--escs",
+            str(escs),
+            "--seconds",
+            str(length),
+            "--warmup",
+            str(warmup),
+        ]
+        self.process = start(
+            [*command, "--priority", str(_PRIORITY), *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        self._heard = ""
+        told = self._line()
+        self.ports: list[str] = told["ports"]
+
+    def _line(self, gateway: "Gateway | None" = None) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        fd, deadline = self.process.stdout.fileno(), time.monotonic() + self._limit_s
+        while "\n" not in self._heard:
+            if not select.select([fd], [], [], 0.2)[0]:
+                if gateway is not None:
+                    gateway.check()
+                if time.monotonic() > deadline:
+                    raise RuntimeError("the feeder says nothing more")
+                continue
+            if not (data := os.read(fd, 1 << 16)):
+                raise RuntimeError(f"the feeder ended: exit code {self.process.wait()}")
+            self._heard += data.decode()
+        line, _, self._heard = self._heard.partition("\n")
+        found: dict[str, Any] = json.loads(line)
+        return found
+
+    def go(self) -> None:
+        """On a real bus nothing else tells that the gateway is there."""
+        if self.bus.startswith("can:"):
+            assert self.process.stdin is not None
+            time.sleep(2)
+            self.process.stdin.write("go\n")
+            self.process.stdin.flush()
+
+    def measure(self, gateway: "Gateway") -> Measured:
+        """Wait for the run to be over. RuntimeError if the gateway ended meanwhile."""
+        self.go()
+        begun = self._line(gateway)["begin"]
+        before, started = cpu_ns(gateway.pid), time.monotonic_ns()
+        ended = self._line(gateway)["end"]
+        gateway.check()
+        used, took = cpu_ns(gateway.pid) - before, time.monotonic_ns() - started
+        result = self._line()
+        frames = max(1, ended - begun)
+        return Measured(used / 1000 / frames, used / took, result["sent"], result["lost"], result)
+
+    def close(self) -> None:
+        end(self.process, 0.5)
+
+
+class Gateway:
+    """One of the three programs at work."""
+
+    def __init__(
+        self,
+        context: Context,
+        program: str,
+        feeder: Feeder,
+        config: str = "",
+        dbc: Path | None = FIVE,
+        wrap: Callable[[list[str]], list[str]] = list,
+        environment: dict[str, str] | None = None,
+    ) -> None:
+        """``config``: further lines of our configuration, tables at their end. ``wrap`` makes another command of the command."""
+        self._folder = tempfile.TemporaryDirectory(prefix="kontronik-bench-")
+        folder = Path(self._folder.name)
+        self.folder = folder
+        channel = context.vcan or "lo"
+        if program == "c":
+            command = [str(context.compiled("gateway.c")), feeder.bus, *feeder.ports]
+        elif program == "obvious":
+            command = [sys.executable, str(STANDIN), feeder.bus, "obvious", str(FIVE), channel, *feeder.ports]
+        else:
+            (folder / "gateway.toml").write_text(config_text(feeder.ports, channel, dbc, folder, config))
+            command = [sys.executable, str(STANDIN), feeder.bus, "ours", "run", "-c", str(folder / "gateway.toml")]
+        self._errors = (folder / "errors").open("w+")
+        further = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""} | (environment or {})
+        self.process = start(
+            wrap(command), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._errors, env=further
+        )
+        self.program = program
+        self.pid = self.process.pid
+
+    def check(self) -> None:
+        """RuntimeError if it has ended."""
+        if self.process.poll() is not None:
+            raise RuntimeError(f"{self.program} ended by itself: {self.said()}")
+
+    def said(self) -> str:
+        """What it wrote to standard error."""
+        self._errors.flush()
+        return (self.folder / "errors").read_text().strip()[-2000:]
+
+    def close(self) -> None:
+        end(self.process)
+        self._errors.close()
+        self._folder.cleanup()
+
+
+def config_text(ports: Sequence[str], channel: str, dbc: Path | None, folder: Path, further: str = "") -> str:
+    """Our configuration. ``dbc`` None: the shipped one. ``further`` may begin with lines of [dbc]."""
+    lines = ["[can]", 'interface = "socketcan"', f'channel = "{channel}"', "[dbc]"]
+    if dbc is not None:
+        lines += [f'file = "{dbc}"']
+    lines += [further, ""]
+    if "[statistics]" not in further:
+        lines += ["[statistics]", f'file = "{folder / "status.json"}"']
+    for index, port in enumerate(ports):
+        lines += ["[[esc]]", f'port = "{port}"', f'name = "e{index + 1}"', "pole_pairs = 7"]
+    return "\n".join(lines) + "\n"
+
+
+@contextlib.contextmanager
+def running(
+    context: Context, program: str, escs: int, *options: str, seconds: float | None = None, **further: Any
+) -> Iterator[tuple[Feeder, Gateway]]:
+    """A feeder and a gateway, both ended at the end."""
+    feeder = Feeder(context, escs, *options, seconds=seconds)
+    try:
+        gateway = Gateway(context, program, feeder, **further)
+        try:
+            yield feeder, gateway
+        except RuntimeError as error:
+            raise RuntimeError(f"{program}: {error}; it said: {gateway.said()}") from None
+        finally:
+            gateway.close()
+    finally:
+        feeder.close()
+
+
+def once(context: Context, program: str, escs: int, *options: str, **further: Any) -> Measured:
+    """One measurement."""
+    with running(context, program, escs, *options, **further) as (feeder, gateway):
+        measured = feeder.measure(gateway)
+    delay = measured.delay
+    context.say(
+        f"{program} {escs:3} ESC: {measured.cpu_us:7.1f} us/frame, {measured.cpu_share:5.1%} of a core, lost {measured.lost} of "
+        f"{5 * measured.sent}, delay {delay['p50']} / {delay['p99']} / {delay['max']:.0f} us {' '.join(options)}"
+    )
+    return measured
+
+
+def median(values: Sequence[float]) -> float:
+    """Of a few rounds."""
+    return float(statistics.median(values))

@@ -1,0 +1,66 @@
+"""Starts a gateway on a bus that is no CAN interface, for kernels without one: each CAN socket is a local one that leads to the feeder.
+
+    python standin.py unix:NAME ours run -c FILE      the real gateway's own command line
+    python standin.py unix:NAME obvious DBC lo PORT...
+    python standin.py can:vcan0 ours run -c FILE      on a real interface nothing is replaced
+
+Only how the socket is made, and its options, are replaced: ``send`` and ``recv`` are the C methods. Frames have the bytes of a raw CAN
+socket, and the local socket keeps them apart.
+"""
+
+import os
+import socket
+import sys
+from pathlib import Path
+from typing import Any
+
+
+class BusSocket(socket.socket):
+    """A socket that, where a CAN socket is asked for, is connected to the feeder when it is bound."""
+
+    name = ""
+
+    def __init__(self, family: int = -1, type: int = -1, proto: int = -1, fileno: int | None = None) -> None:  # noqa: A002
+        self.is_bus = family == socket.AF_CAN
+        if self.is_bus:
+            family, type, proto = socket.AF_UNIX, socket.SOCK_SEQPACKET, 0  # noqa: A001
+        super().__init__(family, type, proto, fileno)
+
+    def bind(self, address: Any, /) -> None:
+        if self.is_bus:
+            self.connect("\0" + self.name)
+        else:
+            super().bind(address)
+
+    def setsockopt(self, *args: Any) -> None:
+        if not self.is_bus:  # the options are of CAN; the queue's length is the same for all programs
+            super().setsockopt(*args)
+
+
+def use(bus: str) -> None:
+    """From now on CAN sockets of this process lead to ``bus``."""
+    kind, _, name = bus.partition(":")
+    if kind == "unix":
+        BusSocket.name = name
+        socket.socket = BusSocket  # type: ignore[misc]
+
+
+def main(arguments: list[str]) -> int:
+    bus, program, *rest = arguments
+    use(bus)
+    sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parent / "peers")]
+    if program == "obvious":
+        sys.modules["asammdf"] = None  # type: ignore[assignment]  # where it is installed python-can takes seconds to start
+        import obvious
+
+        obvious.main(rest)
+        return 0
+    from kontronik_can_gw.cli import main as run
+    from kontronik_can_gw.runtime import claims
+
+    claims.PREFIX += f"bench/{os.getpid()}/"  # other benchmarks may run beside this one, each on a bus of its own
+    return run(rest)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
