@@ -27,7 +27,7 @@ SHIPPED = ROOT / "dbc" / "kontronik_esc.dbc"
 LIVE = LiveData(electrical_speed=12_345, battery_voltage=2442)
 CANOPEN = '[canopen]\nenabled = true\nnode_id = 1\nstore = "{folder}/store"\n'
 RECORDER = '[record]\ndirectory = "{folder}/captures"\n'
-PROMETHEUS = '[statistics]\nfile = "{folder}/status.json"\nprometheus = "127.0.0.1:0"\n'
+PROMETHEUS = '[statistics]\nfile = "{folder}/status.json"\nprometheus = "127.0.0.1:{port}"\n'
 _PATIENCE_S = 20.0
 _EXTENDED = 0x80000000
 
@@ -143,7 +143,9 @@ def _voltage(can_id: int, data: bytes) -> float | None:
     message = next(message for message in _database.messages if "BatteryVoltage" in message.signal_tree)
     if can_id != message.frame_id:
         return None
-    value = message.decode(data, decode_choices=True)["BatteryVoltage"]  # type: ignore[index]
+    decoded = message.decode(data)
+    assert isinstance(decoded, dict)
+    value = decoded["BatteryVoltage"]
     return float(value) if isinstance(value, (int, float)) else None
 
 
@@ -167,7 +169,7 @@ def start_up(context: Context) -> list[Figure]:
             for name, escs, config in cases:
                 found[name].append(start_once(context, ports[escs], config)[0])
         _, said = start_once(context, one, "", ("-X", "importtime"))
-    for name, escs, _ in cases:
+    for name, _, _ in cases:
         first = median([each.first_ms for each in found[name]])
         values = median([each.values_ms for each in found[name]])
         cpu = median([each.cpu_ms for each in found[name]])
@@ -214,6 +216,13 @@ def many_escs_dbc(folder: Path) -> Path:
     return file
 
 
+def free_port() -> int:
+    """A TCP port that nobody has at the moment."""
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
 def memory(context: Context) -> list[Figure]:
     """After some seconds of traffic."""
     cases = [
@@ -230,7 +239,7 @@ def memory(context: Context) -> list[Figure]:
         for number, (case, escs, config) in enumerate(cases):
             own = Path(name) / str(number)
             own.mkdir()
-            text = config.format(folder=own)
+            text = config.format(folder=own, port=free_port())
             with running(context, "ours", escs, seconds=seconds, dbc=dbc, config=text) as (feeder, gateway):
                 measured = feeder.measure(gateway)
                 found[case] = memory_of(gateway.pid)
