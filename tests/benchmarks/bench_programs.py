@@ -132,17 +132,8 @@ class Feeder:
         found: dict[str, Any] = json.loads(line)
         return found
 
-    def go(self) -> None:
-        """On a real bus nothing else tells that the gateway is there."""
-        if self.bus.startswith("can:"):
-            assert self.process.stdin is not None
-            time.sleep(2)
-            self.process.stdin.write("go\n")
-            self.process.stdin.flush()
-
     def measure(self, gateway: "Gateway") -> Measured:
         """Wait for the run to be over. RuntimeError if the gateway ended meanwhile."""
-        self.go()
         begun = self._line(gateway)["begin"]
         before, started = cpu_ns(gateway.pid), time.monotonic_ns()
         ended = self._line(gateway)["end"]
@@ -151,6 +142,21 @@ class Feeder:
         result = self._line()
         frames = max(1, ended - begun)
         return Measured(used / 1000 / frames, used / took, result["sent"], result["lost"], result)
+
+    def rest(self, gateway: "Gateway") -> list[str]:
+        """All lines until the feeder ends."""
+        assert self.process.stdout is not None
+        fd, deadline = self.process.stdout.fileno(), time.monotonic() + self._limit_s
+        while True:
+            if not select.select([fd], [], [], 0.2)[0]:
+                gateway.check()
+                if time.monotonic() > deadline:
+                    raise RuntimeError("the feeder says nothing more")
+                continue
+            if not (data := os.read(fd, 1 << 16)):
+                break
+            self._heard += data.decode()
+        return self._heard.splitlines()
 
     def close(self) -> None:
         end(self.process, 0.5)

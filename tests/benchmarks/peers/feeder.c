@@ -2,12 +2,12 @@
 
        feeder [--escs N] [--seconds S] [--warmup S] [--period US] [--bytewise] [--seed N] [--priority P] [--sdo] [--file F] --bus BUS
 
-   BUS as in bus.h. Prints lines of JSON: {"ports": [...]}; once the gateway is connected (on a real bus: once a line came on standard
-   input) and the warm-up is over {"begin": live frames so far}; at the end {"end": ...}; then the results. Every CAN frame with an id of
+   BUS as in bus.h. Prints lines of JSON: {"ports": [...]}; once the gateway has sent a frame and the warm-up is over
+   {"begin": live frames so far}; at the end {"end": ...}; then the results. Every CAN frame with an id of
    five.dbc is compared with what the frames written say it must hold, in their order. The delay is from the write of a frame's last byte
    to the receipt of the fifth CAN frame that belongs to it.
-   --file: write these bytes once, in pieces of 40 bytes a period, in place of live frames; the received frames go to standard output as
-   lines "ID DATA" in hex. --sdo: be a CANopen master that uploads 1018h:1 of nodes 1..N twenty times a second each. */
+   --file: write these pieces (feed_file) to the one ESC in place of live frames; the received frames go to standard output as lines
+   "ID DATA" in hex. --sdo: be a CANopen master that uploads 1018h:1 of nodes 1..N twenty times a second each. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <poll.h>
@@ -53,6 +53,7 @@ static int count = 1, bus, on_can, bytewise, sdo, priority;
 static const char *bus_name = "";
 static int64_t period = 10000000, strange, others, write_failures;
 static _Atomic int stopping;
+static _Atomic int64_t received;
 static _Atomic int measuring;
 static uint32_t histogram[BUCKETS + 1]; /* microseconds */
 static int64_t delays, delay_sum, delay_max;
@@ -223,9 +224,13 @@ static void note_delay(int64_t delay)
 static void receive(const struct can_frame *frame, int64_t now)
 {
     int id = frame->can_id, slot = (id - 272) / 128, index = (id - 272) % 128;
-    if (dump)
-        fprintf(dump, "%X %0*llX\n", id, frame->can_dlc * 2, frame->can_dlc ? (unsigned long long)__builtin_bswap64(
-            *(const uint64_t *)(const void *)frame->data) >> (64 - 8 * frame->can_dlc) : 0ULL);
+    received++;
+    if (dump) {
+        fprintf(dump, "%X ", id);
+        for (int i = 0; i < frame->can_dlc; i++)
+            fprintf(dump, "%02X", frame->data[i]);
+        fprintf(dump, "\n");
+    }
     if (sdo && id > 0x580 && id <= 0x580 + count) {
         int64_t at = sdo_at[id - 0x581], us = (now - at) / 1000;
         if (at) {
@@ -405,6 +410,7 @@ static void feed(double seconds, double warmup)
     measuring = 0;
 }
 
+/* Pieces: a byte with the length, and 80h where a live frame ends with it: then go on when its five CAN frames have come. */
 static void feed_file(const char *name)
 {
     static uint8_t data[1 << 22];
@@ -413,13 +419,14 @@ static void feed_file(const char *name)
     if (!file)
         die(name);
     size = fread(data, 1, sizeof data, file);
-    int64_t next = now_ns() + 50000000;
     while (at < size && !stopping) {
-        int n = size - at < 40 ? size - at : 40;
-        sleep_until(next);
-        write_all(&escs[0], data + at, n);
-        at += n;
-        next += period;
+        int n = data[at] & 127, is_live = data[at] & 128;
+        int64_t before = received, patience = now_ns() + 1000000000;
+        write_all(&escs[0], data + at + 1, n);
+        at += 1 + n;
+        do
+            sleep_until(now_ns() + 500000);
+        while (is_live && received < before + FIVE && now_ns() < patience);
     }
 }
 
@@ -470,18 +477,18 @@ int main(int argc, char **argv)
     printf("], ");
     on_can = !strncmp(bus_name, "can:", 4);
     if (on_can) {
-        char line[16];
         bus = can_socket(bus_name + 4);
         printf("\"bus\": \"ready\"}\n");
         fflush(stdout);
-        if (read(0, line, sizeof line) <= 0)
-            return 0;
     } else {
         bus = accept_gateway();
     }
     pthread_create(&watcher, NULL, watch_parent, NULL);
     be_prompt();
     pthread_create(&thread, NULL, receiver, NULL); /* has our priority */
+    while (!received && !stopping)
+        sleep_until(now_ns() + 1000000);
+    sleep_until(now_ns() + 300000000); /* a gateway looks round once more behind its start */
     if (sdo)
         pthread_create(&sdo_thread, NULL, master, NULL);
     if (file) {
@@ -490,7 +497,6 @@ int main(int argc, char **argv)
         fflush(stdout);
         _exit(0);
     }
-    sleep_until(now_ns() + 300000000); /* the gateway looks round once more behind its start */
     feed(seconds, warmup);
     sleep_until(now_ns() + 200000000);
     stopping = 1;

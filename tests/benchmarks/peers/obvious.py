@@ -16,7 +16,6 @@ from zlib import crc32
 import can
 import cantools
 import serial
-from cantools.database.errors import EncodeError
 
 LIVE = struct.Struct("<4xIHhhhHHHHbBbbIBB")
 LENGTHS = {b"KODL": (38, 40), b"KODI": (41, 44)}
@@ -140,24 +139,16 @@ class Esc:
             self.send(message.name, {signal.name: "NotAvailable" for signal in message.signals})
 
     def send(self, name: str, values: dict[str, Any]) -> None:
-        """Encode and send a message."""
+        """Encode and send a message; what a signal has no room for is Error."""
         message = self.database.get_message_by_name(name)
-        try:
-            data = message.encode(values)
-        except EncodeError:
-            data = message.encode(values | self.errors_of(message, values))
+        for signal in message.signals:
+            value = values[signal.name]
+            if not isinstance(value, str) and not signal.minimum <= value <= signal.maximum:
+                values[signal.name] = "Error"
+        data = message.encode(values)
         frame = can.Message(arbitration_id=message.frame_id + self.index, data=data, is_extended_id=False)
         with self.lock:
             self.bus.send(frame)
-
-    @staticmethod
-    def errors_of(message: Any, values: dict[str, Any]) -> dict[str, str]:
-        """Error in place of each value that its signal has no room for."""
-        return {
-            signal.name: "Error"
-            for signal in message.signals
-            if not isinstance(values[signal.name], str) and not signal.minimum <= values[signal.name] <= signal.maximum
-        }
 
 
 def main(arguments: list[str]) -> None:
