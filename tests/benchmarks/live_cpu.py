@@ -20,6 +20,12 @@ def cpu_of(runs: list[Measured]) -> float:
     return median([run.cpu_us for run in runs])
 
 
+def losses(runs: list[Measured]) -> str:
+    """In words, where they are worth a word."""
+    lost = median([run.lost_share for run in runs])
+    return f"{lost:.1%} of its CAN frames lost" if lost >= 0.001 else ""
+
+
 def ratio(above: list[Measured], below: list[Measured]) -> float:
     """Median of the ratios of the rounds."""
     return median([a.cpu_us / b.cpu_us for a, b in zip(above, below, strict=True)])
@@ -33,13 +39,12 @@ def keep(context: Context, name: str, found: dict[str, list[Measured]]) -> None:
 def cpu(context: Context) -> list[Figure]:
     """The table of the three programs."""
     figures = []
-    for escs, c_target, obvious_target in ((1, 3.2, None), (8, 2.2, 4.0), (64, None, None)):
+    cases = ((1, 3.2, None), (8, 2.2, 4.0), (64, None, None))
+    for escs, c_target, obvious_target in cases[:1] if context.quick else cases:
         found = compare(context, ("c", "ours", "obvious"), escs)
         keep(context, str(escs), found)
         for program, runs in found.items():
-            lost = median([run.lost_share for run in runs])
-            note = f"{lost:.0%} of its CAN frames lost" if lost > 0.005 else ""
-            figures.append(Figure(f"{program}, {escs} ESC", cpu_of(runs), "us/frame", note=note))
+            figures.append(Figure(f"{program}, {escs} ESC", cpu_of(runs), "us/frame", note=losses(runs)))
         beside_c, beside_obvious = ratio(found["ours"], found["c"]), ratio(found["obvious"], found["ours"])
         target = f"<= {c_target}" if c_target else ""
         figures.append(
@@ -51,4 +56,106 @@ def cpu(context: Context) -> list[Figure]:
     return figures
 
 
-BENCHMARKS = [Benchmark("cpu", "CPU time a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program", cpu)]
+CANOPEN = """[canopen]
+enabled = true
+self_start = true
+store = "store"
+"""
+
+
+def canopen(context: Context) -> list[Figure]:
+    """Ours at 8 ESCs with nodes and default PDOs, and without, by turns."""
+    ratios, nodes, frames = [], [], []
+    for _ in range(context.rounds):
+        plain = once(context, "ours", 8)
+        both = once(context, "ours", 8, config=CANOPEN)
+        if not both.result["others"]:
+            raise RuntimeError("the CANopen nodes sent nothing")
+        ratios.append(both.cpu_us / plain.cpu_us)
+        nodes.append(both.cpu_us)
+        frames.append(both.result["others"] / both.sent)
+    value = median(ratios)
+    return [
+        Figure("ours, 8 ESC, CANopen too", median(nodes), "us/frame"),
+        Figure("CANopen frames for each live frame", median(frames), "frames"),
+        Figure("with / without CANopen", value, "x", "<= 1.6", value <= 1.6),
+    ]
+
+
+def shipped(context: Context) -> list[Figure]:
+    """Ours with the DBC that it comes with."""
+    figures = []
+    for escs in (1, 8):
+        runs = [once(context, "ours", escs, dbc=None) for _ in range(context.rounds)]
+        if not all(run.result["others"] for run in runs):
+            raise RuntimeError("nothing was sent")
+        frames = median([run.result["others"] / run.sent for run in runs])
+        figures.append(Figure(f"ours, shipped DBC, {escs} ESC", cpu_of(runs), "us/frame", note=f"{frames:.1f} frames each"))
+    return figures
+
+
+def bytewise(context: Context) -> list[Figure]:
+    """Bytes one by one as the wire brings them, in place of whole frames."""
+    figures = []
+    for escs in (1, 8):
+        found = compare(context, ("c", "ours", "obvious"), escs, "--bytewise")
+        keep(context, str(escs), found)
+        for program, runs in found.items():
+            figures.append(Figure(f"{program}, byte by byte, {escs} ESC", cpu_of(runs), "us/frame", note=losses(runs)))
+        figures.append(Figure(f"ours / c, byte by byte, {escs} ESC", ratio(found["ours"], found["c"]), "x"))
+    return figures
+
+
+def growth(context: Context) -> list[Figure]:
+    """CPU time a frame over the number of ESCs; falling or flat is the target."""
+    numbers = [1, 2] if context.quick else [1, 2, 4, 8, 16, 32, 64, 128]
+    series: dict[str, list[float]] = {"c": [], "ours": []}
+    lost = {}
+    for escs in numbers:
+        found = compare(context, ("c", "ours"), escs)
+        for program, runs in found.items():
+            series[program].append(cpu_of(runs))
+        lost[escs] = median([run.lost_share for run in found["ours"]])
+    context.data["escs"], context.data["cpu_us"] = numbers, series
+    if context.plots is not None:
+        draw(context.plots / "cpu_growth.png", numbers, series)
+    figures = [
+        Figure(f"{program}, {escs} ESC", value, "us/frame", note=f"{lost[escs]:.1%} lost" if program == "ours" and lost[escs] else "")
+        for program, values in series.items()
+        for escs, value in zip(numbers, values, strict=True)
+    ]
+    ours = series["ours"]
+    worst = max(after / before for before, after in zip(ours, ours[1:], strict=False))
+    figures.append(Figure("steepest step up, ours, doubling the ESCs", worst, "x", "<= 1.15", worst <= 1.15))
+    return figures
+
+
+def draw(file: Path, numbers: list[int], series: dict[str, list[float]]) -> None:
+    """CPU time a frame over the number of ESCs."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(8, 5))
+    for program, values in series.items():
+        axes.plot(numbers, values, marker="o", label={"c": "C", "ours": "kontronik-can-gw"}[program])
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(numbers, [str(number) for number in numbers])
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("ESCs at 100 frames a second each")
+    axes.set_ylabel("CPU time for each live frame, µs")
+    axes.set_title("Five CAN frames for each live frame")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(file, dpi=120, bbox_inches="tight")
+    pyplot.close(figure)
+
+
+BENCHMARKS = [
+    Benchmark("cpu", "CPU time a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program", cpu),
+    Benchmark("cpu-canopen", "CPU time with CANopen nodes and default PDOs beside the DBC's messages", canopen),
+    Benchmark("cpu-shipped", "CPU time with the shipped DBC", shipped),
+    Benchmark("cpu-bytewise", "CPU time where the bytes come one by one", bytewise),
+    Benchmark("cpu-growth", "CPU time a live frame over 1 to 128 ESCs, and a plot", growth),
+]

@@ -135,12 +135,11 @@ def child(arguments: list[str]) -> int:
             super().__init__(*arguments, clock=lambda: self.virtual, **further)
 
         def run(self) -> None:
-            rows: list[dict[str, Any]] = []
             self.begin()
             warm = int(args.frames * WARM_UP)
             marks = [warm + (args.frames - warm) * each // SAMPLES for each in range(SAMPLES + 1)]
             turns = 0
-            try:
+            with args.report.open("w") as report:  # nothing is kept here: it would be growth
                 for mark in marks:
                     while sum(esc.counters.live for esc in self.gateway.escs) < mark:
                         for _ in range(100):
@@ -150,12 +149,14 @@ def child(arguments: list[str]) -> int:
                         turns += 100
                         if turns % 5000 == 0:
                             time.sleep(0.02)  # the threads beside the loop have the time they would have
-                    rows.append(self._sample(turns))
-                rows[-1]["unreachable"] = gc.collect()
-                rows[-1]["resident_after_collection_kb"] = resident_kb()
-            finally:
-                args.report.write_text(json.dumps(rows))
-                self.end()
+                    if mark == marks[-1]:
+                        last = self._sample(turns)
+                        last["unreachable"] = gc.collect()
+                        last["resident_after_collection_kb"] = resident_kb()
+                        report.write(json.dumps(last) + "\n")
+                    else:
+                        report.write(json.dumps(self._sample(turns)) + "\n")
+            self.end()
 
         def _sample(self, turns: int) -> dict[str, Any]:
             status = self.gateway.status
@@ -280,8 +281,10 @@ def run_child(context: Context, frames: int, config: str) -> tuple[list[dict[str
             raise RuntimeError(f"the gateway ended with {process.returncode}: {said[-2000:]}")
         if "Traceback" in said:
             raise NotEqual(f"growth: the gateway raised something: {said[said.index('Traceback') :][:2000]}")
-        rows: list[dict[str, Any]] = json.loads(report.read_text())
-        context.say(f"{len(said.splitlines())} lines of log, {master.received} CAN frames received, {master.asked} sent")
+        rows: list[dict[str, Any]] = [json.loads(line) for line in report.read_text().splitlines()]
+        context.say(
+            f"{len(said.splitlines())} lines of log, {master.received} CAN frames received, {master.asked} sent"
+        )
         return rows, master
 
 
@@ -292,8 +295,10 @@ def figures_of(context: Context, name: str, frames: int, config: str, target_kb:
     took = time.monotonic() - begun
     first, last = rows[0], rows[-1]
     context.data[name] = rows
-    context.say(f"{'frames':>9} {'hours':>6} {'RSS kB':>7} {'blocks':>8} {'gen 0/1/2':>14} {'losses':>6} {'bad':>5} {'reopened':>8}")
-    for row in rows[:: max(1, len(rows) // 10)] if rows[-1] in rows[:: max(1, len(rows) // 10)] else [*rows[::3], last]:
+    context.say(
+        f"{'frames':>9} {'hours':>6} {'RSS kB':>7} {'blocks':>8} {'gen 0/1/2':>14} {'losses':>6} {'bad':>5} {'reopened':>8}"
+    )
+    for row in (*rows[:: max(1, SAMPLES // 10)], last):
         counts = "/".join(map(str, row["collections"]))
         context.say(
             f"{row['frames']:9} {row['hours']:6.2f} {row['resident_kb']:7} {row['blocks']:8} {counts:>14} {row['losses']:6} "
@@ -306,18 +311,23 @@ def figures_of(context: Context, name: str, frames: int, config: str, target_kb:
         raise NotEqual(f"growth: the gateway counts {last['sent']} CAN frames, the other end {master.received}")
     between = last["frames"] - first["frames"]
     grown = last["resident_kb"] - first["resident_kb"]
-    collections = [b - a for a, b in zip(first["collections"], last["collections"], strict=True)]
-    unreachable = last["unreachable"]
-    target = "" if target_kb is None else f"<= {target_kb / 1000}"
-    note = f"{last['hours']:.1f} h of {ESCS} ESCs in {took:.0f} s; {first['resident_kb'] / 1024:.1f} MB at first"
     blocks = last["blocks"] - first["blocks"]
+    young, middle, full = (b - a for a, b in zip(first["collections"], last["collections"], strict=True))
+    target, reached = ("", None) if target_kb is None else (f"<= {target_kb / 1000}", grown <= target_kb)
+    note = f"{last['hours']:.1f} h of {ESCS} ESCs in {took:.0f} s; {first['resident_kb'] / 1024:.1f} MB at first"
+    before = f"by gc.collect(); {last['collected'] - first['collected']} were collected before"
     return [
-        Figure(f"{name}: growth over {between} frames", grown / 1024, "MB", target, None if target_kb is None else grown <= target_kb, note),
-        Figure(f"{name}: growth in blocks", blocks, "blocks", note="of the allocator; a live frame makes hundreds and gives them back"),
-        Figure(f"{name}: full collections", collections[2], "", "<= 0", collections[2] == 0, "generation 2"),
-        Figure(f"{name}: collections, generation 0", collections[0] * 1000 / between, "/1000 frames"),
-        Figure(f"{name}: collections, generation 1", collections[1] * 1000 / between, "/1000 frames"),
-        Figure(f"{name}: unreachable at the end", unreachable, "objects", note=f"by gc.collect(); {last['collected'] - first['collected']} were collected before"),
+        Figure(f"{name}: growth over {between} frames", grown / 1024, "MB", target, reached, note),
+        Figure(
+            f"{name}: growth",
+            blocks,
+            "blocks",
+            note="of Python's allocator; a live frame makes hundreds and gives them back",
+        ),
+        Figure(f"{name}: full collections", full, "", "<= 0", full == 0, "generation 2"),
+        Figure(f"{name}: collections, generation 0", young * 1000 / between, "/1000 frames"),
+        Figure(f"{name}: collections, generation 1", middle * 1000 / between, "/1000 frames"),
+        Figure(f"{name}: unreachable at the end", last["unreachable"], "objects", note=before),
     ]
 
 

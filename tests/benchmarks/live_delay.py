@@ -1,0 +1,102 @@
+"""The delay from a live frame's last byte to the last of its five CAN frames: beside C, with everything switched on, under load."""
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+from bench_programs import Measured, end, median, once, start
+from live_cpu import CANOPEN, compare, keep
+from registry import Benchmark, Context, Figure
+
+_PRIORITY = 60
+
+
+def delay(context: Context) -> list[Figure]:
+    """One ESC, the three programs by turns."""
+    found = compare(context, ("c", "ours", "obvious"), 1)
+    keep(context, "1", found)
+    figures = []
+    for program, runs in found.items():
+        p50, p99, longest = (median([run.delay[key] for run in runs]) for key in ("p50", "p99", "max"))
+        figures.append(Figure(f"{program}, median", p50, "us", note=f"99 %: {p99:.0f}, longest {longest:.0f}"))
+    value = median([a.delay["p50"] / b.delay["p50"] for a, b in zip(found["ours"], found["c"], strict=True)])
+    slow = median([run.delay["p99"] for run in found["ours"]])
+    figures.append(Figure("ours / c, median", value, "x", "<= 2", value <= 2))
+    figures.append(Figure("ours, 99 %", slow, "us", "<= 2000", slow <= 2000))
+    return figures
+
+
+def everything(context: Context) -> str:
+    """Recorder, status file, Prometheus, nodes."""
+    return f'{CANOPEN}[record]\ndirectory = "captures"\n[statistics]\nfile = "status.json"\nprometheus = "127.0.0.1:{_free_port()}"\n'
+
+
+def _free_port() -> int:
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port: int = server.getsockname()[1]
+        return port
+
+
+def full(context: Context) -> list[Figure]:
+    """8 ESCs with recorder, status file and socket, CANopen nodes and a master that polls them."""
+    runs = [once(context, "ours", 8, "--sdo", config=everything(context)) for _ in range(context.rounds)]
+    context.data["runs"] = [run.result for run in runs]
+    p50, p99, longest = (median([run.delay[key] for run in runs]) for key in ("p50", "p99", "max"))
+    unanswered = sum(run.result["sdo_sent"] - run.result["sdo_answers"] for run in runs)
+    asked = sum(run.result["sdo_sent"] for run in runs)
+    answer = median([run.result["sdo_us"]["p99"] for run in runs])
+    if not asked or unanswered == asked:
+        raise RuntimeError("the nodes answered no SDO request")
+    return [
+        Figure("8 ESCs and all, median", p50, "us"),
+        Figure("8 ESCs and all, 99 %", p99, "us", "<= 2000", p99 <= 2000, note=f"longest {longest:.0f}"),
+        Figure("SDO answers, 99 %", answer, "us", note=f"{asked} requests, {unanswered} without an answer in 50 ms"),
+        Figure("CPU, all of it", median([run.cpu_us for run in runs]), "us/frame"),
+    ]
+
+
+@contextlib.contextmanager
+def burners() -> Iterator[None]:
+    """Two programs a core that do nothing but work."""
+    children: list[subprocess.Popen[str]] = []
+    try:
+        for _ in range(2 * len(os.sched_getaffinity(0))):
+            children.append(start([sys.executable, "-c", "while True: pass"]))
+        yield
+    finally:
+        for child in children:
+            child.kill()
+            end(child)
+
+
+def realtime(context: Context) -> list[Figure]:
+    """With and without real-time priority while other programs load all cores."""
+    priority = context.realtime or _PRIORITY
+    config = f"[run]\nrealtime_priority = {priority}\n"
+    runs: dict[str, list[Measured]] = {"normal": [], "real-time": []}
+    with burners():
+        for _ in range(context.rounds):
+            runs["normal"].append(once(context, "ours", 8))
+            runs["real-time"].append(once(context, "ours", 8, config=config))
+    context.data["runs"] = {name: [run.result for run in several] for name, several in runs.items()}
+    normal = median([run.delay["p99"] for run in runs["normal"]])
+    value = median([run.delay["p99"] for run in runs["real-time"]])
+    longest = median([run.delay["max"] for run in runs["real-time"]])
+    note = f"longest {longest:.0f}"
+    if not all(run.result["priority"] for run in runs["real-time"]):
+        note += "; the feeder itself got no real-time priority (root, or: sudo prlimit --rtprio=99 --pid $$)"
+    return [
+        Figure("loaded, normal priority, 99 %", normal, "us"),
+        Figure(f"loaded, real-time priority {priority}, 99 %", value, "us", "<= 500", value <= 500, note=note),
+    ]
+
+
+BENCHMARKS = [
+    Benchmark("delay", "from the last byte to the fifth CAN frame: C, ours, the obvious program", delay),
+    Benchmark("delay-full", "the same with 8 ESCs, recorder, statistics, CANopen and a polling master", full),
+    Benchmark("delay-realtime", "the same with real-time priority while other programs load all cores", realtime),
+]
