@@ -17,6 +17,7 @@ from kontronik_can_gw.telemetry import SECOND, EscSettings, EscTelemetry, Event
 _CONFLICT_NS = 10 * SECOND
 """So long without a further one, and a conflict of ids is over."""
 _ECHO_NS = SECOND // 5
+_NOTHING: frozenset[int] = frozenset()
 
 
 class Conflict:
@@ -272,7 +273,7 @@ class Gateway:
                 self._output.on_gateway_change(now)
 
     def _follow_ids(self) -> None:
-        routed = frozenset() if self.nodes is None else self.nodes.receive_ids
+        routed = _NOTHING if self.nodes is None else self.nodes.receive_ids
         if routed is self._routed:
             return
         self._routed = routed

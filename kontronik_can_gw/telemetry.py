@@ -5,7 +5,7 @@ or not known of the device now on the line, is None.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
@@ -22,6 +22,8 @@ INFO_TIMEOUT_NS = 10 * SECOND
 """Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
 MW_NS_PER_WH = 3_600_000 * SECOND
 """Energy is kept in milliwatt nanoseconds: one step of voltage (10 mV) by one of current (0.1 A) is exactly 1 mW."""
+_V4 = Layout.V4
+_LEGACY = 2
 _DEGRADED_DROPPED_SHARE = 10  # one dropped byte in so many received
 
 
@@ -34,6 +36,10 @@ class LinkState(IntEnum):
     DEGRADED = 3
     LOST = 4
     PORT_ERROR = 5
+
+
+# An enumeration's members are slow to look up.
+_NEVER_SEEN, _OK, _DEGRADED = LinkState.NEVER_SEEN, LinkState.OK, LinkState.DEGRADED
 
 
 class Event:
@@ -141,26 +147,36 @@ class EscTelemetry:
             events |= found
         return events
 
-    def receive_each(self, data: bytes, now: int) -> Iterator[int]:
-        """Take bytes that were read at ``now``; the events of each frame in turn, so that none is passed over.
+    def receive_each(self, data: bytes, now: int) -> Iterable[int]:
+        """Take bytes that were read at ``now``; the events of each frame in turn, so that none is passed over: iterate to the end.
 
         An unfinished frame older than the time-out is given up first.
         """
         if events := self._expire(now):
-            yield events
+            return self._receive_behind(events, data, now)
         deframer = self._deframer
         if self._arrivals and now - self._arrivals[0][1] > self.settings.timeout_ns:
             self.late_frames += len(deframer.flush())
             self._arrivals.clear()
         frames = deframer.feed(data)
         end = deframer.counters.bytes
-        pending = deframer.pending
-        if pending:
+        if pending := deframer.pending:
             self._arrivals.append((end, now))
             while self._arrivals[0][0] <= end - pending:
                 self._arrivals.popleft()
-        else:
+        elif self._arrivals:
             self._arrivals.clear()
+        if len(frames) == 1:
+            frame = frames[0]
+            if frame.offset + frame.form.length == end and self.link is not _NEVER_SEEN:
+                return (self._accept(frame, now),)  # as nearly always: its last byte has just come
+        return self._accept_each(frames, end, now)
+
+    def _receive_behind(self, events: int, data: bytes, now: int) -> Iterator[int]:
+        yield events
+        yield from self.receive_each(data, now)
+
+    def _accept_each(self, frames: list[Frame], end: int, now: int) -> Iterator[int]:
         for frame in frames:
             when = now - (end - frame.offset - frame.form.length) * NS_PER_BYTE
             if now - when > self.settings.timeout_ns:  # with so many bytes behind it in one read it is old already
@@ -203,7 +219,8 @@ class EscTelemetry:
         return None if self.up else self.counters.diagnosis(self._diagnosis_counters)
 
     def _accept(self, frame: Frame, when: int) -> int:
-        layout = 1 if frame.layout is Layout.V4 else 2
+        form, _, data = frame
+        layout = 1 if form.layout is _V4 else _LEGACY
         events = Event.NONE
         if layout != self.layout:
             self.layout = layout
@@ -211,7 +228,6 @@ class EscTelemetry:
             self.last_live = self.last_info = None  # of another device
             self.last_info_ns = None
             events = Event.INFO | Event.LINK
-        data = frame.data
         if isinstance(data, InfoData):
             if self.info is not None and data.device_and_variant != self.info.device_and_variant:
                 events |= Event.LINK
@@ -219,7 +235,7 @@ class EscTelemetry:
             self.info_ns = self.last_info_ns = when
             self.cells = self.settings.cell_count or data.cell_count
             return events | Event.INFO
-        if frame.suspect:
+        if layout == _LEGACY and frame.suspect:
             self.suspect_frames += 1
         if self.live_ns is not None:
             when = max(when, self.live_ns)  # a pseudo terminal is faster than the wire
@@ -231,8 +247,8 @@ class EscTelemetry:
         self._last_power = data.battery_voltage * data.battery_current
         self.live = self.last_live = data
         self.live_ns = when
-        if self.link is not LinkState.OK and self.link is not LinkState.DEGRADED:
-            events |= self._set_link(LinkState.OK)
+        if self.link is not _OK and self.link is not _DEGRADED:
+            events |= self._set_link(_OK)
             self.frame_rate = None
             self._window_ns = when
             self._window_counters = self._diagnosis_counters = self.counters.copy()

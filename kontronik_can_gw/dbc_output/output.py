@@ -25,8 +25,13 @@ class _Message:
         "alive",
         "alive_modulus",
         "by_event",
+        "can_id",
         "crc_at",
+        "extended",
+        "fd",
+        "is_plain",
         "last",
+        "length",
         "on_change",
         "owed",
         "pack",
@@ -38,6 +43,7 @@ class _Message:
 
     def __init__(self, plan: MessagePlan, silent: bool) -> None:
         self.plan = plan
+        self.can_id, self.length, self.extended, self.fd = plan.can_id, plan.length, plan.extended, plan.fd
         self.pack = compile_pack(plan)
         self.page = 0
         self.owed: list[int] = []
@@ -51,6 +57,8 @@ class _Message:
         self.silent_able = silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
+        # its frame is its pack and nothing else
+        self.is_plain = len(plan.pages) == 1 and not (self.silent_able or self.on_change or crc)
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
             for pace in plan.paces:
@@ -73,11 +81,11 @@ class DbcOutput:
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
         self._schedule = Schedule(layout.messages, now)
-        self._listeners: list[list[tuple[int, int]]] = [[] for _ in escs]
+        self._listeners: list[list[tuple[int, _Message]]] = [[] for _ in escs]
         for index, message in enumerate(self._messages):
             for esc in message.plan.escs:
                 if message.triggers:
-                    self._listeners[esc].append((index, message.triggers))
+                    self._listeners[esc].append((index, message))
 
     def start(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
@@ -104,19 +112,24 @@ class DbcOutput:
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
-        for index, triggers in self._listeners[esc]:
-            if triggers & events:
-                message = self._messages[index]
-                if message.by_event:
-                    state = self._escs[esc]
-                    if triggers & Event.LIVE and triggers & events == Event.LINK and state.up:
-                        continue  # live frames set the pace
-                    gone = not state.up or (events & Event.INFO and state.info is None)
-                    if gone and len(message.plan.pages) > 1:  # no further event will bring the other pages
-                        message.owed = list(range(len(message.plan.pages)))
+        schedule, state = self._schedule, self._escs[esc]
+        is_live_alone = events == Event.LIVE and state.live is not None
+        for index, message in self._listeners[esc]:
+            triggers = message.triggers
+            if not triggers & events:
+                continue
+            if not message.by_event:
+                if self._note_changes(message, now):
                     self._request(index, now)
-                elif self._note_changes(message, now):
-                    self._request(index, now)
+                continue
+            if not is_live_alone:
+                if triggers & Event.LIVE and triggers & events == Event.LINK and state.up:
+                    continue  # live frames set the pace
+                gone = not state.up or (events & Event.INFO and state.info is None)
+                if gone and len(message.plan.pages) > 1:  # no further event will bring the other pages
+                    message.owed = list(range(len(message.plan.pages)))
+            if schedule.request(index, now):
+                self._send(index, now)
 
     def on_gateway_change(self, now: int, at_once: bool = False, each_second: bool = False) -> None:
         """The gateway's own state changed: messages with its values that are sent by event or on change follow.
@@ -156,18 +169,29 @@ class DbcOutput:
 
     def _note_changes(self, message: _Message, now: int) -> bool:
         """True if a page differs from what was sent of it last; with several pages those that do are owed."""
-        plan = message.plan
+        pack, last = message.pack, message.last
+        pages = message.plan.pages
+        if len(pages) == 1:
+            page = pages[0]
+            return pack(self._escs, self._gateway, now, 0, page or 0) != last.get(page)
         changed = [
             place
-            for place, page in enumerate(plan.pages)
-            if message.pack(self._escs, self._gateway, now, 0, page or 0) != message.last.get(page)
+            for place, page in enumerate(pages)
+            if pack(self._escs, self._gateway, now, 0, page or 0) != last.get(page)
         ]
-        if len(plan.pages) > 1:
-            message.owed += [place for place in changed if place not in message.owed]
+        message.owed += [place for place in changed if place not in message.owed]
         return bool(changed)
 
     def _send(self, index: int, now: int) -> None:
         message = self._messages[index]
+        if message.is_plain:
+            message.owed.clear()
+            bits = message.pack(self._escs, self._gateway, now, message.alive, 0)
+            message.alive = (message.alive + 1) % message.alive_modulus
+            data = bits.to_bytes(message.length, "little")
+            self.frames.append(CanFrame(message.can_id, data, message.extended, message.fd))
+            self._schedule.sent(index, now)
+            return
         plan = message.plan
         if message.silent_able and not any(self._escs[esc].up for esc in plan.escs):
             message.owed.clear()

@@ -157,13 +157,17 @@ def _value(signal: SignalPlan) -> list[str]:
     if source.rolls:
         return [f"v = ({expression}) % {signal.high + 1}", f"bits |= {_placed(signal)}"]
     lines = [f"v = {scaled_text(expression, signal.slope, signal.intercept, source.whole)}"]
-    if not _always_fits(signal):
-        lines.append(f"if not {signal.low} <= v <= {signal.high}:")
+    low, high = _ends(signal)
+    outside = [f"v < {signal.low}"] if low is None or low < signal.low else []
+    outside += [f"v > {signal.high}"] if high is None or high > signal.high else []
+    # a code amid the values: a true value must not look like it
+    code_inside = signal.low <= signal.not_available <= signal.high
+    if outside:
+        lines.append(f"if {' or '.join(outside)}:")
         lines.append(f"    v = {signal.error}")
-        codes = {code for code in (signal.not_available, signal.error) if signal.low <= code <= signal.high}
-        if codes and signal.error != signal.not_available:  # a code amid the values: a true value must not look like it
-            lines.append(f"elif v == {signal.not_available}:")
-            lines.append(f"    v = {signal.error}")
+    if code_inside and signal.error != signal.not_available:
+        lines.append(f"{'elif' if outside else 'if'} v == {signal.not_available}:")
+        lines.append(f"    v = {signal.error}")
     lines.append(f"bits |= {_placed(signal)}")
     return lines
 
@@ -185,21 +189,24 @@ def scaled_text(expression: str, slope: Fraction, intercept: Fraction, whole: bo
     return f"(({expression}) * {2 * a} + {2 * b + common}) // {2 * common}"
 
 
-def _always_fits(signal: SignalPlan) -> bool:
+def _ends(signal: SignalPlan) -> tuple[Fraction | None, Fraction | None]:
+    """Least and greatest raw value that the source can give; None where it has no bound."""
     source = signal.source
     assert source is not None
     if source.low is None or source.high is None or not source.whole:
-        return False
+        return None, None
     ends = [source.low * signal.slope + signal.intercept, source.high * signal.slope + signal.intercept]
-    inside = signal.low <= min(ends) and max(ends) <= signal.high
-    return inside and not signal.low <= signal.not_available <= signal.high
+    return min(ends), max(ends)
 
 
 def _placed(signal: SignalPlan) -> str:
     """``v`` at its bits. Only signed values and codes can have bits beyond the length."""
     parts = []
     for piece in signal.pieces:
-        moved = f"v >> {piece.shift}" if piece.shift else "v"
-        part = f"({moved} & {(1 << piece.width) - 1:#x})"
+        part = f"v >> {piece.shift}" if piece.shift else "v"
+        if signal.signed or piece.shift + piece.width < signal.length:
+            part = f"({part} & {(1 << piece.width) - 1:#x})"
+        elif piece.shift:
+            part = f"({part})"
         parts.append(f"{part} << {piece.at}" if piece.at else part)
     return " | ".join(parts)

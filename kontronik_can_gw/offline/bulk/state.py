@@ -337,6 +337,8 @@ class Moments:
         self, block: Steady, turns: Numbers, states: Numbers, now: Numbers, with_bytes: NDArray[np.bool_] | bool
     ) -> None:
         self.count = len(states)
+        self.turns = turns
+        self.states = states
         self.now = now
         self.gateway = block.gateway.status
         self.live = _Fields(block.live_column, block.live_rows[states])
