@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.capture import COUNTERS, Entry, Kind, read_counters, read_frame, read_json, read_number
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Mailboxes, Sent
+from kontronik_can_gw.mailboxes import Mailboxes, Sent, stand_alone
 from kontronik_can_gw.sources import CanState, GatewayState
 
 
@@ -155,10 +155,9 @@ class Replay:
 
 def in_order(frames: list[CanFrame], waiting: Mailboxes) -> list[CanFrame]:
     """The frames of one turn as an interface that takes them all is given them; ``waiting``: the same one for each turn."""
-    if len(frames) < 2:
+    if stand_alone(frames):
         return frames
-    for frame in frames:
-        waiting.put(frame)
+    waiting.put_all(frames)
     sent: list[CanFrame] = []
 
     def take(frame: CanFrame) -> Sent:

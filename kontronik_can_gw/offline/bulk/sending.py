@@ -1,0 +1,396 @@
+"""When each message is sent while a block of frames comes, and with what: DbcOutput and Schedule for many frames at once.
+
+A message is sent without regard to the others, so each is followed by itself. Most have a plain pace, with each frame or by their cycle
+alone; their sending times are reckoned in columns. The others are followed step by step from one thing that concerns them to the next.
+"""
+
+from bisect import bisect_left
+from heapq import heappop, heappush
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan
+from kontronik_can_gw.dbc_output.output import DbcOutput, _Message
+from kontronik_can_gw.dbc_output.schedule import LEAST_DISTANCE_NS
+from kontronik_can_gw.offline.bulk.columns import Bits, ColumnPacker
+from kontronik_can_gw.offline.bulk.state import Numbers, Rare, Steady
+from kontronik_can_gw.sources import Group
+from kontronik_can_gw.telemetry import Event
+
+MOST_FRAMES = (1 << 14) - 1
+"""In a block; of UART frames."""
+MOST_PERIOD_NS = (1 << 36) - 1
+_MOST_MESSAGES = 1 << 10
+_TOLD_WITH_BYTES, _EVENT, _SECOND, _TOLD, _DUE = range(5)
+"""What a frame goes out for, in the order in which it is asked within one instant."""
+_END = (1 << 14, 0, 0)
+
+
+class CanFrames(NamedTuple):
+    """Many CAN frames in the order in which they are sent."""
+
+    times: Numbers
+    messages: NDArray[np.int16]
+    """Indices in the layout."""
+    data: NDArray[np.uint8]
+    """A row each, filled up with zeros behind the message's length."""
+
+
+class _Sends(NamedTuple):
+    """The frames of one message. ``number``: counted from the first of the block, replaced ones too."""
+
+    turn: Numbers
+    since: Numbers
+    rank: Numbers
+    state: Numbers
+    time: Numbers
+    place: Numbers
+    number: Numbers
+    with_bytes: NDArray[np.bool_]
+    """What it holds is that of the step of a frame's bytes."""
+
+
+class Sender:
+    """The messages of a layout. ``possible``: False where one of them can only be followed by the packer itself."""
+
+    def __init__(self, layout: Layout, output: DbcOutput) -> None:
+        self._output = output
+        self._followers = [
+            _Follower(output, index, plan, message)
+            for index, (plan, message) in enumerate(zip(layout.messages, output._messages, strict=True))
+        ]
+        self.width = 8 * max((f.packer.words for f in self._followers), default=1)
+        self.possible = len(self._followers) <= _MOST_MESSAGES and all(f.possible for f in self._followers)
+
+    @property
+    def is_ready(self) -> bool:
+        """True where a block may begin now."""
+        return all(follower.is_ready for follower in self._followers)
+
+    def send(self, block: Steady) -> CanFrames:
+        """The frames of a block; the output's objects are as after its last frame."""
+        keys, times, messages, rows = [], [], [], []
+        for index, follower in enumerate(self._followers):
+            sends, data = follower.send(block)
+            count = len(sends.turn)
+            if not count:
+                continue
+            keys.append(((sends.turn << 36 | sends.since) << 3 | sends.rank) << 10 | index)
+            times.append(sends.time)
+            messages.append(np.full(count, index, np.int16))
+            if data.shape[1] < self.width:
+                data = np.pad(data, ((0, 0), (0, self.width - data.shape[1])))
+            rows.append(data)
+        heap = self._output._schedule._heap
+        heap[:] = sorted(entry for entry in heap if entry[0] > block.times[-1])
+        if not keys:
+            return CanFrames(np.empty(0, np.int64), np.empty(0, np.int16), np.empty((0, self.width), np.uint8))
+        order = np.argsort(np.concatenate(keys), kind="stable")
+        data = np.concatenate(rows)[order]
+        return CanFrames(np.concatenate(times)[order], np.concatenate(messages)[order], data)
+
+
+class _Follower:
+    """One message."""
+
+    def __init__(self, output: DbcOutput, index: int, plan: MessagePlan, message: _Message) -> None:
+        self._schedule = output._schedule
+        self._index = index
+        self._plan = plan
+        self._message = message
+        self.packer = ColumnPacker(plan)
+        self._tells = Group.GATEWAY in plan.paces and not plan.cycle_ns
+        asked = bool(message.triggers & (Event.LIVE | Event.INFO | Event.SECOND)) or self._tells
+        self.possible = not message.silent_able and not (
+            message.on_change and not message.by_event and self.packer.follows_time and asked
+        )
+
+    @property
+    def is_ready(self) -> bool:
+        schedule, index = self._schedule, self._index
+        if not self.packer.follows_time or self._message.by_event or not self._message.on_change:
+            return True
+        return not schedule._waiting[index] and not self._message.owed
+
+    def send(self, block: Steady) -> tuple[_Sends, NDArray[np.uint8]]:
+        """When it is sent, and with what."""
+        sends = self._plain_events(block) or self._plain_cycle(block) or _Steps(self, block).sends
+        message, plan = self._message, self._plan
+        count = len(sends.turn)
+        if not count:
+            return sends, np.empty((0, plan.length), np.uint8)
+        alive = (sends.number + message.alive) % message.alive_modulus
+        bits = np.empty((count, self.packer.words), np.uint64)
+        for place in range(len(plan.pages)) if len(plan.pages) > 1 else (0,):
+            chosen = slice(None) if len(plan.pages) == 1 else np.flatnonzero(sends.place == place)
+            moments = block.moments(
+                sends.turn[chosen], sends.state[chosen], sends.time[chosen], sends.with_bytes[chosen]
+            )
+            if moments.count:
+                bits[chosen] = self.packer.bits(moments, alive[chosen], plan.pages[place])
+                if message.on_change:  # without the alive counter
+                    last = slice(-1, None)
+                    end = block.moments(
+                        moments.turns[last], moments.states[last], moments.now[last], sends.with_bytes[chosen][last]
+                    )
+                    message.last[plan.pages[place]] = number_of(self.packer.bits(end, 0, plan.pages[place]), 0)
+        message.alive = (message.alive + int(sends.number.max()) + 1) % message.alive_modulus
+        return sends, self.packer.data(bits)
+
+    def asking(self, block: Steady) -> Numbers:
+        """The turns whose frames ask for the message."""
+        wanted = self._message.triggers
+        if wanted & Event.LIVE and wanted & Event.INFO:
+            return np.arange(1, block.count + 1)
+        if wanted & (Event.LIVE | Event.INFO):
+            return np.flatnonzero(block.is_live if wanted & Event.LIVE else ~block.is_live) + 1
+        return np.empty(0, np.int64)
+
+    def rare(self, block: Steady) -> list[tuple[tuple[int, int, int], Rare]]:
+        """What else asks for the message, with its step."""
+        found = []
+        for one in block.rare:
+            if one.events & self._message.triggers:
+                found.append(((one.turn, one.since_ns, _SECOND), one))
+            if one.is_told and self._tells:
+                found.append(((one.turn, one.since_ns, _TOLD_WITH_BYTES if one.with_bytes else _TOLD), one))
+        return found
+
+    def _plain_events(self, block: Steady) -> _Sends | None:
+        """Sent with each frame that asks, and for nothing else; None where it is not so."""
+        message, schedule, index = self._message, self._schedule, self._index
+        if not message.by_event or message.owed or schedule._waiting[index] or self._plan.cycle_ns or self.rare(block):
+            return None
+        turns = self.asking(block)
+        times = block.times[turns]
+        delay = self._plan.delay_ns
+        if len(times) and (times[0] < schedule._last[index] + delay or (np.diff(times) < delay).any()):
+            return None
+        return self._at_pace(turns, np.zeros_like(turns), _EVENT, times)
+
+    def _plain_cycle(self, block: Steady) -> _Sends | None:
+        """Sent by its cycle and for nothing else; None where it is not so."""
+        message, schedule, index, cycle = self._message, self._schedule, self._index, self._plan.cycle_ns
+        if not cycle or message.owed or schedule._waiting[index] or self.rare(block):
+            return None
+        if self._plan.delay_ns > cycle:
+            return None
+        if len(self.asking(block)) and (message.by_event or not self._never_changes(block)):
+            return None
+        place = next(at for at, (_, i, waited) in enumerate(schedule._heap) if i == index and not waited)
+        first, end = schedule._heap[place][0], int(block.times[-1])
+        if first < schedule._last[index] + self._plan.delay_ns:
+            return None
+        times = np.arange(first, end + 1, cycle, dtype=np.int64)
+        schedule._heap[place] = (first + cycle * len(times), index, False)
+        turns, since = step_of(block.times, times)
+        return self._at_pace(turns, since, _DUE, times)
+
+    def _at_pace(self, turns: Numbers, since: Numbers, rank: int, times: Numbers) -> _Sends:
+        message, count = self._message, len(turns)
+        number = np.arange(count)
+        place = (number + message.page) % len(self._plan.pages)
+        message.page = (message.page + count) % len(self._plan.pages)
+        if count:
+            self._schedule._last[self._index] = int(times[-1])
+            self._schedule._waiting[self._index] = self._schedule._cycle_waits[self._index] = False
+        return _Sends(turns, since, np.full(count, rank), turns, times, place, number, np.full(count, rank == _EVENT))
+
+    def _never_changes(self, block: Steady) -> bool:
+        """True where no frame that asks finds another page than was sent last."""
+        turns = self.asking(block)
+        for page, bits in self.bits_by_state(block).items():
+            last = self._message.last.get(page)
+            if last is None or (bits[turns] != words_of(last, self.packer.words)).any():
+                return False
+        return True
+
+    def bits_by_state(self, block: Steady) -> dict[int | None, Bits]:
+        """Of each page what it holds at each state."""
+        states = np.arange(block.count + 1)
+        moments = block.moments(states, states, block.times, True)
+        return {page: self.packer.bits(moments, 0, page) for page in self._plan.pages}
+
+
+class _Steps:
+    """A message step by step: the same rules as DbcOutput and Schedule have, for one message."""
+
+    def __init__(self, follower: _Follower, block: Steady) -> None:
+        self._block = block
+        message, schedule, index = follower._message, follower._schedule, follower._index
+        self._message = message
+        self._plan = follower._plan
+        self._delay = follower._plan.delay_ns
+        self._last_ns = schedule._last[index]
+        self._waiting = schedule._waiting[index]
+        self._cycle_waits = schedule._cycle_waits[index]
+        self._put_offs = sorted(when for when, i, waited in schedule._heap if i == index and waited)
+        self._cycle_ns = next((when for when, i, waited in schedule._heap if i == index and not waited), None)
+        self._last = dict(message.last)
+        self._turns = follower.asking(block).tolist()
+        self._times = [block.time_list[turn] for turn in self._turns]
+        self._rare = follower.rare(block)
+        self._bits: dict[int | None, Bits] = {}
+        self._changes: list[int] = []
+        if message.on_change and (self._turns or self._waiting or self._rare or message.owed):
+            self._bits = follower.bits_by_state(block)
+            if len(self._plan.pages) == 1:
+                found = self._bits[self._plan.pages[0]][np.array(self._turns, np.int64)]
+                self._changes = (np.flatnonzero((found[1:] != found[:-1]).any(axis=1)) + 1).tolist()
+        self._found: list[tuple[int, int, int, int, int, int, int, bool]] = []
+        self._number = 0
+        self._follow()
+        schedule._last[index], schedule._waiting[index] = self._last_ns, self._waiting
+        schedule._cycle_waits[index] = self._cycle_waits
+        heap = [entry for entry in schedule._heap if entry[1] != index]
+        heap += [(when, index, True) for when in self._put_offs]
+        if self._cycle_ns is not None:
+            heap.append((self._cycle_ns, index, False))
+        schedule._heap[:] = heap
+        columns = [np.ascontiguousarray(column) for column in np.array(self._found, np.int64).reshape(-1, 8).T]
+        turn, since, rank, state, time, place, number, with_bytes = columns
+        self.sends = _Sends(turn, since, rank, state, time, place, number, with_bytes.astype(bool))
+
+    def _follow(self) -> None:
+        times = self._block.time_list
+        end = times[-1]
+        at, rare_at = 0, 0
+        message = self._message
+        while True:
+            at = self._next_asking(at)
+            asks = (self._turns[at], 0, _EVENT) if at < len(self._turns) else _END
+            rare = self._rare[rare_at][0] if rare_at < len(self._rare) else _END
+            due = self._next_due()
+            step = _END
+            if due is not None and due <= end:
+                turn = bisect_left(times, due, 1)
+                step = (turn, 0, _DUE) if times[turn] == due else (turn - 1, due - times[turn - 1], _DUE)
+            first = min(asks, rare, step)
+            if first is _END or first == _END:
+                return
+            turn, since, rank = first
+            now = times[turn] + since
+            if first == asks:
+                at += 1
+                if (message.by_event or self._note(turn)) and self._request(now):
+                    self._send(turn, since, rank, turn, now)
+            elif first == rare:
+                state = self._rare[rare_at][1].state
+                rare_at += 1
+                if (message.by_event or self._note(state)) and self._request(now):
+                    self._send(turn, since, rank, state, now)
+            else:
+                self._turn_clock(turn, since, now)
+
+    def _next_asking(self, at: int) -> int:
+        """The next of the frames that ask which can make a difference."""
+        message = self._message
+        alone = len(self._plan.pages) == 1
+        if self._waiting and (message.by_event or alone):
+            at = max(at, bisect_left(self._times, self._last_ns + self._delay))
+        if message.by_event or not alone or at >= len(self._turns):
+            return at
+        page = self._plan.pages[0]
+        if number_of(self._bits[page], self._turns[at]) != self._last.get(page):
+            return at
+        change = bisect_left(self._changes, at + 1)
+        return self._changes[change] if change < len(self._changes) else len(self._turns)
+
+    def _next_due(self) -> int | None:
+        if self._put_offs and (self._cycle_ns is None or self._put_offs[0] < self._cycle_ns):
+            return self._put_offs[0]
+        return self._cycle_ns
+
+    def _turn_clock(self, turn: int, since: int, now: int) -> None:
+        """As Schedule.due and DbcOutput.advance."""
+        found: bool | None = None
+        message = self._message
+        if self._cycle_ns == now:
+            self._cycle_ns += self._plan.cycle_ns
+            if self._request(now):
+                found = True
+            else:
+                self._cycle_waits = True
+        while self._put_offs and self._put_offs[0] <= now:
+            heappop(self._put_offs)
+            if not self._waiting:
+                continue
+            if now < self._last_ns + self._delay:
+                heappush(self._put_offs, self._last_ns + self._delay)
+                continue
+            self._waiting = False
+            found = found or self._cycle_waits
+            self._cycle_waits = False
+        if found is None:
+            return
+        pages = len(self._plan.pages)
+        if found and pages > 1:
+            if message.page not in message.owed:
+                message.owed.append(message.page)
+            message.page = (message.page + 1) % pages
+        if found or message.by_event or message.owed or self._note(turn):
+            self._send(turn, since, _DUE, turn, now)
+
+    def _request(self, now: int) -> bool:
+        if now >= self._last_ns + self._delay:
+            return True
+        self._put_off(self._last_ns + self._delay)
+        return False
+
+    def _put_off(self, until: int) -> None:
+        if not self._waiting:
+            self._waiting = True
+            heappush(self._put_offs, until)
+
+    def _note(self, state: int) -> bool:
+        changed = [
+            place
+            for place, page in enumerate(self._plan.pages)
+            if number_of(self._bits[page], state) != self._last.get(page)
+        ]
+        if len(self._plan.pages) > 1:
+            self._message.owed += [place for place in changed if place not in self._message.owed]
+        return bool(changed)
+
+    def _send(self, turn: int, since: int, rank: int, state: int, now: int) -> None:
+        message = self._message
+        if message.owed:
+            place = message.owed.pop(0)
+        else:
+            place = message.page
+            message.page = (place + 1) % len(self._plan.pages)
+        page = self._plan.pages[place]
+        if self._bits:
+            self._last[page] = number_of(self._bits[page], state)
+        sent = (turn, since, rank, state, now, place, self._number, rank <= _EVENT)
+        self._number += 1
+        at = len(self._found) - 1
+        while at >= 0 and self._found[at][:2] == (turn, since) and self._found[at][5] != place:
+            at -= 1
+        if at >= 0 and self._found[at][:2] == (turn, since):  # the newest of an instant stands where the first one did
+            self._found[at] = (*sent[:2], self._found[at][2], *sent[3:])
+        else:
+            self._found.append(sent)
+        self._last_ns = now
+        self._waiting = self._cycle_waits = False
+        if message.owed:
+            self._put_off(now + max(self._delay, LEAST_DISTANCE_NS))
+
+
+def step_of(times: Numbers, when: Numbers) -> tuple[Numbers, Numbers]:
+    """The turn of each instant at which the clock turns, and how long after its frame."""
+    turns = np.searchsorted(times[1:], when, "left") + 1
+    turns -= times[np.minimum(turns, len(times) - 1)] != when
+    return turns, when - times[turns]
+
+
+def number_of(bits: Bits, row: int) -> int:
+    """A row as one number."""
+    return int.from_bytes(bits[row].astype("<u8").tobytes(), "little")
+
+
+def words_of(number: int, words: int) -> NDArray[np.uint64]:
+    """One number as 64-bit words."""
+    return np.frombuffer(number.to_bytes(8 * words, "little"), "<u8")
