@@ -1,0 +1,206 @@
+"""The hot path makes no garbage in circles: with the collector off, thousands of frames leave nothing that only it could find."""
+
+import gc
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kontronik_can_gw.cli.common import Loaded, assemble
+from kontronik_can_gw.config import CanConfig, parse
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.protocol.codec import Layout, encode
+from kontronik_can_gw.protocol.fields import InfoData, LiveData
+from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.runtime.prometheus import metrics
+from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings
+from kontronik_can_gw.runtime.snapshot import (
+    CanFacts,
+    Document,
+    PortFacts,
+    ProcessFacts,
+    ProgramFacts,
+    snapshot,
+    with_rates,
+)
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import MS, SECOND
+
+FRAMES = 3000
+START = range(1, 100)
+"""Turns in which the nodes boot and what is made once is made."""
+STEADY = range(100, 100 + FRAMES)
+LIVE = [
+    encode(LiveData(electrical_speed=n * 100, battery_voltage=2000 + n, operating_errors=n % 3), Layout.V4)
+    for n in range(50)
+]
+INFO = encode(InfoData(device_and_variant=1 << 10, firmware_word=0x0203), Layout.V4)
+
+
+def garbage() -> list[str]:
+    """What only the collector finds now, each by its type and text."""
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        gc.collect()
+        return [f"{type(each).__name__}: {str(each)[:80]}" for each in gc.garbage]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+
+
+@contextmanager
+def collector_off() -> Iterator[None]:
+    """Nothing is collected inside, and what was left over before is away."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+def loaded(folder: Path, canopen: bool) -> Loaded:
+    tables: dict[str, Any] = {"esc": [{"port": "a"}, {"port": "b"}], "can": {"bitrate": 1_000_000}}
+    if canopen:
+        tables["canopen"] = {"enabled": True, "store": str(folder / "store"), "self_start": True}
+    return assemble(parse(tables, "test"))
+
+
+def drive(gateway: Gateway, turns: range, each_turn: Callable[[int, int], object] = lambda _turn, _now: None) -> int:
+    """Live and info frames, damaged ones, silence, an unplugged port, a bus in trouble, a master; the CAN frames that came of it."""
+    sent = 0
+    for turn in turns:
+        now = turn * 10 * MS + turn // 501 * SECOND
+        esc, wire = turn % 2, LIVE[turn % 50]
+        if turn % 100 < 2:
+            wire = INFO + wire
+        if turn % 97 == 0:
+            wire = wire[:9] + b"?" + wire[10:]
+        gateway.receive_bytes(esc, wire, now)
+        if turn % 700 == 0:
+            gateway.port_lost(esc, now)
+            gateway.port_opened(esc, now)
+        if turn % 300 == 0:
+            gateway.set_can_state(CanState.BUS_OFF if turn % 600 else CanState.ERROR_ACTIVE, now)
+        if turn % 50 == 0:
+            for request in ("4018100100000000", "4008100000000000", "4000400000000000"):
+                gateway.receive_frame(CanFrame(0x601 + esc, bytes.fromhex(request)), now)
+            gateway.receive_frame(CanFrame(0x000, bytes([1, 0])), now)
+        gateway.advance(now)
+        gateway.take_link_changes()
+        gateway.take_conflicts()
+        gateway.take_saves()
+        sent += len(gateway.take_frames())
+        each_turn(turn, now)
+    return sent
+
+
+def test_a_circle_would_be_found() -> None:
+    class Circle:
+        def __init__(self) -> None:
+            self.me = self
+
+    with collector_off():
+        Circle()
+        assert any("Circle object" in found for found in garbage())
+
+
+@pytest.mark.parametrize("canopen", [False, True], ids=["dbc", "canopen with its PDOs"])
+def test_frames_leave_no_garbage(tmp_path: Path, canopen: bool) -> None:
+    setup = loaded(tmp_path, canopen)
+    gateway = Gateway(setup.escs, setup.layout, 0, False, setup.canopen)
+    gateway.start(0)
+    drive(gateway, START)
+    with collector_off():
+        sent = drive(gateway, STEADY)
+        assert garbage() == []
+    assert sent > FRAMES
+    if canopen:
+        assert sum(pdos for _, _, pdos in gateway.node_states()) > FRAMES
+
+
+def test_recording_leaves_no_garbage(tmp_path: Path) -> None:
+    setup = loaded(tmp_path, canopen=True)
+    recorder = Recorder(RecordSettings(tmp_path / "captures"))
+    gateway = RecordedGateway(recorder.put, setup.escs, setup.layout, 0, False, setup.canopen)
+    recorder.start()
+
+    def note(turn: int, now: int) -> None:
+        if turn % 10 == 0:
+            recorder.note(gateway, now)
+            recorder.reports(now)
+
+    try:
+        gateway.start(0)
+        drive(gateway, START, note)
+        with collector_off():
+            drive(gateway, STEADY, note)
+            until = time.monotonic() + 10
+            while recorder.facts.bytes < 10 * FRAMES and time.monotonic() < until:
+                time.sleep(0.05)
+            assert garbage() == []
+    finally:
+        recorder.close()
+    assert recorder.facts.bytes >= 10 * FRAMES
+
+
+def test_statistics_leave_no_garbage(tmp_path: Path) -> None:
+    setup = loaded(tmp_path, canopen=True)
+    gateway = Gateway(setup.escs, setup.layout, 0, False, setup.canopen)
+    ports = [PortFacts(esc.name, "/dev/ttyUSB0", True) for esc in setup.escs]
+    before: list[Document] = []
+    told = 0
+
+    def tell(turn: int, now: int) -> None:
+        nonlocal told
+        if turn % 20:
+            return
+        document = snapshot(
+            gateway,
+            now=now,
+            wall=0.0,
+            program=ProgramFacts("x"),
+            process=ProcessFacts(),
+            ports=ports,
+            can=CanFacts("socketcan", "can0", 500_000, True),
+        )
+        document = with_rates(document, before[-1] if before else None)
+        told += len(json.dumps(document)) + len(metrics(document))
+        before[:] = [document]
+
+    gateway.start(0)
+    drive(gateway, START, tell)
+    with collector_off():
+        drive(gateway, STEADY, tell)
+        assert garbage() == []
+    assert told > 100_000
+
+
+def test_the_loop_leaves_no_garbage(tmp_path: Path) -> None:
+    """With its selector, ports, conditions and the CAN side; python-can's virtual interface in place of a socket."""
+    setup = loaded(tmp_path, canopen=True)
+    gateway = Gateway(setup.escs, setup.layout, time.monotonic_ns(), False, setup.canopen)
+    clock = [time.monotonic_ns()]
+    with ExitStack() as ends:
+        escs = [ends.enter_context(PtyEsc()) for _ in setup.escs]
+        loop = Loop(gateway, [esc.path for esc in escs], CanConfig("virtual", "garbage"), clock=lambda: clock[0])
+        loop.open()
+        loop.begin()
+        try:
+            with collector_off():
+                for turn in range(600):
+                    for esc in escs:
+                        esc.write(LIVE[turn % 50] if turn % 90 else b"???")
+                    clock[0] += 10 * MS if turn % 200 else 300 * MS
+                    loop.turn()
+                assert garbage() == []
+        finally:
+            loop.end()
+    assert all(esc.counters.live > 400 for esc in gateway.escs)
