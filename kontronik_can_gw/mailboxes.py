@@ -1,12 +1,22 @@
 """What waits to be sent: a slot for each CAN id (and multiplexer page), where the newest value wins, and a queue that keeps its order."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
+from operator import attrgetter
 
 from kontronik_can_gw.frames import CanFrame
 
 QUEUE_LENGTH = 2048
+_slot_of = attrgetter("can_id", "extended", "page")
+_is_queued = attrgetter("queued")
+
+
+def stand_alone(frames: Sequence[CanFrame]) -> bool:
+    """True where no frame replaces another or goes in front of one: empty mailboxes would hand them out as they are."""
+    if len(frames) < 2:
+        return True
+    return len(set(map(_slot_of, frames))) == len(frames) and not any(map(_is_queued, frames))
 
 
 class Sent(Enum):
@@ -52,6 +62,11 @@ class Mailboxes:
         if key in self._slots:
             self.replaced += 1
         self._slots[key] = frame
+
+    def put_all(self, frames: Iterable[CanFrame]) -> None:
+        """Let frames wait, one behind the other."""
+        for frame in frames:
+            self.put(frame)
 
     def flush(self, send: Callable[[CanFrame], Sent]) -> tuple[int, Sent]:
         """Send until nothing waits or the interface does not take more. Returns how many went and the last answer.

@@ -45,6 +45,8 @@ _MOST_FILTERS = 512
 """CAN_RAW_FILTER_MAX: the kernel takes no more for one socket."""
 _ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
 _CTRL_RX_OVERFLOW, _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x01, 0x0C, 0x30, 0x40
+_OK = Sent.OK
+_DOWN, _UNKNOWN = CanState.DOWN, CanState.UNKNOWN
 _SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
 """The kernel's figures of a socket; the last one counts what it dropped for want of room."""
 
@@ -136,10 +138,11 @@ class CanPort:
         result = self._send(frame)
         if result is Sent.DOWN:
             result = self._send(frame)
-        if result is Sent.OK and self.state in (CanState.UNKNOWN, CanState.DOWN):
-            self.state = CanState.ERROR_ACTIVE
-        elif result in (Sent.DOWN, Sent.GONE):
-            self.state = CanState.DOWN
+        if result is _OK:
+            if self.state is _DOWN or self.state is _UNKNOWN:
+                self.state = CanState.ERROR_ACTIVE
+        elif result is Sent.DOWN or result is Sent.GONE:
+            self.state = _DOWN
         return result
 
     def close(self) -> None:
@@ -231,25 +234,26 @@ class CanPort:
                 self.state = CanState.ERROR_ACTIVE
 
     def _send(self, frame: CanFrame) -> Sent:
-        if self.gone:
-            return Sent.GONE
         if self._socket is None:
-            return self._send_message(frame)
-        can_id = frame.can_id | (EXTENDED if frame.extended else 0) | (_REMOTE if frame.remote else 0)
-        size = len(frame.data)
-        if frame.fd:
-            packet = _FD.pack(can_id, size, _FD_BRS, frame.data)
-        else:
-            packet = _CLASSIC.pack(can_id, size, frame.data)
+            return Sent.GONE if self.gone else self._send_message(frame)
+        if self._removed:
+            return Sent.GONE
+        can_id, data, extended, fd, _, remote, _ = frame
+        if extended:
+            can_id |= EXTENDED
+        if remote:
+            can_id |= _REMOTE
         try:
-            self._socket.send(packet)
+            self._socket.send(
+                _FD.pack(can_id, len(data), _FD_BRS, data) if fd else _CLASSIC.pack(can_id, len(data), data)
+            )
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return Sent.FULL
             if error.errno in (errno.ENOBUFS, errno.ENOMEM):
                 return Sent.BUSY
             return Sent.GONE if error.errno in (errno.ENXIO, errno.ENODEV, errno.EBADF) else Sent.DOWN
-        return Sent.OK
+        return _OK
 
     def _send_message(self, frame: CanFrame) -> Sent:
         import can

@@ -5,14 +5,14 @@ import errno
 import logging
 import selectors
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Conflict, Gateway
-from kontronik_can_gw.mailboxes import Mailboxes, Sent
+from kontronik_can_gw.mailboxes import Mailboxes, Sent, stand_alone
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
 from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
 from kontronik_can_gw.runtime.conditions import Conditions
@@ -28,6 +28,7 @@ LASTING_BUSY_NS = SECOND
 ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
 """How often the kernel is asked for the controller's state: as a rule, and in bus-off."""
 ASK_RESTARTING_NS, SETTLING_NS = 20 * MS, 200 * MS
+_OK = Sent.OK
 RESTARTED_NS = SECOND
 """So long behind a restart a driver may go on telling of bus-off."""
 
@@ -69,6 +70,8 @@ class CanSide:
         self._busy_until: int | None = None
         self._busy_since: int | None = None
         self._stalled = False
+        self._is_proven = False
+        """A frame was taken since the interface failed last."""
         self._off = False
         self._runs_since: int | None = None
         self._restarted_ns = -RESTARTED_NS
@@ -206,6 +209,7 @@ class CanSide:
             self.port = None
 
     def _failed(self, reason: str, now: int) -> None:
+        self._is_proven = False
         self._retry.failed(now)
         self.clear()
         self._gateway.set_can_state(CanState.DOWN, now)
@@ -342,32 +346,37 @@ class CanSide:
         """Hand what is to be sent to the interface, as far as it takes it."""
         status, waiting = self._gateway.status, self.mailboxes
         frames = self._gateway.take_frames()
-        for frame in frames:
-            waiting.put(frame)
-        if self.port is None or self._sends_in_vain:
+        if self.port is None or (self._off and self._sends_in_vain):
             if frames:
                 self._gateway.not_sent(now)
+            waiting.put_all(frames)
             self.clear()
             self._busy_until = self._busy_since = None
             return
-        self._count_losses()
-        if self._busy_until is not None:
-            if now < self._busy_until:
-                return
-            self._busy_until = None
-        if not len(waiting):
+        self._turn_ns = now
+        if len(waiting) or self._busy_until is not None or not stand_alone(frames):
+            waiting.put_all(frames)
+            self._count_losses()
+            if self._busy_until is not None:
+                if now < self._busy_until:
+                    return
+                self._busy_until = None
+            count, answer = waiting.flush(self._send)
+        elif frames:  # the mailboxes would hand them out just so
+            count, answer = self._send_all(frames)
+            waiting.put_all(frames[count:])
+        else:
             if not self._stalled:
                 self._busy_since = None
             return
-        self._turn_ns = now
-        count, answer = waiting.flush(self._send)
         status.sent_frames += count
         if count:
             self._busy_since = None
-        if answer is Sent.LATE:
+        if answer is _OK:
+            if not self._is_proven:
+                self._works(now)
+        elif answer is Sent.LATE:
             return  # the next turn throws it away
-        if answer is Sent.OK:
-            self._works(now)
         else:
             status.send_failures += 1
             if answer in (Sent.BUSY, Sent.FULL):
@@ -381,14 +390,25 @@ class CanSide:
             self._gateway.can_returned(now)
         self._follow_state(now)
 
-    def _send(self, frame: CanFrame) -> Sent:
-        if self._clock() - self._turn_ns > self.longest_turn_ns:  # the process was stopped in the middle of its turn
-            return Sent.LATE
+    def _send_all(self, frames: Sequence[CanFrame]) -> tuple[int, Sent]:
+        """Send until the interface does not take more. Returns how many went and the last answer."""
         assert self.port is not None
-        answer = self.port.send(frame)
-        if self.tap is not None and answer is Sent.OK:
-            self.tap(frame, self._turn_ns, False)
-        return answer
+        send, clock, tap = self.port.send, self._clock, self.tap
+        latest = self._turn_ns + self.longest_turn_ns
+        count = 0
+        for frame in frames:
+            if clock() > latest:  # the process was stopped in the middle of its turn
+                return count, Sent.LATE
+            answer = send(frame)
+            if answer is not _OK:
+                return count, answer
+            if tap is not None:
+                tap(frame, self._turn_ns, False)
+            count += 1
+        return count, _OK
+
+    def _send(self, frame: CanFrame) -> Sent:
+        return self._send_all((frame,))[1]
 
     def _busy(self, answer: Sent, now: int) -> Sent:
         """The interface takes no more for now; GONE if it has not for so long that it must be."""
@@ -418,6 +438,7 @@ class CanSide:
         self._conditions.begin(self._sending_condition, text, now)
 
     def _works(self, now: int) -> None:
+        self._is_proven = True
         self._retry.succeeded()
         self._conditions.end(self._interface_condition, f"CAN {self.config.channel}: frames are sent again", now)
 
@@ -438,11 +459,12 @@ class CanSide:
             self._follow_state(now)
 
     def _follow_state(self, now: int) -> None:
-        port = self.port
+        port, status = self.port, self._gateway.status
         assert port is not None
-        self._gateway.status.bus_off_count += port.bus_off_count
-        port.bus_off_count = 0
-        if port.state is self._gateway.status.can_state:
+        if port.bus_off_count:
+            status.bus_off_count += port.bus_off_count
+            port.bus_off_count = 0
+        if port.state is status.can_state:
             return
         if self._off and port.state is not CanState.BUS_OFF:
             if not self._has_restarted(now):
