@@ -20,11 +20,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parents[1]), str(HERE / "peers")]
-
 import standin
 
+HERE = Path(__file__).resolve().parent
 PERIOD_NS = 10_000_000
 # counts what comes, and says so at the end: it is not part of what is measured
 _DRAIN = """
@@ -137,6 +135,7 @@ def obvious(master: int, slave: int, path: str, all_frames: list[bytes]) -> None
 
 
 def main(program: str, count: int) -> int:
+    sys.path[:0] = [str(HERE.parents[1]), str(HERE / "peers")]
     name = f"kontronik-bench-{uuid.uuid4().hex[:12]}"
     drain: Any = subprocess.Popen([sys.executable, "-c", _DRAIN, name], stdout=subprocess.PIPE, text=True)
     drain.stdout.readline()

@@ -1,6 +1,7 @@
 """CPU time for each live frame: C, ours and the obvious program by turns, at several numbers of ESCs; what else costs; how it grows."""
 
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 
 from bench_programs import Measured, median, once
@@ -90,7 +91,9 @@ def shipped(context: Context) -> list[Figure]:
         if not all(run.result["others"] for run in runs):
             raise RuntimeError("nothing was sent")
         frames = median([run.result["others"] / run.sent for run in runs])
-        figures.append(Figure(f"ours, shipped DBC, {escs} ESC", cpu_of(runs), "us/frame", note=f"{frames:.1f} frames each"))
+        figures.append(
+            Figure(f"ours, shipped DBC, {escs} ESC", cpu_of(runs), "us/frame", note=f"{frames:.1f} frames each")
+        )
     return figures
 
 
@@ -120,12 +123,17 @@ def growth(context: Context) -> list[Figure]:
     if context.plots is not None:
         draw(context.plots / "cpu_growth.png", numbers, series)
     figures = [
-        Figure(f"{program}, {escs} ESC", value, "us/frame", note=f"{lost[escs]:.1%} lost" if program == "ours" and lost[escs] else "")
+        Figure(
+            f"{program}, {escs} ESC",
+            value,
+            "us/frame",
+            note=f"{lost[escs]:.1%} lost" if program == "ours" and lost[escs] else "",
+        )
         for program, values in series.items()
         for escs, value in zip(numbers, values, strict=True)
     ]
     ours = series["ours"]
-    worst = max(after / before for before, after in zip(ours, ours[1:], strict=False))
+    worst = max(after / before for before, after in pairwise(ours))
     figures.append(Figure("steepest step up, ours, doubling the ESCs", worst, "x", "<= 1.15", worst <= 1.15))
     return figures
 
@@ -135,9 +143,9 @@ def draw(file: Path, numbers: list[int], series: dict[str, list[float]]) -> None
     import matplotlib as mpl
 
     mpl.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot as plt
 
-    figure, axes = pyplot.subplots(figsize=(8, 5))
+    figure, axes = plt.subplots(figsize=(8, 5))
     for program, values in series.items():
         axes.plot(numbers, values, marker="o", label={"c": "C", "ours": "kontronik-can-gw"}[program])
     axes.set_xscale("log", base=2)
@@ -149,7 +157,7 @@ def draw(file: Path, numbers: list[int], series: dict[str, list[float]]) -> None
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(file, dpi=120, bbox_inches="tight")
-    pyplot.close(figure)
+    plt.close(figure)
 
 
 BENCHMARKS = [

@@ -3,7 +3,6 @@
 import random
 import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from bench_programs import FIVE, PROGRAMS, Feeder, Gateway
