@@ -1,0 +1,171 @@
+"""What the running gateway has imported: the real ``run`` command on a stand-in of a CAN interface, looked at when it has sent values.
+
+A gateway on a small board pays for each library in time and memory, and libraries bring others: python-can brings asammdf where it is
+installed. So what may be there is listed.
+"""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.protocol.codec import Layout, encode
+from kontronik_can_gw.protocol.fields import LiveData
+
+LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), Layout.V4)
+STANDIN = Path(__file__).resolve().parent / "benchmarks"
+
+CANTOOLS = {"cantools", "argparse_addons", "bitstruct", "textparser", "crccheck", "diskcache"}
+PYTHON_CAN = {"can", "wrapt", "typing_extensions", "packaging"}
+ALWAYS = {"kontronik_can_gw", "serial"} | PYTHON_CAN
+"""Libraries that every gateway may have."""
+CANOPEN = {"canopen"}
+OWN = {
+    "cli": {"run", "common", "arguments", "node_setup", "recording"},
+    "offline": set[str](),
+    "simulator": set[str](),
+}
+"""Of our own rooms that are large, what may be there; the others are the gateway itself."""
+NEVER = (
+    *(
+        "asammdf",
+        "numpy",
+        "pandas",
+        "pyarrow",
+        "matplotlib",
+        "rich",
+        "pygments",
+        "jsonschema",
+        "paho",
+        "shtab",
+        "PIL",
+        "lxml",
+    ),
+    *(
+        "pytest",
+        "hypothesis",
+        "prometheus_client",
+        "tkinter",
+        "curses",
+        "multiprocessing",
+        "unittest",
+        "pydoc",
+        "doctest",
+    ),
+)
+"""Said once more by name, also of the standard library: the list above could be widened without a thought."""
+CONFIGURATIONS = {
+    "DBC": ("", CANTOOLS),
+    "CANopen only": (
+        '[dbc]\nenabled = false\n[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\nself_start = true\n',
+        CANOPEN,
+    ),
+    "DBC and CANopen": ('[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\n', CANTOOLS | CANOPEN),
+    "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS),
+    "recorder with a CAN log": ('[record]\ndirectory = "captures"\ncan_log = "candump"\n', CANTOOLS),
+    "status and Prometheus": ('[statistics]\nfile = "status.json"\nprometheus = "127.0.0.1:{port}"\n', CANTOOLS),
+}
+
+AT_THE_END = """
+import atexit, sys
+sys.path.append({standin!r})
+{extra}
+from standin import use
+use("unix:{bus}")
+sys.path.pop()
+
+from kontronik_can_gw.runtime import claims
+claims.PREFIX += "{bus}/"  # tests may run side by side, all on "lo"
+
+def write():
+    with open({file!r}, "w") as file:
+        file.write("\\n".join(sorted(name for name, module in sys.modules.items() if module is not None)))
+
+atexit.register(write)
+"""
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
+    """The modules of a gateway with these tables that has sent values of an ESC; ``extra`` is run in it at its start."""
+    bus, names = f"kontronik-test-{os.getpid()}-{time.monotonic_ns()}", folder / "names"
+    (folder / "sitecustomize.py").write_text(
+        AT_THE_END.format(standin=str(STANDIN), extra=extra, bus=bus, file=str(names))
+    )
+    with PtyEsc() as esc, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind("\0" + bus)
+        listener.listen(1)
+        listener.settimeout(30)
+        config = folder / "gateway.toml"
+        can = '[can]\ninterface = "socketcan"\nchannel = "lo"\n'
+        config.write_text(f'{can}{tables.format(port=free_port())}[[esc]]\nport = "{esc.path}"\n')
+        process = subprocess.Popen(
+            [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)],
+            env=os.environ | {"PYTHONPATH": str(folder)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            peer, _ = listener.accept()
+            with peer:
+                peer.settimeout(0.1)
+                _until_values(peer, esc)
+            process.send_signal(signal.SIGTERM)
+            _, said = process.communicate(timeout=10)
+        finally:
+            process.kill()
+            process.communicate()
+    assert process.returncode == 0, said
+    return set(names.read_text().splitlines())
+
+
+def _until_values(peer: socket.socket, esc: PtyEsc) -> None:
+    """Feed the ESC's frames until its voltage, 24.42 V, is on the bus: by a DBC message, or by a PDO."""
+    until = time.monotonic() + 30
+    while time.monotonic() < until:
+        esc.write(LIVE)
+        try:
+            packet = peer.recv(128)
+        except TimeoutError:
+            continue
+        if (2442).to_bytes(2, "little") in packet[8:]:
+            return
+    raise AssertionError("no values came")
+
+
+def surplus(modules: set[str], allowed: set[str]) -> set[str]:
+    """Modules that are neither of the standard library nor allowed."""
+    libraries = {name.partition(".")[0] for name in modules}
+    found = {name for name in libraries - allowed if name not in sys.stdlib_module_names and not name.startswith("_")}
+    for room, may in OWN.items():
+        of_room = {name for name in modules if name.startswith(f"kontronik_can_gw.{room}.")}
+        found |= {name for name in of_room if name.split(".")[2] not in may}
+    return found - {"sitecustomize", "standin", "distutils-precedence"}
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_a_running_gateway_has_what_it_needs_and_no_more(name: str, tmp_path: Path) -> None:
+    tables, further = CONFIGURATIONS[name]
+    modules = imported(tmp_path, tables)
+    assert "kontronik_can_gw.runtime.loop" in modules
+    assert surplus(modules, ALWAYS | further) == set()
+    assert [name for name in NEVER if name in modules] == []
+
+
+def test_the_list_can_fail(tmp_path: Path) -> None:
+    """With a library and a room of ours that do not belong there, imported on purpose."""
+    modules = imported(tmp_path, "", "import rich.console, kontronik_can_gw.offline.pacing")
+    found = surplus(modules, ALWAYS | CANTOOLS)
+    assert {"rich", "kontronik_can_gw.offline.pacing"} <= found
+    assert "rich" in [name for name in NEVER if name in modules]
