@@ -110,11 +110,11 @@ def modules() -> list[str]:
 
 
 def benchmarks() -> list[Benchmark]:
-    """All of them; ValueError where two have one name."""
+    """All of them, what must be equal first; ValueError where two have one name."""
     found: dict[str, Benchmark] = {}
     for name in modules():
         for benchmark in importlib.import_module(name).BENCHMARKS:
             if benchmark.name in found:
                 raise ValueError(f"{name}: there is a benchmark {benchmark.name} already")
             found[benchmark.name] = benchmark
-    return list(found.values())
+    return sorted(found.values(), key=lambda benchmark: benchmark.name != "equal")

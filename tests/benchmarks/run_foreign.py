@@ -209,8 +209,8 @@ def foreign(context: Context) -> list[Figure]:
             each["cpu_percent"] for each in rows["without"]
         )
         extra, extra_woken = cpu["foreign"] - cpu["without"], woken["foreign"] - woken["without"]
-        noise = max(spread, 0.05 * cpu["without"])
-        told = f"{cpu['without']:.2f} % without, {cpu['foreign']:.2f} % with {rate['foreign']:.0f} foreign frames/s ({which})"
+        noise = max(spread, 0.05 * cpu["without"], 1 / seconds)  # some kernels count CPU time in steps of 10 ms
+        told = f"{cpu['without']:.2f} % without, {cpu['foreign']:.2f} % with {rate['foreign']:.0f} foreign frames/s, {which}"
         heard = f"{woken['without']:.0f} without; {woken['heard']:.0f} where it listens, {cpu['heard']:.1f} % of a core then"
         figures.append(
             Figure(f"{name}: further CPU", extra, "% of a core", f"<= {noise:.2g} (noise)", extra <= noise, told)
@@ -226,7 +226,7 @@ def foreign(context: Context) -> list[Figure]:
                 heard,
             )
         )
-        if woken["heard"] < woken["without"] + 50:
+        if woken["heard"] < woken["without"] + 50 and cpu["heard"] < cpu["without"] + 2 * noise:
             raise NotEqual(f"foreign: the measure does not see frames that the gateway does listen to ({heard})")
     return figures
 

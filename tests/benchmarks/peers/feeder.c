@@ -477,7 +477,9 @@ int main(int argc, char **argv)
     printf("], ");
     on_can = !strncmp(bus_name, "can:", 4);
     if (on_can) {
+        int room = 1 << 22;
         bus = can_socket(bus_name + 4);
+        setsockopt(bus, SOL_SOCKET, SO_RCVBUF, &room, sizeof room);
         printf("\"bus\": \"ready\"}\n");
         fflush(stdout);
     } else {
