@@ -215,7 +215,7 @@ def foreign(context: Context) -> list[Figure]:
         figures.append(
             Figure(f"{name}: further CPU", extra, "% of a core", f"<= {noise:.2g} (noise)", extra <= noise, told)
         )
-        limit_woken = max(2.0, 0.05 * woken["without"])
+        limit_woken = max(2.0, 0.05 * woken["without"], spread_woken)
         figures.append(
             Figure(
                 f"{name}: further wake-ups",
