@@ -205,8 +205,9 @@ def foreign(context: Context) -> list[Figure]:
             {case: median([each[key] for each in rows[case]]) for case in rows}
             for key in ("cpu_percent", "wakeups_per_s", "frames_per_s")
         )
-        spread = max(each["cpu_percent"] for each in rows["without"]) - min(
-            each["cpu_percent"] for each in rows["without"]
+        spread, spread_woken = (
+            max(each[key] for each in rows["without"]) - min(each[key] for each in rows["without"])
+            for key in ("cpu_percent", "wakeups_per_s")
         )
         extra, extra_woken = cpu["foreign"] - cpu["without"], woken["foreign"] - woken["without"]
         noise = max(spread, 0.05 * cpu["without"], 1 / seconds)  # some kernels count CPU time in steps of 10 ms
