@@ -3,18 +3,77 @@
 (1.010000) can0 688#0000008A09000001 T
 """
 
-from collections.abc import Sequence
+import io
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kontronik_can_gw.dbc_output.layout import MessagePlan
+from kontronik_can_gw.offline.bulk.frames import Found
 from kontronik_can_gw.offline.bulk.sending import CanFrames
+from kontronik_can_gw.offline.can_logs import CanLogWriter
+from kontronik_can_gw.offline.tables import DISORDER_NS
 
 _US = 1_000_000
 _MOST_SECONDS = 1 << 16
+_LATEST_NS = 1 << 62
 _HEX = np.frombuffer("".join(f"{byte:02X}" for byte in range(256)).encode(), "V2")
 _THREE = np.frombuffer("".join(f"{number:03d}" for number in range(1000)).encode(), "V3")
+
+
+def write(
+    blocks: Iterator[Found],
+    plans: Sequence[MessagePlan],
+    opened: Callable[[], IO[bytes] | Path],
+    start_ns: int | None,
+    end_ns: int | None,
+    reached: Callable[[], None],
+) -> tuple[int, int] | None:
+    """Write the frames from ``start_ns`` to ``end_ns`` after the first one; how many, and when the last one was.
+
+    None where there is none; then nothing was opened. ``reached`` is called from time to time.
+    """
+    lines = Lines(plans)
+    single = io.BytesIO()
+    write_one = CanLogWriter(single, "candump", None).write
+    file: IO[bytes] | None = None
+    origin_ns: int | None = None
+    low, high = 0 if start_ns is None else start_ns, _LATEST_NS if end_ns is None else end_ns
+    count, last, latest = 0, 0, 0
+    for found in blocks:
+        if isinstance(found, CanFrames):
+            if not len(found.times):
+                continue
+            origin_ns = int(found.times[0]) if origin_ns is None else origin_ns
+            since = found.times - origin_ns
+            chosen = slice(*np.searchsorted(since, (low, high + 1)).tolist())
+            since, latest = since[chosen], int(since[-1])
+            text = lines.text(found.part(chosen), origin_ns)
+            if len(since):
+                count, last = count + len(since), int(since[-1])
+        else:
+            for time_ns, frame, received in found:
+                origin_ns = time_ns if origin_ns is None else origin_ns
+                latest = time_ns - origin_ns
+                if low <= latest <= high:
+                    write_one(latest, frame, received)
+                    count, last = count + 1, latest
+            text = single.getvalue()
+            single.seek(0)
+            single.truncate()
+        if text:
+            if file is None:
+                opened_file = opened()
+                assert not isinstance(opened_file, Path)
+                file = opened_file
+            file.write(text)
+        reached()
+        if latest > high + DISORDER_NS:
+            break
+    return None if file is None else (count, last)
 
 
 class Lines:

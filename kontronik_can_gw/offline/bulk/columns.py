@@ -71,7 +71,7 @@ class ColumnPacker:
         bits = np.zeros((moments.count, self.words), np.uint64)
         with np.errstate(all="ignore"):
             for key in (None,) if page is None else (None, page):
-                self._add(bits, moments, alive, key)
+                self._add(bits, moments, alive, key, page)
         return bits
 
     def data(self, bits: Bits) -> Bytes:
@@ -85,10 +85,10 @@ class ColumnPacker:
             data[:, self._crc_at] = value
         return data
 
-    def _add(self, bits: Bits, moments: Moments, alive: Column | int, page: int | None) -> None:
+    def _add(self, bits: Bits, moments: Moments, alive: Column | int, key: int | None, page: int | None) -> None:
         constant = 0
-        flags, flag_ids = self._flags[page]
-        for signal in self._pages[page]:
+        flags, flag_ids = self._flags[key]
+        for signal in self._pages[key]:
             if signal.role is Role.CONSTANT:
                 constant |= place(signal.pieces, signal.constant)
             elif signal.role is Role.MULTIPLEXER and page is not None:

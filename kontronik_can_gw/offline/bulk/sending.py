@@ -37,6 +37,10 @@ class CanFrames(NamedTuple):
     data: NDArray[np.uint8]
     """A row each, filled up with zeros behind the message's length."""
 
+    def part(self, chosen: slice) -> "CanFrames":
+        """Some of them."""
+        return CanFrames(self.times[chosen], self.messages[chosen], self.data[chosen])
+
 
 class _Sends(NamedTuple):
     """The frames of one message. ``number``: counted from the first of the block, replaced ones too."""
@@ -259,8 +263,8 @@ class _Steps:
         at, rare_at = 0, 0
         message = self._message
         while True:
-            at = self._next_asking(at)
-            asks = (self._turns[at], 0, _EVENT) if at < len(self._turns) else _END
+            asking = self._next_asking(at)
+            asks = (self._turns[asking], 0, _EVENT) if asking < len(self._turns) else _END
             rare = self._rare[rare_at][0] if rare_at < len(self._rare) else _END
             due = self._next_due()
             step = _END
@@ -272,8 +276,8 @@ class _Steps:
                 return
             turn, since, rank = first
             now = times[turn] + since
+            at = bisect_left(self._turns, turn if rank < _EVENT else turn + 1, at)  # what asked before has been heard
             if first == asks:
-                at += 1
                 if (message.by_event or self._note(turn)) and self._request(now):
                     self._send(turn, since, rank, turn, now)
             elif first == rare:

@@ -51,6 +51,7 @@ class Stretched:
 
     def __init__(self, stretch: Stretch, lives: int, period_ns: int) -> None:
         self.stretch = stretch
+        self.period_ns = period_ns
         self.layout = 1 if stretch.layout is Layout.V4 else 2
         count = stretch.live_count + len(stretch.infos)
         self.is_live = np.ones(count, bool)
@@ -102,8 +103,10 @@ class Steady:
         lives = int(stretched.live_rows[first + count])
         self._live = stretch.live[self._first_live : lives]
         self._info = stretch.info[self._first_info : first + count - lives]
-        self._live_length = form_of(Kind.LIVE, stretch.layout).length
-        self._info_length = form_of(Kind.INFO, stretch.layout).length
+        self.layout = stretch.layout
+        self.lengths = {kind: form_of(kind, stretch.layout).length for kind in Kind}
+        self._live_length = self.lengths[Kind.LIVE]
+        self._info_length = self.lengths[Kind.INFO]
         self._is_legacy = stretch.layout is Layout.LEGACY
         self.is_live = stretched.is_live[first : first + count]
         self.times = np.concatenate(([since_ns], stretched.times[first : first + count]))
@@ -165,7 +168,7 @@ class Steady:
     @cached_property
     def energy(self) -> NDArray[Any]:
         """Drawn so far with each live frame, behind what it was before; of Python's numbers where int64 has no room."""
-        power = self.live_column(_VOLTAGE) * self.live_column(_CURRENT)
+        power = self._power.copy()
         power[0] = self.esc._last_power
         power = np.maximum(power[:-1], 0)
         elapsed = np.diff(self.live_ns)
@@ -176,6 +179,19 @@ class Steady:
         if not len(drawn):
             return np.array([self.esc.energy], object)
         return np.concatenate(([self.esc.energy], drawn + self.esc.energy))
+
+    @property
+    def drawn(self) -> int:
+        """Drawn in all, with the last live frame."""
+        power = np.maximum(np.concatenate(([self.esc._last_power], self._power[1:]))[:-1], 0)
+        elapsed = np.diff(self.live_ns)
+        if int(power.sum()) * int(elapsed.max(initial=0)) >= _ROOM:
+            power = power.astype(object)
+        return self.esc.energy + int((power * elapsed).sum())
+
+    @cached_property
+    def _power(self) -> Numbers:
+        return self.live_column(_VOLTAGE) * self.live_column(_CURRENT)
 
     @cached_property
     def run_time(self) -> Numbers:
@@ -256,13 +272,17 @@ class Steady:
         def deadline(state: int) -> int:
             return min(window + SECOND, *(until + 1 for until in fresh_until(state)))
 
+        last_turn = 0
         while (turn := bisect_left(times, due, 1)) <= count:
             with_frame = times[turn] == due
             before = turn - 1
+            if turn != last_turn:  # what happens between two frames belongs to the second one
+                last_turn = turn
+                back = (window, told, due, old, older, rate), len(self.rare), len(self._closes)
             if due > min(fresh_until(before)):
                 count = before
                 break
-            was_due, was_told, so_far = due, told, len(self.rare)
+            was_due = due
             tells = due - told >= SECOND
             if with_frame:  # its bytes come before the clock turns
                 due = deadline(before)
@@ -282,8 +302,7 @@ class Steady:
                     or dropped * _DEGRADED_DROPPED_SHARE > received
                 )
                 if (LinkState.DEGRADED if bad else LinkState.OK) is not esc.link:
-                    count, due, told = before, was_due, was_told
-                    del self.rare[so_far:]
+                    count = before
                     break
                 rate = round((new.live - old.live) * 10 * SECOND / (was_due - window))
                 self._closes.append((state, was_due, rate))
@@ -295,14 +314,18 @@ class Steady:
             if events or tells:
                 since = was_due - times[state]
                 self.rare.append(Rare(state, since, False, state, was_due, events, tells))
-        self._left = (window, told, due, old, older, rate)
+        else:
+            self._left = (window, told, due, old, older, rate)
+            return count
+        self._left, rare, closes = back
+        del self.rare[rare:], self._closes[closes:]
         return count
 
     def leave(self) -> None:
         """Let ESC and gateway be as after the last frame of the block."""
         gateway, esc = self.gateway, self.esc
         after = self.counters(self.count)
-        energy, run_time, suspects = self.energy[-1], self.run_time[-1], self.suspects[-1]
+        energy, run_time, suspects = self.drawn, self.run_time[-1], self.suspects[-1]
         live_ns = self.live_ns[-1]
         if len(self._live):
             esc.live = esc.last_live = LiveData._make(self._live[-1].item())
