@@ -61,17 +61,20 @@ def main(arguments: list[str] | None = None) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     if args.plots is not None:
         args.plots.mkdir(parents=True, exist_ok=True)
-    results = []
+    results, interrupted = [], False
     try:
         for each in chosen:
             context = Context(folder, seconds, rounds, args.quick, args.plots, args.realtime, args.vcan)
             results.append(run_one(each, context))
     except KeyboardInterrupt:
+        interrupted = True
         print("bench: ended by hand; what is done is written", file=sys.stderr)
     args.json.parent.mkdir(parents=True, exist_ok=True)
     args.json.write_text(json.dumps(document(args, results), indent=1, allow_nan=False) + "\n")
     print(table(results))
     print(f"JSON: {args.json}", file=sys.stderr)
+    if interrupted:
+        return 130
     return 1 if any(result["error"] for result in results) else 0
 
 
@@ -168,15 +171,14 @@ def table(results: list[dict[str, Any]]) -> str:
 
 
 def shortfall(value: float, target: str) -> str:
-    """How far a value is from a target such as "<= 2.2", in per cent of it; empty where the target is other text."""
+    """How far a value is from a target such as "<= 2.2", in per cent of it; empty where it is not, or the target is other text."""
     sign, _, rest = target.partition(" ")
     try:
         limit = float(rest.split(" ")[0])
     except ValueError:
         return ""
-    if sign not in ("<=", ">=", "<", ">") or not limit:
-        return ""
-    return f"{abs(value - limit) / limit:.0%}"
+    too_much = {"<=": value - limit, "<": value - limit, ">=": limit - value, ">": limit - value}.get(sign, 0)
+    return f"{too_much / abs(limit):.0%}" if limit and too_much > 0 else ""
 
 
 if __name__ == "__main__":

@@ -62,14 +62,14 @@ def cpu_ns(pid: int) -> int:
     return total
 
 
-def _die_with_us() -> None:
+def die_with_us() -> None:
     """In a child: end when the benchmark does, however it ends."""
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
 def start(command: Sequence[str], **further: Any) -> "subprocess.Popen[str]":
     """A child that ends with us."""
-    return subprocess.Popen(command, text=True, preexec_fn=_die_with_us, **further)
+    return subprocess.Popen(command, text=True, preexec_fn=die_with_us, **further)
 
 
 def end(process: "subprocess.Popen[str]", patience_s: float = 3.0) -> None:

@@ -30,6 +30,7 @@ import socket, sys
 listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 listener.bind("\\0" + sys.argv[1])
 listener.listen(1)
+listener.settimeout(120)
 print("ready", flush=True)
 bus, _ = listener.accept()
 count = 0

@@ -5,10 +5,12 @@ import os
 import socket
 import subprocess
 import sys
+import threading
+import urllib.request
 from collections.abc import Iterator
 
 from bench_programs import Measured, end, median, once, start
-from live_cpu import CANOPEN, compare, keep
+from live_cpu import CANOPEN, compare, keep, losses
 from registry import Benchmark, Context, Figure, LeftOut
 
 _PRIORITY = 60
@@ -30,9 +32,10 @@ def delay(context: Context) -> list[Figure]:
     return figures
 
 
-def everything(context: Context) -> str:
+def everything(port: int) -> str:
     """Recorder, status file, Prometheus, nodes."""
-    return f'{CANOPEN}[record]\ndirectory = "captures"\n[statistics]\nfile = "status.json"\nprometheus = "127.0.0.1:{_free_port()}"\n'
+    statistics = f'[statistics]\nfile = "status.json"\nprometheus = "127.0.0.1:{port}"\n'
+    return f'{CANOPEN}[record]\ndirectory = "captures"\n{statistics}'
 
 
 def _free_port() -> int:
@@ -41,9 +44,38 @@ def _free_port() -> int:
         return port
 
 
+@contextlib.contextmanager
+def scraping(port: int) -> Iterator[list[int]]:
+    """Be a Prometheus that asks each second, as from the moment when there is an answer. Gives the lengths of the answers."""
+    sizes: list[int] = []
+    over = threading.Event()
+
+    def ask() -> None:
+        while not over.wait(1):
+            with (
+                contextlib.suppress(OSError),
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=2) as answer,
+            ):
+                sizes.append(len(answer.read()))
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        yield sizes
+    finally:
+        over.set()
+        thread.join()
+
+
 def full(context: Context) -> list[Figure]:
-    """8 ESCs with recorder, status file and socket, CANopen nodes and a master that polls them."""
-    runs = [once(context, "ours", 8, "--sdo", config=everything(context)) for _ in range(context.rounds)]
+    """8 ESCs with recorder, status file, a Prometheus that asks, CANopen nodes and a master that polls them."""
+    runs = []
+    for _ in range(context.rounds):
+        port = _free_port()
+        with scraping(port) as sizes:
+            runs.append(once(context, "ours", 8, "--sdo", config=everything(port)))
+        if not sizes:
+            raise RuntimeError("Prometheus got no answer")
     context.data["runs"] = [run.result for run in runs]
     p50, p99, longest = (median([run.delay[key] for run in runs]) for key in ("p50", "p99", "max"))
     unanswered = sum(run.result["sdo_sent"] - run.result["sdo_answers"] for run in runs)
@@ -55,7 +87,7 @@ def full(context: Context) -> list[Figure]:
         Figure("8 ESCs and all, median", p50, "us"),
         Figure("8 ESCs and all, 99 %", p99, "us", "<= 2000", p99 <= 2000, note=f"longest {longest:.0f}"),
         Figure("SDO answers, 99 %", answer, "us", note=f"{asked} requests, {unanswered} without an answer in 50 ms"),
-        Figure("CPU, all of it", median([run.cpu_us for run in runs]), "us/frame"),
+        Figure("CPU, all of it", median([run.cpu_us for run in runs]), "us/frame", note=losses(runs)),
     ]
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from bench_programs import Feeder, Gateway
+from bench_programs import Feeder, Gateway, die_with_us
 from registry import HERE, VALGRIND_LINE, Benchmark, Context, Figure, LeftOut
 
 _SUMMARY = re.compile(r"^(?:summary|totals): (\d+)", re.MULTILINE)
@@ -42,7 +42,12 @@ def of_python(program: str, frames: int) -> int:
         out = Path(folder) / "callgrind"
         command = [*counted_by(out), sys.executable, str(HERE / "instruction_driver.py"), program, str(frames)]
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=600, env=os.environ | {"PYTHONHASHSEED": "0"}
+            command,
+            capture_output=True,
+            text=True,
+            timeout=600,
+            env=os.environ | {"PYTHONHASHSEED": "0"},
+            preexec_fn=die_with_us,
         )
         if done.returncode:
             raise RuntimeError(f"{program}: {done.stderr.strip()[-1500:]}")
