@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,13 +72,16 @@ def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) 
 
 
 def fingerprint(config: Config) -> bytes:
-    """What a configuration is made of, in short: its keys and the content of its DBC and EDS. [mqtt] is another process's."""
-    digest = sha256(repr(replace(config, file="", mqtt=MqttConfig())).encode())
+    """What a configuration is made of: its keys and the content of its DBC and EDS. [mqtt] is another process's.
+
+    To be compared only, so it is no digest: for one OpenSSL would be loaded, which takes 4 MB.
+    """
+    found = [repr(replace(config, file="", mqtt=MqttConfig())).encode()]
     for path, used in ((config.dbc_path, config.dbc.enabled), (config.eds_path, config.canopen.enabled)):
         if used:
             with suppress(OSError):  # removed since
-                digest.update(path.read_bytes())
-    return digest.digest()
+                found.append(path.read_bytes())
+    return b"\0".join(found)
 
 
 def check_devices(config: Config) -> None:
