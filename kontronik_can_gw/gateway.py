@@ -95,8 +95,10 @@ class Gateway:
 
     def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
         """Bytes of one ESC's UART, read at ``now``."""
-        self._expire(now, but=esc)  # a message may hold values of several ESCs
-        for events in self.escs[esc].receive_each(data, now):
+        all_fresh = now < self._next_expiry
+        if not all_fresh:
+            self._expire(now, but=esc)  # a message may hold values of several ESCs
+        for events in self.escs[esc].receive_each(data, now, all_fresh):
             self._follow(esc, events, now)
 
     @property

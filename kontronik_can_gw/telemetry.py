@@ -147,28 +147,28 @@ class EscTelemetry:
             events |= found
         return events
 
-    def receive_each(self, data: bytes, now: int) -> Iterable[int]:
+    def receive_each(self, data: bytes, now: int, all_fresh: bool = False) -> Iterable[int]:
         """Take bytes that were read at ``now``; the events of each frame in turn, so that none is passed over: iterate to the end.
 
-        An unfinished frame older than the time-out is given up first.
+        An unfinished frame older than the time-out is given up first. ``all_fresh``: the caller knows that nothing is too old at ``now``.
         """
-        if events := self._expire(now):
+        if not all_fresh and (events := self._expire(now)):
             return self._receive_behind(events, data, now)
-        deframer = self._deframer
-        if self._arrivals and now - self._arrivals[0][1] > self.settings.timeout_ns:
+        deframer, arrivals = self._deframer, self._arrivals
+        if arrivals and now - arrivals[0][1] > self.settings.timeout_ns:
             self.late_frames += len(deframer.flush())
-            self._arrivals.clear()
+            arrivals.clear()
         frames = deframer.feed(data)
         end = deframer.counters.bytes
         if pending := deframer.pending:
-            self._arrivals.append((end, now))
-            while self._arrivals[0][0] <= end - pending:
-                self._arrivals.popleft()
-        elif self._arrivals:
-            self._arrivals.clear()
+            arrivals.append((end, now))
+            while arrivals[0][0] <= end - pending:
+                arrivals.popleft()
+        elif arrivals:
+            arrivals.clear()
         if len(frames) == 1:
-            frame = frames[0]
-            if frame.offset + frame.form.length == end and self.link is not _NEVER_SEEN:
+            form, at, _ = frame = frames[0]
+            if at + form.length == end and self.link is not _NEVER_SEEN:
                 return (self._accept(frame, now),)  # as nearly always: its last byte has just come
         return self._accept_each(frames, end, now)
 
@@ -237,13 +237,14 @@ class EscTelemetry:
             return events | Event.INFO
         if layout == _LEGACY and frame.suspect:
             self.suspect_frames += 1
-        if self.live_ns is not None:
-            when = max(when, self.live_ns)  # a pseudo terminal is faster than the wire
+        if (before := self.live_ns) is not None:
+            if when < before:
+                when = before  # a pseudo terminal is faster than the wire
             if self.live is not None:
-                elapsed = when - self.live_ns
-                self.energy += max(0, self._last_power) * elapsed
+                if self._last_power > 0:
+                    self.energy += self._last_power * (when - before)
                 if self.live.electrical_speed:
-                    self.run_time += elapsed
+                    self.run_time += when - before
         self._last_power = data.battery_voltage * data.battery_current
         self.live = self.last_live = data
         self.live_ns = when

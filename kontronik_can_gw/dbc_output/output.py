@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import groupby
 
 from kontronik_can_gw.dbc_output import e2e
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
-from kontronik_can_gw.dbc_output.packer import alive_modulus, compile_pack
+from kontronik_can_gw.dbc_output.packer import SendLive, alive_modulus, compile_live, compile_pack
 from kontronik_can_gw.dbc_output.schedule import Schedule
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import GatewayStatus, Group, Source, sources
@@ -29,6 +31,7 @@ class _Message:
         "crc_at",
         "extended",
         "fd",
+        "follows_live",
         "is_plain",
         "last",
         "length",
@@ -59,6 +62,8 @@ class _Message:
         self.on_change = SendType.ON_CHANGE in plan.send_type
         # its frame is its pack and nothing else
         self.is_plain = len(plan.pages) == 1 and not (self.silent_able or self.on_change or crc)
+        # and nothing but the minimum distance keeps it back when there is a live frame
+        self.follows_live = self.by_event and len(plan.pages) == 1 and not (self.on_change or crc)
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
             for pace in plan.paces:
@@ -86,6 +91,25 @@ class DbcOutput:
             for esc in message.plan.escs:
                 if message.triggers:
                     self._listeners[esc].append((index, message))
+        self._live_steps = [self._steps_of_live(esc) for esc in range(len(escs))]
+        """What follows each live frame of an ESC, in order."""
+
+    def _steps_of_live(self, esc: int) -> list[SendLive]:
+        steps: list[SendLive] = []
+        listeners = [(i, m) for i, m in self._listeners[esc] if m.triggers & Event.LIVE]
+        for is_plain, group in groupby(listeners, lambda one: one[1].follows_live):
+            if is_plain:
+                steps.append(self._compile_live(esc, dict(group)))
+            else:
+                steps += [partial(self._on_live, index, message) for index, message in group]
+        return steps
+
+    def _compile_live(self, esc: int, messages: Mapping[int, _Message]) -> SendLive:
+        schedule = self._schedule
+        names: dict[str, object] = {f"m{index}": message for index, message in messages.items()}
+        names |= {"escs": self._escs, "gateway": self._gateway, "request": schedule.request}
+        names |= {"last": schedule.last, "waiting": schedule.waiting, "cycle_waits": schedule.cycle_waits}
+        return compile_live({index: message.plan for index, message in messages.items()}, esc, names)
 
     def start(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
@@ -105,6 +129,7 @@ class DbcOutput:
             if signals != message.plan.signals:
                 message.plan = replace(message.plan, signals=signals)
                 message.pack = compile_pack(message.plan)
+        self._live_steps = [self._steps_of_live(each) for each in range(len(self._escs))]
 
     def bits(self, index: int, now: int, page: int | None) -> int:
         """What a message would hold now, alive counter and CRC 0."""
@@ -112,24 +137,29 @@ class DbcOutput:
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
-        schedule, state = self._schedule, self._escs[esc]
-        is_live_alone = events == Event.LIVE and state.live is not None
+        state = self._escs[esc]
+        if events == Event.LIVE and state.live is not None:
+            append = self.frames.append
+            for step in self._live_steps[esc]:
+                step(now, append)
+            return
         for index, message in self._listeners[esc]:
             triggers = message.triggers
             if not triggers & events:
                 continue
-            if not message.by_event:
-                if self._note_changes(message, now):
-                    self._request(index, now)
-                continue
-            if not is_live_alone:
+            if message.by_event:
                 if triggers & Event.LIVE and triggers & events == Event.LINK and state.up:
                     continue  # live frames set the pace
                 gone = not state.up or (events & Event.INFO and state.info is None)
                 if gone and len(message.plan.pages) > 1:  # no further event will bring the other pages
                     message.owed = list(range(len(message.plan.pages)))
-            if schedule.request(index, now):
-                self._send(index, now)
+                self._request(index, now)
+            elif self._note_changes(message, now):
+                self._request(index, now)
+
+    def _on_live(self, index: int, message: _Message, now: int, _append: object) -> None:
+        if message.by_event or self._note_changes(message, now):
+            self._request(index, now)
 
     def on_gateway_change(self, now: int, at_once: bool = False, each_second: bool = False) -> None:
         """The gateway's own state changed: messages with its values that are sent by event or on change follow.

@@ -5,15 +5,23 @@ available its NotAvailable code; nothing wraps, nothing is clipped. Bit 0 of the
 """
 
 import math
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.dbc_output.layout import MessagePlan, Piece, Role, SignalPlan
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.protocol.fields import LiveData
 from kontronik_can_gw.sources import GatewayStatus, Group
 from kontronik_can_gw.telemetry import EscTelemetry
 
+_LIVE_VALUE = re.compile(r"\blive\[(\d+)\]")
+_ESC = re.compile(r"\besc\.")
+_TABLE = re.compile(r"\bnumbers_at_")
+_PLAIN_VALUE = re.compile(r"live\[\d+\]|info\[\d+\]")
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
+SendLive = Callable[[int, Callable[[CanFrame], None]], None]
 
 
 def place(pieces: Sequence[Piece], raw: int) -> int:
@@ -51,9 +59,8 @@ def alive_modulus(signal: SignalPlan, has_crc: bool) -> int:
 
 
 def source_text(plan: MessagePlan) -> str:
-    """The generated function, behind the tables of its enumerations."""
-    lines = [f"{_table_name(s)} = { {int(k): v for k, v in s.numbers.items()} }" for s in plan.signals if s.numbers]
-    lines.append("def pack(escs, gateway, now, alive, page):")
+    """The generated function. It names the tables of its enumerations."""
+    lines = ["def pack(escs, gateway, now, alive, page):"]
     constant = 0
     has_crc = any(signal.role is Role.CRC for signal in plan.signals)
     for signal in plan.signals:
@@ -78,26 +85,70 @@ def source_text(plan: MessagePlan) -> str:
 
 def compile_pack(plan: MessagePlan, further: Mapping[str, object] | None = None) -> Pack:
     """The function of ``source_text``, compiled. ``further``: what expressions of the plan's sources may name besides."""
-    names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf, **(further or {})}
+    names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf, **_tables(plan), **(further or {})}
     exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
     return names["pack"]  # type: ignore[return-value]
 
 
-def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
+def live_text(plans: Mapping[int, MessagePlan], esc: int) -> str:
+    """The generated function that sends the messages which follow each live frame of an ESC: ``send(now, append)``.
+
+    ``plans`` by their index: messages of one page and without CRC, which nothing but their minimum distance keeps back.
+    The function names, besides what packers do: ``escs``, ``gateway``, each message as ``m`` and its index, CanFrame as ``new(CanFrame,
+    (...))``, and of their schedule ``last``, ``waiting``, ``cycle_waits`` and ``request``.
+    """
+    values = ", ".join(f"live{index}" for index in range(len(LiveData._fields)))
+    lines = [f"live = escs[{esc}].live", f"{values} = live"]
+    for index, plan in plans.items():
+        constant = sum(place(s.pieces, s.constant) for s in plan.signals if s.role is Role.CONSTANT)
+        body = [f"bits = {constant:#x}"]
+        if (alive := next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)) is not None:
+            body += [f"alive = m{index}.alive", f"m{index}.alive = (alive + 1) % {alive_modulus(alive, False)}"]
+        body += [_TABLE.sub(rf"m{index}_\g<0>", line) for line in _body(plan, None, False, esc)]
+        fields = (
+            f'{plan.can_id:#x}, bits.to_bytes({plan.length}, "little"), {plan.extended}, {plan.fd}, 0, False, False'
+        )
+        body += [f"append(new(CanFrame, ({fields})))", f"last[{index}] = now"]
+        if plan.cycle_ns or plan.delay_ns:
+            body.append(f"waiting[{index}] = cycle_waits[{index}] = False")
+        if plan.delay_ns:
+            lines.append(f"if now < last[{index}] + {plan.delay_ns}:")
+            lines += [f"    request({index}, now)", "else:", *(f"    {line}" for line in body)]
+        else:
+            lines += body
+    return "".join(f"{line}\n" for line in ["def send(now, append):", *(f"    {line}" for line in lines)])
+
+
+def compile_live(plans: Mapping[int, MessagePlan], esc: int, names: Mapping[str, object]) -> SendLive:
+    """The function of ``live_text``, compiled. ``names``: what it names that is not of the plans."""
+    tables = {f"m{index}_{name}": table for index, plan in plans.items() for name, table in _tables(plan).items()}
+    found = {"float_bits": float_bits, "inf": math.inf, "new": tuple.__new__, "CanFrame": CanFrame, **tables, **names}
+    exec(compile(live_text(plans, esc), f"<live frames of ESC {esc}>", "exec"), found)  # noqa: S102  text made here, from checked plans
+    return found["send"]  # type: ignore[return-value]
+
+
+def _tables(plan: MessagePlan) -> dict[str, dict[int, int]]:
+    return {_table_name(s): {int(k): v for k, v in s.numbers.items()} for s in plan.signals if s.numbers}
+
+
+def _body(plan: MessagePlan, page: int | None, has_crc: bool, fresh: int | None = None) -> list[str]:
+    """Lines that add a page's signals to ``bits``. ``fresh``: the ESC whose live values are there, as locals."""
     lines: list[str] = []
     chosen = [signal for signal in plan.signals if signal.page == page]
     for signal in chosen:
         if signal.role is Role.ALIVE:
-            lines += [f"v = alive % {alive_modulus(signal, has_crc)}", f"bits |= {_placed(signal)}"]
+            lines.append(f"bits |= {_placed(signal, f'alive % {alive_modulus(signal, has_crc)}')}")
     by_owner: dict[tuple[int | None, Group], list[SignalPlan]] = {}
     for signal in chosen:
         if signal.source is not None:
             by_owner.setdefault((signal.esc, signal.source.group), []).append(signal)
     for (esc, group), signals in by_owner.items():
-        if esc is not None:
+        line = f"bits |= {' | '.join(_terms(signals))}"
+        if esc is not None and (esc != fresh or _ESC.search(line)):
             lines.append(f"esc = escs[{esc}]")
-        code = _values(signals)
-        if group in (Group.LIVE, Group.INFO):
+        if group is Group.LIVE and esc is not None and esc == fresh:
+            lines.append(_LIVE_VALUE.sub(r"live\1", line))
+        elif group in (Group.LIVE, Group.INFO):
             nothing = 0
             for signal in signals:
                 nothing |= not_available_bits(signal)
@@ -105,14 +156,15 @@ def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
             lines.append(f"if {group.value} is None:")
             lines.append(f"    bits |= {nothing:#x}")
             lines.append("else:")
-            lines += [f"    {line}" for line in code]
+            lines.append(f"    {line}")
         else:
-            lines += code
+            lines.append(line)
     return lines
 
 
-def _values(signals: Sequence[SignalPlan]) -> list[str]:
-    lines: list[str] = []
+def _terms(signals: Sequence[SignalPlan]) -> list[str]:
+    """Python text of each signal's bits; flags of one word that move together are one."""
+    terms: list[str] = []
     flags: dict[tuple[str, int], int] = {}  # (word, distance moved up) -> bits of the word that move together
     for signal in signals:
         source = signal.source
@@ -121,18 +173,14 @@ def _values(signals: Sequence[SignalPlan]) -> list[str]:
             key = (source.expression, signal.pieces[0].at - source.bit)
             flags[key] = flags.get(key, 0) | 1 << source.bit
             continue
-        code = _value(signal)
+        term = _placed(signal, _value(signal))
         if source.supplied is not None:
-            lines.append(f"if {source.supplied}:")
-            lines += [f"    {line}" for line in code]
-            lines.append("else:")
-            lines.append(f"    bits |= {not_available_bits(signal):#x}")
-        else:
-            lines += code
+            term = f"({term} if {source.supplied} else {not_available_bits(signal):#x})"
+        terms.append(term)
     for (word, distance), mask in flags.items():
-        moved = f"<< {distance}" if distance >= 0 else f">> {-distance}"
-        lines.append(f"bits |= ({word} & {mask:#x}) {moved}")
-    return lines
+        moved = f" << {distance}" if distance > 0 else f" >> {-distance}" if distance else ""
+        terms.append(f"({word} & {mask:#x}){moved}")
+    return terms
 
 
 def _is_plain_flag(signal: SignalPlan) -> bool:
@@ -141,7 +189,8 @@ def _is_plain_flag(signal: SignalPlan) -> bool:
     )
 
 
-def _value(signal: SignalPlan) -> list[str]:
+def _value(signal: SignalPlan) -> str:
+    """Python text of a signal's raw value, or of its Error code where it has none."""
     source = signal.source
     assert source is not None
     expression = source.expression if source.bit is None else f"{source.expression} >> {source.bit} & 1"
@@ -150,26 +199,26 @@ def _value(signal: SignalPlan) -> list[str]:
         if signal.numbers is not None:
             scaled = f"{_table_name(signal)}.get({expression})"
         low, high = signal.limits
-        told = f"{signal.error}, {signal.not_available}"
-        return [f"v = float_bits({scaled}, {signal.length}, {low!r}, {high!r}, {told})", f"bits |= {_placed(signal)}"]
+        return f"float_bits({scaled}, {signal.length}, {low!r}, {high!r}, {signal.error}, {signal.not_available})"
     if signal.numbers is not None:
-        return [f"v = {_table_name(signal)}.get({expression}, {signal.error})", f"bits |= {_placed(signal)}"]
+        return f"{_table_name(signal)}.get({expression}, {signal.error})"
     if source.rolls:
-        return [f"v = ({expression}) % {signal.high + 1}", f"bits |= {_placed(signal)}"]
-    lines = [f"v = {scaled_text(expression, signal.slope, signal.intercept, source.whole)}"]
+        return f"({expression}) % {signal.high + 1}"
+    value = scaled_text(expression, signal.slope, signal.intercept, source.whole)
     low, high = _ends(signal)
-    outside = [f"v < {signal.low}"] if low is None or low < signal.low else []
-    outside += [f"v > {signal.high}"] if high is None or high > signal.high else []
-    # a code amid the values: a true value must not look like it
-    code_inside = signal.low <= signal.not_available <= signal.high
-    if outside:
-        lines.append(f"if {' or '.join(outside)}:")
-        lines.append(f"    v = {signal.error}")
-    if code_inside and signal.error != signal.not_available:
-        lines.append(f"{'elif' if outside else 'if'} v == {signal.not_available}:")
-        lines.append(f"    v = {signal.error}")
-    lines.append(f"bits |= {_placed(signal)}")
-    return lines
+    unfit = [f"> {signal.high}"] if high is None or high > signal.high else []
+    unfit += [f"< {signal.low}"] if low is None or low < signal.low else []
+    if signal.low <= signal.not_available <= signal.high and signal.error != signal.not_available:
+        unfit.append(f"== {signal.not_available}")  # a code amid the values: a true value must not look like it
+    if not unfit:
+        return value
+    name = "v"
+    if _PLAIN_VALUE.fullmatch(value):
+        name = first = value
+    else:
+        first = f"(v := {value})"
+    tests = " or ".join([f"{first} {unfit[0]}", *(f"{name} {test}" for test in unfit[1:])])
+    return f"{signal.error} if {tests} else {name}"
 
 
 def _table_name(signal: SignalPlan) -> str:
@@ -199,11 +248,14 @@ def _ends(signal: SignalPlan) -> tuple[Fraction | None, Fraction | None]:
     return min(ends), max(ends)
 
 
-def _placed(signal: SignalPlan) -> str:
-    """``v`` at its bits. Only signed values and codes can have bits beyond the length."""
+def _placed(signal: SignalPlan, value: str) -> str:
+    """A value's Python text at the signal's bits. Only signed values and codes can have bits beyond the length."""
     parts = []
+    at_first = f"({value})" if len(signal.pieces) == 1 else f"(w := {value})"
     for piece in signal.pieces:
-        part = f"v >> {piece.shift}" if piece.shift else "v"
+        part = "w" if parts else at_first
+        if piece.shift:
+            part += f" >> {piece.shift}"
         if signal.signed or piece.shift + piece.width < signal.length:
             part = f"({part} & {(1 << piece.width) - 1:#x})"
         elif piece.shift:

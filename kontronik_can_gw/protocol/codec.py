@@ -61,7 +61,7 @@ class Form:
 
     def decode(self, buffer: bytes, at: int = 0) -> Data:
         """The fields of a frame that ``matches``; no check is repeated here."""
-        return self.data_type._make(self._data.unpack_from(buffer, at))
+        return tuple.__new__(self.data_type, self._data.unpack_from(buffer, at))
 
     def encode(self, data: Data) -> bytes:
         """The frame with reserved bytes 0 and its CRC. ValueError naming the field that does not fit its wire type."""

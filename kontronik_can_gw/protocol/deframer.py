@@ -6,6 +6,7 @@ comes out with its last byte unless an earlier, still undecided header forbids i
 is counted and dropped. At most 43 bytes are held; work is linear in the bytes fed.
 """
 
+import struct
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 from zlib import crc32
@@ -15,8 +16,11 @@ from kontronik_can_gw.protocol.fields import Data, LiveData
 from kontronik_can_gw.protocol.states import LARGEST_STATE
 
 LONGEST = max(form.length for form in FORMS)
-_LIVE_V4 = next(form for form in FORMS if form.kind is Kind.LIVE and form.layout is Layout.V4)
-_LIVE_LEGACY = next(form for form in FORMS if form.kind is Kind.LIVE and form.layout is Layout.LEGACY)
+_LIVE_LEGACY, _LIVE_V4 = (form for form in FORMS if form.kind is Kind.LIVE)
+_LIVE, _V4_LENGTH = _LIVE_V4.header, _LIVE_V4.length
+_COVERED, _LEGACY_CRC_AT = _LIVE_LEGACY.covered, _LIVE_LEGACY.crc_at
+_u32_at = struct.Struct("<I").unpack_from
+_new = tuple.__new__
 _RESIDUE = 0x2144DF1C
 """The CRC-32 of anything with its own CRC behind it."""
 _PREFIX = b"KOD"
@@ -146,36 +150,30 @@ class Deframer:
     def feed(self, data: bytes) -> list[Frame]:
         """Take the next bytes; return the frames that are now certain, in stream order."""
         size = len(data)
-        self.counters.bytes += size
+        counters = self.counters
+        counters.bytes += size
         if size < self._need:
             self._pending += data
             self._need -= size
             return []
         buffer = self._pending + data if self._pending else bytes(data)
-        if len(buffer) == _LIVE_V4.length and (frame := self._whole_live_v4(buffer)) is not None:
-            return [frame]
+        if len(buffer) == _V4_LENGTH:
+            # one live frame of layout V4 and nothing else, as nearly always: one CRC over it and its own
+            head = crc32(buffer[:_COVERED])
+            if (
+                crc32(buffer[_COVERED:], head) == _RESIDUE
+                and buffer.startswith(_LIVE)
+                and _u32_at(buffer, _LEGACY_CRC_AT)[0] != head  # where two match, the shorter
+            ):
+                counters.headers += 1
+                counters.live_v4 += 1
+                at = self._base
+                self._base = at + _V4_LENGTH
+                self._pending = b""
+                self._need = 1
+                self._blame_until = 0
+                return [_new(Frame, (_LIVE_V4, at, _LIVE_V4.decode(buffer)))]
         return self._scan(buffer, ended=False)
-
-    def _whole_live_v4(self, buffer: bytes) -> Frame | None:
-        """What ``_scan`` finds in a buffer that is one live frame of layout V4 and nothing else; None for anything else.
-
-        Nearly every call is given just this: here it is one CRC over the frame and its own.
-        """
-        legacy, v4 = _LIVE_LEGACY, _LIVE_V4
-        head = crc32(buffer[: legacy.covered])
-        if crc32(buffer[legacy.covered :], head) != _RESIDUE or not buffer.startswith(v4.header):
-            return None
-        if buffer.startswith(head.to_bytes(4, "little"), legacy.crc_at):  # where two match, the shorter
-            return None
-        counters = self.counters
-        counters.headers += 1
-        counters.live_v4 += 1
-        frame = Frame(v4, self._base, v4.decode(buffer))
-        self._base += v4.length
-        self._pending = b""
-        self._need = 1
-        self._blame_until = 0
-        return frame
 
     def flush(self) -> list[Frame]:
         """The stream ended or was interrupted: search what is pending, drop the rest, be ready for a new start."""
