@@ -5,11 +5,12 @@ frame, and with its loss; from CAN frames with each group of messages that belon
 message, within 5 ms goes into the same row.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from kontronik_can_gw.capture_setup import CaptureSetup
 from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.dbc_output.output import DbcOutput
 from kontronik_can_gw.dbc_output.unpacker import Part, SignalReader, Value
 from kontronik_can_gw.dbc_output.view import View
 from kontronik_can_gw.gateway import Gateway
@@ -18,7 +19,8 @@ from kontronik_can_gw.sources import Group
 from kontronik_can_gw.telemetry import MS, Event
 
 SAME_ROW_NS = 5 * MS
-_GATEWAY_NS = 100 * MS
+GATEWAY_NS = 100 * MS
+"""The gateway's own values are read so often."""
 
 
 class Sample(NamedTuple):
@@ -32,16 +34,43 @@ _Taken = tuple[int, int | None, slice, Callable[[int], list[Value]]]
 """A part: index of its message, page, columns, what gives their values."""
 
 
-class SampledGateway(Gateway):
-    """A gateway that makes rows beside its frames. They gather in ``rows``, which the owner empties; ``finish`` gives the last."""
+class _ValuesOnly(DbcOutput):
+    """An output of which only ``bits`` is wanted: nothing is ever due."""
 
-    def __init__(self, setup: CaptureSetup, layout: Layout, reader: SignalReader, now: int) -> None:
+    def start(self, now: int) -> None:
+        pass
+
+    def on_event(self, esc: int, events: int, now: int) -> None:
+        pass
+
+    def on_gateway_change(self, now: int, at_once: bool = False, each_second: bool = False) -> None:
+        pass
+
+    def advance(self, now: int) -> None:
+        pass
+
+    def next_deadline(self) -> int | None:
+        return None
+
+
+class SampledGateway(Gateway):
+    """A gateway that makes rows. They gather in ``rows``, which the owner empties; ``finish`` gives the last.
+
+    ``frames_count``: the owner counts the frames that are sent; they are made where a row may hold how many there were. Otherwise nobody
+    would take note of them.
+    """
+
+    def __init__(
+        self, setup: CaptureSetup, layout: Layout, reader: SignalReader, now: int, frames_count: bool = True
+    ) -> None:
         self.rows: list[Sample] = []
         self._values: list[Value] = [None] * len(reader.columns)
         self._row_ns: int | None = None
         self._last_ns = 0
         self._in_row: set[int] = set()
-        self._gateway_ns = now - _GATEWAY_NS
+        self._gateway_ns = now - GATEWAY_NS
+        self._all_read_ns = now
+        """When the messages of an ESC were read that do not come with live frames."""
         indices = {plan.name: index for index, plan in enumerate(layout.messages)}
 
         def taken(parts: Iterable[Part]) -> list[_Taken]:
@@ -54,6 +83,29 @@ class SampledGateway(Gateway):
         self._with_live = [taken(p for p in parts if {Group.LIVE, Group.LINK} & p.plan.paces) for parts in by_esc]
         self._of_gateway = taken(p for p in reader.parts if not p.plan.escs)
         super().__init__(setup.escs, layout, now, setup.silent_on_loss, setup.canopen)
+        if not frames_count or not any(column.source == "sent_frames" for column in reader.columns):
+            self._output = _ValuesOnly(layout, self.escs, self.status, now)
+        self._started = False
+
+    def play(self, now: int, data: bytes) -> None:
+        """Bytes of the only ESC, with which it starts, and time goes by; it is never late."""
+        if not self._started:
+            self._started = True
+            self.port_opened(0, now)
+            self.start(now)
+        while (due := self.next_deadline()) < now:
+            self.advance(due)
+        self.receive_bytes(0, data, now)
+        self.advance(now)
+        self.take_frames()
+        self.take_link_changes()
+
+    def take_rows(self) -> Sequence[Sample]:
+        """The rows that are complete."""
+        if not self.rows:
+            return ()
+        rows, self.rows = self.rows, []
+        return rows
 
     def finish(self) -> list[Sample]:
         """The row that is not closed yet."""
@@ -75,8 +127,12 @@ class SampledGateway(Gateway):
             again = events & Event.LIVE and esc in self._in_row
             if again or when - self._row_ns > SAME_ROW_NS:
                 self._close_row()
-        self._read((self._by_esc if events & (Event.LINK | Event.INFO) else self._with_live)[esc], when)
-        if when - self._gateway_ns >= _GATEWAY_NS or events & Event.LINK:
+        if events & (Event.LINK | Event.INFO):
+            self._all_read_ns = when
+            self._read(self._by_esc[esc], when)
+        else:
+            self._read(self._with_live[esc], when)
+        if when - self._gateway_ns >= GATEWAY_NS or events & Event.LINK:
             self._gateway_ns = when
             self._read(self._of_gateway, when)
         if events & Event.LIVE:

@@ -306,9 +306,8 @@ def _word(frames: _Bytes, at: int) -> Words:
         halves = frames.view(np.dtype("<u2"))
         word: Words = halves[:, at // 2] | halves[:, at // 2 + 1].astype(np.uint32) << np.uint32(16)
         return word
-    one = frames[:, at : at + 4].astype(np.uint32)
-    word = one[:, 0] | one[:, 1] << np.uint32(8) | one[:, 2] << np.uint32(16) | one[:, 3] << np.uint32(24)
-    return word
+    single: Words = np.ascontiguousarray(frames[:, at : at + 4]).view(np.dtype("<u4"))[:, 0]
+    return single
 
 
 def _state(data: bytes) -> int:

@@ -1,7 +1,21 @@
 """Tables of ESC values, a row at each time: CSV, JSON lines, Parquet, MF4."""
 
+from kontronik_can_gw.offline.tables.blocks import Block, BlockColumn
 from kontronik_can_gw.offline.tables.fields import Field, Table
 from kontronik_can_gw.offline.tables.rows import DISORDER_NS, Choice, Row, Rows, first_of
 from kontronik_can_gw.offline.tables.writers import FORMATS, TableWriter, open_table
 
-__all__ = ["DISORDER_NS", "FORMATS", "Choice", "Field", "Row", "Rows", "Table", "TableWriter", "first_of", "open_table"]
+__all__ = [
+    "DISORDER_NS",
+    "FORMATS",
+    "Block",
+    "BlockColumn",
+    "Choice",
+    "Field",
+    "Row",
+    "Rows",
+    "Table",
+    "TableWriter",
+    "first_of",
+    "open_table",
+]

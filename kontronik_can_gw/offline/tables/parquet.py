@@ -1,16 +1,20 @@
 """Tables as Parquet by pyarrow (an extra): typed columns, units and provenance in the metadata."""
 
 import json
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.offline.tables.blocks import Block, BlockColumn
 from kontronik_can_gw.offline.tables.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.offline.tables.rows import SECOND_NS, Row
 
 ROWS = 16_384
-"""Rows of a row group, which stay in memory until it is full."""
+"""Rows that gather as such."""
+GROUP = 1 << 17
+"""Rows of a row group, whose columns stay in memory until it is full."""
 
 
 class ParquetTable:
@@ -37,26 +41,50 @@ class ParquetTable:
         ]
         provenance = json.dumps(dict(table.provenance), ensure_ascii=False)
         self._schema = pa.schema(heads, metadata={"kontronik_can_gw": provenance})
-        self._writer: Any = parquet.ParquetWriter(str(path), self._schema)
+        # a dictionary costs more than it saves where every value is another one, or takes one byte
+        plain = [f"{TIME} [s]", *(one.header for one in table.fields if one.kind is Kind.FLAG)]
+        with_dictionary = [name for name in self._schema.names if name not in plain]
+        self._writer: Any = parquet.ParquetWriter(str(path), self._schema, use_dictionary=with_dictionary)
+        self._batches: list[Any] = []
+        self._held = 0
+        self._thread = ThreadPoolExecutor(1)
+        self._writing: Future[None] | None = None
 
     def write(self, row: Row) -> None:
         """Add a row."""
         self._rows.append(row)
         if len(self._rows) >= ROWS:
-            self._flush()
+            self._gather_rows()
+
+    def write_block(self, block: Block) -> None:
+        """Add many rows."""
+        self._gather_rows()
+        pa, count = self._pa, len(block)
+        arrays = [pa.array(_seconds(block.times_ns), pa.float64())]
+        if self._table.has_utc:
+            kind = pa.timestamp("ns", tz="UTC")
+            arrays.append(pa.nulls(count, kind) if block.walls_ns is None else pa.array(block.walls_ns, kind))
+        for one, codes, column in zip(self._table.fields, self._codes, block.columns, strict=True):
+            arrays.append(self._array(one, codes, column, count))
+        self._gather(arrays)
 
     def close(self) -> None:
         """Write the rest and the end."""
-        if self._rows:
-            self._flush()
+        self._gather_rows()
+        self._write_group()
+        self._end_thread()
         self._writer.close()
 
     def discard(self) -> None:
         """Release the file."""
+        with suppress(Exception):  # it is told already
+            self._end_thread()
         with suppress(OSError):  # there is no room for its end
             self._writer.close()
 
-    def _flush(self) -> None:
+    def _gather_rows(self) -> None:
+        if not self._rows:
+            return
         pa, rows = self._pa, self._rows
         times, walls, values = zip(*rows, strict=True)
         arrays = [pa.array([time_ns / SECOND_NS for time_ns in times], pa.float64())]
@@ -71,13 +99,63 @@ class ParquetTable:
             else:
                 arrays.append(pa.array(column, kind))
         self._rows = []
-        self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+        self._gather(arrays)
+
+    def _gather(self, arrays: list[Any]) -> None:
+        batch = self._pa.RecordBatch.from_arrays(arrays, schema=self._schema)
+        self._batches.append(batch)
+        self._held += batch.num_rows
+        if self._held >= GROUP:
+            self._write_group()
+
+    def _array(self, one: Field, codes: dict[str, int], column: BlockColumn, count: int) -> Any:
+        """A column of a block."""
+        pa, values, valid = self._pa, column.values, column.valid
+        missing = None if valid is None else ~valid
+        if one.kind is Kind.TEXT:
+            if not codes:
+                return pa.nulls(count, self._type(one))
+            # the same text may stand for several numbers
+            places = pa.array([codes[text] for _, text in one.texts], pa.int32())
+            indices = places.take(pa.array(values, pa.int64(), mask=missing))
+            if len(values) == 1 < count:
+                indices = pa.repeat(indices[0], count)
+            return pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string()))
+        kind = self._type(one)
+        if len(values) == 1 < count:
+            return pa.repeat(pa.array(values.astype(kind.to_pandas_dtype()), kind, mask=missing)[0], count)
+        return pa.array(values.astype(kind.to_pandas_dtype(), copy=False), kind, mask=missing)
+
+    def _write_group(self) -> None:
+        """Let a row group be written beside what is done next; the one before is finished first."""
+        if self._batches:
+            table = self._pa.Table.from_batches(self._batches, self._schema)
+            self._batches, self._held = [], 0
+            self._wait()
+            self._writing = self._thread.submit(self._writer.write_table, table, GROUP)
+
+    def _wait(self) -> None:
+        if self._writing is not None:
+            writing, self._writing = self._writing, None
+            writing.result()
+
+    def _end_thread(self) -> None:
+        try:
+            self._wait()
+        finally:
+            self._thread.shutdown()
 
     def _type(self, one: Field) -> Any:
         pa = self._pa
         if one.kind is Kind.TEXT:
             return pa.dictionary(pa.int32(), pa.string())
         return {Kind.FLAG: pa.int8(), Kind.WHOLE: pa.int64(), Kind.FLOAT: pa.float64()}[one.kind]
+
+
+def _seconds(times_ns: Any) -> Any:
+    if int(times_ns[-1]) < 1 << 53:
+        return times_ns / SECOND_NS
+    return [time_ns / SECOND_NS for time_ns in times_ns.tolist()]  # as exact as can be
 
 
 def _in_range(wall_ns: int | None) -> int | None:
