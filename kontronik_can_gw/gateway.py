@@ -107,7 +107,8 @@ class Gateway:
 
         Those that the nodes listen to, and those that only this gateway sends with: who else does is to be noticed.
         """
-        self._follow_ids()
+        if self.nodes is not None:
+            self._follow_ids()
         return self._receive_ids
 
     def receive_frame(self, frame: CanFrame, now: int) -> None:
@@ -217,8 +218,9 @@ class Gateway:
 
     def take_frames(self) -> list[CanFrame]:
         """The frames to send, oldest first; the list is handed over."""
-        frames = self._output.frames
-        self._output.frames = []
+        frames: list[CanFrame] = []
+        if self._output.frames:
+            frames, self._output.frames = self._output.frames, frames
         if self.nodes is not None and self.nodes.frames:
             frames = self.nodes.frames + frames
             self.nodes.frames = []
@@ -229,6 +231,8 @@ class Gateway:
 
     def take_link_changes(self) -> list[int]:
         """ESCs whose link state, layout or device changed since the last call."""
+        if not self._link_changes:
+            return []
         changes, self._link_changes = self._link_changes, []
         return changes
 

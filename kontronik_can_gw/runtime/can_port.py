@@ -11,7 +11,10 @@ import errno
 import select
 import socket
 import struct
-from collections.abc import Collection
+import sys
+import time
+from collections.abc import Callable, Collection, Sequence
+from operator import length_hint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,6 +148,28 @@ class CanPort:
             self.state = _DOWN
         return result
 
+    def send_all(
+        self, frames: Sequence[CanFrame], clock: Callable[[], int] = time.monotonic_ns, latest: int = sys.maxsize
+    ) -> tuple[int, Sent]:
+        """Hand frames to the interface until it does not take one, or ``clock`` is beyond ``latest``: how many went, the last answer."""
+        if self._socket is None or self._removed or self.state is _DOWN or self.state is _UNKNOWN:
+            return one_by_one(self.send, frames, clock, latest)
+        send, pack = self._socket.send, _CLASSIC.pack
+        rest = iter(frames)
+        try:
+            for can_id, data, extended, fd, _, remote, _ in rest:
+                if clock() > latest:
+                    return len(frames) - length_hint(rest) - 1, Sent.LATE
+                if extended or fd or remote:
+                    send(_packet(can_id, data, extended, fd, remote))
+                else:
+                    send(pack(can_id, len(data), data))
+        except OSError:  # once more, to see what it means
+            count = len(frames) - length_hint(rest) - 1
+            more, answer = one_by_one(self.send, frames[count:], clock, latest)
+            return count + more, answer
+        return len(frames), _OK
+
     def close(self) -> None:
         if self._reader is not None:
             self._reader.close()  # before the driver is shut down: few of them bear both at once
@@ -239,14 +264,8 @@ class CanPort:
         if self._removed:
             return Sent.GONE
         can_id, data, extended, fd, _, remote, _ = frame
-        if extended:
-            can_id |= EXTENDED
-        if remote:
-            can_id |= _REMOTE
         try:
-            self._socket.send(
-                _FD.pack(can_id, len(data), _FD_BRS, data) if fd else _CLASSIC.pack(can_id, len(data), data)
-            )
+            self._socket.send(_packet(can_id, data, extended, fd, remote))
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return Sent.FULL
@@ -273,6 +292,23 @@ class CanPort:
         except Exception:  # what a driver lets out when its adapter has gone: OSError, termios.error ...
             return Sent.GONE
         return Sent.OK
+
+
+def one_by_one(
+    send: Callable[[CanFrame], Sent], frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+) -> tuple[int, Sent]:
+    """What ``CanPort.send_all`` does, by a function that sends one frame."""
+    for count, frame in enumerate(frames):
+        answer = Sent.LATE if clock() > latest else send(frame)
+        if answer is not _OK:
+            return count, answer
+    return len(frames), _OK
+
+
+def _packet(can_id: int, data: bytes, extended: bool, fd: bool, remote: bool) -> bytes:
+    """A frame as the kernel has it (struct can_frame, canfd_frame)."""
+    can_id |= (EXTENDED if extended else 0) | (_REMOTE if remote else 0)
+    return _FD.pack(can_id, len(data), _FD_BRS, data) if fd else _CLASSIC.pack(can_id, len(data), data)
 
 
 def _kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:

@@ -17,6 +17,7 @@ from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
 from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
+from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.snapshot import CanFacts, name_in_words
 from kontronik_can_gw.sources import CanState
@@ -40,7 +41,7 @@ class CanSide:
         self,
         config: CanConfig,
         gateway: Gateway,
-        selector: selectors.BaseSelector,
+        selector: Registry,
         conditions: Conditions,
         esc_at: Callable[[str], str | None] = lambda _path: None,
         clock: Callable[[], int] = time.monotonic_ns,
@@ -90,6 +91,10 @@ class CanSide:
         if self._retry.due is None and self._busy_until is None:
             return self._ask_due
         return min(d for d in (self._retry.due, self._busy_until, self._ask_due) if d is not None)
+
+    def rests(self, now: int) -> bool:
+        """True where ``reopen`` and ``ask_if_due`` have nothing to do, and the port was not opened just now."""
+        return self.port is not None and not self.just_opened and (self._ask_due is None or now < self._ask_due)
 
     @property
     def is_open(self) -> bool:
@@ -391,21 +396,13 @@ class CanSide:
         self._follow_state(now)
 
     def _send_all(self, frames: Sequence[CanFrame]) -> tuple[int, Sent]:
-        """Send until the interface does not take more. Returns how many went and the last answer."""
         assert self.port is not None
-        send, clock, tap = self.port.send, self._clock, self.tap
-        latest = self._turn_ns + self.longest_turn_ns
-        count = 0
-        for frame in frames:
-            if clock() > latest:  # the process was stopped in the middle of its turn
-                return count, Sent.LATE
-            answer = send(frame)
-            if answer is not _OK:
-                return count, answer
-            if tap is not None:
-                tap(frame, self._turn_ns, False)
-            count += 1
-        return count, _OK
+        # LATE where the process was stopped in the middle of its turn
+        count, answer = self.port.send_all(frames, self._clock, self._turn_ns + self.longest_turn_ns)
+        if self.tap is not None:
+            for frame in frames[:count]:
+                self.tap(frame, self._turn_ns, False)
+        return count, answer
 
     def _send(self, frame: CanFrame) -> Sent:
         return self._send_all((frame,))[1]

@@ -8,6 +8,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import (
     Identity,
@@ -37,7 +38,7 @@ class EscInput:
         index: int,
         path: str,
         gateway: Gateway,
-        selector: selectors.BaseSelector,
+        selector: Registry,
         conditions: Conditions,
         lost: "set[EscInput]",
     ) -> None:

@@ -23,6 +23,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
+from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.reload import Reloader
 from kontronik_can_gw.runtime.serial_port import Identity
@@ -85,20 +86,20 @@ class Loop:
         self._reloader = reloader
         self._reload_asked = False
         self._stopping = False
-        self._selector = selectors.DefaultSelector()
+        self._poller = Poller()
         self._lost: set[EscInput] = set()
         self.escs = [
-            EscInput(i, path, gateway, self._selector, self.conditions, self._lost) for i, path in enumerate(ports)
+            EscInput(i, path, gateway, self._poller, self.conditions, self._lost) for i, path in enumerate(ports)
         ]
-        self.can = CanSide(can_config, gateway, self._selector, self.conditions, self._esc_at, clock)
+        self.can = CanSide(can_config, gateway, self._poller, self.conditions, self._esc_at, clock)
         if recorder is not None and recorder.wants_frames:
             self.can.tap = recorder.put_frame
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
+        self._poller.register(self._wake_read, selectors.EVENT_READ, self._woken)
         if store is not None:
-            self._selector.register(store.fileno(), selectors.EVENT_READ, self._take_kept)
+            self._poller.register(store.fileno(), selectors.EVENT_READ, self._take_kept)
         if reloader is not None:
-            self._selector.register(reloader.fileno(), selectors.EVENT_READ, self._take_reloaded)
+            self._poller.register(reloader.fileno(), selectors.EVENT_READ, self._take_reloaded)
 
     def stop(self) -> None:
         """End ``run`` soon; safe in a signal handler and from another thread."""
@@ -164,22 +165,29 @@ class Loop:
 
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
-        gateway, clock = self.gateway, self._clock
+        gateway, can, clock = self.gateway, self.can, self._clock
         last = self._now
-        pause = max(0, self._next_deadline() - clock())
-        ready = self._selector.select(pause / SECOND)
+        pause = self._next_deadline() - clock()
+        if pause < 0:
+            pause = 0
+        ready = self._poller.wait(pause)
         now = clock()
         if now - last - pause > LEAST_SUSPENDED_NS and now - last - pause > self._suspended_ns():
             self._discard_input(now - last - pause, now)
             ready = []  # what they announced is gone; a hang-up comes again
-        for key, events in ready:
-            key.data(now, events)
-        now = self._now = self._reopen(now)
+        for handler, events in ready:
+            handler(now, events)
+        if self._lost or not can.rests(now):
+            now = self._reopen(now)
+        self._now = now
         self._keep(now)  # in front: what it answers belongs to this turn, in a replay too
         gateway.advance(now)
-        self.can.follow_ids()
-        self.can.transmit(now)
-        self._report(now)
+        can.follow_ids()
+        can.transmit(now)
+        if gateway.node_changes != self._node_changes:
+            self._report_nodes(now)
+        for index in dict.fromkeys(gateway.take_link_changes()):
+            self.escs[index].follow_link(now)
         if now >= self._look_due:
             self._look_round(now)
 
@@ -195,7 +203,7 @@ class Loop:
         for esc in self.escs:
             esc.close()
         self.can.close()
-        self._selector.close()
+        self._poller.close()
         self._statistics.close()
         if self._recorder is not None:
             self._recorder.close()
@@ -219,11 +227,13 @@ class Loop:
     def _next_deadline(self) -> int:
         if self.gateway.frames_wait:  # of a change that sending itself brought about
             return 0
-        due = [self.gateway.next_deadline(), self._look_due]
-        due += [esc.due for esc in self._lost]
-        if (can_due := self.can.due) is not None:
-            due.append(can_due)
-        return min(due)
+        due = self.gateway.next_deadline()
+        if self._look_due < due:
+            due = self._look_due
+        for esc in self._lost:
+            due = min(due, esc.due)
+        can_due = self.can.due
+        return due if can_due is None or due < can_due else can_due
 
     def _others(self, esc: EscInput) -> tuple[Identity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)
@@ -262,7 +272,8 @@ class Loop:
 
     def _keep(self, now: int) -> None:
         """Hand what is to be stored to the store's thread; while the disk has not taken what came before, it waits."""
-        self._to_keep += self.gateway.take_saves()
+        if saves := self.gateway.take_saves():
+            self._to_keep += saves
         while self._to_keep:
             index, stored = self._to_keep[0]
             if self._store is not None and self._store.save(self.escs[index].name, encode(stored)):
@@ -362,8 +373,6 @@ class Loop:
     # --- words
 
     def _report_nodes(self, now: int) -> None:
-        if self.gateway.node_changes == self._node_changes:
-            return
         self._node_changes = self.gateway.node_changes
         for index, key in self.gateway.take_misfits():
             where = f"{key >> 8:04X}h:{key & 0xFF:02X}"
@@ -398,11 +407,6 @@ class Loop:
                 node_id, state, _ = states[number]
                 words.append(f"node {node_id} {name_in_words(state.name)} {rates[1 + number]:.0f} PDOs/s")
         log.info("%s", "; ".join(words))
-
-    def _report(self, now: int) -> None:
-        self._report_nodes(now)
-        for index in dict.fromkeys(self.gateway.take_link_changes()):
-            self.escs[index].follow_link(now)
 
     def _look_round(self, now: int) -> None:
         """What need not be done each time the loop comes round."""

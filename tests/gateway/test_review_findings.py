@@ -2,7 +2,7 @@
 
 import os
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.protocol import codec
 from kontronik_can_gw.protocol.fields import InfoData, LiveData
 from kontronik_can_gw.runtime import can_side
+from kontronik_can_gw.runtime.can_port import one_by_one
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
@@ -258,6 +259,12 @@ class StoppedBusBase:
     tells_busy_from_gone = False
     gone = False
     bus_off_count = overruns = 0
+
+    def send(self, frame: CanFrame) -> Sent:
+        raise NotImplementedError
+
+    def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
+        return one_by_one(self.send, frames, clock, latest)
 
     def fileno(self) -> None:
         return None

@@ -1,6 +1,7 @@
 """A bus that takes nothing for long: what waits is dropped, said once, and told anew when frames go again."""
 
 import logging
+from collections.abc import Callable, Sequence
 
 import pytest
 
@@ -9,6 +10,7 @@ from kontronik_can_gw.config import parse
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Sent
+from kontronik_can_gw.runtime.can_port import one_by_one
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -30,6 +32,9 @@ class Port:
             return Sent.BUSY
         self.sent.append(frame)
         return Sent.OK
+
+    def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
+        return one_by_one(self.send, frames, clock, latest)
 
     def fileno(self) -> None:
         return None

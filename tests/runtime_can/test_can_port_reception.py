@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +26,7 @@ from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.runtime import can_port, can_side
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, one_by_one
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
@@ -573,6 +573,9 @@ class ScriptedPort:
         else:
             self.state = CanState.DOWN
         return self.answer
+
+    def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
+        return one_by_one(self.send, frames, clock, latest)
 
     def close(self) -> None:
         pass

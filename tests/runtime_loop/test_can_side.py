@@ -2,7 +2,7 @@
 
 import logging
 import selectors
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime import can_side
-from kontronik_can_gw.runtime.can_port import socketcan_error
+from kontronik_can_gw.runtime.can_port import one_by_one, socketcan_error
 from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
@@ -58,6 +58,9 @@ class Port:
             if self.state is CanState.UNKNOWN:
                 self.state = CanState.ERROR_ACTIVE
         return self.answer
+
+    def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
+        return one_by_one(self.send, frames, clock, latest)
 
     def close(self) -> None:
         pass

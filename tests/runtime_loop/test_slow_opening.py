@@ -1,5 +1,7 @@
 """A machine on which an interface takes long to open: that is no suspension of the process."""
 
+from collections.abc import Callable, Sequence
+
 import pytest
 
 from kontronik_can_gw.cli.common import assemble
@@ -12,6 +14,7 @@ from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.protocol.codec import Layout, encode
 from kontronik_can_gw.protocol.fields import LiveData
 from kontronik_can_gw.runtime import can_side
+from kontronik_can_gw.runtime.can_port import one_by_one
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -47,6 +50,9 @@ def test_the_boot_up_is_sent_and_what_came_meanwhile_is_thrown_away(monkeypatch:
             if len(sent) > 40:
                 loop.stop()
             return Sent.OK
+
+        def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
+            return one_by_one(self.send, frames, clock, latest)
 
         def close(self) -> None:
             pass
