@@ -15,12 +15,15 @@ from kontronik_can_gw.dbc_output.layout import MessagePlan
 from kontronik_can_gw.offline.bulk.frames import Found
 from kontronik_can_gw.offline.bulk.sending import CanFrames
 from kontronik_can_gw.offline.can_logs import CanLogWriter
+from kontronik_can_gw.offline.can_logs.record import SECOND_NS
 from kontronik_can_gw.offline.tables import DISORDER_NS
 
 _US = 1_000_000
 _MOST_SECONDS = 1 << 16
 _LATEST_NS = 1 << 62
-_HEX = np.frombuffer("".join(f"{byte:02X}" for byte in range(256)).encode(), "V2")
+_Records = NDArray[np.void]
+_HEX = np.frombuffer("".join(f"{pair & 255:02X}{pair >> 8:02X}" for pair in range(1 << 16)).encode(), np.uint32)
+"""Four digits of each pair of bytes, as a little-endian number has them."""
 _THREE = np.frombuffer("".join(f"{number:03d}" for number in range(1000)).encode(), "V3")
 
 
@@ -43,17 +46,17 @@ def write(
     origin_ns: int | None = None
     low, high = 0 if start_ns is None else start_ns, _LATEST_NS if end_ns is None else end_ns
     count, last, latest = 0, 0, 0
+    text: bytes | memoryview
     for found in blocks:
         if isinstance(found, CanFrames):
-            if not len(found.times):
+            if not len(found):
                 continue
-            origin_ns = int(found.times[0]) if origin_ns is None else origin_ns
-            since = found.times - origin_ns
-            chosen = slice(*np.searchsorted(since, (low, high + 1)).tolist())
-            since, latest = since[chosen], int(since[-1])
-            text = lines.text(found.part(chosen), origin_ns)
-            if len(since):
-                count, last = count + len(since), int(since[-1])
+            origin_ns = found.first_ns if origin_ns is None else origin_ns
+            latest = found.last_ns - origin_ns
+            chosen = found.between(origin_ns + low, origin_ns + high)
+            text = lines.text(chosen, origin_ns)
+            if len(chosen):
+                count, last = count + len(chosen), chosen.last_ns - origin_ns
         else:
             for time_ns, frame, received in found:
                 origin_ns = time_ns if origin_ns is None else origin_ns
@@ -64,7 +67,7 @@ def write(
             text = single.getvalue()
             single.seek(0)
             single.truncate()
-        if text:
+        if len(text):
             if file is None:
                 opened_file = opened()
                 assert not isinstance(opened_file, Path)
@@ -80,49 +83,85 @@ class Lines:
     """Of the messages of one layout, all sent on ``channel``."""
 
     def __init__(self, plans: Sequence[MessagePlan], channel: str = "can0") -> None:
-        names = [f"{plan.can_id:08X}" if plan.extended else f"{plan.can_id:03X}" for plan in plans]
-        heads = [f") {channel} {name}#{'#1' if plan.fd else ''}" for name, plan in zip(names, plans, strict=True)]
-        # shorter ones are filled up with bytes 0, which no line has: they are taken out of the text at the end
-        self._heads = np.array([head.encode() for head in heads] or [b""])
-        self._lengths = np.array([plan.length for plan in plans], np.int64)
-        self._width = max((plan.length for plan in plans), default=0)
-        self._even = len({len(head) for head in heads}) <= 1 and len(set(self._lengths.tolist())) <= 1
+        self._heads = [f") {channel} {_name(plan)}#{'#1' if plan.fd else ''}".encode("ascii") for plan in plans]
+        self._forms: dict[tuple[int, int], _Records] = {}
+        """By message and width of the time: lines whose constant parts are written; they are used again and again."""
 
-    def text(self, frames: CanFrames, origin_ns: int) -> bytes:
+    def text(self, frames: CanFrames, origin_ns: int) -> bytes | memoryview:
         """The lines; times count from ``origin_ns``."""
-        count, width = len(frames.times), self._width
-        if not count:
+        if not len(frames):
             return b""
-        us = (frames.times - (origin_ns - 500)) // 1000
-        seconds, us = us // _US, us % _US
-        stamps = _seconds(seconds)
-        heads = self._heads.dtype
-        line = np.empty(
-            count,
-            [
-                *(("open", "V1"), ("s", stamps.dtype), ("dot", "V1"), ("ms", "V3"), ("us", "V3")),
-                *(("head", f"V{heads.itemsize}"), ("data", "V2", (width,)), ("end", "V3")),
-            ],
-        )
-        line["open"], line["dot"], line["end"] = np.void(b"("), np.void(b"."), np.void(b" T\n")
-        line["s"] = stamps
-        ms = us // 1000
-        line["ms"] = _THREE[ms]
-        line["us"] = _THREE[us - ms * 1000]
-        line["head"] = self._heads.view(f"V{heads.itemsize}")[frames.messages]
-        line["data"] = _HEX[frames.data[:, :width]]
-        if self._even and seconds[0] >= 0 and len(str(seconds[0])) == len(str(seconds[-1])):
-            return line.tobytes()
-        short = self._lengths[frames.messages]
-        beyond = np.arange(width) >= short[:, None]
-        if beyond.any():
-            line["data"][beyond] = np.void(b"\0\0")
-        return line.tobytes().translate(None, b"\0")
+        last = _second(frames.last_ns - origin_ns)
+        if (digits := len(str(last))) > len(str(_second(frames.first_ns - origin_ns))):
+            border = origin_ns + 10 ** (digits - 1) * SECOND_NS - 500  # from there on seconds have a digit more
+            before, behind = frames.between(origin_ns, border - 1), frames.between(border, frames.last_ns)
+            return bytes(self.text(before, origin_ns)) + bytes(self.text(behind, origin_ns))
+        stamps: dict[int, _Records] = {}
+        lines = []
+        for part in frames.parts:
+            if id(part.times) not in stamps:
+                stamps[id(part.times)] = _stamps(part.times - origin_ns, digits)
+            lines.append(self._lines(part.message, stamps[id(part.times)], part.data))
+        return _merged(lines, [part.places for part in frames.parts])
+
+    def _lines(self, message: int, stamps: _Records, data: NDArray[np.uint8]) -> _Records:
+        count, length = data.shape
+        form = self._forms.get((message, stamps.itemsize))
+        if form is None or len(form) < count:
+            head = self._heads[message]
+            form = np.empty(
+                count, [("stamp", stamps.dtype), ("head", f"V{len(head)}"), ("data", f"V{2 * length}"), ("end", "V3")]
+            )
+            form["head"], form["end"] = np.void(head), np.void(b" T\n")
+            self._forms[message, stamps.itemsize] = form
+        made = form[:count]
+        even = data if length % 2 == 0 else np.pad(data, ((0, 0), (0, 1)))
+        made["stamp"] = stamps
+        made["data"] = _HEX[np.ascontiguousarray(even).view(np.uint16)].view(f"V{even.shape[1] * 2}")[:, 0]
+        return made.view(f"V{made.itemsize}")
 
 
-def _seconds(seconds: NDArray[np.int64]) -> NDArray[np.bytes_]:
-    """As text, filled up with bytes 0 behind; they do not go back."""
+def _name(plan: MessagePlan) -> str:
+    return f"{plan.can_id:08X}" if plan.extended else f"{plan.can_id:03X}"
+
+
+def _second(since_ns: int) -> int:
+    return (since_ns + 500) // SECOND_NS
+
+
+def _stamps(since_ns: NDArray[np.int64], digits: int) -> _Records:
+    """An opening bracket and the time, whose seconds all have so many digits."""
+    us = (since_ns + 500) // 1000
+    seconds = us // _US
+    us = (us - seconds * _US).astype(np.uint32)
+    ms = us // 1000
     first, last = int(seconds[0]), int(seconds[-1])
+    made = np.empty(len(us), [("open", "V1"), ("s", f"V{digits}"), ("dot", "V1"), ("ms", "V3"), ("us", "V3")])
+    made["open"], made["dot"] = np.void(b"("), np.void(b".")
     if last - first <= _MOST_SECONDS:
-        return np.array([b"%d" % number for number in range(first, last + 1)])[seconds - first]
-    return np.array([b"%d" % number for number in seconds.tolist()])
+        texts = "".join(str(number) for number in range(first, last + 1)).encode("ascii")
+        made["s"] = np.frombuffer(texts, f"V{digits}")[seconds - first]
+    else:
+        made["s"] = np.array([b"%d" % number for number in seconds.tolist()]).view(f"V{digits}")
+    made["ms"] = _THREE[ms]
+    made["us"] = _THREE[us - ms * 1000]
+    return made.view(f"V{made.itemsize}")
+
+
+def _merged(lines: list[_Records], places: list[NDArray[np.int64]]) -> memoryview:
+    """All lines, each at its place among all."""
+    lengths = [each.itemsize for each in lines]
+    if len(set(lengths)) == 1:
+        merged = np.empty(sum(len(each) for each in lines), lines[0].dtype)
+        for each, where in zip(lines, places, strict=True):
+            merged[where] = each
+        return merged.view(np.uint8).data
+    widths = np.empty(sum(len(each) for each in lines), np.int64)
+    for length, where in zip(lengths, places, strict=True):
+        widths[where] = length
+    ends = widths.cumsum()
+    text = np.empty(int(ends[-1]), np.uint8)
+    for each, length, where in zip(lines, lengths, places, strict=True):
+        anywhere = np.ndarray(len(text) - length + 1, each.dtype, text, 0, (1,))  # a line may begin at any byte
+        anywhere[ends[where] - length] = each
+    return text.data

@@ -49,6 +49,7 @@ class _Signal:
     supplied: CodeType | None
     table: tuple[Column, Column] | None
     """Of an enumeration: by source number, whether there is a raw value, and which."""
+    ends: tuple[Fraction | None, Fraction | None]
 
 
 class ColumnPacker:
@@ -116,7 +117,7 @@ class ColumnPacker:
         supplied: Any = True if signal.supplied is None else _eval(signal.supplied, moments)
         if not isinstance(supplied, np.ndarray):
             if not supplied:
-                _put(bits, plan.pieces, _column(_signed(plan.not_available)))
+                _put(bits, plan.pieces, np.array([_signed(plan.not_available)], np.int64))
                 return
             supplied = None
         column = _column(_eval(signal.expression, moments))
@@ -126,6 +127,9 @@ class ColumnPacker:
         raw = _float_raw(signal, column) if plan.is_float else _raw(signal, column)
         if supplied is not None:
             raw = np.where(supplied, raw, _signed(plan.not_available))
+        if len(plan.pieces) == 1 and not plan.signed and plan.length < 64:  # no bit is set beyond the length
+            _put_masked(bits, np.ascontiguousarray(raw).view(np.uint64), _WORD, plan.pieces[0].at, plan.length)
+            return
         _put(bits, plan.pieces, raw)
 
 
@@ -164,7 +168,7 @@ def _compiled(signal: SignalPlan) -> _Signal:
             raws[number] = raw if signal.is_float else _signed(raw)
         table = known, raws
     supplied = None if source.supplied is None else compile(source.supplied, f"<{source.name}>", "eval")
-    return _Signal(signal, compile(text, f"<{source.name}>", "eval"), supplied, table)
+    return _Signal(signal, compile(text, f"<{source.name}>", "eval"), supplied, table, _ends(signal))
 
 
 def _eval(code: CodeType, moments: Moments) -> Any:
@@ -216,23 +220,30 @@ def _raw(signal: _Signal, column: Column) -> Column:
         value = _scaled(column, plan.slope, plan.intercept)
     else:
         value = _rounded(column * float(plan.slope) + float(plan.intercept))
-    if _always_fits(plan):
-        return _patterns(value)
-    inside = _at_least(value, plan.low) & _at_most(value, plan.high)
+    least, most = signal.ends
+    wrong = None
+    if least is None or least < plan.low:
+        wrong = ~_at_least(value, plan.low)
+    if most is None or most > plan.high:
+        above = ~_at_most(value, plan.high)
+        wrong = above if wrong is None else wrong | above
     if plan.low <= plan.not_available <= plan.high:  # a code amid the values: a true value must not look like it
-        inside &= (value if abs(plan.not_available) < _ROOM else _wide(value)) != plan.not_available
-    return np.where(inside.astype(bool), _patterns(value), error)
+        hides = ((value if abs(plan.not_available) < _ROOM else _wide(value)) == plan.not_available).astype(bool)
+        wrong = hides if wrong is None else wrong | hides
+    patterns = _patterns(value)
+    if wrong is None or not wrong.any():
+        return patterns
+    return np.where(wrong, error, patterns)
 
 
-def _always_fits(signal: SignalPlan) -> bool:
-    """True where no value can be outside the signal's range, or look like a code."""
+def _ends(signal: SignalPlan) -> tuple[Fraction | None, Fraction | None]:
+    """Least and greatest raw value that the source can give; None where it has no bound."""
     source = signal.source
     assert source is not None
     if source.low is None or source.high is None or not source.whole:
-        return False
+        return None, None
     ends = [end * signal.slope + signal.intercept for end in (source.low, source.high)]
-    inside = signal.low <= min(ends) and max(ends) <= signal.high
-    return inside and not min(ends) <= signal.not_available <= max(ends)
+    return min(ends), max(ends)
 
 
 def _float_raw(signal: _Signal, column: Column) -> Column:
@@ -285,13 +296,13 @@ def _wide(column: Column) -> Column:
 
 def _at_least(column: Column, low: int) -> Column:
     if column.dtype == object or -_ROOM < low < _ROOM:
-        return column >= low
+        return (column >= low).astype(bool, copy=False)
     return np.full(len(column), low < 0)
 
 
 def _at_most(column: Column, high: int) -> Column:
     if column.dtype == object or -_ROOM < high < _ROOM:
-        return column <= high
+        return (column <= high).astype(bool, copy=False)
     return np.full(len(column), high > 0)
 
 
@@ -309,8 +320,8 @@ def _put(bits: Bits, pieces: Sequence[Piece], raw: Column) -> None:
         _put_masked(bits, moved, (1 << piece.width) - 1, piece.at)
 
 
-def _put_masked(bits: Bits, patterns: Column, mask: int, distance: int) -> None:
-    """``(patterns & mask) << distance``, downward where it is negative, over the words' borders."""
+def _put_masked(bits: Bits, patterns: Column, mask: int, distance: int, width: int = 64) -> None:
+    """``(patterns & mask) << distance``, downward where it is negative, over the words' borders. ``width``: of the patterns, at most."""
     if mask != _WORD:
         patterns = patterns & np.uint64(mask)
     if distance < 0:
@@ -318,5 +329,5 @@ def _put_masked(bits: Bits, patterns: Column, mask: int, distance: int) -> None:
     word, up = divmod(distance, 64)
     if word < bits.shape[1]:
         bits[:, word] |= patterns << np.uint64(up) if up else patterns
-    if up and mask >> 64 - up and word + 1 < bits.shape[1]:
+    if up and up + min(width, mask.bit_length()) > 64 and word + 1 < bits.shape[1]:
         bits[:, word + 1] |= patterns >> np.uint64(64 - up)

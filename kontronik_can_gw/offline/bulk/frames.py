@@ -11,7 +11,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.bulk.feed import Feed
 from kontronik_can_gw.offline.bulk.scan import Stretch, pieces
 from kontronik_can_gw.offline.bulk.sending import MOST_PERIOD_NS, CanFrames, Sender
-from kontronik_can_gw.offline.bulk.state import Steady, Stretched, is_steady
+from kontronik_can_gw.offline.bulk.state import Quiet, Steady, Stretched, is_steady
 from kontronik_can_gw.offline.replay import BytesFollower, TimedFrame
 
 BLOCK = 8192
@@ -69,7 +69,8 @@ def _follow_stretch(
     at, end, data = 0, len(stretched), stretched.stretch.data
     while at < end:
         if end - at >= least and feed.is_between and sender.is_ready and is_steady(gateway, stretched.layout):
-            steady = Steady(gateway, stretched, at, min(end - at, block), feed.now)
+            follow = Steady if sender.tells else Quiet
+            steady = follow(gateway, stretched, at, min(end - at, block), feed.now)
             if steady.count:
                 frames = sender.send(steady)
                 steady.leave()

@@ -28,31 +28,63 @@ _TOLD_WITH_BYTES, _EVENT, _SECOND, _TOLD, _DUE = range(5)
 _END = (1 << 14, 0, 0)
 
 
-class CanFrames(NamedTuple):
-    """Many CAN frames in the order in which they are sent."""
+class Part(NamedTuple):
+    """The frames of one message in a block."""
 
+    message: int
+    """Its index in the layout."""
     times: Numbers
-    messages: NDArray[np.int16]
-    """Indices in the layout."""
+    places: Numbers
+    """Where each stands among the frames of all messages."""
     data: NDArray[np.uint8]
-    """A row each, filled up with zeros behind the message's length."""
+    """A row each."""
 
-    def part(self, chosen: slice) -> "CanFrames":
-        """Some of them."""
-        return CanFrames(self.times[chosen], self.messages[chosen], self.data[chosen])
+
+class CanFrames:
+    """Many CAN frames, by message."""
+
+    def __init__(self, parts: list[Part]) -> None:
+        self.parts = [part for part in parts if len(part.times)]
+        self.count = sum(len(part.times) for part in self.parts)
+
+    def __len__(self) -> int:
+        return self.count
+
+    @property
+    def first_ns(self) -> int:
+        """When the first one is sent."""
+        return min(int(part.times[0]) for part in self.parts)
+
+    @property
+    def last_ns(self) -> int:
+        """When the last one is sent."""
+        return max(int(part.times[-1]) for part in self.parts)
+
+    def between(self, first_ns: int, last_ns: int) -> "CanFrames":
+        """Those that are sent from ``first_ns`` to ``last_ns``."""
+        if not self.parts or (first_ns <= self.first_ns and self.last_ns <= last_ns):
+            return self
+        cuts = [np.searchsorted(part.times, (first_ns, last_ns + 1)).tolist() for part in self.parts]
+        before = sum(begin for begin, _ in cuts)
+        return CanFrames(
+            [
+                Part(part.message, part.times[begin:end], part.places[begin:end] - before, part.data[begin:end])
+                for part, (begin, end) in zip(self.parts, cuts, strict=True)
+            ]
+        )
 
 
 class _Sends(NamedTuple):
-    """The frames of one message. ``number``: counted from the first of the block, replaced ones too."""
+    """The frames of one message; a number stands for all. ``number``: counted from the first of the block, replaced ones too."""
 
     turn: Numbers
-    since: Numbers
-    rank: Numbers
+    since: "Numbers | int"
+    rank: "Numbers | int"
     state: Numbers
     time: Numbers
-    place: Numbers
+    place: "Numbers | int"
     number: Numbers
-    with_bytes: NDArray[np.bool_]
+    with_bytes: "NDArray[np.bool_] | bool"
     """What it holds is that of the step of a frame's bytes."""
 
 
@@ -65,7 +97,8 @@ class Sender:
             _Follower(output, index, plan, message)
             for index, (plan, message) in enumerate(zip(layout.messages, output._messages, strict=True))
         ]
-        self.width = 8 * max((f.packer.words for f in self._followers), default=1)
+        self.tells = any(follower.tells for follower in self._followers)
+        """True where it makes a difference when the gateway is told that a second is over."""
         self.possible = len(self._followers) <= _MOST_MESSAGES and all(f.possible for f in self._followers)
 
     @property
@@ -75,25 +108,25 @@ class Sender:
 
     def send(self, block: Steady) -> CanFrames:
         """The frames of a block; the output's objects are as after its last frame."""
-        keys, times, messages, rows = [], [], [], []
+        keys, found = [], []
         for index, follower in enumerate(self._followers):
             sends, data = follower.send(block)
-            count = len(sends.turn)
-            if not count:
-                continue
             keys.append(((sends.turn << 36 | sends.since) << 3 | sends.rank) << 10 | index)
-            times.append(sends.time)
-            messages.append(np.full(count, index, np.int16))
-            if data.shape[1] < self.width:
-                data = np.pad(data, ((0, 0), (0, self.width - data.shape[1])))
-            rows.append(data)
+            found.append((sends.time, data))
         heap = self._output._schedule._heap
         heap[:] = sorted(entry for entry in heap if entry[0] > block.times[-1])
         if not keys:
-            return CanFrames(np.empty(0, np.int64), np.empty(0, np.int16), np.empty((0, self.width), np.uint8))
+            return CanFrames([])
         order = np.argsort(np.concatenate(keys), kind="stable")
-        data = np.concatenate(rows)[order]
-        return CanFrames(np.concatenate(times)[order], np.concatenate(messages)[order], data)
+        places = np.empty_like(order)
+        places[order] = np.arange(len(order))
+        ends = np.cumsum([len(key) for key in keys]).tolist()
+        return CanFrames(
+            [
+                Part(index, time, places[end - len(time) : end], data)
+                for index, (end, (time, data)) in enumerate(zip(ends, found, strict=True))
+            ]
+        )
 
 
 class _Follower:
@@ -105,8 +138,8 @@ class _Follower:
         self._plan = plan
         self._message = message
         self.packer = ColumnPacker(plan)
-        self._tells = Group.GATEWAY in plan.paces and not plan.cycle_ns
-        asked = bool(message.triggers & (Event.LIVE | Event.INFO | Event.SECOND)) or self._tells
+        self.tells = Group.GATEWAY in plan.paces and not plan.cycle_ns
+        asked = bool(message.triggers & (Event.LIVE | Event.INFO | Event.SECOND)) or self.tells
         self.possible = not message.silent_able and not (
             message.on_change and not message.by_event and self.packer.follows_time and asked
         )
@@ -126,31 +159,37 @@ class _Follower:
         if not count:
             return sends, np.empty((0, plan.length), np.uint8)
         alive = (sends.number + message.alive) % message.alive_modulus
-        bits = np.empty((count, self.packer.words), np.uint64)
-        for place in range(len(plan.pages)) if len(plan.pages) > 1 else (0,):
-            chosen = slice(None) if len(plan.pages) == 1 else np.flatnonzero(sends.place == place)
-            moments = block.moments(
-                sends.turn[chosen], sends.state[chosen], sends.time[chosen], sends.with_bytes[chosen]
-            )
-            if moments.count:
-                bits[chosen] = self.packer.bits(moments, alive[chosen], plan.pages[place])
-                if message.on_change:  # without the alive counter
-                    last = slice(-1, None)
-                    end = block.moments(
-                        moments.turns[last], moments.states[last], moments.now[last], sends.with_bytes[chosen][last]
-                    )
-                    message.last[plan.pages[place]] = number_of(self.packer.bits(end, 0, plan.pages[place]), 0)
+        if len(plan.pages) == 1:
+            bits = self._packed(block, sends, alive, plan.pages[0], slice(None))
+        else:
+            bits = np.empty((count, self.packer.words), np.uint64)
+            for place, page in enumerate(plan.pages):
+                chosen = np.flatnonzero(sends.place == place)
+                if len(chosen):
+                    bits[chosen] = self._packed(block, sends, alive, page, chosen)
         message.alive = (message.alive + int(sends.number.max()) + 1) % message.alive_modulus
         return sends, self.packer.data(bits)
+
+    def _packed(
+        self, block: Steady, sends: _Sends, alive: Numbers, page: int | None, chosen: "slice | Numbers"
+    ) -> Bits:
+        """What the frames of one page hold."""
+        turns, states, times = sends.turn[chosen], sends.state[chosen], sends.time[chosen]
+        with_bytes = sends.with_bytes
+        if isinstance(with_bytes, np.ndarray):
+            with_bytes = with_bytes[chosen]
+        if self._message.on_change:  # what is compared with has no alive counter
+            of_last = with_bytes[-1:] if isinstance(with_bytes, np.ndarray) else with_bytes
+            last = block.moments(turns[-1:], states[-1:], times[-1:], of_last)
+            self._message.last[page] = number_of(self.packer.bits(last, 0, page), 0)
+        if with_bytes is True and isinstance(chosen, slice):
+            return self.packer.bits(block.moments_with_bytes(sends.turn), alive, page)
+        return self.packer.bits(block.moments(turns, states, times, with_bytes), alive[chosen], page)
 
     def asking(self, block: Steady) -> Numbers:
         """The turns whose frames ask for the message."""
         wanted = self._message.triggers
-        if wanted & Event.LIVE and wanted & Event.INFO:
-            return np.arange(1, block.count + 1)
-        if wanted & (Event.LIVE | Event.INFO):
-            return np.flatnonzero(block.is_live if wanted & Event.LIVE else ~block.is_live) + 1
-        return np.empty(0, np.int64)
+        return block.turns_of(bool(wanted & Event.LIVE), bool(wanted & Event.INFO))
 
     def rare(self, block: Steady) -> list[tuple[tuple[int, int, int], Rare]]:
         """What else asks for the message, with its step."""
@@ -158,7 +197,7 @@ class _Follower:
         for one in block.rare:
             if one.events & self._message.triggers:
                 found.append(((one.turn, one.since_ns, _SECOND), one))
-            if one.is_told and self._tells:
+            if one.is_told and self.tells:
                 found.append(((one.turn, one.since_ns, _TOLD_WITH_BYTES if one.with_bytes else _TOLD), one))
         return found
 
@@ -168,11 +207,11 @@ class _Follower:
         if not message.by_event or message.owed or schedule._waiting[index] or self._plan.cycle_ns or self.rare(block):
             return None
         turns = self.asking(block)
-        times = block.times[turns]
+        times, least = block.times_at(turns)
         delay = self._plan.delay_ns
-        if len(times) and (times[0] < schedule._last[index] + delay or (np.diff(times) < delay).any()):
+        if len(times) and (times[0] < schedule._last[index] + delay or least < delay):
             return None
-        return self._at_pace(turns, np.zeros_like(turns), _EVENT, times)
+        return self._at_pace(turns, 0, _EVENT, times)
 
     def _plain_cycle(self, block: Steady) -> _Sends | None:
         """Sent by its cycle and for nothing else; None where it is not so."""
@@ -192,15 +231,15 @@ class _Follower:
         turns, since = step_of(block.times, times)
         return self._at_pace(turns, since, _DUE, times)
 
-    def _at_pace(self, turns: Numbers, since: Numbers, rank: int, times: Numbers) -> _Sends:
-        message, count = self._message, len(turns)
+    def _at_pace(self, turns: Numbers, since: "Numbers | int", rank: int, times: Numbers) -> _Sends:
+        message, count, pages = self._message, len(turns), len(self._plan.pages)
         number = np.arange(count)
-        place = (number + message.page) % len(self._plan.pages)
-        message.page = (message.page + count) % len(self._plan.pages)
+        place = (number + message.page) % pages if pages > 1 else 0
+        message.page = (message.page + count) % pages
         if count:
             self._schedule._last[self._index] = int(times[-1])
             self._schedule._waiting[self._index] = self._schedule._cycle_waits[self._index] = False
-        return _Sends(turns, since, np.full(count, rank), turns, times, place, number, np.full(count, rank == _EVENT))
+        return _Sends(turns, since, rank, turns, times, place, number, rank == _EVENT)
 
     def _never_changes(self, block: Steady) -> bool:
         """True where no frame that asks finds another page than was sent last."""
@@ -236,12 +275,13 @@ class _Steps:
         self._turns = follower.asking(block).tolist()
         self._times = [block.time_list[turn] for turn in self._turns]
         self._rare = follower.rare(block)
-        self._bits: dict[int | None, Bits] = {}
+        self._bits: dict[int | None, list[int]] = {}
         self._changes: list[int] = []
         if message.on_change and (self._turns or self._waiting or self._rare or message.owed):
-            self._bits = follower.bits_by_state(block)
+            by_state = follower.bits_by_state(block)
+            self._bits = {page: numbers_of(bits) for page, bits in by_state.items()}
             if len(self._plan.pages) == 1:
-                found = self._bits[self._plan.pages[0]][np.array(self._turns, np.int64)]
+                found = by_state[self._plan.pages[0]][np.array(self._turns, np.int64)]
                 self._changes = (np.flatnonzero((found[1:] != found[:-1]).any(axis=1)) + 1).tolist()
         self._found: list[tuple[int, int, int, int, int, int, int, bool]] = []
         self._number = 0
@@ -297,7 +337,7 @@ class _Steps:
         if message.by_event or not alone or at >= len(self._turns):
             return at
         page = self._plan.pages[0]
-        if number_of(self._bits[page], self._turns[at]) != self._last.get(page):
+        if self._bits[page][self._turns[at]] != self._last.get(page):
             return at
         change = bisect_left(self._changes, at + 1)
         return self._changes[change] if change < len(self._changes) else len(self._turns)
@@ -350,9 +390,7 @@ class _Steps:
 
     def _note(self, state: int) -> bool:
         changed = [
-            place
-            for place, page in enumerate(self._plan.pages)
-            if number_of(self._bits[page], state) != self._last.get(page)
+            place for place, page in enumerate(self._plan.pages) if self._bits[page][state] != self._last.get(page)
         ]
         if len(self._plan.pages) > 1:
             self._message.owed += [place for place in changed if place not in self._message.owed]
@@ -367,7 +405,7 @@ class _Steps:
             message.page = (place + 1) % len(self._plan.pages)
         page = self._plan.pages[place]
         if self._bits:
-            self._last[page] = number_of(self._bits[page], state)
+            self._last[page] = self._bits[page][state]
         sent = (turn, since, rank, state, now, place, self._number, rank <= _EVENT)
         self._number += 1
         at = len(self._found) - 1
@@ -393,6 +431,15 @@ def step_of(times: Numbers, when: Numbers) -> tuple[Numbers, Numbers]:
 def number_of(bits: Bits, row: int) -> int:
     """A row as one number."""
     return int.from_bytes(bits[row].astype("<u8").tobytes(), "little")
+
+
+def numbers_of(bits: Bits) -> list[int]:
+    """Each row as one number."""
+    if bits.shape[1] == 1:
+        numbers: list[int] = bits[:, 0].tolist()
+        return numbers
+    data, size = bits.astype("<u8").tobytes(), 8 * bits.shape[1]
+    return [int.from_bytes(data[at : at + size], "little") for at in range(0, len(data), size)]
 
 
 def words_of(number: int, words: int) -> NDArray[np.uint64]:

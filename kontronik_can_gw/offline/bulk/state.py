@@ -136,6 +136,47 @@ class Steady:
         found: Numbers = np.arange(self.count + 1) - self.live_rows
         return found
 
+    @cached_property
+    def _turns(self) -> dict[tuple[bool, bool], Numbers]:
+        return {}
+
+    def turns_of(self, live: bool, info: bool) -> Numbers:
+        """The turns with live frames, information frames, or both; the same object each time."""
+        found = self._turns.get((live, info))
+        if found is None:
+            if live and info:
+                found = np.arange(1, self.count + 1)
+            elif live or info:
+                found = np.flatnonzero(self.is_live if live else ~self.is_live) + 1
+            else:
+                found = np.empty(0, np.int64)
+            self._turns[live, info] = found
+        return found
+
+    @cached_property
+    def _times_at(self) -> dict[int, tuple[Numbers, int]]:
+        return {}
+
+    def times_at(self, turns: Numbers) -> tuple[Numbers, int]:
+        """The times of what ``turns_of`` gives, and the least distance between two; the same object each time."""
+        found = self._times_at.get(id(turns))
+        if found is None:
+            times = self.times[turns]
+            least = int(np.diff(times).min()) if len(times) > 1 else _ROOM
+            found = self._times_at[id(turns)] = times, least
+        return found
+
+    @cached_property
+    def _shared(self) -> "dict[int, Moments]":
+        return {}
+
+    def moments_with_bytes(self, turns: Numbers) -> "Moments":
+        """What is known with the frames of what ``turns_of`` gives; the same object each time."""
+        found = self._shared.get(id(turns))
+        if found is None:
+            found = self._shared[id(turns)] = self.moments(turns, turns, self.times_at(turns)[0], True)
+        return found
+
     def moments(
         self, turns: Numbers, states: Numbers, now: Numbers, with_bytes: "NDArray[np.bool_] | bool"
     ) -> "Moments":
@@ -347,6 +388,53 @@ class Steady:
         gateway._told_ns, gateway._next_expiry = told, due
 
 
+class Quiet(Steady):
+    """A block for which it makes no difference when a gateway is told that a second is over: nobody asks.
+
+    Of the instants between frames only the ends of the one-second windows count then; the ESC is never late for them.
+    """
+
+    def _follow(self, count: int) -> int:
+        esc = self.esc
+        count = self._informed(count)
+        window, old, older, rate = esc._window_ns, esc._window_counters, esc._diagnosis_counters, esc.frame_rate
+        ends = np.arange(window + SECOND, int(self.times[count]) + 1, SECOND)
+        if len(ends):
+            before = np.searchsorted(self.times[1 : count + 1], ends)
+            states = before + (self.times[before + 1] == ends)  # a frame of the same instant comes first
+            first = self.counters(int(states[0]))
+            harmed = first.crc_errors != old.crc_errors or first.dropped_bytes != old.dropped_bytes
+            if harmed or esc.link is not LinkState.OK or esc.settings.crc_error_threshold <= 0:  # the link may change
+                count, ends = int(before[0]), ends[:0]
+        if len(ends):
+            lives = np.concatenate(([old.live], self.live_rows[states] + esc.counters.live))
+            self._closes = list(zip(states.tolist(), ends.tolist(), (np.diff(lives) * 10).tolist(), strict=True))
+            times = self.times
+            self.rare = [
+                Rare(state, end - int(times[state]), False, state, end, Event.SECOND, False)
+                for state, end, _ in self._closes
+            ]
+            older = old if len(ends) == 1 else self.counters(int(states[-2]))
+            window, old, rate = int(ends[-1]), self.counters(int(states[-1])), self._closes[-1][2]
+        self._left = (window, self.gateway._told_ns, 0, old, older, rate)
+        return count
+
+    def _informed(self, count: int) -> int:
+        """How many frames come while information is fresh."""
+        if self.esc.info_ns is None:
+            return count
+        known = np.concatenate(([self.esc.info_ns], self.times[1 : count + 1][~self.is_live[:count]]))
+        if np.diff(known, append=self.times[count]).max() <= INFO_TIMEOUT_NS:
+            return count
+        seen = np.arange(count) - self.live_rows[:count]
+        late = np.flatnonzero(self.times[1 : count + 1] > known[seen] + INFO_TIMEOUT_NS)
+        return int(late[0]) if len(late) else count
+
+    def leave(self) -> None:
+        super().leave()
+        self.gateway._next_expiry = self.esc.next_deadline()
+
+
 _VOLTAGE, _CURRENT, _SPEED, _STATE = (
     LiveData._fields.index(name)
     for name in ("battery_voltage", "battery_current", "electrical_speed", "operating_state")
@@ -364,13 +452,20 @@ class Moments:
         self.states = states
         self.now = now
         self.gateway = block.gateway.status
-        self.live = _Fields(block.live_column, block.live_rows[states])
+        self.live = _Fields(block.live_column, _rows(block.live_rows[states]))
         self.info = None if block.esc.info is None else _InfoFields(block.info_column, block.info_rows[states])
         self.esc = _Esc(block, turns, states, with_bytes, self)
 
 
+def _rows(rows: Numbers) -> "Numbers | slice":
+    """As a slice, where they follow each other: that costs no copy."""
+    if len(rows) and rows[-1] - rows[0] == len(rows) - 1 and (len(rows) < 2 or (np.diff(rows) == 1).all()):
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return rows
+
+
 class _Fields:
-    def __init__(self, column: Any, rows: Numbers) -> None:
+    def __init__(self, column: Any, rows: "Numbers | slice") -> None:
         self._column = column
         self.rows = rows
 
