@@ -1,9 +1,10 @@
 """Takes so many live frames through ours or the obvious program, turn by turn, so that valgrind can count the instructions.
 
-    python instruction_driver.py ours|obvious FRAMES
+    python instruction_driver.py ours|core|obvious FRAMES
 
 Live frames go into a pseudo terminal and come out as CAN frames on a local socket, which another process empties. The clock of ours is
 passed in: 10 ms go by with each frame, with all that is due meanwhile.
+``core`` is ours without ports, loop and socket: bytes in, frames out.
 """
 
 import os
@@ -115,6 +116,28 @@ def ours(master: int, slave: int, path: str, folder: Path, all_frames: list[byte
     loop.end()
 
 
+def core(folder: Path, all_frames: list[bytes]) -> int:
+    """Decode, pack and schedule: what of ours knows neither ports nor sockets. Returns how many frames came out."""
+    from bench_programs import FIVE, config_text
+
+    from kontronik_can_gw.cli.common import load_all
+    from kontronik_can_gw.gateway import Gateway
+    from kontronik_can_gw.runtime.store import ParameterStore
+
+    file = folder / "gateway.toml"
+    file.write_text(config_text(["/dev/null"], "lo", FIVE, folder))
+    loaded = load_all(file, ParameterStore)
+    now, count = 1_000_000_000_000, 0
+    gateway = Gateway(loaded.escs, loaded.layout, now)
+    gateway.start(now)
+    for frame in all_frames:
+        now += PERIOD_NS
+        gateway.receive_bytes(0, frame, now)
+        gateway.advance(now)
+        count += len(gateway.take_frames())
+    return count
+
+
 def obvious(master: int, slave: int, path: str, all_frames: list[bytes]) -> None:
     """One port of the obvious program, in this thread."""
     sys.modules["asammdf"] = None  # type: ignore[assignment]
@@ -137,11 +160,14 @@ def obvious(master: int, slave: int, path: str, all_frames: list[bytes]) -> None
 
 def main(program: str, count: int) -> int:
     sys.path[:0] = [str(HERE.parents[1]), str(HERE / "peers")]
+    all_frames = frames(count)
+    if program == "core":
+        with tempfile.TemporaryDirectory() as folder:
+            return int(core(Path(folder), all_frames) < 5 * count)
     name = f"kontronik-bench-{uuid.uuid4().hex[:12]}"
     drain: Any = subprocess.Popen([sys.executable, "-c", _DRAIN, name], stdout=subprocess.PIPE, text=True)
     drain.stdout.readline()
     standin.use(f"unix:{name}")
-    all_frames = frames(count)
     master, slave = pty.openpty()
     tty.setraw(slave)
     path = os.ttyname(slave)

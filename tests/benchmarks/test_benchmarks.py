@@ -54,6 +54,13 @@ def test_c_and_the_obvious_program_send_what_the_gateway_sends(context: Context)
     assert [figure.reached for figure in figures] == [True] * 3  # our values, C's frames, the obvious program's
 
 
+@pytest.mark.parametrize("program", ["ours", "core", "obvious"])
+def test_the_driver_whose_instructions_are_counted_gets_all_frames_through(program: str) -> None:
+    command = [sys.executable, str(BENCH.with_name("instruction_driver.py")), program, "30"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_difference_is_found() -> None:
     ours = {0x110: ["01", "02"], 0x190: ["03"]}
     assert live_equal.first_difference("c", ours, {0x110: ["01", "02"], 0x190: ["03"]}) == ""
