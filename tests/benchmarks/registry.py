@@ -67,6 +67,8 @@ class Context:
     """Real-time priority of the gateway, where it is measured with one; 0: the benchmark's own choice."""
     vcan: str = ""
     """A vcan interface to use in place of the local socket that stands for the bus."""
+    long: bool = False
+    """Take what takes minutes, and gigabytes of disk, too."""
     data: dict[str, Any] = field(default_factory=dict)
     """What else goes into the JSON, under the benchmark's name: tables, series."""
 

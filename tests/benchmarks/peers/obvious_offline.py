@@ -101,9 +101,7 @@ class Converter:
                 values[signal.name] = "Error"
         data = self.database.encode_message(name, values)
         self.log.on_message_received(
-            can.Message(
-                timestamp=now, arbitration_id=message.frame_id, data=data, is_extended_id=False, is_rx=False
-            )
+            can.Message(timestamp=now, arbitration_id=message.frame_id, data=data, is_extended_id=False, is_rx=False)
         )
 
 

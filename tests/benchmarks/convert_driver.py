@@ -1,0 +1,57 @@
+"""One conversion in a process of its own: prints its CPU and wall time, its peak memory and what was said of it, as JSON.
+
+    python convert_driver.py FORM IN OUT [--dbc FILE] [--streaming]
+
+The libraries are loaded before the clock starts. ``--streaming``: one frame after the other, as where numpy is missing.
+"""
+
+import argparse
+import json
+import re
+import time
+from pathlib import Path
+
+from kontronik_can_gw.offline.convert import TABLES, Conversion, LogConversion, Output, TableConversion
+from kontronik_can_gw.offline.inputs import DumpInput
+from kontronik_can_gw.offline.layouts import layout_of_dbc
+from kontronik_can_gw.offline.tables import Choice
+
+
+def peak_mb() -> float:
+    """The most memory that this process had, in MB (0 where the system does not tell)."""
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return int(found[1]) / 1024 if found else 0.0
+
+
+def main() -> None:
+    """Convert as asked."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("form")
+    parser.add_argument("source", type=Path)
+    parser.add_argument("target", type=Path)
+    parser.add_argument("--dbc", type=Path)
+    parser.add_argument("--streaming", action="store_true")
+    args = parser.parse_args()
+    import kontronik_can_gw.offline.bulk.candump
+    import kontronik_can_gw.offline.bulk.rows
+    import kontronik_can_gw.offline.tables.parquet  # noqa: F401
+
+    if args.form == "parquet":
+        import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
+    layout = None if args.dbc is None else layout_of_dbc(args.dbc)
+    with DumpInput(args.source, layout) as recording:
+        if args.streaming:
+            recording.bulk_frames = lambda: None  # type: ignore[method-assign]
+            recording.blocks = lambda chosen: None  # type: ignore[method-assign]
+        conversion: Conversion = LogConversion(args.form)
+        if args.form in TABLES:
+            conversion = TableConversion(args.form, Choice.of(recording.reader.columns))
+        cpu, wall = time.process_time(), time.perf_counter()
+        with Output(args.target, args.form) as out:
+            told = conversion(recording, out, lambda position: None)
+        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    print(json.dumps({"cpu_s": cpu, "wall_s": wall, "peak_mb": peak_mb(), "told": told}))
+
+
+if __name__ == "__main__":
+    main()
