@@ -75,6 +75,12 @@ class ColumnPacker:
                 self._add(bits, moments, alive, key, page)
         return bits
 
+    def put_alive(self, bits: Bits, alive: Column) -> None:
+        """Write the alive counter into bits that hold 0 for it."""
+        for signal in self.plan.signals:
+            if signal.role is Role.ALIVE:
+                _put(bits, signal.pieces, _column(alive % alive_modulus(signal, self._crc_at is not None)))
+
     def data(self, bits: Bits) -> Bytes:
         """The frames' bytes, with their CRC."""
         data = np.ascontiguousarray(bits.astype("<u8", copy=False)).view(np.uint8)[:, : self.plan.length]

@@ -138,6 +138,7 @@ class _Follower:
         self._plan = plan
         self._message = message
         self.packer = ColumnPacker(plan)
+        self._states: tuple[Steady, dict[int | None, Bits]] | None = None  # of the block in work
         self.tells = Group.GATEWAY in plan.paces and not plan.cycle_ns
         asked = bool(message.triggers & (Event.LIVE | Event.INFO | Event.SECOND)) or self.tells
         self.possible = not message.silent_able and not (
@@ -175,13 +176,19 @@ class _Follower:
     ) -> Bits:
         """What the frames of one page hold."""
         turns, states, times = sends.turn[chosen], sends.state[chosen], sends.time[chosen]
+        message = self._message
+        if self._states is not None and self._states[0] is block:
+            bits = self._states[1][page][states]
+            message.last[page] = number_of(bits, -1)
+            self.packer.put_alive(bits, alive[chosen])
+            return bits
         with_bytes = sends.with_bytes
         if isinstance(with_bytes, np.ndarray):
             with_bytes = with_bytes[chosen]
-        if self._message.on_change:  # what is compared with has no alive counter
+        if message.on_change:  # what is compared with has no alive counter
             of_last = with_bytes[-1:] if isinstance(with_bytes, np.ndarray) else with_bytes
             last = block.moments(turns[-1:], states[-1:], times[-1:], of_last)
-            self._message.last[page] = number_of(self.packer.bits(last, 0, page), 0)
+            message.last[page] = number_of(self.packer.bits(last, 0, page), 0)
         if with_bytes is True and isinstance(chosen, slice):
             return self.packer.bits(block.moments_with_bytes(sends.turn), alive, page)
         return self.packer.bits(block.moments(turns, states, times, with_bytes), alive[chosen], page)
@@ -251,10 +258,16 @@ class _Follower:
         return True
 
     def bits_by_state(self, block: Steady) -> dict[int | None, Bits]:
-        """Of each page what it holds at each state."""
-        states = np.arange(block.count + 1)
-        moments = block.moments(states, states, block.times, True)
-        return {page: self.packer.bits(moments, 0, page) for page in self._plan.pages}
+        """Of each page what it holds at each state, alive counter 0; of a message that does not follow time."""
+        if self._states is None or self._states[0] is not block:
+            states = np.arange(block.count + 1)
+            rows = None
+            if self._plan.paces == {Group.INFO}:  # they hold until the next information comes
+                states, rows = np.concatenate(([0], block.turns_of(False, True))), block.info_rows
+            moments = block.moments(states, states, block.times[states], True)
+            found = {page: self.packer.bits(moments, 0, page) for page in self._plan.pages}
+            self._states = block, found if rows is None else {page: bits[rows] for page, bits in found.items()}
+        return self._states[1]
 
 
 class _Steps:
@@ -277,13 +290,16 @@ class _Steps:
         self._rare = follower.rare(block)
         self._bits: dict[int | None, list[int]] = {}
         self._changes: list[int] = []
+        self._state_changes: list[int] = []
         if message.on_change and (self._turns or self._waiting or self._rare or message.owed):
             by_state = follower.bits_by_state(block)
             self._bits = {page: numbers_of(bits) for page, bits in by_state.items()}
             if len(self._plan.pages) == 1:
                 found = by_state[self._plan.pages[0]][np.array(self._turns, np.int64)]
-                self._changes = (np.flatnonzero((found[1:] != found[:-1]).any(axis=1)) + 1).tolist()
-        self._found: list[tuple[int, int, int, int, int, int, int, bool]] = []
+                self._changes = changes_of(found)
+                self._state_changes = changes_of(by_state[self._plan.pages[0]])
+        self._found: list[tuple[int, int, int, int, int, int, int, bool, int]] = []
+        """As _Sends, and how many: of more than one, each a cycle behind the one before."""
         self._number = 0
         self._follow()
         schedule._last[index], schedule._waiting[index] = self._last_ns, self._waiting
@@ -293,9 +309,23 @@ class _Steps:
         if self._cycle_ns is not None:
             heap.append((self._cycle_ns, index, False))
         schedule._heap[:] = heap
-        columns = [np.ascontiguousarray(column) for column in np.array(self._found, np.int64).reshape(-1, 8).T]
+        self.sends = self._all_found()
+
+    def _all_found(self) -> _Sends:
+        columns = [np.ascontiguousarray(column) for column in np.array(self._found, np.int64).reshape(-1, 9).T]
+        counts = columns.pop()
+        if counts.sum() > len(counts):
+            entry = np.repeat(np.arange(len(counts)), counts)
+            more = np.arange(len(entry)) - np.repeat(counts.cumsum() - counts, counts)
+            columns = [column[entry] for column in columns]
+            turn, since, _, state, time, _, number, _ = columns
+            time += more * self._plan.cycle_ns
+            number += more
+            further = np.flatnonzero(more)
+            turn[further], since[further] = step_of(self._block.times, time[further])
+            state[further] = turn[further]
         turn, since, rank, state, time, place, number, with_bytes = columns
-        self.sends = _Sends(turn, since, rank, state, time, place, number, with_bytes.astype(bool))
+        return _Sends(turn, since, rank, state, time, place, number, with_bytes.astype(bool))
 
     def _follow(self) -> None:
         times = self._block.time_list
@@ -325,8 +355,34 @@ class _Steps:
                 rare_at += 1
                 if (message.by_event or self._note(state)) and self._request(now):
                     self._send(turn, since, rank, state, now)
-            else:
+            elif not self._run(turn, since, now, min(asks, rare)):
                 self._turn_clock(turn, since, now)
+
+    def _run(self, turn: int, since: int, now: int, until: tuple[int, int, int]) -> bool:
+        """Send by the cycle alone, as long as nothing changes and nobody asks (``until``); False where this is no such place."""
+        cycle, times = self._plan.cycle_ns, self._block.time_list
+        if not self._bits or len(self._plan.pages) > 1 or self._delay > cycle:
+            return False
+        if self._waiting or self._put_offs or self._message.owed or now < self._last_ns + self._delay:
+            return False
+        page = self._plan.pages[0]
+        if self._bits[page][turn] != self._last.get(page) or (self._found and self._found[-1][:2] == (turn, since)):
+            return False
+        limit = times[-1] + 1
+        if until != _END:
+            limit = min(limit, times[until[0]] + until[1])
+        change = bisect_left(self._state_changes, turn + 1)
+        if change < len(self._state_changes):
+            limit = min(limit, times[self._state_changes[change]])
+        count = (limit - 1 - now) // cycle + 1
+        if count < 2:
+            return False
+        self._found.append((turn, since, _DUE, turn, now, 0, self._number, False, count))
+        self._number += count
+        self._cycle_ns = now + count * cycle
+        self._last_ns = self._cycle_ns - cycle
+        self._cycle_waits = False
+        return True
 
     def _next_asking(self, at: int) -> int:
         """The next of the frames that ask which can make a difference."""
@@ -406,7 +462,7 @@ class _Steps:
         page = self._plan.pages[place]
         if self._bits:
             self._last[page] = self._bits[page][state]
-        sent = (turn, since, rank, state, now, place, self._number, rank <= _EVENT)
+        sent = (turn, since, rank, state, now, place, self._number, rank <= _EVENT, 1)
         self._number += 1
         at = len(self._found) - 1
         while at >= 0 and self._found[at][:2] == (turn, since) and self._found[at][5] != place:
@@ -440,6 +496,12 @@ def numbers_of(bits: Bits) -> list[int]:
         return numbers
     data, size = bits.astype("<u8").tobytes(), 8 * bits.shape[1]
     return [int.from_bytes(data[at : at + size], "little") for at in range(0, len(data), size)]
+
+
+def changes_of(bits: Bits) -> list[int]:
+    """The rows that differ from the one before."""
+    found: list[int] = (np.flatnonzero((bits[1:] != bits[:-1]).any(axis=1)) + 1).tolist()
+    return found
 
 
 def words_of(number: int, words: int) -> NDArray[np.uint64]:
