@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import cantools.database
+import numpy as np
 import pytest
 from cantools.database.can import Database
 from hypothesis import given, settings
@@ -18,11 +19,13 @@ from protocol.streams import FRAGMENTS, damaged
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.dbc_output.layout import DbcSettings
 from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.offline.bulk.candump import Lines
 from kontronik_can_gw.offline.bulk.feed import Feed
 from kontronik_can_gw.offline.bulk.frames import can_follow, follow
-from kontronik_can_gw.offline.bulk.sending import CanFrames
+from kontronik_can_gw.offline.bulk.sending import CanFrames, Part
 from kontronik_can_gw.offline.can_logs import CanLogWriter
+from kontronik_can_gw.offline.convert import LogConversion, Output
 from kontronik_can_gw.offline.inputs import CHUNK, DumpInput
 from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.offline.replay import TimedFrame
@@ -319,3 +322,78 @@ def test_random_layouts(tmp_path: Path, seed: int) -> None:
         assert recording.bulk_frames() is None
         return
     check(path, stream, layout, rate, block=source.choice([64, 500]))
+
+
+# --- the conversion -----------------------------------------------------------------------------------------------------
+
+
+def convert(recording: DumpInput, target: Path, start: float | None, end: float | None) -> tuple[str | None, bytes]:
+    """What was said, and the log; without a log b''."""
+    conversion = LogConversion("candump", *(None if at is None else round(at * SECOND) for at in (start, end)))
+    with Output(target, "candump") as out:
+        told = conversion(recording, out, lambda _: None)
+    written = target.read_bytes() if target.exists() else b""
+    target.unlink(missing_ok=True)
+    return told, written
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        (None, None),
+        (0, 0),
+        (3.3, None),
+        (None, 7.77),
+        (5, 5.001),
+        (9.99, 10.01),
+        (12.5, 29),
+        (40, None),
+        (29.9, 60),
+        (8, 3),
+    ],
+)
+@pytest.mark.parametrize("harm", [0, 3])
+def test_a_part_of_it(tmp_path: Path, start: float | None, end: float | None, harm: int) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(damaged(flight(7, 3000), random.Random(1), harm))
+    recording = DumpInput(path)
+    found = convert(recording, tmp_path / "a.log", start, end), recording.damage, recording.position
+    other = DumpInput(path)
+    other.bulk_frames = lambda: None  # type: ignore[method-assign]
+    expected = convert(other, tmp_path / "a.log", start, end), other.damage
+    assert found[0] == expected[0]
+    if end is None:  # a part that ends is not read to the end
+        assert found[1] == expected[1]
+        assert found[2] == path.stat().st_size
+
+
+def test_a_message_that_changes_with_time_goes_the_streaming_way(tmp_path: Path) -> None:
+    layout = bus_layout([(Msg("Age", 0x200, 2, [sig("DataAge", 0, 16, unit="ms")]), ON_CHANGE, 0, 0)])
+    path = tmp_path / "a.bin"
+    path.write_bytes(flight(1, 300))
+    recording = DumpInput(path, layout)
+    assert recording.bulk_frames() is None
+    told, log = convert(recording, tmp_path / "a.log", None, None)
+    assert log == one_by_one(recording)[0]
+    assert told is not None
+
+
+@pytest.mark.parametrize("seconds", [0, 8, 98, 99_998, 9_999_999])
+def test_times_with_more_and_more_digits(seconds: int) -> None:
+    """A second gets a digit more amid a block, and where half a microsecond makes it so."""
+    times = np.array([0, 1, 499, 500, 999_999_499, 999_999_500, 10**9, 2 * 10**9 - 501, 2 * 10**9 - 500, 3 * 10**9])
+    times = np.sort(np.concatenate([times, times + 10**9])) + seconds * SECOND
+    plans = SHIPPED.layout.messages
+    chance = np.random.default_rng(seconds)
+    messages, data = chance.integers(0, len(plans), len(times)), chance.integers(0, 256, (len(times), 8), np.uint8)
+    parts = []
+    for index in range(len(plans)):
+        places = np.flatnonzero(messages == index)
+        parts.append(Part(index, times[places], places, data[places]))
+    expected = io.BytesIO()
+    writer = CanLogWriter(expected, "candump", None)
+    for time_ns, message, row in zip(times.tolist(), messages.tolist(), data, strict=True):
+        writer.write(time_ns, CanFrame(plans[message].can_id, row.tobytes()), False)
+    assert bytes(Lines(plans).text(CanFrames(parts), 0)) == expected.getvalue()
+    few = CanFrames(parts).between(int(times[3]), int(times[7]))
+    assert bytes(Lines(plans).text(few, 0)) == b"".join(expected.getvalue().splitlines(keepends=True)[3:8])

@@ -91,16 +91,17 @@ class Lines:
         """The lines; times count from ``origin_ns``."""
         if not len(frames):
             return b""
-        last = _second(frames.last_ns - origin_ns)
-        if (digits := len(str(last))) > len(str(_second(frames.first_ns - origin_ns))):
+        first, last = _second(frames.first_ns - origin_ns), _second(frames.last_ns - origin_ns)
+        if (digits := len(str(last))) > len(str(first)):
             border = origin_ns + 10 ** (digits - 1) * SECOND_NS - 500  # from there on seconds have a digit more
             before, behind = frames.between(origin_ns, border - 1), frames.between(border, frames.last_ns)
             return bytes(self.text(before, origin_ns)) + bytes(self.text(behind, origin_ns))
+        seconds = _Seconds(first, last, digits)
         stamps: dict[int, _Records] = {}
         lines = []
         for part in frames.parts:
             if id(part.times) not in stamps:
-                stamps[id(part.times)] = _stamps(part.times - origin_ns, digits)
+                stamps[id(part.times)] = _stamps(part.times - origin_ns, seconds)
             lines.append(self._lines(part.message, stamps[id(part.times)], part.data))
         return _merged(lines, [part.places for part in frames.parts])
 
@@ -129,20 +130,33 @@ def _second(since_ns: int) -> int:
     return (since_ns + 500) // SECOND_NS
 
 
-def _stamps(since_ns: NDArray[np.int64], digits: int) -> _Records:
-    """An opening bracket and the time, whose seconds all have so many digits."""
+class _Seconds:
+    """Texts of whole seconds from ``first`` to ``last``, which all have so many digits."""
+
+    def __init__(self, first: int, last: int, digits: int) -> None:
+        self.digits = digits
+        self._first = first
+        self._texts: _Records | None = None
+        if last - first <= _MOST_SECONDS:
+            self._texts = self._made(list(range(first, last + 1)))
+
+    def of(self, seconds: NDArray[np.int64]) -> _Records:
+        """The text of each."""
+        return self._made(seconds.tolist()) if self._texts is None else self._texts[seconds - self._first]
+
+    def _made(self, numbers: list[int]) -> _Records:
+        return np.frombuffer("".join(map(str, numbers)).encode("ascii"), f"V{self.digits}")
+
+
+def _stamps(since_ns: NDArray[np.int64], texts: _Seconds) -> _Records:
+    """An opening bracket and the time of each line."""
     us = (since_ns + 500) // 1000
     seconds = us // _US
     us = (us - seconds * _US).astype(np.uint32)
     ms = us // 1000
-    first, last = int(seconds[0]), int(seconds[-1])
-    made = np.empty(len(us), [("open", "V1"), ("s", f"V{digits}"), ("dot", "V1"), ("ms", "V3"), ("us", "V3")])
+    made = np.empty(len(us), [("open", "V1"), ("s", f"V{texts.digits}"), ("dot", "V1"), ("ms", "V3"), ("us", "V3")])
     made["open"], made["dot"] = np.void(b"("), np.void(b".")
-    if last - first <= _MOST_SECONDS:
-        texts = "".join(str(number) for number in range(first, last + 1)).encode("ascii")
-        made["s"] = np.frombuffer(texts, f"V{digits}")[seconds - first]
-    else:
-        made["s"] = np.array([b"%d" % number for number in seconds.tolist()]).view(f"V{digits}")
+    made["s"] = texts.of(seconds)
     made["ms"] = _THREE[ms]
     made["us"] = _THREE[us - ms * 1000]
     return made.view(f"V{made.itemsize}")

@@ -285,8 +285,9 @@ class _Steps:
         self._put_offs = sorted(when for when, i, waited in schedule._heap if i == index and waited)
         self._cycle_ns = next((when for when, i, waited in schedule._heap if i == index and not waited), None)
         self._last = dict(message.last)
-        self._turns = follower.asking(block).tolist()
-        self._times = [block.time_list[turn] for turn in self._turns]
+        asking = follower.asking(block)
+        self._turns: list[int] = asking.tolist()
+        self._times: list[int] = block.times_at(asking)[0].tolist()
         self._rare = follower.rare(block)
         self._bits: dict[int | None, list[int]] = {}
         self._changes: list[int] = []
