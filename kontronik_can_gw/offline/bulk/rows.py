@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from kontronik_can_gw.dbc_output.unpacker import Part, SignalReader
 from kontronik_can_gw.offline.bulk.feed import Feed
 from kontronik_can_gw.offline.bulk.scan import Stretch, pieces
-from kontronik_can_gw.offline.bulk.state import Steady, Stretched, is_steady
-from kontronik_can_gw.offline.bulk.values import ColumnReader, Steps, Unsuited, Values
+from kontronik_can_gw.offline.bulk.state import Quiet, Steady, Stretched, is_steady
+from kontronik_can_gw.offline.bulk.values import ColumnReader, Steps, Unsuited
 from kontronik_can_gw.offline.samples import GATEWAY_NS, SAME_ROW_NS, Sample, SampledGateway
 from kontronik_can_gw.offline.tables.blocks import Block, BlockColumn
 from kontronik_can_gw.protocol.codec import Kind, Layout
 from kontronik_can_gw.protocol.fields import InfoData, LiveData
 from kontronik_can_gw.protocol.states import LARGEST_STATE, Device
 from kontronik_can_gw.sources import Group
-from kontronik_can_gw.telemetry import INFO_TIMEOUT_NS, MS, SECOND, LinkState
+from kontronik_can_gw.telemetry import MS
 
 Numbers = NDArray[np.int64]
 
@@ -89,10 +89,10 @@ def _stretch_rows(
             and feed.is_between
             and is_steady(gateway, stretched.layout)
         ):
-            steady = _Quiet(gateway, stretched, at, behind - at, feed.now)
+            steady = Quiet(gateway, stretched, at, behind - at, feed.now)
             if steady.count and not steady.is_live[steady.count - 1]:
                 count = int(np.flatnonzero(steady.is_live[: steady.count])[-1]) + 1
-                steady = _Quiet(gateway, stretched, at, count, feed.now)
+                steady = Quiet(gateway, stretched, at, count, feed.now)
             if steady.count:
                 try:
                     found = columns.follow(steady, stretched)
@@ -108,47 +108,6 @@ def _stretch_rows(
             gateway.play(now, part)
         at += 1
         yield None
-
-
-class _Quiet(Steady):
-    """A block of which nobody wants what is sent: of the instants between frames only the ends of the one-second windows count."""
-
-    def _follow(self, count: int) -> int:
-        esc = self.esc
-        count = self._informed(count)
-        window, old, older, rate = esc._window_ns, esc._window_counters, esc._diagnosis_counters, esc.frame_rate
-        ends = np.arange(window + SECOND, int(self.times[count]) + 1, SECOND)
-        before = np.searchsorted(self.times[1 : count + 1], ends)
-        if len(ends):
-            states = before + (self.times[before + 1] == ends)  # a frame of the same instant comes first
-            first = self.counters(int(states[0]))
-            bad = first.crc_errors != old.crc_errors or first.dropped_bytes != old.dropped_bytes
-            if bad or esc.link is not LinkState.OK:  # the link may change
-                count, ends = int(before[0]), ends[:0]
-        if len(ends):
-            lives = np.concatenate(([old.live], self.live_rows[states] + esc.counters.live))
-            rates = np.diff(lives) * 10
-            self._closes = list(zip(states.tolist(), ends.tolist(), rates.tolist(), strict=True))
-            older = old if len(ends) == 1 else self.counters(int(states[-2]))
-            window, old, rate = int(ends[-1]), self.counters(int(states[-1])), int(rates[-1])
-        self._left = (window, self.gateway._told_ns, 0, old, older, rate)
-        return count
-
-    def _informed(self, count: int) -> int:
-        """How many frames come while information is fresh."""
-        if self.esc.info_ns is None:
-            return count
-        infos = self.times[1 : count + 1][~self.is_live[:count]]
-        known = np.concatenate(([self.esc.info_ns], infos))
-        if np.diff(known, append=self.times[count]).max() <= INFO_TIMEOUT_NS:
-            return count
-        seen = np.arange(count) - self.live_rows[:count]
-        late = np.flatnonzero(self.times[1 : count + 1] > known[seen] + INFO_TIMEOUT_NS)
-        return int(late[0]) if len(late) else count
-
-    def leave(self) -> None:
-        super().leave()
-        self.gateway._next_expiry = self.esc.next_deadline()
 
 
 class _Columns:
@@ -187,19 +146,17 @@ class _Columns:
         return Block(times, None, found).of(0, count - 1)
 
     def _column(self, reader: ColumnReader, views: "_Views", which: str) -> BlockColumn:
-        values, valid = reader.read(getattr(views, which))
+        numbers, valid, divisor = reader.read(getattr(views, which))
         if which != "rows":
-            values, valid = _spread(Values(values, valid), getattr(views, which).index)
+            numbers, valid = _spread(numbers, valid, getattr(views, which).index)
         rows = len(views.live_times)
         if valid is not None and valid.all():
             valid = None
         elif valid is not None and not valid.any():
-            return BlockColumn(values[:1], valid[:1])
-        if valid is not None and len(valid) == 1 < len(values):
-            valid = None  # it is True
-        if valid is not None and len(values) == 1 < rows:
-            values = np.broadcast_to(values, rows)
-        return BlockColumn(values, valid)
+            return BlockColumn(numbers[:1], valid[:1], divisor)
+        if valid is not None and len(numbers) == 1 < rows:
+            numbers = np.broadcast_to(numbers, rows)
+        return BlockColumn(numbers, valid, divisor)
 
 
 def _read_with(part: Part, group: Group) -> str:
@@ -209,14 +166,15 @@ def _read_with(part: Part, group: Group) -> str:
     return "infos" if group is Group.INFO or not {Group.LIVE, Group.LINK} & part.plan.paces else "rows"
 
 
-def _spread(found: Values, index: Numbers) -> Values:
+def _spread(
+    numbers: NDArray[Any], valid: NDArray[np.bool_] | None, index: Numbers
+) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     """From info frames, or the gateway's turns, to rows."""
-    values, valid = found
-    if len(values) > 1:
-        values = values[:1] if (values == values[0]).all() else values[index]
+    if len(numbers) > 1:
+        numbers = numbers[:1] if (numbers == numbers[0]).all() else numbers[index]
     if valid is not None and len(valid) > 1:
         valid = valid[:1] if (valid == valid[0]).all() else valid[index]
-    return Values(values, valid)
+    return numbers, valid
 
 
 class _Views:

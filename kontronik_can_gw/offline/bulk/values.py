@@ -27,10 +27,14 @@ class Unsuited(ArithmeticError):
 
 
 class Values(NamedTuple):
-    """A column: its values (of a text, the place in the signal's texts) and where they are available; None: everywhere."""
+    """A column: its values in steps of 1 / ``divisor`` (of a text, the place in the signal's texts).
 
-    values: Array
+    ``valid``: where they are available; None: everywhere.
+    """
+
+    numbers: Array
     valid: NDArray[np.bool_] | None = None
+    divisor: int = 1
 
 
 @dataclass(frozen=True)
@@ -128,6 +132,7 @@ class ColumnReader:
         self._known = Table(dict.fromkeys(numbers, 1), 0)
         self._codes = {plan.not_available, plan.error}
         self._divisor = plan.factor.denominator * plan.offset.denominator
+        self._steps = 1 if plan.is_float or plan.numbers is not None else self._divisor
         self._factor, self._constant = int(plan.factor * self._divisor), int(plan.offset * self._divisor)
         self._scaler = _Scaler(plan.slope, plan.intercept)
 
@@ -150,17 +155,16 @@ class ColumnReader:
         if supplied is True:
             return found
         if self._is_flag:
-            values = np.where(supplied, found.values, plan.not_available & 1)
+            values = np.where(supplied, found.numbers, plan.not_available & 1)
             return Values(values)
         valid = supplied if found.valid is None else supplied & found.valid
-        return Values(found.values, valid)
+        return Values(found.numbers, valid, found.divisor)
 
     def _nothing(self, supplied: bool = True) -> Values:
         """Not available at all. A flag has no code for that where no other value of its message has one."""
-        is_float = self.plan.is_float or (self.plan.numbers is None and self._divisor > 1)
-        values: Array = np.zeros(1, np.float64 if is_float else np.int64)
+        values: Array = np.zeros(1, np.float64 if self.plan.is_float else np.int64)
         if not self._is_flag or (supplied and self._others):
-            return Values(values, np.zeros(1, np.bool_))
+            return Values(values, np.zeros(1, np.bool_), self._steps)
         return Values(values + (self.plan.not_available & 1))
 
     def _flag(self, moments: Moments) -> Values:
@@ -209,7 +213,7 @@ class ColumnReader:
             raw = raw * a
         if b:
             raw = raw + b
-        return Values(raw if divisor == 1 else raw / divisor, valid)
+        return Values(raw, valid, divisor)
 
     def _raw(self, moments: Moments) -> tuple[Range, NDArray[np.bool_] | None]:
         """The raw value that is sent, and where it is one; elsewhere the Error code is sent."""

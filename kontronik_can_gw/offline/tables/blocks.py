@@ -12,32 +12,53 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BlockColumn:
-    """The values of one signal: numbers, of a text its place in the column's texts. Of length 1 where all rows have the same.
+    """The values of one signal: numbers in steps of 1 / ``divisor``, of a text its place in the column's texts.
 
-    ``valid``: where they are available (of length 1 too, or as many as rows); None: everywhere.
+    Of length 1 where all rows have the same. ``valid``: where they are available (of length 1 too, or as many as rows); None: everywhere.
     """
 
-    values: "NDArray[Any]"
+    numbers: "NDArray[Any]"
     valid: "NDArray[Any] | None" = None
+    divisor: int = 1
+
+    @property
+    def values(self) -> "NDArray[Any]":
+        """The numbers as they are meant."""
+        return self.numbers if self.divisor == 1 else self.numbers / self.divisor
+
+    @property
+    def is_same(self) -> bool:
+        """True where all rows have the same."""
+        return len(self.numbers) == 1 and (self.valid is None or len(self.valid) == 1)
 
     def of(self, first: int, behind: int) -> "BlockColumn":
         """Of some of the rows."""
-        valid = self.valid
-        return BlockColumn(
-            self.values if len(self.values) == 1 else self.values[first:behind],
-            valid if valid is None or len(valid) == 1 else valid[first:behind],
-        )
+        numbers, valid = self.numbers, self.valid
+        if len(numbers) > 1:
+            numbers = numbers[first:behind]
+        if valid is not None and len(valid) > 1:
+            valid = valid[first:behind]
+        return BlockColumn(numbers, valid, self.divisor)
+
+    def at(self, rows: "NDArray[Any]") -> "BlockColumn":
+        """Of rows by their numbers."""
+        numbers, valid = self.numbers, self.valid
+        if len(numbers) > 1:
+            numbers = numbers[rows]
+        if valid is not None and len(valid) > 1:
+            valid = valid[rows]
+        return BlockColumn(numbers, valid, self.divisor)
 
     def listed(self, rows: int, texts: Sequence[str] = ()) -> list[Value]:
         """The values as the streaming way has them."""
         values: list[Value] = self.values.tolist()
         if texts:
             values = [texts[place] if isinstance(place, int) and place >= 0 else None for place in values]
-        valid = None if self.valid is None else self.valid.tolist()
         if len(values) == 1 and rows != 1:
             values *= rows
-        if valid is None:
+        if self.valid is None:
             return values
+        valid = self.valid.tolist()
         if len(valid) == 1 and rows != 1:
             valid *= rows
         return [value if there else None for value, there in zip(values, valid, strict=True)]
