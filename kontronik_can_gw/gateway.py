@@ -10,7 +10,7 @@ from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.dbc_output.output import DbcOutput
-from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.frames import EXTENDED, CanFrame, frame_of
 from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.telemetry import SECOND, EscSettings, EscTelemetry, Event
 
@@ -95,10 +95,12 @@ class Gateway:
 
     def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
         """Bytes of one ESC's UART, read at ``now``."""
-        all_fresh = now < self._next_expiry
-        if not all_fresh:
+        if now >= self._next_expiry:
             self._expire(now, but=esc)  # a message may hold values of several ESCs
-        for events in self.escs[esc].receive_each(data, now, all_fresh):
+        elif self.escs[esc].receive_live(data, now):
+            self._follow(esc, Event.LIVE, now)
+            return
+        for events in self.escs[esc].receive_each(data, now):
             self._follow(esc, events, now)
 
     @property
@@ -218,11 +220,13 @@ class Gateway:
 
     def take_frames(self) -> list[CanFrame]:
         """The frames to send, oldest first; the list is handed over."""
-        frames: list[CanFrame] = []
-        if self._output.frames:
-            frames, self._output.frames = self._output.frames, frames
+        return [frame_of(frame) for frame in self.take_ready()]
+
+    def take_ready(self) -> list[CanFrame | bytes]:
+        """As ``take_frames``, but with images (frames.py) as they are."""
+        frames = self._output.take()
         if self.nodes is not None and self.nodes.frames:
-            frames = self.nodes.frames + frames
+            frames = [*self.nodes.frames, *frames]
             self.nodes.frames = []
         return frames
 

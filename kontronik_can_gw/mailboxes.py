@@ -5,17 +5,26 @@ from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
 from operator import attrgetter
 
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import CanFrame, frame_of
 
 QUEUE_LENGTH = 2048
 _slot_of = attrgetter("can_id", "extended", "page")
 _is_queued = attrgetter("queued")
 
 
-def stand_alone(frames: Sequence[CanFrame]) -> bool:
+_IMAGES_ONLY = {bytes}
+
+
+def are_images(frames: Sequence[CanFrame | bytes]) -> bool:
+    """True where all of them are images."""
+    return set(map(type, frames)) == _IMAGES_ONLY
+
+
+def stand_alone(frames: Sequence[CanFrame | bytes]) -> bool:
     """True where no frame replaces another or goes in front of one: empty mailboxes would hand them out as they are."""
-    if len(frames) < 2:
+    if len(frames) < 2 or are_images(frames):
         return True
+    frames = [frame for frame in frames if isinstance(frame, CanFrame)]
     return len(set(map(_slot_of, frames))) == len(frames) and not any(map(_is_queued, frames))
 
 
@@ -50,8 +59,9 @@ class Mailboxes:
     def __len__(self) -> int:
         return len(self._slots) + len(self._queue)
 
-    def put(self, frame: CanFrame) -> None:
+    def put(self, frame: CanFrame | bytes) -> None:
         """Let a frame wait: behind the queued ones, or in place of an older one of its id."""
+        frame = frame_of(frame)
         if frame.queued:
             if len(self._queue) >= QUEUE_LENGTH:
                 self.dropped += 1
@@ -63,7 +73,7 @@ class Mailboxes:
             self.replaced += 1
         self._slots[key] = frame
 
-    def put_all(self, frames: Iterable[CanFrame]) -> None:
+    def put_all(self, frames: Iterable[CanFrame | bytes]) -> None:
         """Let frames wait, one behind the other."""
         for frame in frames:
             self.put(frame)

@@ -147,12 +147,12 @@ class EscTelemetry:
             events |= found
         return events
 
-    def receive_each(self, data: bytes, now: int, all_fresh: bool = False) -> Iterable[int]:
+    def receive_each(self, data: bytes, now: int) -> Iterable[int]:
         """Take bytes that were read at ``now``; the events of each frame in turn, so that none is passed over: iterate to the end.
 
-        An unfinished frame older than the time-out is given up first. ``all_fresh``: the caller knows that nothing is too old at ``now``.
+        An unfinished frame older than the time-out is given up first.
         """
-        if not all_fresh and (events := self._expire(now)):
+        if events := self._expire(now):
             return self._receive_behind(events, data, now)
         deframer, arrivals = self._deframer, self._arrivals
         if arrivals and now - arrivals[0][1] > self.settings.timeout_ns:
@@ -171,6 +171,25 @@ class EscTelemetry:
             if at + form.length == end and self.link is not _NEVER_SEEN:
                 return (self._accept(frame, now),)  # as nearly always: its last byte has just come
         return self._accept_each(frames, end, now)
+
+    def receive_live(self, data: bytes, now: int) -> bool:
+        """What ``receive_each`` does where nothing is too old, one live frame has come, whole and alone, and nothing but it is new.
+
+        False for anything else: then nothing has happened. True: the event is LIVE.
+        """
+        if (old := self.live) is None or self.layout != 1 or (live := self._deframer.take_live(data)) is None:
+            return False
+        before = self.live_ns
+        assert before is not None
+        if now > before:  # a pseudo terminal is faster than the wire
+            if self._last_power > 0:
+                self.energy += self._last_power * (now - before)
+            if old[0]:
+                self.run_time += now - before
+            self.live_ns = now
+        self.live = self.last_live = live
+        self._last_power = live[1] * live[2]
+        return True
 
     def _receive_behind(self, events: int, data: bytes, now: int) -> Iterator[int]:
         yield events

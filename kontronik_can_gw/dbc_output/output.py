@@ -9,7 +9,7 @@ from kontronik_can_gw.dbc_output import e2e
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
 from kontronik_can_gw.dbc_output.packer import SendLive, alive_modulus, compile_live, compile_pack
 from kontronik_can_gw.dbc_output.schedule import Schedule
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import CanFrame, frame_of
 from kontronik_can_gw.sources import GatewayStatus, Group, Source, sources
 from kontronik_can_gw.telemetry import EscSettings, EscTelemetry, Event
 
@@ -81,7 +81,9 @@ class DbcOutput:
     def __init__(
         self, layout: Layout, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int, silent: bool = False
     ) -> None:
-        self.frames: list[CanFrame] = []
+        self.frames: list[CanFrame | bytes] = []
+        self._touched: set[int] = set()
+        """ESCs of which something was sent since the frames were taken."""
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
@@ -113,6 +115,7 @@ class DbcOutput:
 
     def start(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
+        self._end_images()
         for index, message in enumerate(self._messages):
             message.last.clear()
             if not message.plan.cycle_ns:
@@ -137,12 +140,16 @@ class DbcOutput:
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
-        state = self._escs[esc]
-        if events == Event.LIVE and state.live is not None:
+        state, touched = self._escs[esc], self._touched
+        if esc in touched:
+            self._end_images()
+        elif events == Event.LIVE and state.live is not None:
+            touched.add(esc)
             append = self.frames.append
             for step in self._live_steps[esc]:
                 step(now, append)
             return
+        touched.add(esc)
         for index, message in self._listeners[esc]:
             triggers = message.triggers
             if not triggers & events:
@@ -189,6 +196,18 @@ class DbcOutput:
             if cyclic or message.by_event or message.owed or self._note_changes(message, now):
                 self._send(index, now)
 
+    def take(self) -> list[CanFrame | bytes]:
+        """The frames so far, images among them; the list is handed over."""
+        self._touched.clear()
+        if not self.frames:
+            return []
+        frames, self.frames = self.frames, []
+        return frames
+
+    def _end_images(self) -> None:
+        """What comes now may have the ids of images that wait: they are frames as others."""
+        self.frames = [frame_of(frame) for frame in self.frames]
+
     def next_deadline(self) -> int | None:
         """When ``advance`` has something to do."""
         return self._schedule.next_deadline()
@@ -214,6 +233,7 @@ class DbcOutput:
 
     def _send(self, index: int, now: int) -> None:
         message = self._messages[index]
+        self._touched |= message.plan.escs
         if message.is_plain:
             message.owed.clear()
             bits = message.pack(self._escs, self._gateway, now, message.alive, 0)

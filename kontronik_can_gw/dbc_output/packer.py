@@ -11,17 +11,17 @@ from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.dbc_output.layout import MessagePlan, Piece, Role, SignalPlan
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import IMAGE, CanFrame, image_id
 from kontronik_can_gw.protocol.fields import LiveData
 from kontronik_can_gw.sources import GatewayStatus, Group
 from kontronik_can_gw.telemetry import EscTelemetry
 
 _LIVE_VALUE = re.compile(r"\blive\[(\d+)\]")
-_ESC = re.compile(r"\besc\.")
+_ADDED = "bits |= "
 _TABLE = re.compile(r"\bnumbers_at_")
 _PLAIN_VALUE = re.compile(r"live\[\d+\]|info\[\d+\]")
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
-SendLive = Callable[[int, Callable[[CanFrame], None]], None]
+SendLive = Callable[[int, Callable[[CanFrame | bytes], None]], None]
 
 
 def place(pieces: Sequence[Piece], raw: int) -> int:
@@ -87,28 +87,36 @@ def compile_pack(plan: MessagePlan, further: Mapping[str, object] | None = None)
     """The function of ``source_text``, compiled. ``further``: what expressions of the plan's sources may name besides."""
     names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf, **_tables(plan), **(further or {})}
     exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
-    return names["pack"]  # type: ignore[return-value]
+    return names.pop("pack")  # type: ignore[return-value]  # what its own globals hold would be a circle
 
 
 def live_text(plans: Mapping[int, MessagePlan], esc: int) -> str:
     """The generated function that sends the messages which follow each live frame of an ESC: ``send(now, append)``.
 
     ``plans`` by their index: messages of one page and without CRC, which nothing but their minimum distance keeps back.
-    The function names, besides what packers do: ``escs``, ``gateway``, each message as ``m`` and its index, CanFrame as ``new(CanFrame,
-    (...))``, and of their schedule ``last``, ``waiting``, ``cycle_waits`` and ``request``.
+    The function names, besides what packers do: ``escs``, ``gateway``, each message as ``m`` and its index, ``CanFrame``, ``image``, and of
+    their schedule ``last``, ``waiting``, ``cycle_waits`` and ``request``.
     """
     values = ", ".join(f"live{index}" for index in range(len(LiveData._fields)))
-    lines = [f"live = escs[{esc}].live", f"{values} = live"]
+    lines = [f"esc = escs[{esc}]", f"{values} = esc.live"]
     for index, plan in plans.items():
-        constant = sum(place(s.pieces, s.constant) for s in plan.signals if s.role is Role.CONSTANT)
-        body = [f"bits = {constant:#x}"]
+        body = []
         if (alive := next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)) is not None:
             body += [f"alive = m{index}.alive", f"m{index}.alive = (alive + 1) % {alive_modulus(alive, False)}"]
-        body += [_TABLE.sub(rf"m{index}_\g<0>", line) for line in _body(plan, None, False, esc)]
-        fields = (
-            f'{plan.can_id:#x}, bits.to_bytes({plan.length}, "little"), {plan.extended}, {plan.fd}, 0, False, False'
-        )
-        body += [f"append(new(CanFrame, ({fields})))", f"last[{index}] = now"]
+        constant = sum(place(s.pieces, s.constant) for s in plan.signals if s.role is Role.CONSTANT)
+        of_bits = [f"bits |= {constant:#x}"] if constant else []
+        of_bits += [_TABLE.sub(rf"m{index}_\g<0>", line) for line in _body(plan, None, False, esc)]
+        if of_bits and all(line.startswith(_ADDED) for line in of_bits):
+            bits = " | ".join(line.removeprefix(_ADDED) for line in of_bits)
+        else:
+            bits = "bits"
+            body += ["bits = 0", *of_bits]
+        if plan.fd or plan.cycle_ns or len(plan.escs) > 1 or Group.GATEWAY in plan.paces:
+            data = f'({bits}).to_bytes({plan.length}, "little")'
+            body.append(f"append(CanFrame({plan.can_id:#x}, {data}, {plan.extended}, {plan.fd}))")
+        else:  # nothing else sends it in the same turn
+            body.append(f"append(image({image_id(plan.can_id, plan.extended):#x}, {plan.length}, {bits}))")
+        body.append(f"last[{index}] = now")
         if plan.cycle_ns or plan.delay_ns:
             body.append(f"waiting[{index}] = cycle_waits[{index}] = False")
         if plan.delay_ns:
@@ -122,9 +130,9 @@ def live_text(plans: Mapping[int, MessagePlan], esc: int) -> str:
 def compile_live(plans: Mapping[int, MessagePlan], esc: int, names: Mapping[str, object]) -> SendLive:
     """The function of ``live_text``, compiled. ``names``: what it names that is not of the plans."""
     tables = {f"m{index}_{name}": table for index, plan in plans.items() for name, table in _tables(plan).items()}
-    found = {"float_bits": float_bits, "inf": math.inf, "new": tuple.__new__, "CanFrame": CanFrame, **tables, **names}
+    found = {"float_bits": float_bits, "inf": math.inf, "image": IMAGE.pack, "CanFrame": CanFrame, **tables, **names}
     exec(compile(live_text(plans, esc), f"<live frames of ESC {esc}>", "exec"), found)  # noqa: S102  text made here, from checked plans
-    return found["send"]  # type: ignore[return-value]
+    return found.pop("send")  # type: ignore[return-value]
 
 
 def _tables(plan: MessagePlan) -> dict[str, dict[int, int]]:
@@ -142,9 +150,10 @@ def _body(plan: MessagePlan, page: int | None, has_crc: bool, fresh: int | None 
     for signal in chosen:
         if signal.source is not None:
             by_owner.setdefault((signal.esc, signal.source.group), []).append(signal)
+    is_alone = {esc for esc, _ in by_owner} <= {fresh, None}  # ``esc`` is there too
     for (esc, group), signals in by_owner.items():
         line = f"bits |= {' | '.join(_terms(signals))}"
-        if esc is not None and (esc != fresh or _ESC.search(line)):
+        if esc is not None and not is_alone:
             lines.append(f"esc = escs[{esc}]")
         if group is Group.LIVE and esc is not None and esc == fresh:
             lines.append(_LIVE_VALUE.sub(r"live\1", line))
@@ -198,8 +207,8 @@ def _value(signal: SignalPlan) -> str:
         scaled = f"({expression}) * {float(signal.slope)!r} + {float(signal.intercept)!r}"
         if signal.numbers is not None:
             scaled = f"{_table_name(signal)}.get({expression})"
-        low, high = signal.limits
-        return f"float_bits({scaled}, {signal.length}, {low!r}, {high!r}, {signal.error}, {signal.not_available})"
+        least, most = signal.limits
+        return f"float_bits({scaled}, {signal.length}, {least!r}, {most!r}, {signal.error}, {signal.not_available})"
     if signal.numbers is not None:
         return f"{_table_name(signal)}.get({expression}, {signal.error})"
     if source.rolls:
@@ -250,7 +259,7 @@ def _ends(signal: SignalPlan) -> tuple[Fraction | None, Fraction | None]:
 
 def _placed(signal: SignalPlan, value: str) -> str:
     """A value's Python text at the signal's bits. Only signed values and codes can have bits beyond the length."""
-    parts = []
+    parts: list[str] = []
     at_first = f"({value})" if len(signal.pieces) == 1 else f"(w := {value})"
     for piece in signal.pieces:
         part = "w" if parts else at_first

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from zlib import crc32
 
 from kontronik_can_gw.protocol.codec import FORMS, FORMS_BY_KIND_BYTE, Form, Kind, Layout
-from kontronik_can_gw.protocol.fields import Data, LiveData
+from kontronik_can_gw.protocol.fields import Data, LiveData, body_format
 from kontronik_can_gw.protocol.states import LARGEST_STATE
 
 LONGEST = max(form.length for form in FORMS)
@@ -20,6 +20,7 @@ _LIVE_LEGACY, _LIVE_V4 = (form for form in FORMS if form.kind is Kind.LIVE)
 _LIVE, _V4_LENGTH = _LIVE_V4.header, _LIVE_V4.length
 _COVERED, _LEGACY_CRC_AT = _LIVE_LEGACY.covered, _LIVE_LEGACY.crc_at
 _u32_at = struct.Struct("<I").unpack_from
+_live_values = struct.Struct(f"<4x{body_format(LiveData)}").unpack_from
 _new = tuple.__new__
 _RESIDUE = 0x2144DF1C
 """The CRC-32 of anything with its own CRC behind it."""
@@ -157,23 +158,29 @@ class Deframer:
             self._need -= size
             return []
         buffer = self._pending + data if self._pending else bytes(data)
-        if len(buffer) == _V4_LENGTH:
-            # one live frame of layout V4 and nothing else, as nearly always: one CRC over it and its own
-            head = crc32(buffer[:_COVERED])
-            if (
-                crc32(buffer[_COVERED:], head) == _RESIDUE
-                and buffer.startswith(_LIVE)
-                and _u32_at(buffer, _LEGACY_CRC_AT)[0] != head  # where two match, the shorter
-            ):
-                counters.headers += 1
-                counters.live_v4 += 1
-                at = self._base
-                self._base = at + _V4_LENGTH
-                self._pending = b""
-                self._need = 1
-                self._blame_until = 0
-                return [_new(Frame, (_LIVE_V4, at, _LIVE_V4.decode(buffer)))]
         return self._scan(buffer, ended=False)
+
+    def take_live(self, data: bytes) -> LiveData | None:
+        """What ``feed`` finds in one live frame of layout V4 and nothing else, as most reads bring it: one CRC over it and its own.
+
+        None for anything else, also while bytes are pending: then nothing has happened, and it is for ``feed``.
+        """
+        if self._pending or len(data) != _V4_LENGTH:
+            return None
+        head = crc32(data[:_COVERED])
+        if (
+            crc32(data[_COVERED:], head) != _RESIDUE
+            or not data.startswith(_LIVE)
+            or _u32_at(data, _LEGACY_CRC_AT)[0] == head  # where two match, it is the shorter
+        ):
+            return None
+        counters = self.counters
+        counters.bytes += _V4_LENGTH
+        counters.headers += 1
+        counters.live_v4 += 1
+        self._base += _V4_LENGTH
+        self._blame_until = 0
+        return _new(LiveData, _live_values(data))
 
     def flush(self) -> list[Frame]:
         """The stream ended or was interrupted: search what is pending, drop the rest, be ready for a new start."""

@@ -16,13 +16,13 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from operator import length_hint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.frames import EXTENDED, CanFrame, frame_of
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.mailboxes import Sent
+from kontronik_can_gw.mailboxes import Sent, are_images
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
 from kontronik_can_gw.sources import CanState
 
@@ -149,21 +149,25 @@ class CanPort:
         return result
 
     def send_all(
-        self, frames: Sequence[CanFrame], clock: Callable[[], int] = time.monotonic_ns, latest: int = sys.maxsize
+        self,
+        frames: Sequence[CanFrame | bytes],
+        clock: Callable[[], int] = time.monotonic_ns,
+        latest: int = sys.maxsize,
     ) -> tuple[int, Sent]:
-        """Hand frames to the interface until it does not take one, or ``clock`` is beyond ``latest``: how many went, the last answer."""
+        """Hand frames and images to the interface until it does not take one, or ``clock`` is beyond ``latest``.
+
+        Returns how many went and the last answer.
+        """
         if self._socket is None or self._removed or self.state is _DOWN or self.state is _UNKNOWN:
             return one_by_one(self.send, frames, clock, latest)
-        send, pack = self._socket.send, _CLASSIC.pack
-        rest = iter(frames)
+        send = self._socket.send
+        images = cast(Sequence[bytes], frames) if are_images(frames) else [_image(frame) for frame in frames]
+        rest = iter(images)
         try:
-            for can_id, data, extended, fd, _, remote, _ in rest:
+            for image in rest:
                 if clock() > latest:
                     return len(frames) - length_hint(rest) - 1, Sent.LATE
-                if extended or fd or remote:
-                    send(_packet(can_id, data, extended, fd, remote))
-                else:
-                    send(pack(can_id, len(data), data))
+                send(image)
         except OSError:  # once more, to see what it means
             count = len(frames) - length_hint(rest) - 1
             more, answer = one_by_one(self.send, frames[count:], clock, latest)
@@ -263,9 +267,8 @@ class CanPort:
             return Sent.GONE if self.gone else self._send_message(frame)
         if self._removed:
             return Sent.GONE
-        can_id, data, extended, fd, _, remote, _ = frame
         try:
-            self._socket.send(_packet(can_id, data, extended, fd, remote))
+            self._socket.send(_image(frame))
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return Sent.FULL
@@ -295,18 +298,21 @@ class CanPort:
 
 
 def one_by_one(
-    send: Callable[[CanFrame], Sent], frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+    send: Callable[[CanFrame], Sent], frames: Sequence[CanFrame | bytes], clock: Callable[[], int], latest: int
 ) -> tuple[int, Sent]:
     """What ``CanPort.send_all`` does, by a function that sends one frame."""
     for count, frame in enumerate(frames):
-        answer = Sent.LATE if clock() > latest else send(frame)
+        answer = Sent.LATE if clock() > latest else send(frame_of(frame))
         if answer is not _OK:
             return count, answer
     return len(frames), _OK
 
 
-def _packet(can_id: int, data: bytes, extended: bool, fd: bool, remote: bool) -> bytes:
+def _image(frame: CanFrame | bytes) -> bytes:
     """A frame as the kernel has it (struct can_frame, canfd_frame)."""
+    if isinstance(frame, bytes):
+        return frame
+    can_id, data, extended, fd, _, remote, _ = frame
     can_id |= (EXTENDED if extended else 0) | (_REMOTE if remote else 0)
     return _FD.pack(can_id, len(data), _FD_BRS, data) if fd else _CLASSIC.pack(can_id, len(data), data)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import CanFrame, frame_of
 from kontronik_can_gw.gateway import Conflict, Gateway
 from kontronik_can_gw.mailboxes import Mailboxes, Sent, stand_alone
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
@@ -350,7 +350,7 @@ class CanSide:
     def transmit(self, now: int) -> None:
         """Hand what is to be sent to the interface, as far as it takes it."""
         status, waiting = self._gateway.status, self.mailboxes
-        frames = self._gateway.take_frames()
+        frames = self._gateway.take_ready()
         if self.port is None or (self._off and self._sends_in_vain):
             if frames:
                 self._gateway.not_sent(now)
@@ -395,13 +395,13 @@ class CanSide:
             self._gateway.can_returned(now)
         self._follow_state(now)
 
-    def _send_all(self, frames: Sequence[CanFrame]) -> tuple[int, Sent]:
+    def _send_all(self, frames: Sequence[CanFrame | bytes]) -> tuple[int, Sent]:
         assert self.port is not None
         # LATE where the process was stopped in the middle of its turn
         count, answer = self.port.send_all(frames, self._clock, self._turn_ns + self.longest_turn_ns)
         if self.tap is not None:
             for frame in frames[:count]:
-                self.tap(frame, self._turn_ns, False)
+                self.tap(frame_of(frame), self._turn_ns, False)
         return count, answer
 
     def _send(self, frame: CanFrame) -> Sent:

@@ -473,8 +473,9 @@ class Node(Gateway):
     def frames_wait(self) -> bool:
         return bool(self.waiting) or super().frames_wait
 
-    def take_frames(self) -> list[CanFrame]:
-        frames, self.waiting = self.waiting + super().take_frames(), []
+    def take_ready(self) -> list[CanFrame | bytes]:
+        frames: list[CanFrame | bytes] = [*self.waiting, *super().take_ready()]
+        self.waiting = []
         return frames
 
 
