@@ -210,11 +210,8 @@ class BlockText:
 def _changes(column: BlockColumn) -> "NDArray[Any]":
     """The rows at which something else begins."""
     numbers, valid = column.numbers, column.valid
-    if valid is None or len(valid) == 1:
-        other = numbers[1:] != numbers[:-1]
-    elif len(numbers) == 1:
-        other = valid[1:] != valid[:-1]
-    else:
-        other = (numbers[1:] != numbers[:-1]) | (valid[1:] != valid[:-1])
+    other = numbers[1:] != numbers[:-1]
+    if valid is not None:
+        other |= valid[1:] != valid[:-1]
     found: NDArray[Any] = other.nonzero()[0] + 1
     return found

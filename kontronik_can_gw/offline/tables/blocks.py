@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class BlockColumn:
     """The values of one signal: numbers in steps of 1 / ``divisor``, of a text its place in the column's texts.
 
-    Of length 1 where all rows have the same. ``valid``: where they are available (of length 1 too, or as many as rows); None: everywhere.
+    Of length 1 where all rows have the same. ``valid``: which of the numbers are available; None: all.
     """
 
     numbers: "NDArray[Any]"
@@ -29,39 +29,29 @@ class BlockColumn:
     @property
     def is_same(self) -> bool:
         """True where all rows have the same."""
-        return len(self.numbers) == 1 and (self.valid is None or len(self.valid) == 1)
+        return len(self.numbers) == 1
 
     def of(self, first: int, behind: int) -> "BlockColumn":
         """Of some of the rows."""
-        numbers, valid = self.numbers, self.valid
-        if len(numbers) > 1:
-            numbers = numbers[first:behind]
-        if valid is not None and len(valid) > 1:
-            valid = valid[first:behind]
-        return BlockColumn(numbers, valid, self.divisor)
+        if self.is_same:
+            return self
+        valid = self.valid
+        return BlockColumn(self.numbers[first:behind], None if valid is None else valid[first:behind], self.divisor)
 
     def at(self, rows: "NDArray[Any]") -> "BlockColumn":
         """Of rows by their numbers."""
-        numbers, valid = self.numbers, self.valid
-        if len(numbers) > 1:
-            numbers = numbers[rows]
-        if valid is not None and len(valid) > 1:
-            valid = valid[rows]
-        return BlockColumn(numbers, valid, self.divisor)
+        if self.is_same:
+            return self
+        return BlockColumn(self.numbers[rows], None if self.valid is None else self.valid[rows], self.divisor)
 
     def listed(self, rows: int, texts: Sequence[str] = ()) -> list[Value]:
         """The values as the streaming way has them."""
         values: list[Value] = self.values.tolist()
         if texts:
             values = [texts[place] if isinstance(place, int) and place >= 0 else None for place in values]
-        if len(values) == 1 and rows != 1:
-            values *= rows
-        if self.valid is None:
-            return values
-        valid = self.valid.tolist()
-        if len(valid) == 1 and rows != 1:
-            valid *= rows
-        return [value if there else None for value, there in zip(values, valid, strict=True)]
+        if self.valid is not None:
+            values = [value if there else None for value, there in zip(values, self.valid.tolist(), strict=True)]
+        return values * rows if self.is_same else values
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,11 @@ class ParquetTable:
 
             self._np = np
         self._table = table
-        self._codes = [{text: code for code, (_, text) in enumerate(one.texts)} for one in table.fields]
+        # the same text may stand for several numbers
+        self._codes = [
+            {text: code for code, text in enumerate(dict.fromkeys(text for _, text in one.texts))}
+            for one in table.fields
+        ]
         self._rows: list[Row] = []
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:
@@ -129,7 +133,6 @@ class ParquetTable:
         if one.kind is Kind.TEXT:
             if not codes:
                 return pa.nulls(count, self._type(one))
-            # the same text may stand for several numbers
             places = [codes[text] for _, text in one.texts]
             if column.is_same:
                 place = None if self._is_missing(column) else places[int(column.numbers[0])]
