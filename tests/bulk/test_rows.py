@@ -77,7 +77,7 @@ def check(
 @pytest.mark.parametrize("block", [6, 100, 16_384])
 def test_a_clean_stream_is_read_in_blocks(tmp_path: Path, layout: Layout, block: int) -> None:
     """Suspect frames and all: in the legacy layout, an operating state above the known ones."""
-    count, rows = check(tmp_path / "a.bin", Wandering(random.Random(1), layout).frames(3000), block=block)
+    count, rows = check(tmp_path / "a.bin", Wandering(random.Random(1), layout).frames(1500), block=block)
     assert count > rows * (0.8 if block > 6 else 0.5)
 
 
@@ -85,22 +85,22 @@ def test_a_clean_stream_is_read_in_blocks(tmp_path: Path, layout: Layout, block:
 def test_a_simulated_esc(tmp_path: Path, device: Device) -> None:
     """The JIVEPro does not supply the BEC current."""
     esc = SimulatedEsc(EscOptions(device=device), seed=int(device))
-    stream = b"".join(sent.wire for sent in esc.frames_until(40 * SECOND))
+    stream = b"".join(sent.wire for sent in esc.frames_until(20 * SECOND))
     count, rows = check(tmp_path / "a.bin", stream)
     assert count > rows * 0.9
 
 
-@pytest.mark.parametrize("rate", [2, 3.7, 19, 20, 50, 90, 101, 333, 1000, 12_345, 1e6])
+@pytest.mark.parametrize("rate", [2, 3.7, 20, 50, 101, 333, 12_345, 1e6])
 def test_any_rate(tmp_path: Path, rate: float) -> None:
     """At 100 Hz and above an info frame goes into the row in front of it; slowly enough, information goes stale."""
     source = Wandering(random.Random(7))
-    stream = source.frames(700, 9, infos=2) + source.frames(700, 100) + source.frames(700, 0) + source.frames(300, 50)
+    stream = source.frames(400, 9, infos=2) + source.frames(300, 100) + source.frames(450, 0) + source.frames(200, 50)
     check(tmp_path / "a.bin", stream, rate=rate, block=130)
 
 
 @pytest.mark.parametrize("info_each", [1, 2, 10, 1100, 0])
 def test_information_often_seldom_and_never(tmp_path: Path, info_each: int) -> None:
-    stream = Wandering(random.Random(info_each)).frames(3500, info_each)
+    stream = Wandering(random.Random(info_each)).frames(2500, info_each)
     count, rows = check(tmp_path / "a.bin", stream, block=500)
     assert count > rows * 0.5 or info_each == 1
 
@@ -113,34 +113,34 @@ def test_another_device_and_another_layout(tmp_path: Path) -> None:
     source.becomes(3)
     stream += source.frames(500, 50)
     source.layout = Layout.LEGACY
-    stream += source.frames(700, 50)
+    stream += source.frames(500, 50)
     source.layout = Layout.V4
     count, rows = check(tmp_path / "a.bin", stream + source.frames(700, 0))
     assert count > rows * 0.4
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_bad_line(tmp_path: Path, seed: int) -> None:
     """The link is degraded for a while now and then."""
     spoilt = Faults(noise=0.05 * (seed % 3), lost_bytes=0.0002, flipped_bits=0.00002)
     esc = SimulatedEsc(EscOptions(device=Device.KOLIBRI, faults=spoilt), seed=seed)
-    stream = b"".join(sent.wire for sent in esc.frames_until(30 * SECOND))
+    stream = b"".join(sent.wire for sent in esc.frames_until(20 * SECOND))
     check(tmp_path / "a.bin", stream, block=random.Random(seed).choice([50, 1000]))
 
 
-@pytest.mark.parametrize("length", [63, 65, 300, CHUNK - 1, CHUNK + 70])
+@pytest.mark.parametrize("length", [65, 300, CHUNK + 70])
 def test_rubbish_over_the_limits_of_what_is_read_at_once(tmp_path: Path, length: int) -> None:
     """Where no frame comes for long, bytes are given to the gateway before the next one comes."""
     source = Wandering(random.Random(length))
     head = source.frames(CHUNK // 40 - 30)
     rubbish = random.Random(1).randbytes(length)
-    for cut in (20, 300, 1500):
+    for cut in (20, 1400):
         stream = head + source.frames(30, 7)[:cut] + rubbish + source.frames(300)
         check(tmp_path / "a.bin", stream)
 
 
 @given(st.integers(0, 1 << 32))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_any_damage(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     source = random.Random(seed)
     esc = Wandering(source, source.choice(list(Layout)), source.choice([1, 3]))
@@ -160,7 +160,7 @@ def test_any_damage(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None
     )
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))
 def test_random_layouts(tmp_path: Path, seed: int) -> None:
     source = random.Random(seed)
     layout = random_layout(source, source.choice([3, 12]))
@@ -175,7 +175,7 @@ def test_some_columns_only(tmp_path: Path) -> None:
     columns = DumpInput(_written(tmp_path, b"KOD"), SHIPPED).reader.columns
     source = random.Random(2)
     stream = Wandering(source).frames(400)
-    for _ in range(12):
+    for _ in range(6):
         check(tmp_path / "a.bin", stream, chosen=source.sample(range(len(columns)), source.choice([1, 3, 20])))
 
 

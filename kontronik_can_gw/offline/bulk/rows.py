@@ -141,7 +141,7 @@ class _Columns:
         gateway._row_ns = int(times[-1])
         if count > 1:
             gateway._last_ns = int(times[-2])
-        gateway._gateway_ns = int(views.gateway_reads[1][-1])
+        gateway._gateway_ns = views.last_gateway_read
         gateway._all_read_ns = int(views.info_reads[-1])
         return Block(times, None, found).of(0, count - 1)
 
@@ -214,26 +214,41 @@ class _Views:
         return self.index_of(self.seen_from)
 
     @cached_property
-    def gateway_reads(self) -> tuple[Numbers, Numbers]:
-        """When the gateway's own values were read: the row that sees it first, and the time; behind the last time before the block."""
+    def _turns(self) -> list[tuple[int, int, int, int]]:
+        """When the gateway's own values are read: the row that sees it first, the time, how many rows it is to the next, how many times."""
         last, start, period = self.gateway._gateway_ns, int(self.live_times[0]), self.period_ns
         step = -(-GATEWAY_NS // period)
-        rows, times = [np.empty(0, np.int64)], [np.array([last], np.int64)]
+        found = []
         begin = 0
         infos = zip(self.live_before.tolist(), self.info_times.tolist(), self.seen_from.tolist(), strict=True)
         for behind, info_ns, row in [*infos, (len(self.live_times), None, 0)]:
             first = max(begin, -((start - last - GATEWAY_NS) // period))
             if first < behind:
-                read = np.arange(first, behind, step)
-                rows.append(read)
-                times.append(start + read * period)
-                last = int(times[-1][-1])
+                count = (behind - 1 - first) // step + 1
+                found.append((first, start + first * period, step, count))
+                last = start + (first + (count - 1) * step) * period
             begin = behind
             if info_ns is not None and info_ns - last >= GATEWAY_NS:
                 last = info_ns
-                rows.append(np.array([row], np.int64))
-                times.append(np.array([last], np.int64))
-        return np.concatenate(rows), np.concatenate(times)
+                found.append((row, last, 0, 1))
+        return found
+
+    @property
+    def last_gateway_read(self) -> int:
+        """When the gateway's own values were read last."""
+        if not self._turns:
+            return self.gateway._gateway_ns
+        _, time_ns, step, count = self._turns[-1]
+        return time_ns + (count - 1) * step * self.period_ns
+
+    @cached_property
+    def gateway_reads(self) -> tuple[Numbers, Numbers]:
+        """The row that sees each reading first, and the times; in front of them the last time before the block."""
+        counts = [count for *_, count in self._turns]
+        number = np.arange(sum(counts)) - np.repeat(np.cumsum([0, *counts[:-1]]), counts) if counts else np.arange(0)
+        first, times, step = (np.repeat([turn[at] for turn in self._turns], counts).astype(np.int64) for at in range(3))
+        times = times + number * step * self.period_ns
+        return first + number * step, np.concatenate(([self.gateway._gateway_ns], times))
 
     @cached_property
     def info_fields(self) -> "_InfoFields | None":
