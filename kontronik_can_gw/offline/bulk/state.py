@@ -363,7 +363,8 @@ class Steady:
         return count
 
     def leave(self) -> None:
-        """Let ESC and gateway be as after the last frame of the block."""
+        """Let ESC and gateway be as after the last frame of the block. What was made of the block is not to be used any more."""
+        self._shared.clear()  # they know the block: it would wait for the garbage collection, with all its columns
         gateway, esc = self.gateway, self.esc
         after = self.counters(self.count)
         energy, run_time, suspects = self.drawn, self.run_time[-1], self.suspects[-1]
@@ -403,9 +404,16 @@ class Quiet(Steady):
             before = np.searchsorted(self.times[1 : count + 1], ends)
             states = before + (self.times[before + 1] == ends)  # a frame of the same instant comes first
             first = self.counters(int(states[0]))
-            harmed = first.crc_errors != old.crc_errors or first.dropped_bytes != old.dropped_bytes
-            if harmed or esc.link is not LinkState.OK or esc.settings.crc_error_threshold <= 0:  # the link may change
-                count, ends = int(before[0]), ends[:0]
+            dropped, errors = first.dropped_bytes - old.dropped_bytes, first.crc_errors - old.crc_errors
+            bad = dropped * _DEGRADED_DROPPED_SHARE > first.bytes - old.bytes
+            kept = len(ends)
+            if self._link(bad, errors) is not esc.link:
+                kept = 0
+            elif self._link(False, 0) is not esc.link:  # nothing more is dropped in the further ones
+                kept = 1
+            if kept < len(ends):
+                count = int(before[kept])
+                ends, states = ends[:kept], states[:kept]
         if len(ends):
             lives = np.concatenate(([old.live], self.live_rows[states] + esc.counters.live))
             self._closes = list(zip(states.tolist(), ends.tolist(), (np.diff(lives) * 10).tolist(), strict=True))
@@ -418,6 +426,10 @@ class Quiet(Steady):
             window, old, rate = int(ends[-1]), self.counters(int(states[-1])), self._closes[-1][2]
         self._left = (window, self.gateway._told_ns, 0, old, older, rate)
         return count
+
+    def _link(self, bad: bool, errors: int) -> LinkState:
+        """What the link is behind a window."""
+        return LinkState.DEGRADED if bad or errors >= self.esc.settings.crc_error_threshold else LinkState.OK
 
     def _informed(self, count: int) -> int:
         """How many frames come while information is fresh."""
@@ -454,7 +466,7 @@ class Moments:
         self.gateway = block.gateway.status
         self.live = _Fields(block.live_column, _rows(block.live_rows[states]))
         self.info = None if block.esc.info is None else _InfoFields(block.info_column, block.info_rows[states])
-        self.esc = _Esc(block, turns, states, with_bytes, self)
+        self.esc = _Esc(block, turns, states, with_bytes, self.live, self.info, now)
 
 
 def _rows(rows: Numbers) -> "Numbers | slice":
@@ -488,13 +500,22 @@ class _Esc:
     """As an EscTelemetry."""
 
     def __init__(
-        self, block: Steady, turns: Numbers, states: Numbers, with_bytes: NDArray[np.bool_] | bool, moments: Moments
+        self,
+        block: Steady,
+        turns: Numbers,
+        states: Numbers,
+        with_bytes: NDArray[np.bool_] | bool,
+        live: _Fields,
+        info: _InfoFields | None,
+        now: Numbers,
     ) -> None:
         self._block = block
         self._turns = turns
         self._states = states
         self._with_bytes = with_bytes
-        self._moments = moments
+        self._live = live
+        self._info = info
+        self._now = now
         self.link = block.esc.link
         self.layout = block.esc.layout
         self.losses = block.esc.losses
@@ -505,29 +526,29 @@ class _Esc:
 
     @property
     def cells(self) -> Any:
-        if self._block.esc.settings.cell_count or self._moments.info is None:
+        if self._block.esc.settings.cell_count or self._info is None:
             return self._block.esc.cells
-        return self._moments.info[InfoData._fields.index("cell_count")]
+        return self._info[InfoData._fields.index("cell_count")]
 
     @property
     def energy(self) -> NDArray[Any]:
-        return self._block.energy[self._moments.live.rows]
+        return self._block.energy[self._live.rows]
 
     @property
     def run_time(self) -> Numbers:
-        return self._block.run_time[self._moments.live.rows]
+        return self._block.run_time[self._live.rows]
 
     @property
     def suspect_frames(self) -> Numbers:
-        return self._block.suspects[self._moments.live.rows]
+        return self._block.suspects[self._live.rows]
 
     @property
     def live_ns(self) -> Numbers:
-        return self._block.live_ns[self._moments.live.rows]
+        return self._block.live_ns[self._live.rows]
 
     @property
     def frame_rate(self) -> Numbers:
-        return self._block.rate_at(self._turns, self._moments.now, self._with_bytes)
+        return self._block.rate_at(self._turns, self._now, self._with_bytes)
 
     def age_ms(self, now: Numbers) -> Numbers:
         found: Numbers = np.maximum(now - self.live_ns, 0) // MS
