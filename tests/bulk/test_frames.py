@@ -2,6 +2,8 @@
 
 import io
 import random
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -376,6 +378,18 @@ def test_a_message_that_changes_with_time_goes_the_streaming_way(tmp_path: Path)
     told, log = convert(recording, tmp_path / "a.log", None, None)
     assert log == one_by_one(recording)[0]
     assert told is not None
+
+
+def test_without_numpy_it_goes_the_streaming_way(tmp_path: Path) -> None:
+    path, target = tmp_path / "a.bin", tmp_path / "a.log"
+    path.write_bytes(flight(1, 300))
+    code = (
+        "import sys; sys.modules['numpy'] = None\n"
+        "from kontronik_can_gw.cli import main\n"
+        "sys.exit(main(['convert', '-q', *sys.argv[1:]]))"
+    )
+    subprocess.run([sys.executable, "-c", code, path, target], check=True)
+    assert target.read_bytes() == one_by_one(DumpInput(path))[0]
 
 
 @pytest.mark.parametrize("seconds", [0, 8, 98, 99_998, 9_999_999])

@@ -21,6 +21,7 @@ from kontronik_can_gw.offline.tables import DISORDER_NS
 _US = 1_000_000
 _MOST_SECONDS = 1 << 16
 _LATEST_NS = 1 << 62
+_TURN = 64
 _Records = NDArray[np.void]
 _HEX = np.frombuffer("".join(f"{pair & 255:02X}{pair >> 8:02X}" for pair in range(1 << 16)).encode(), np.uint32)
 """Four digits of each pair of bytes, as a little-endian number has them."""
@@ -47,7 +48,7 @@ def write(
     low, high = 0 if start_ns is None else start_ns, _LATEST_NS if end_ns is None else end_ns
     count, last, latest = 0, 0, 0
     text: bytes | memoryview
-    for found in blocks:
+    for number, found in enumerate(blocks):
         if isinstance(found, CanFrames):
             if not len(found):
                 continue
@@ -73,9 +74,11 @@ def write(
                 assert not isinstance(opened_file, Path)
                 file = opened_file
             file.write(text)
-        reached()
+        if isinstance(found, CanFrames) or not number % _TURN:
+            reached()
         if latest > high + DISORDER_NS:
             break
+    reached()
     return None if file is None else (count, last)
 
 
