@@ -26,7 +26,7 @@ from kontronik_can_gw.telemetry import MS
 
 Numbers = NDArray[np.int64]
 
-BLOCK = 16_384
+BLOCK = 8192
 """Frames at a time, so that columns stay in the processor's cache."""
 LEAST = 64
 """Of fewer frames, the streaming way is as quick."""

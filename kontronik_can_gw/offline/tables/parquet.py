@@ -59,6 +59,7 @@ class ParquetTable:
             str(path),
             self._schema,
             use_dictionary=with_dictionary,
+            memory_pool=pa.system_memory_pool(),  # the others keep what they were given once
             write_statistics=[name for name in (f"{TIME} [s]", UTC) if name in self._schema.names],
         )
         self._batches: list[Any] = []
