@@ -5,6 +5,7 @@ alone; their sending times are reckoned in columns. The others are followed step
 """
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from heapq import heappop, heappush
 from typing import NamedTuple
 
@@ -108,25 +109,32 @@ class Sender:
 
     def send(self, block: Steady) -> CanFrames:
         """The frames of a block; the output's objects are as after its last frame."""
-        keys, found = [], []
-        for index, follower in enumerate(self._followers):
-            sends, data = follower.send(block)
-            keys.append(((sends.turn << 36 | sends.since) << 3 | sends.rank) << 10 | index)
-            found.append((sends.time, data))
+        sent = [follower.send(block) for follower in self._followers]
         heap = self._output._schedule._heap
         heap[:] = sorted(entry for entry in heap if entry[0] > block.times[-1])
-        if not keys:
-            return CanFrames([])
-        order = np.argsort(np.concatenate(keys), kind="stable")
-        places = np.empty_like(order)
-        places[order] = np.arange(len(order))
-        ends = np.cumsum([len(key) for key in keys]).tolist()
+        all_places = _places([sends for sends, _ in sent])
         return CanFrames(
             [
-                Part(index, time, places[end - len(time) : end], data)
-                for index, (end, (time, data)) in enumerate(zip(ends, found, strict=True))
+                Part(index, sends.time, places, data)
+                for index, ((sends, data), places) in enumerate(zip(sent, all_places, strict=True))
             ]
         )
+
+
+def _places(sent: Sequence[_Sends]) -> list[Numbers]:
+    """Where the frames of each message stand among those of all."""
+    if not sent:
+        return []
+    turns, count = sent[0].turn, len(sent)
+    if all(
+        sends.turn is turns and isinstance(sends.rank, int) and sends.rank == _EVENT for sends in sent
+    ):  # each with the same frames
+        return [np.arange(index, count * len(turns), count) for index in range(count)]
+    keys = [((s.turn << 36 | s.since) << 3 | s.rank) << 10 | index for index, s in enumerate(sent)]
+    order = np.argsort(np.concatenate(keys), kind="stable")
+    places = np.empty_like(order)
+    places[order] = np.arange(len(order))
+    return np.split(places, np.cumsum([len(key) for key in keys])[:-1])
 
 
 class _Follower:
@@ -159,7 +167,7 @@ class _Follower:
         count = len(sends.turn)
         if not count:
             return sends, np.empty((0, plan.length), np.uint8)
-        alive = (sends.number + message.alive) % message.alive_modulus
+        alive = (sends.number + message.alive) % message.alive_modulus if message.alive_modulus > 1 else None
         if len(plan.pages) == 1:
             bits = self._packed(block, sends, alive, plan.pages[0], slice(None))
         else:
@@ -172,15 +180,16 @@ class _Follower:
         return sends, self.packer.data(bits)
 
     def _packed(
-        self, block: Steady, sends: _Sends, alive: Numbers, page: int | None, chosen: "slice | Numbers"
+        self, block: Steady, sends: _Sends, alive: Numbers | None, page: int | None, chosen: "slice | Numbers"
     ) -> Bits:
         """What the frames of one page hold."""
+        alive = np.zeros(1, np.int64) if alive is None else alive[chosen]
         turns, states, times = sends.turn[chosen], sends.state[chosen], sends.time[chosen]
         message = self._message
         if self._states is not None and self._states[0] is block:
             bits = self._states[1][page][states]
             message.last[page] = number_of(bits, -1)
-            self.packer.put_alive(bits, alive[chosen])
+            self.packer.put_alive(bits, alive)
             return bits
         with_bytes = sends.with_bytes
         if isinstance(with_bytes, np.ndarray):
@@ -191,7 +200,7 @@ class _Follower:
             message.last[page] = number_of(self.packer.bits(last, 0, page), 0)
         if with_bytes is True and isinstance(chosen, slice):
             return self.packer.bits(block.moments_with_bytes(sends.turn), alive, page)
-        return self.packer.bits(block.moments(turns, states, times, with_bytes), alive[chosen], page)
+        return self.packer.bits(block.moments(turns, states, times, with_bytes), alive, page)
 
     def asking(self, block: Steady) -> Numbers:
         """The turns whose frames ask for the message."""
