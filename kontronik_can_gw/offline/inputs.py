@@ -250,7 +250,14 @@ class CaptureInput(_Base):
         self._tell(replay)
 
     def samples(self) -> Iterator[Sample]:
-        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, self._created_ns)
+        yield from self._samples(frames_count=True)
+
+    def blocks(self, chosen: Sequence[int]) -> "Iterator[Sample | RowBlock] | None":
+        """Single rows; the frames that were sent are made only where the number of them is wanted."""
+        return self._samples(any(self.reader.columns[index].source == "sent_frames" for index in chosen))
+
+    def _samples(self, frames_count: bool) -> Iterator[Sample]:
+        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, self._created_ns, frames_count)
         replay = Replay(gateway, self.header.get("state"))
         for entry in self.entries():
             replay.play(entry)

@@ -6,16 +6,19 @@ import math
 import random
 import sys
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet  # type: ignore[import-untyped]
 import pytest
+from capture_bench import START, Bench, made
 from flights import Wandering, random_layout
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from protocol.streams import damaged
 
+from kontronik_can_gw import capture
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.offline import inputs
 from kontronik_can_gw.offline.layouts import BusLayout
@@ -168,11 +171,9 @@ def blocks(draw: st.DrawFn) -> Block:
             values = [0.1, 1e300, source.uniform(-5, 5), math.inf, -math.inf]
             numbers = np.array([values[pick] for pick in picks])
         else:
-            divisor = source.choice([1, 100, 3]) if field.kind is Kind.FLOAT else 1
+            divisor = 3 if field.kind is Kind.FLOAT else 1  # of one column always the same
             values = [0, -7, source.randrange(1 << 40), 65_535, source.randrange(-300, 300)]
             numbers = np.array([values[pick] for pick in picks], np.int64)
-            if field.kind is Kind.FLOAT and divisor == 1:
-                numbers = numbers.astype(np.float64)
         valid = np.array([source.random() < 0.6 for _ in numbers]) if source.random() < 0.5 else None
         columns.append(BlockColumn(numbers, valid, divisor))
     first = draw(st.sampled_from([0, 999_990_000, 3_600_000_000_123, -500]))
@@ -219,3 +220,31 @@ def test_some_of_a_block() -> None:
     assert block.rows_before(4) == 4
     assert (block.time_ns, block.last_ns) == (0, 9)
     assert list(block.since(-5).times_ns) == list(range(5, 15))
+
+
+@cache
+def capture_bytes(escs: int, nodes: bool) -> bytes:
+    """A capture in which everything happens."""
+    bench = Bench(*made(escs, canopen=nodes)).live(escs, 5)
+    header = bench.setup.header() | {"run": "r", "part": 0, "created_ns": START, "monotonic_ns": START, "wall_ns": 7}
+    data = capture.block(b"D", 1, capture.data_payload(bench.entries))
+    return b"".join([capture.block(b"H", 0, capture.json_payload(header)), data, capture.block(b"E", 2, b"")])
+
+
+@pytest.mark.parametrize(("escs", "nodes"), [(1, False), (2, True)])
+def test_a_capture_without_its_frames_has_the_same_values(tmp_path: Path, escs: int, nodes: bool) -> None:
+    path = tmp_path / "a.kcap"
+    path.write_bytes(capture_bytes(escs, nodes))
+    with inputs.open_input(path) as recording:
+        columns = recording.reader.columns
+        chosen = [index for index, column in enumerate(columns) if column.source != "sent_frames"]
+        assert len(chosen) < len(columns)
+        found = recording.blocks(chosen)
+        assert found is not None
+        rows = [(row.time_ns, [row.values[i] for i in chosen]) for row in found if not isinstance(row, Block)]
+        expected = [(row.time_ns, [row.values[i] for i in chosen]) for row in recording.samples()]
+        assert len(rows) > 100
+        assert rows == expected
+        every = recording.blocks(range(len(columns)))
+        assert every is not None
+        assert list(every) == list(recording.samples())

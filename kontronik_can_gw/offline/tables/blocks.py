@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BlockColumn:
-    """The values of one signal: numbers in steps of 1 / ``divisor``, of a text its place in the column's texts.
+    """The values of one signal: numbers in steps of 1 / ``divisor`` (in all blocks the same), of a text its place
+    in the column's texts.
 
     Of length 1 where all rows have the same. ``valid``: which of the numbers are available; None: all.
     """
