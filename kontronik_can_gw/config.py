@@ -201,6 +201,14 @@ class RunConfig:
     wait_for_devices: bool = _key(
         "at start: wait for ports and interfaces that are missing instead of ending with an error", "boolean", False
     )
+    realtime_priority: int | None = _key(
+        "real-time priority (SCHED_FIFO) and memory that is never given away, so that no other program's load delays a frame "
+        "(default: a program as others)",
+        "integer",
+        None,
+        low=1,
+        high=99,
+    )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
 import argparse
 import gc
 import logging
+import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +21,7 @@ from kontronik_can_gw.cli.common import (
 )
 from kontronik_can_gw.cli.node_setup import parameter_folder
 from kontronik_can_gw.config import Config, load
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.runtime.can_port import check_interface
 from kontronik_can_gw.telemetry import SECOND
 
@@ -32,6 +34,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("kontronik_can_gw")
 
+_NEVER = (1 << 31) - 1
+_LOCK_SWITCH_S = 0.0005
+"""So long the loop waits for another thread of ours that computes, before it asks for the interpreter."""
 _PAUSE_S = 5
 """Before the end of a service that cannot start; a signal ends it at once."""
 
@@ -112,11 +117,13 @@ class _Run:
         """Until a signal ends it."""
         from kontronik_can_gw.runtime.store import ParameterStore
 
+        sys.setswitchinterval(_LOCK_SWITCH_S)
         with stopping_on_signals(self._stop, self._reload):
             loaded = load_all(self._file, ParameterStore)
             self._open(loaded, self._wait or loaded.config.run.wait_for_devices)
             while True:
                 assert self._loop is not None
+                settle_memory()
                 self._loop.run()
                 new, self._reloader.new = self._reloader.new, None
                 if self._stopping or not isinstance(new, Config):
@@ -175,12 +182,22 @@ class _Run:
     def _open(self, loaded: Loaded, wait: bool) -> None:
         from kontronik_can_gw.cli.recording import in_words, record_folder, recorder_of, setup_of
         from kontronik_can_gw.gateway import Gateway
+        from kontronik_can_gw.runtime import realtime
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
         from kontronik_can_gw.runtime.recorder import state_of
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
 
         config = loaded.config
+        if config.run.realtime_priority is None:
+            realtime.end()
+        else:
+            try:
+                realtime.begin(config.run.realtime_priority)
+            except RunError as error:
+                if not wait:
+                    raise
+                log.error("%s Running without.", error)  # a late frame is better than none
         silent = config.dbc.on_loss == "silent"
         created_ns = time.monotonic_ns()
         parts = (loaded.escs, loaded.layout, created_ns, silent, loaded.canopen)
@@ -208,7 +225,6 @@ class _Run:
         if self._loop is not None:
             gateway.take_over(self._loop.gateway)
             loop.take_over(self._loop)
-            gc.collect()  # what belonged to an old configuration goes in circles
         _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
         folder = record_folder(config, self._record)
         if recorder is not None and folder is not None:
@@ -217,11 +233,25 @@ class _Run:
         loop.open()
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
-        self._loaded, self._print, self._loop = loaded, fingerprint(config), loop
+        # nobody needs the DBC's own tree any more
+        self._loaded, self._print, self._loop = replace(loaded, database=None), fingerprint(config), loop
         if self._stopping:  # a signal came while there was no loop
             loop.stop()
         if self._reload_asked:
             loop.reload()
+
+
+def settle_memory() -> None:
+    """What is there now stays: no collection of garbage ever walks through it again.
+
+    The hot path makes no objects that refer to each other in a circle (tests/runtime_loop/test_garbage.py), so only what is young is looked
+    through now and then; the whole only here, at the start and when the configuration is another one.
+    """
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()
+    young, middle, _ = gc.get_threshold()
+    gc.set_threshold(young, middle, _NEVER)
 
 
 def _say_parameters(loaded: Loaded) -> None:

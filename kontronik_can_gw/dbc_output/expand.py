@@ -3,7 +3,7 @@
 import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from copy import copy, deepcopy
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc_output.layout import Binder, is_one_esc_layout
@@ -63,28 +63,28 @@ def expand(
     for message in database.messages:
         copies = enumerate(escs) if message in per_esc else [(0, None)]
         for index, esc in copies:
-            copy = deepcopy(message)
+            made = _copy(message)
             if message in ours:
-                copy.frame_id = message.frame_id + shift + index * step
+                made.frame_id = message.frame_id + shift + index * step
                 limit = 0x1FFFFFFF if message.is_extended_frame else 0x7FF
-                if not 0 <= copy.frame_id <= limit:
+                if not 0 <= made.frame_id <= limit:
                     problems.append(
-                        f"{file}: {message.name}: id {message.frame_id:X}h moved to {copy.frame_id:X}h is outside 0..{limit:X}h."
+                        f"{file}: {message.name}: id {message.frame_id:X}h moved to {made.frame_id:X}h is outside 0..{limit:X}h."
                     )
             if esc is not None:
-                _rename(copy, esc_prefix(esc.name))
-            for old, new in zip(message.signals, copy.signals, strict=True):
+                _rename(made, esc_prefix(esc.name))
+            for old, new in zip(message.signals, made.signals, strict=True):
                 for key in (f"{message.name}.{old.name}", old.name):
                     if key in bind and message in ours:
                         value = bind[key]
                         out_bind.pop(key, None)
                         if esc is not None and isinstance(value, str):
                             value = f"{esc.name}.{value}"
-                        out_bind[f"{copy.name}.{new.name}"] = value
+                        out_bind[f"{made.name}.{new.name}"] = value
                         break
-            messages.append(copy)
-            names = {old.name: new.name for old, new in zip(message.signals, copy.signals, strict=True)}
-            moved.setdefault(frame_id(message), []).append((frame_id(copy), names))
+            messages.append(made)
+            names = {old.name: new.name for old, new in zip(message.signals, made.signals, strict=True)}
+            moved.setdefault(frame_id(message), []).append((frame_id(made), names))
     _check_lengths(messages, per_esc, escs, problems, file)
     if problems:
         raise UserError(*problems)
@@ -161,6 +161,15 @@ def _step(
     if wanted is not None:
         raise UserError(f"{file}: with ids moved by {wanted} an ESC, ids of {count} ESCs clash. Take another step.")
     raise UserError(f"{file}: no step moves the ids for {count} ESCs without a clash. Give the messages other ids.")
+
+
+def _copy(message: "Message") -> "Message":
+    """A message that can be moved and renamed; what is not changed is shared, which is most of what a message is."""
+    made = copy(message)
+    made._signals = [copy(signal) for signal in message.signals]
+    if message.signal_groups is not None:
+        made.signal_groups = [copy(group) for group in message.signal_groups]
+    return made
 
 
 def _rename(message: "Message", prefix: str) -> None:

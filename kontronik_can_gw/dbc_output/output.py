@@ -61,9 +61,9 @@ class _Message:
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         # its frame is its pack and nothing else
-        self.is_plain = len(plan.pages) == 1 and not (self.silent_able or self.on_change or crc)
+        self.is_plain = plan.pages == (None,) and not (self.silent_able or self.on_change or crc)
         # and nothing but the minimum distance keeps it back when there is a live frame
-        self.follows_live = self.by_event and len(plan.pages) == 1 and not (self.on_change or crc)
+        self.follows_live = self.by_event and plan.pages == (None,) and not (self.on_change or crc)
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
             for pace in plan.paces:

@@ -8,7 +8,6 @@ import contextlib
 import errno
 import socket
 from collections.abc import Iterable
-from hashlib import sha256
 
 from kontronik_can_gw.errors import RunError
 
@@ -66,6 +65,8 @@ def _short(name: str) -> str:
     """A name that fits into an address: the channel of a long one in short."""
     if len(PREFIX + name) < _LONGEST_NAME:
         return name
+    from hashlib import sha256  # which loads OpenSSL: 4 MB
+
     channel, what, number = name.rsplit("/", 2)
     return f"{sha256(channel.encode()).hexdigest()[:32]}/{what}/{number}"
 

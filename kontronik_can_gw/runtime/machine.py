@@ -1,6 +1,5 @@
 """What is the machine's own: serial numbers for its nodes, the folder for its parameters."""
 
-import hashlib
 import os
 from pathlib import Path
 
@@ -29,6 +28,8 @@ def serial_number(number: int, name: str, identity: bytes) -> int:
     """
     if not identity:
         return 0
+    import hashlib  # which loads OpenSSL: 4 MB, and not every gateway needs it
+
     digest = hashlib.sha256(identity + f"{_NAME} {number} {name}".encode()).digest()
     return int.from_bytes(digest[:4], "big") or 1
 

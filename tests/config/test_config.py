@@ -27,7 +27,7 @@ TABLES: dict[str, tuple[str, ...]] = {
     "canopen": (
         *("enabled", "node_id", "eds", "vendor_id", "serial", "self_start", "read_only", "cia402_mirrors", "store"),
     ),
-    "run": ("wait_for_devices",),
+    "run": ("wait_for_devices", "realtime_priority"),
     "statistics": ("file", "prometheus"),
     "record": ("directory", "part_mb", "part_minutes", "keep_mb", "min_free_mb", "can_log"),
     "mqtt": (
@@ -50,7 +50,7 @@ DEFAULTS: dict[str, dict[str, object]] = {
     | {"bind": {}, "e2e_data_ids": {}},
     "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
-    "run": {"wait_for_devices": False},
+    "run": {"wait_for_devices": False, "realtime_priority": None},
     "statistics": {"file": None, "prometheus": None},
     "record": {"directory": None, "part_mb": 64, "part_minutes": 60, "keep_mb": 0, "min_free_mb": 100}
     | {"can_log": "none"},
@@ -64,6 +64,7 @@ RANGES = {
     ("can", "data_bitrate"): (10_000, 8_000_000),
     ("dbc", "base_id"): (0, 0x1FFFFFFF),
     ("dbc", "id_step"): (1, 0x1FFFFFFF),
+    ("run", "realtime_priority"): (1, 99),
     ("canopen", "vendor_id"): (0, 0xFFFFFFFF),
     ("canopen", "serial"): (0, 0xFFFFFFFF),
     ("canopen", "node_id"): (1, 127),
@@ -394,7 +395,7 @@ def test_a_data_id_is_a_whole_number_of_16_bits_beside_a_message_name() -> None:
         ({"cann": {}}, "a.toml: cann: unknown table. Did you mean can?"),
         ({"xyzzy": {}}, "a.toml: xyzzy: unknown table. Known: can, dbc, canopen, run, statistics, record, mqtt, esc."),
         ({"can": {"bitrte": 1}}, "a.toml: can.bitrte: unknown key. Did you mean bitrate?"),
-        ({"run": {"x": 1}}, "a.toml: run.x: unknown key. Known: wait_for_devices."),
+        ({"run": {"x": 1}}, "a.toml: run.x: unknown key. Known: wait_for_devices, realtime_priority."),
         ({"can": 3}, "a.toml: can: is a table, written [can]"),
         ({"dbc": []}, "a.toml: dbc: is a table, written [dbc]"),
     ],
@@ -587,6 +588,7 @@ def test_what_the_example_shows_as_default_is_the_default() -> None:
     examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store"), ("record", "directory")}
     examples |= {("statistics", "file"), ("statistics", "prometheus"), ("mqtt", "discovery"), ("mqtt", "gateway")}
     examples |= {("mqtt", key) for key in ("broker", "ca_file", "cert_file", "key_file", "username", "password_file")}
+    examples.add(("run", "realtime_priority"))
     for (table, key), value in shown.items():
         if (table, key) not in examples:
             assert value == DEFAULTS[table][key], f"{table}.{key}"

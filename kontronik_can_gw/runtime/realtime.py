@@ -1,0 +1,85 @@
+"""Real-time priority, so that no other program's load delays a frame: SCHED_FIFO, and memory that is never given away.
+
+The loop's thread has the priority that was asked for, the threads beside it one less: a thread that held the interpreter's lock and had to
+wait for other programs would hold the loop up with it. The kernel leaves others a share in any case (sched_rt_runtime_us, 5 %).
+"""
+
+import contextlib
+import os
+import resource
+import threading
+from pathlib import Path
+
+from kontronik_can_gw.errors import RunError
+
+_CAP_IPC_LOCK = 14
+_LOCK_CURRENT, _LOCK_FUTURE, _LOCK_ON_FAULT = 1, 2, 4
+"""Of mlockall(2): what is used, as it comes to be used."""
+
+
+def begin(priority: int) -> None:
+    """Take real-time priority for this thread, the loop's, and those beside it. RunError where this process has no right to it."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        raise RunError(
+            f"run.realtime_priority = {priority}: not permitted. {_how(priority)}, then start again."
+        ) from None
+    except OSError as error:
+        raise RunError(f"run.realtime_priority = {priority}: {error.strerror or error}. Leave it out.") from None
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread():
+            follow(thread)
+    _lock_memory(_LOCK_CURRENT | _LOCK_FUTURE | _LOCK_ON_FAULT)
+
+
+def end() -> None:
+    """Be a program as others again."""
+    if os.sched_getscheduler(0) != os.SCHED_FIFO:
+        return
+    for thread in threading.enumerate():
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(thread.native_id or 0, os.SCHED_OTHER, os.sched_param(0))
+    _lock_memory(0)
+
+
+def follow(thread: threading.Thread) -> None:
+    """Give a thread beside the loop its priority: that of the caller less one; nothing where the caller has none."""
+    if os.sched_getscheduler(0) != os.SCHED_FIFO or thread.native_id is None:
+        return
+    priority = max(1, os.sched_getparam(0).sched_priority - 1)
+    with contextlib.suppress(OSError):  # it has ended by now
+        os.sched_setscheduler(thread.native_id, os.SCHED_FIFO, os.sched_param(priority))
+
+
+def _how(priority: int) -> str:
+    if "INVOCATION_ID" in os.environ:  # systemd
+        return (
+            "sudo systemctl edit kontronik-can-gw, and there under [Service]: RestrictRealtime=no, "
+            f"LimitRTPRIO={priority} and LimitMEMLOCK=infinity, each on a line"
+        )
+    return f"Once, for this shell: sudo prlimit --rtprio={priority} --memlock=unlimited --pid $$"
+
+
+def _may_lock_all() -> bool:
+    """Whether memory may be locked without a bound: with one, an allocation would fail some day."""
+    if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY:
+        return True
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        held = next(int(line.split()[1], 16) for line in lines if line.startswith("CapEff:"))
+        return bool(held >> _CAP_IPC_LOCK & 1)
+    return False
+
+
+def _lock_memory(how: int) -> None:
+    """Keep what is used in memory (0: no longer). A right that is missing, or an old kernel, is no reason not to run."""
+    if not _may_lock_all():
+        return
+    import ctypes  # a megabyte that others need not pay for
+
+    system = ctypes.CDLL(None, use_errno=True)
+    if how:
+        system.mlockall(how)
+    else:
+        system.munlockall()

@@ -1,0 +1,131 @@
+"""Real-time priority: who gets which, and what is said where it is not permitted."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from kontronik_can_gw.cli import main
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.runtime import realtime
+from kontronik_can_gw.runtime.threads import start_beside_the_loop
+
+
+class Scheduler:
+    """Stands for the kernel's: which thread has which policy and priority."""
+
+    def __init__(self) -> None:
+        self.of: dict[int, tuple[int, int]] = {}
+        self.permits = True
+
+    def _thread(self, pid: int) -> int:
+        return pid or threading.get_native_id()
+
+    def set(self, pid: int, policy: int, param: os.sched_param) -> None:
+        if not self.permits:
+            raise PermissionError(1, "Operation not permitted")
+        self.of[self._thread(pid)] = (policy, param.sched_priority)
+
+    def policy(self, pid: int) -> int:
+        return self.of.get(self._thread(pid), (os.SCHED_OTHER, 0))[0]
+
+    def param(self, pid: int) -> os.sched_param:
+        return os.sched_param(self.of.get(self._thread(pid), (os.SCHED_OTHER, 0))[1])
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> Scheduler:
+    scheduler = Scheduler()
+    monkeypatch.setattr(os, "sched_setscheduler", scheduler.set)
+    monkeypatch.setattr(os, "sched_getscheduler", scheduler.policy)
+    monkeypatch.setattr(os, "sched_getparam", scheduler.param)
+    monkeypatch.setattr(realtime, "_lock_memory", lambda _how: None)
+    return scheduler
+
+
+@pytest.fixture
+def sleeper() -> Iterator[threading.Thread]:
+    ended = threading.Event()
+    thread = threading.Thread(target=ended.wait)
+    yield thread
+    ended.set()
+    thread.join()
+
+
+def test_the_loop_goes_before_the_threads_beside_it(kernel: Scheduler, sleeper: threading.Thread) -> None:
+    sleeper.start()
+    realtime.begin(30)
+    assert kernel.of[threading.get_native_id()] == (os.SCHED_FIFO, 30)
+    assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 29)
+    realtime.end()
+    assert {policy for policy, _ in kernel.of.values()} == {os.SCHED_OTHER}
+
+
+def test_a_thread_that_is_started_later_follows(kernel: Scheduler, sleeper: threading.Thread) -> None:
+    realtime.begin(1)
+    assert start_beside_the_loop(sleeper)
+    assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 1)
+
+
+def test_without_it_nothing_is_changed(kernel: Scheduler, sleeper: threading.Thread) -> None:
+    assert start_beside_the_loop(sleeper)
+    realtime.end()
+    assert kernel.of == {}
+
+
+@pytest.mark.parametrize(("service", "remedy"), [(False, "prlimit --rtprio=20"), (True, "LimitRTPRIO=20")])
+def test_what_is_not_permitted_is_said_with_the_remedy(
+    kernel: Scheduler, monkeypatch: pytest.MonkeyPatch, service: bool, remedy: str
+) -> None:
+    kernel.permits = False
+    monkeypatch.delenv("INVOCATION_ID", raising=False)
+    if service:
+        monkeypatch.setenv("INVOCATION_ID", "1")
+    with pytest.raises(RunError, match=remedy):
+        realtime.begin(20)
+
+
+def configuration(folder: Path, port: str, channel: str) -> Path:
+    file = folder / "gateway.toml"
+    file.write_text(
+        f'[can]\ninterface = "virtual"\nchannel = "{channel}"\n[run]\nrealtime_priority = 7\n[[esc]]\nport = "{port}"\n'
+    )
+    return file
+
+
+def test_a_run_without_the_right_ends_with_one_line(
+    kernel: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kernel.permits = False
+    with PtyEsc() as esc:
+        assert main(["run", "-c", str(configuration(tmp_path, esc.path, "realtime"))]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "run.realtime_priority = 7: not permitted." in line
+
+
+def test_a_real_process_has_what_it_is_permitted_to(tmp_path: Path) -> None:
+    """With the right the main thread has the priority; without it, where --wait asks to go on in any case, an error is logged."""
+    with PtyEsc() as esc:
+        command = [sys.executable, "-m", "kontronik_can_gw", "run", "--wait", "-c"]
+        command.append(str(configuration(tmp_path, esc.path, "realtime-process")))
+        errors = tmp_path / "errors"
+        with errors.open("w") as file, subprocess.Popen(command, stderr=file) as process:
+            try:
+                begun = time.monotonic()
+                while "is open" not in errors.read_text() and time.monotonic() - begun < 30:
+                    time.sleep(0.01)
+                policy, priority = os.sched_getscheduler(process.pid), os.sched_getparam(process.pid).sched_priority
+            finally:
+                process.terminate()
+    said = errors.read_text()
+    assert process.returncode == 0
+    if "not permitted" in said:
+        assert "Running without." in said and policy == os.SCHED_OTHER
+    else:
+        assert (policy, priority) == (os.SCHED_FIFO, 7)
