@@ -4,9 +4,10 @@ import random
 from pathlib import Path
 
 import pytest
-from flights import SHIPPED, Wandering, random_layout
+from flights import SHIPPED, Wandering, bus_layout, random_layout
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from packer_oracle import Msg, Sig
 from protocol.streams import damaged
 
 from kontronik_can_gw.offline.bulk.feed import Feed
@@ -18,7 +19,7 @@ from kontronik_can_gw.offline.tables import Block
 from kontronik_can_gw.protocol import Device
 from kontronik_can_gw.protocol.codec import Layout
 from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.telemetry import SECOND, EscSettings
 
 Rows = list[tuple[int, list[object]]]
 
@@ -132,11 +133,13 @@ def test_a_bad_line(tmp_path: Path, seed: int) -> None:
 def test_rubbish_over_the_limits_of_what_is_read_at_once(tmp_path: Path, length: int) -> None:
     """Where no frame comes for long, bytes are given to the gateway before the next one comes."""
     source = Wandering(random.Random(length))
-    head = source.frames(CHUNK // 40 - 30)
-    rubbish = random.Random(1).randbytes(length)
-    for cut in (20, 1400):
-        stream = head + source.frames(30, 7)[:cut] + rubbish + source.frames(300)
-        check(tmp_path / "a.bin", stream)
+    stream = source.frames(6400)
+    while len(stream) < CHUNK - 140:
+        stream += source.frames(1, 0)
+    assert len(stream) < CHUNK - 64
+    stream += random.Random(1).randbytes(length) + source.frames(300)
+    for rate in (100, 2.1, 2.3, 2.9):  # a second may end between the two frames
+        check(tmp_path / "a.bin", stream, rate=rate)
 
 
 @given(st.integers(0, 1 << 32))
@@ -169,6 +172,35 @@ def test_random_layouts(tmp_path: Path, seed: int) -> None:
         esc.frames(500, source.choice([0, 7, 100])) + esc.frames(300, 25), source, source.choice([0, 0, 2])
     )
     check(tmp_path / "a.bin", stream, layout, source.choice([4, 100, 100, 250]), source.choice([64, 500]))
+
+
+def test_values_of_the_gateway_beside_information_and_flags_that_are_lost(tmp_path: Path) -> None:
+    """The first message is read with information only. In the others all values may be out of range, and the flags with them."""
+    messages = [
+        Msg("Rare", 0x100, 8, [Sig("CellCount", 0, 8), Sig("Uptime", 8, 32, unit="s")]),
+        Msg(
+            "Flags",
+            0x101,
+            2,
+            [
+                Sig("Undervoltage", 0, 1),
+                Sig("Volt", 8, 8, unit="V", texts={255: "NotAvailable"}, bind="battery_voltage"),
+            ],
+        ),
+        Msg(
+            "Tests",
+            0x102,
+            2,
+            [Sig("TestUndervoltage", 0, 1), Sig("Cells", 8, 2, texts={3: "NotAvailable"}, bind="cell_count")],
+        ),
+    ]
+    source = random.Random(5)
+    layout = bus_layout(messages, EscSettings("esc1"), source)
+    for info_each in (3, 40):
+        esc = Wandering(source)
+        esc.restless |= {"battery_voltage": 0.3, "operating_errors": 0.3, "cell_count": 0.5, "selftest_errors": 0.5}
+        count, rows = check(tmp_path / "a.bin", esc.frames(900, info_each), layout, block=70)
+        assert count > rows * 0.5
 
 
 def test_some_columns_only(tmp_path: Path) -> None:
