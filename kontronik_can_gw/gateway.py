@@ -196,7 +196,8 @@ class Gateway:
 
     def advance(self, now: int) -> None:
         """Let time pass: time-outs, cyclic messages."""
-        self._expire(now)
+        if now >= self._next_expiry:
+            self._expire(now)
         self._output.advance(now)
         if self.nodes is not None:
             self.nodes.advance(now)
@@ -270,6 +271,11 @@ class Gateway:
             self._output.on_gateway_change(now, each_second=True)
 
     def _follow(self, esc: int, events: int, now: int) -> None:
+        if events == Event.LIVE:
+            self._output.on_live(esc, now)
+            if self.nodes is not None:
+                self.nodes.on_event(esc, events, now)
+            return
         if events:
             self._output.on_event(esc, events, now)
             if self.nodes is not None:

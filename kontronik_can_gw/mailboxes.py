@@ -56,6 +56,9 @@ class Mailboxes:
         self.dropped = 0
         """Queued frames that were lost: the queue was full, or cleared."""
 
+    def __bool__(self) -> bool:
+        return bool(self._slots or self._queue)
+
     def __len__(self) -> int:
         return len(self._slots) + len(self._queue)
 

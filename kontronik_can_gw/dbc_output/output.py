@@ -138,18 +138,22 @@ class DbcOutput:
         """What a message would hold now, alive counter and CRC 0."""
         return self._messages[index].pack(self._escs, self._gateway, now, 0, page or 0)
 
+    def on_live(self, esc: int, now: int) -> None:
+        """A live frame has come, and nothing else is new."""
+        if esc in self._touched:
+            self.on_event(esc, Event.LIVE, now)
+            return
+        self._touched.add(esc)
+        append = self.frames.append
+        for step in self._live_steps[esc]:
+            step(now, append)
+
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
-        state, touched = self._escs[esc], self._touched
-        if esc in touched:
+        state = self._escs[esc]
+        if esc in self._touched:
             self._end_images()
-        elif events == Event.LIVE and state.live is not None:
-            touched.add(esc)
-            append = self.frames.append
-            for step in self._live_steps[esc]:
-                step(now, append)
-            return
-        touched.add(esc)
+        self._touched.add(esc)
         for index, message in self._listeners[esc]:
             triggers = message.triggers
             if not triggers & events:
@@ -187,6 +191,9 @@ class DbcOutput:
 
     def advance(self, now: int) -> None:
         """Send what is due."""
+        due = self._schedule.next_deadline()
+        if due is None or now < due:
+            return
         for index, cyclic in self._schedule.due(now):
             message = self._messages[index]
             if cyclic and len(message.plan.pages) > 1:

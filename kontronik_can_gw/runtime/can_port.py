@@ -13,16 +13,16 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from operator import length_hint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import EXTENDED, CanFrame, frame_of
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.mailboxes import Sent, are_images
+from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
 from kontronik_can_gw.sources import CanState
 
@@ -162,8 +162,9 @@ class CanPort:
         if self._socket is None or self._removed or self.state is _DOWN or self.state is _UNKNOWN:
             return one_by_one(self.send, frames, clock, latest)
         send = self._socket.send
-        images = cast(Sequence[bytes], frames) if are_images(frames) else [_image(frame) for frame in frames]
-        rest = iter(images)
+        rest: Iterator[Any] = iter(
+            [_image(frame) for frame in frames] if CanFrame in set(map(type, frames)) else frames
+        )
         try:
             for image in rest:
                 if clock() > latest:

@@ -12,7 +12,7 @@ from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame, frame_of
 from kontronik_can_gw.gateway import Conflict, Gateway
-from kontronik_can_gw.mailboxes import Mailboxes, Sent, stand_alone
+from kontronik_can_gw.mailboxes import Mailboxes, Sent, are_images, stand_alone
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
 from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
 from kontronik_can_gw.runtime.conditions import Conditions
@@ -359,7 +359,19 @@ class CanSide:
             self._busy_until = self._busy_since = None
             return
         self._turn_ns = now
-        if len(waiting) or self._busy_until is not None or not stand_alone(frames):
+        if self._is_proven and self._busy_until is None and not waiting and are_images(frames):
+            # as nearly always
+            count, answer = self.port.send_all(frames, self._clock, now + self.longest_turn_ns)
+            if self.tap is not None:
+                self._tell_tap(frames[:count])
+            if answer is _OK and not self._stalled:
+                self._busy_since = None
+                status.sent_frames += count
+                if self.port.state is not status.can_state or self.port.bus_off_count:
+                    self._follow_state(now)
+                return
+            waiting.put_all(frames[count:])
+        elif waiting or self._busy_until is not None or not stand_alone(frames):
             waiting.put_all(frames)
             self._count_losses()
             if self._busy_until is not None:
@@ -400,9 +412,13 @@ class CanSide:
         # LATE where the process was stopped in the middle of its turn
         count, answer = self.port.send_all(frames, self._clock, self._turn_ns + self.longest_turn_ns)
         if self.tap is not None:
-            for frame in frames[:count]:
-                self.tap(frame_of(frame), self._turn_ns, False)
+            self._tell_tap(frames[:count])
         return count, answer
+
+    def _tell_tap(self, frames: Sequence[CanFrame | bytes]) -> None:
+        assert self.tap is not None
+        for frame in frames:
+            self.tap(frame_of(frame), self._turn_ns, False)
 
     def _send(self, frame: CanFrame) -> Sent:
         return self._send_all((frame,))[1]

@@ -180,14 +180,16 @@ class Loop:
         if self._lost or not can.rests(now):
             now = self._reopen(now)
         self._now = now
-        self._keep(now)  # in front: what it answers belongs to this turn, in a replay too
+        if gateway.nodes is not None:
+            self._keep(now)  # in front: what it answers belongs to this turn, in a replay too
         gateway.advance(now)
         can.follow_ids()
         can.transmit(now)
         if gateway.node_changes != self._node_changes:
             self._report_nodes(now)
-        for index in dict.fromkeys(gateway.take_link_changes()):
-            self.escs[index].follow_link(now)
+        if changes := gateway.take_link_changes():
+            for index in dict.fromkeys(changes):
+                self.escs[index].follow_link(now)
         if now >= self._look_due:
             self._look_round(now)
 

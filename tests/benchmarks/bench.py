@@ -33,7 +33,9 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--list", action="store_true", help="list the benchmarks and end")
     made.add_argument("--seconds", type=float, default=5.0, metavar="N", help="length of one measurement (default: 5)")
     made.add_argument("--rounds", type=int, default=3, metavar="N", help="turns of what is compared (default: 3)")
-    made.add_argument("--long", action="store_true", help="files of up to 1 GB too, which takes minutes and as much disk")
+    made.add_argument(
+        "--long", action="store_true", help="files of up to 1 GB too, which takes minutes and as much disk"
+    )
     made.add_argument("--quick", action="store_true", help="as short as it can be: tries the benchmarks themselves")
     made.add_argument("--json", type=Path, default=registry.ROOT / "build" / "bench.json", metavar="FILE")
     made.add_argument("--plots", type=Path, metavar="FOLDER", help="draw PNG pictures into this folder")
