@@ -212,7 +212,7 @@ class Gateway:
         if self.nodes is not None:
             expiry = min(expiry, self.nodes.due)
         output = self._output.next_deadline()
-        return expiry if output is None else min(output, expiry)
+        return expiry if output is None or expiry < output else output
 
     @property
     def frames_wait(self) -> bool:

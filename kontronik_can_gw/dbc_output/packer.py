@@ -116,8 +116,8 @@ def live_text(plans: Mapping[int, MessagePlan], esc: int) -> str:
             body.append(f"append(CanFrame({plan.can_id:#x}, {data}, {plan.extended}, {plan.fd}))")
         else:  # nothing else sends it in the same turn
             body.append(f"append(image({image_id(plan.can_id, plan.extended):#x}, {plan.length}, {bits}))")
-        body.append(f"last[{index}] = now")
         if plan.cycle_ns or plan.delay_ns:
+            body.append(f"last[{index}] = now")
             body.append(f"waiting[{index}] = cycle_waits[{index}] = False")
         if plan.delay_ns:
             lines.append(f"if now < last[{index}] + {plan.delay_ns}:")

@@ -172,8 +172,9 @@ class Loop:
             pause = 0
         ready = self._poller.wait(pause)
         now = clock()
-        if now - last - pause > LEAST_SUSPENDED_NS and now - last - pause > self._suspended_ns():
-            self._discard_input(now - last - pause, now)
+        late = now - last - pause
+        if late > LEAST_SUSPENDED_NS and late > self._suspended_ns():
+            self._discard_input(late, now)
             ready = []  # what they announced is gone; a hang-up comes again
         for handler, events in ready:
             handler(now, events)
@@ -227,9 +228,10 @@ class Loop:
             os.read(self._wake_read, 64)
 
     def _next_deadline(self) -> int:
-        if self.gateway.frames_wait:  # of a change that sending itself brought about
+        gateway = self.gateway
+        if gateway.frames_wait:  # of a change that sending itself brought about
             return 0
-        due = self.gateway.next_deadline()
+        due = gateway.next_deadline()
         if self._look_due < due:
             due = self._look_due
         for esc in self._lost:

@@ -1,5 +1,6 @@
 """Waiting for many descriptors at once: epoll with a handler for each, as selectors has it, at a third of its cost a turn."""
 
+import contextlib
 import select
 import selectors
 from collections.abc import Callable
@@ -9,6 +10,9 @@ from kontronik_can_gw.telemetry import SECOND
 
 Handler = Callable[[int, int], None]
 """Called with the time and what has happened (selectors.EVENT_READ, EVENT_WRITE)."""
+
+
+_READ, _IN = selectors.EVENT_READ, select.EPOLLIN
 
 
 class Registry(Protocol):
@@ -41,25 +45,18 @@ class Poller:
 
     def unregister(self, fileobj: int) -> None:
         del self._watched[fileobj]
-        try:
+        with contextlib.suppress(OSError):  # it is closed already
             self._epoll.unregister(fileobj)
-        except OSError:  # it is closed already
-            return
 
     def wait(self, pause_ns: int) -> list[tuple[Handler, int]]:
         """Handlers of what has happened, with what; empty when ``pause_ns`` is over (rounded up to a millisecond), or by a signal."""
-        found = []
-        for fd, happened in self._epoll.poll(pause_ns / SECOND):
-            if (watched := self._watched.get(fd)) is None:
-                continue
-            handler, events = watched
-            if happened != select.EPOLLIN:
-                readable = selectors.EVENT_READ if happened & ~select.EPOLLOUT else 0
-                events &= readable | (selectors.EVENT_WRITE if happened & ~select.EPOLLIN else 0)
-            else:
-                events = selectors.EVENT_READ
-            found.append((handler, events))
-        return found
+        happened = self._epoll.poll(pause_ns / SECOND)
+        return [(self._watched[fd][0], _READ if bits == _IN else self._events(fd, bits)) for fd, bits in happened]
+
+    def _events(self, fd: int, bits: int) -> int:
+        readable = selectors.EVENT_READ if bits & ~select.EPOLLOUT else 0
+        writable = selectors.EVENT_WRITE if bits & ~select.EPOLLIN else 0
+        return self._watched[fd][1] & (readable | writable)
 
     def close(self) -> None:
         self._epoll.close()

@@ -6,6 +6,7 @@ Each live frame becomes the five messages of the DBC (ESC n has ids n-1 higher).
 frames for 250 ms everything is NotAvailable, as is the BEC current of a JIVEPro.
 """
 
+import contextlib
 import struct
 import sys
 import threading
@@ -147,7 +148,7 @@ class Esc:
                 values[signal.name] = "Error"
         data = message.encode(values)
         frame = can.Message(arbitration_id=message.frame_id + self.index, data=data, is_extended_id=False)
-        with self.lock:
+        with self.lock, contextlib.suppress(can.CanOperationError):  # the bus is full: the next one is newer anyway
             self.bus.send(frame)
 
 
