@@ -109,7 +109,7 @@ install_systemd() {
         install -y --no-install-recommends systemd </dev/null >/dev/null || say "failed; going on"
 }
 
-# What the reports, the MQTT publisher, the screens, the completion and the manual page are tried with.
+# What the reports, the MQTT publisher, the screens, the completion, the manual page and the benchmarks are tried with.
 install_viewers() {
     PATH=$PATH:/usr/sbin:/sbin
     wanted=
@@ -117,6 +117,7 @@ install_viewers() {
     command -v mosquitto >/dev/null || wanted="$wanted mosquitto"
     command -v mosquitto_sub >/dev/null || wanted="$wanted mosquitto-clients"
     command -v groff >/dev/null || wanted="$wanted groff-base"
+    command -v gcc >/dev/null || wanted="$wanted gcc libc6-dev"
     for tool in tmux zsh mandoc openssl; do command -v $tool >/dev/null || wanted="$wanted $tool"; done
     [ -n "$wanted" ] || return 0
     can_root || { say "tests that need them are left out; they come with:  sudo apt-get install$wanted"; return; }

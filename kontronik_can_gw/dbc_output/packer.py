@@ -99,8 +99,9 @@ def live_text(plans: Mapping[int, MessagePlan], esc: int) -> str:
     """
     values = ", ".join(f"live{index}" for index in range(len(LiveData._fields)))
     lines = [f"esc = escs[{esc}]", f"{values} = esc.live"]
+    others = any(len(plan.escs) > 1 for plan in plans.values())
     for index, plan in plans.items():
-        body = []
+        body = [f"esc = escs[{esc}]"] if others else []
         if (alive := next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)) is not None:
             body += [f"alive = m{index}.alive", f"m{index}.alive = (alive + 1) % {alive_modulus(alive, False)}"]
         constant = sum(place(s.pieces, s.constant) for s in plan.signals if s.role is Role.CONSTANT)
