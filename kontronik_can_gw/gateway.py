@@ -281,9 +281,9 @@ class Gateway:
             if self.nodes is not None:
                 self.nodes.on_event(esc, events, now)
         if events & Event.LINK:
-            self._next_expiry = 0
+            self._next_expiry = min(self._next_expiry, self.escs[esc].next_deadline())
             self._link_changes.append(esc)
-            escs_ok = sum(e.up for e in self.escs)
+            escs_ok = sum([e.live is not None for e in self.escs])
             if escs_ok != self.status.escs_ok:
                 self.status.escs_ok = escs_ok
                 self._output.on_gateway_change(now)

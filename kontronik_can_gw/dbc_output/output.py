@@ -84,9 +84,12 @@ class DbcOutput:
         self.frames: list[CanFrame | bytes] = []
         self._touched: set[int] = set()
         """ESCs of which something was sent since the frames were taken."""
+        self._images_end = False
+        """No more images until the frames are taken."""
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
+        self._of_gateway = [(i, m) for i, m in enumerate(self._messages) if Group.GATEWAY in m.plan.paces]
         self._schedule = Schedule(layout.messages, now)
         self._listeners: list[list[tuple[int, _Message]]] = [[] for _ in escs]
         for index, message in enumerate(self._messages):
@@ -141,12 +144,14 @@ class DbcOutput:
     def on_live(self, esc: int, now: int) -> None:
         """A live frame has come, and nothing else is new."""
         if esc in self._touched:
-            self.on_event(esc, Event.LIVE, now)
-            return
+            self._end_images()
         self._touched.add(esc)
-        append = self.frames.append
+        append = self._append_plain if self._images_end else self.frames.append
         for step in self._live_steps[esc]:
             step(now, append)
+
+    def _append_plain(self, frame: CanFrame | bytes) -> None:
+        self.frames.append(frame_of(frame))
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
@@ -178,8 +183,8 @@ class DbcOutput:
         ``at_once``: without regard to their minimum distance, for the last word. ``each_second``: only its counters went on,
         which is news for messages that have no cycle.
         """
-        for index, message in enumerate(self._messages):
-            if Group.GATEWAY not in message.plan.paces or (each_second and message.plan.cycle_ns):
+        for index, message in self._of_gateway:
+            if each_second and message.plan.cycle_ns:
                 continue
             if message.by_event or (message.on_change and self._note_changes(message, now)):
                 if at_once:
@@ -206,14 +211,17 @@ class DbcOutput:
     def take(self) -> list[CanFrame | bytes]:
         """The frames so far, images among them; the list is handed over."""
         self._touched.clear()
+        self._images_end = False
         if not self.frames:
             return []
         frames, self.frames = self.frames, []
         return frames
 
     def _end_images(self) -> None:
-        """What comes now may have the ids of images that wait: they are frames as others."""
-        self.frames = [frame_of(frame) for frame in self.frames]
+        """What comes now may have the ids of images that wait: from now on they are frames as others."""
+        if not self._images_end:
+            self._images_end = True
+            self.frames = [frame_of(frame) for frame in self.frames]
 
     def next_deadline(self) -> int | None:
         """When ``advance`` has something to do."""
