@@ -404,6 +404,8 @@ def _open(config: CanConfig) -> "can.BusABC | _SocketCan":
             return _SocketCan(config)
         except OSError as error:
             raise socketcan_error(config, error.errno or 0, error.strerror or str(error)) from None
+        except AttributeError:  # a Python that was built without it
+            raise socketcan_error(config, errno.EAFNOSUPPORT) from None
     with without_asammdf():
         import can
 

@@ -378,13 +378,15 @@ class CanSide:
                 if now < self._busy_until:
                     return
                 self._busy_until = None
+            if not waiting:
+                self._nothing_waits()
+                return
             count, answer = waiting.flush(self._send)
         elif frames:  # the mailboxes would hand them out just so
             count, answer = self._send_all(frames)
             waiting.put_all(frames[count:])
         else:
-            if not self._stalled:
-                self._busy_since = None
+            self._nothing_waits()
             return
         status.sent_frames += count
         if count:
@@ -406,6 +408,10 @@ class CanSide:
             self._conditions.end(self._sending_condition, f"CAN {self.config.channel}: frames are sent again", now)
             self._gateway.can_returned(now)
         self._follow_state(now)
+
+    def _nothing_waits(self) -> None:
+        if not self._stalled:
+            self._busy_since = None
 
     def _send_all(self, frames: Sequence[CanFrame | bytes]) -> tuple[int, Sent]:
         assert self.port is not None

@@ -51,7 +51,10 @@ class Poller:
     def wait(self, pause_ns: int) -> list[tuple[Handler, int]]:
         """Handlers of what has happened, with what; empty when ``pause_ns`` is over (rounded up to a millisecond), or by a signal."""
         happened = self._epoll.poll(pause_ns / SECOND)
-        return [(self._watched[fd][0], _READ if bits == _IN else self._events(fd, bits)) for fd, bits in happened]
+        watched = self._watched
+        return [
+            (watched[fd][0], _READ if bits == _IN else self._events(fd, bits)) for fd, bits in happened if fd in watched
+        ]
 
     def _events(self, fd: int, bits: int) -> int:
         readable = selectors.EVENT_READ if bits & ~select.EPOLLOUT else 0

@@ -17,8 +17,13 @@ _LOCK_CURRENT, _LOCK_FUTURE, _LOCK_ON_FAULT = 1, 2, 4
 """Of mlockall(2): what is used, as it comes to be used."""
 
 
+_begun: list[int] = []
+"""The priority that was taken here, if any: what others gave this process (chrt) is left as it is."""
+
+
 def begin(priority: int) -> None:
     """Take real-time priority for this thread, the loop's, and those beside it. RunError where this process has no right to it."""
+    end()
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
@@ -27,6 +32,7 @@ def begin(priority: int) -> None:
         ) from None
     except OSError as error:
         raise RunError(f"run.realtime_priority = {priority}: {error.strerror or error}. Leave it out.") from None
+    _begun.append(priority)
     for thread in threading.enumerate():
         if thread is not threading.current_thread():
             follow(thread)
@@ -34,9 +40,10 @@ def begin(priority: int) -> None:
 
 
 def end() -> None:
-    """Be a program as others again."""
-    if os.sched_getscheduler(0) != os.SCHED_FIFO:
+    """Be a program as before again."""
+    if not _begun:
         return
+    _begun.clear()
     for thread in threading.enumerate():
         with contextlib.suppress(OSError):
             os.sched_setscheduler(thread.native_id or 0, os.SCHED_OTHER, os.sched_param(0))
@@ -44,10 +51,10 @@ def end() -> None:
 
 
 def follow(thread: threading.Thread) -> None:
-    """Give a thread beside the loop its priority: that of the caller less one; nothing where the caller has none."""
-    if os.sched_getscheduler(0) != os.SCHED_FIFO or thread.native_id is None:
+    """Give a thread beside the loop its priority: that of the loop less one; nothing where it has none."""
+    if not _begun or thread.native_id is None:
         return
-    priority = max(1, os.sched_getparam(0).sched_priority - 1)
+    priority = max(1, _begun[0] - 1)
     with contextlib.suppress(OSError):  # it has ended by now
         os.sched_setscheduler(thread.native_id, os.SCHED_FIFO, os.sched_param(priority))
 

@@ -328,3 +328,20 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> 
     with pytest.raises(RunError, match="is the port of left: nothing may be sent to an ESC"):
         side.open(0, wait=False)
     side.close()
+
+
+def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(bench: Bench, kernel: Kernel) -> None:
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.turn(100)
+    bench.take()
+    bench.port.answer = Sent.BUSY
+    bench.can.mailboxes.put(CanFrame(0x100, b"held"))
+    bench.can.transmit(bench.now)
+    bench.can._is_proven = False
+    bench.can.clear()
+    later = bench.now + SECOND
+    bench.gateway.take_frames()
+    bench.can.transmit(later)
+    assert not bench.can._is_proven
+    assert bench.can._busy_since is None
