@@ -428,7 +428,9 @@ class DumpInput(_Base):
         """Those of ``frames``, in blocks; None where they can only be had one by one: numpy is missing, or a message is of a rare kind."""
         try:
             from kontronik_can_gw.offline.bulk.frames import can_follow
-        except ModuleNotFoundError:
+        except ModuleNotFoundError as error:
+            if error.name != "numpy":
+                raise
             return None
         gateway = self.setup.gateway(self.bus.layout, 0)
         if not can_follow(gateway, self.bus.layout, self._period_ns, self.size):
@@ -467,7 +469,9 @@ class DumpInput(_Base):
             return None
         try:
             from kontronik_can_gw.offline.bulk.rows import can_read
-        except ModuleNotFoundError:
+        except ModuleNotFoundError as error:
+            if error.name != "numpy":
+                raise
             return None
         return self._blocks(chosen) if can_read(self._period_ns, self.size) else None
 

@@ -25,14 +25,30 @@ import registry
 from registry import Benchmark, Context, Figure, LeftOut, NotEqual
 
 
+def seconds(text: str) -> float:
+    number = float(text)
+    if not 0.1 <= number <= 3600:
+        raise argparse.ArgumentTypeError(f"{text} is not within 0.1 to 3600")
+    return number
+
+
+def rounds(text: str) -> int:
+    number = int(text)
+    if not 1 <= number <= 1000:
+        raise argparse.ArgumentTypeError(f"{text} is not within 1 to 1000")
+    return number
+
+
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="bench", description="Measure the gateway beside C and beside the obvious program."
     )
     made.add_argument("--only", nargs="+", action="extend", metavar="NAME", help="these alone; as 'cpu*' too")
     made.add_argument("--list", action="store_true", help="list the benchmarks and end")
-    made.add_argument("--seconds", type=float, default=5.0, metavar="N", help="length of one measurement (default: 5)")
-    made.add_argument("--rounds", type=int, default=3, metavar="N", help="turns of what is compared (default: 3)")
+    made.add_argument(
+        "--seconds", type=seconds, default=5.0, metavar="N", help="length of one measurement (default: 5)"
+    )
+    made.add_argument("--rounds", type=rounds, default=3, metavar="N", help="turns of what is compared (default: 3)")
     made.add_argument(
         "--long", action="store_true", help="files of up to 1 GB too, which takes minutes and as much disk"
     )
@@ -59,20 +75,26 @@ def main(arguments: list[str] | None = None) -> int:
         if not any(fnmatch.fnmatch(each.name, one) for each in known):
             print(f"bench: there is no benchmark {one}. See --list.", file=sys.stderr)
             return 2
-    seconds, rounds = (min(args.seconds, 0.5), 1) if args.quick else (args.seconds, args.rounds)
+    lasts, turns = (min(args.seconds, 0.5), 1) if args.quick else (args.seconds, args.rounds)
     folder = registry.ROOT / "build" / "bench"
     folder.mkdir(parents=True, exist_ok=True)
-    if args.plots is not None:
-        args.plots.mkdir(parents=True, exist_ok=True)
+    try:
+        if args.plots is not None:
+            args.plots.mkdir(parents=True, exist_ok=True)
+        if not args.json.parent.is_dir():
+            raise NotADirectoryError(2, "there is no such folder")
+        args.json.open("a").close()  # before half an hour of measuring, not behind it
+    except OSError as error:
+        print(f"bench: {error.filename or args.json.parent}: {error.strerror}", file=sys.stderr)
+        return 2
     results, interrupted = [], False
     try:
         for each in chosen:
-            context = Context(folder, seconds, rounds, args.quick, args.plots, args.realtime, args.vcan, args.long)
+            context = Context(folder, lasts, turns, args.quick, args.plots, args.realtime, args.vcan, args.long)
             results.append(run_one(each, context))
     except KeyboardInterrupt:
         interrupted = True
         print("bench: ended by hand; what is done is written", file=sys.stderr)
-    args.json.parent.mkdir(parents=True, exist_ok=True)
     args.json.write_text(json.dumps(document(args, results), indent=1, allow_nan=False) + "\n")
     print(table(results))
     print(f"JSON: {args.json}", file=sys.stderr)
