@@ -17,6 +17,7 @@ from kontronik_can_gw.telemetry import SECOND, EscSettings, EscTelemetry, Event
 _CONFLICT_NS = 10 * SECOND
 """So long without a further one, and a conflict of ids is over."""
 _ECHO_NS = SECOND // 5
+_LIVE = Event.LIVE
 _NOTHING: frozenset[int] = frozenset()
 
 
@@ -98,7 +99,7 @@ class Gateway:
         if now >= self._next_expiry:
             self._expire(now, but=esc)  # a message may hold values of several ESCs
         elif self.escs[esc].receive_live(data, now):
-            self._follow(esc, Event.LIVE, now)
+            self._follow(esc, _LIVE, now)
             return
         for events in self.escs[esc].receive_each(data, now):
             self._follow(esc, events, now)
@@ -271,7 +272,7 @@ class Gateway:
             self._output.on_gateway_change(now, each_second=True)
 
     def _follow(self, esc: int, events: int, now: int) -> None:
-        if events == Event.LIVE:
+        if events == _LIVE:
             self._output.on_live(esc, now)
             if self.nodes is not None:
                 self.nodes.on_event(esc, events, now)

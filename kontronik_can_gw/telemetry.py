@@ -38,6 +38,7 @@ class LinkState(IntEnum):
     PORT_ERROR = 5
 
 
+_new = tuple.__new__
 # An enumeration's members are slow to look up.
 _NEVER_SEEN, _OK, _DEGRADED = LinkState.NEVER_SEEN, LinkState.OK, LinkState.DEGRADED
 
@@ -84,6 +85,8 @@ class EscTelemetry:
         self.live: LiveData | None = None
         self.info: InfoData | None = None
         self.last_live: LiveData | None = None
+        self.live_values: tuple[int, ...] = ()
+        """Of the newest live frame, for who needs them all and fast: a plain tuple."""
         self.last_info: InfoData | None = None
         self.link = LinkState.NEVER_SEEN
         self.layout = 0
@@ -177,18 +180,18 @@ class EscTelemetry:
 
         False for anything else: then nothing has happened. True: the event is LIVE.
         """
-        if (old := self.live) is None or self.layout != 1 or (live := self._deframer.take_live(data)) is None:
+        if (old := self.live) is None or self.layout != 1 or (values := self._deframer.take_live(data)) is None:
             return False
-        before = self.live_ns
-        assert before is not None
+        before: int = self.live_ns  # type: ignore[assignment]  # there is a live frame
         if now > before:  # a pseudo terminal is faster than the wire
             if self._last_power > 0:
                 self.energy += self._last_power * (now - before)
             if old[0]:
                 self.run_time += now - before
             self.live_ns = now
-        self.live = self.last_live = live
-        self._last_power = live[1] * live[2]
+        self.live = self.last_live = _new(LiveData, values)
+        self.live_values = values
+        self._last_power = values[1] * values[2]
         return True
 
     def _receive_behind(self, events: int, data: bytes, now: int) -> Iterator[int]:
@@ -266,6 +269,7 @@ class EscTelemetry:
                     self.run_time += when - before
         self._last_power = data.battery_voltage * data.battery_current
         self.live = self.last_live = data
+        self.live_values = tuple(data)
         self.live_ns = when
         if self.link is not _OK and self.link is not _DEGRADED:
             events |= self._set_link(_OK)

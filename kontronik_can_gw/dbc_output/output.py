@@ -143,9 +143,11 @@ class DbcOutput:
 
     def on_live(self, esc: int, now: int) -> None:
         """A live frame has come, and nothing else is new."""
-        if esc in self._touched:
+        touched = self._touched
+        if esc in touched:
             self._end_images()
-        self._touched.add(esc)
+        else:
+            touched.add(esc)
         append = self._append_plain if self._images_end else self.frames.append
         for step in self._live_steps[esc]:
             step(now, append)
@@ -196,8 +198,8 @@ class DbcOutput:
 
     def advance(self, now: int) -> None:
         """Send what is due."""
-        due = self._schedule.next_deadline()
-        if due is None or now < due:
+        heap = self._schedule.heap
+        if not heap or now < heap[0][0]:
             return
         for index, cyclic in self._schedule.due(now):
             message = self._messages[index]
@@ -212,9 +214,10 @@ class DbcOutput:
         """The frames so far, images among them; the list is handed over."""
         self._touched.clear()
         self._images_end = False
-        if not self.frames:
+        frames = self.frames
+        if not frames:
             return []
-        frames, self.frames = self.frames, []
+        self.frames = []
         return frames
 
     def _end_images(self) -> None:

@@ -98,7 +98,7 @@ def live_text(plans: Mapping[int, MessagePlan], esc: int) -> str:
     their schedule ``last``, ``waiting``, ``cycle_waits`` and ``request``.
     """
     values = ", ".join(f"live{index}" for index in range(len(LiveData._fields)))
-    lines = [f"esc = escs[{esc}]", f"{values} = esc.live"]
+    lines = [f"esc = escs[{esc}]", f"{values} = esc.live_values"]
     others = any(len(plan.escs) > 1 for plan in plans.values())
     for index, plan in plans.items():
         body = [f"esc = escs[{esc}]"] if others else []
@@ -125,7 +125,7 @@ def live_text(plans: Mapping[int, MessagePlan], esc: int) -> str:
             lines += [f"    request({index}, now)", "else:", *(f"    {line}" for line in body)]
         else:
             lines += body
-    return "".join(f"{line}\n" for line in ["def send(now, append):", *(f"    {line}" for line in lines)])
+    return "".join(f"{line}\n" for line in ["def send(now, append, image=image):", *(f"    {line}" for line in lines)])
 
 
 def compile_live(plans: Mapping[int, MessagePlan], esc: int, names: Mapping[str, object]) -> SendLive:

@@ -21,7 +21,6 @@ _LIVE, _V4_LENGTH = _LIVE_V4.header, _LIVE_V4.length
 _COVERED, _LEGACY_CRC_AT = _LIVE_LEGACY.covered, _LIVE_LEGACY.crc_at
 _u32_at = struct.Struct("<I").unpack_from
 _live_values = struct.Struct(f"<4x{body_format(LiveData)}").unpack_from
-_new = tuple.__new__
 _RESIDUE = 0x2144DF1C
 """The CRC-32 of anything with its own CRC behind it."""
 _PREFIX = b"KOD"
@@ -160,10 +159,10 @@ class Deframer:
         buffer = self._pending + data if self._pending else bytes(data)
         return self._scan(buffer, ended=False)
 
-    def take_live(self, data: bytes) -> LiveData | None:
-        """What ``feed`` finds in one live frame of layout V4 and nothing else, as most reads bring it: one CRC over it and its own.
+    def take_live(self, data: bytes) -> tuple[int, ...] | None:
+        """The values of one live frame of layout V4 and nothing else, as most reads bring it: one CRC over it and its own.
 
-        None for anything else, also while bytes are pending: then nothing has happened, and it is for ``feed``.
+        It is what ``feed`` would find. None for anything else, also while bytes are pending: then nothing has happened, and it is for ``feed``.
         """
         if self._pending or len(data) != _V4_LENGTH:
             return None
@@ -179,8 +178,9 @@ class Deframer:
         counters.headers += 1
         counters.live_v4 += 1
         self._base += _V4_LENGTH
-        self._blame_until = 0
-        return _new(LiveData, _live_values(data))
+        if self._blame_until:
+            self._blame_until = 0
+        return _live_values(data)
 
     def flush(self) -> list[Frame]:
         """The stream ended or was interrupted: search what is pending, drop the rest, be ready for a new start."""
