@@ -162,7 +162,8 @@ class Deframer:
     def take_live(self, data: bytes) -> tuple[int, ...] | None:
         """The values of one live frame of layout V4 and nothing else, as most reads bring it: one CRC over it and its own.
 
-        It is what ``feed`` would find. None for anything else, also while bytes are pending: then nothing has happened, and it is for ``feed``.
+        It is what ``feed`` would find. None for anything else, also while bytes are pending: then nothing has happened, and it is for
+        ``feed``.
         """
         if self._pending or len(data) != _V4_LENGTH:
             return None
