@@ -110,7 +110,7 @@ class Gateway:
 
         Those that the nodes listen to, and those that only this gateway sends with: who else does is to be noticed.
         """
-        if self.nodes is not None:
+        if self.nodes is not None and self.nodes.receive_ids is not self._routed:
             self._follow_ids()
         return self._receive_ids
 
@@ -228,8 +228,7 @@ class Gateway:
         """As ``take_frames``, but with images (frames.py) as they are."""
         frames = self._output.take()
         if self.nodes is not None and self.nodes.frames:
-            frames = [*self.nodes.frames, *frames]
-            self.nodes.frames = []
+            frames = self.nodes.take() + frames
         return frames
 
     def not_sent(self, now: int) -> None:
@@ -275,7 +274,7 @@ class Gateway:
         if events == _LIVE:
             self._output.on_live(esc, now)
             if self.nodes is not None:
-                self.nodes.on_event(esc, events, now)
+                self.nodes.on_live(esc, now)
             return
         if events:
             self._output.on_event(esc, events, now)

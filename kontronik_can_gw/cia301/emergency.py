@@ -124,7 +124,8 @@ class Emergencies:
         """1003h, newest first: bits 15..0 code, 23..16 byte 3, 31..24 byte 4."""
         self.mask = 0xFFFFFFFF
         self.inhibit_ns = 0
-        self._word = 0
+        self.word = 0
+        """The ESC's error word."""
         self._word_register = 0
         self._active: dict[Condition, None] = {}
         self._untold: dict[Condition, None] = {}
@@ -153,9 +154,9 @@ class Emergencies:
 
     def set_word(self, word: int, now: int, force: bool = False) -> None:
         """The ESC's error word of a new live frame (or, with ``force``, a new mask)."""
-        if word == self._word and not force:
+        if word == self.word and not force:
             return
-        self._word = word
+        self.word = word
         bits = told_bits(word, self.mask)
         self._word_register = 0
         registered = word & (_ERROR_BITS & ~_SUMMARY_BITS) | bits
@@ -257,5 +258,5 @@ class Emergencies:
         else:
             head = condition.code.to_bytes(2, "little") + bytes((self.register, condition.source))
             from_gateway = condition.source == _FROM_GATEWAY
-            tail = (condition.detail if from_gateway else self._word).to_bytes(4, "little")
+            tail = (condition.detail if from_gateway else self.word).to_bytes(4, "little")
         self._pending.append((condition, head + tail))  # the newest is never the one that finds no room

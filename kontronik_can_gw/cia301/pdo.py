@@ -8,7 +8,7 @@ carry the link status: those go on, with all ones (80..0h for signed types) for 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from kontronik_can_gw.cia301.abort import Abort, SdoAbort
 from kontronik_can_gw.cia301.bindings import LINK, Bound
@@ -16,7 +16,7 @@ from kontronik_can_gw.cia301.dictionary import Dictionary, Value, Variable
 from kontronik_can_gw.cia301.heartbeat import NEVER
 from kontronik_can_gw.dbc_output.layout import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
 from kontronik_can_gw.dbc_output.packer import Pack, compile_pack, place
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import image_id
 from kontronik_can_gw.sources import GatewayStatus, Group, Source
 from kontronik_can_gw.telemetry import MS, SECOND, EscTelemetry, Event
 
@@ -134,8 +134,9 @@ class Tpdo:
         bound: Mapping[tuple[int, int], Bound],
         esc: EscTelemetry,
         gateway: GatewayStatus,
-        send: Callable[[CanFrame], None],
+        send: Callable[[int, int, int], None],
     ) -> None:
+        """``send`` is called with image id, length and bits of each frame (frames.IMAGE)."""
         self.number = number
         self.bound = bound
         self.cob_id = 0
@@ -145,10 +146,13 @@ class Tpdo:
         """Frames so far."""
         self._dictionary = dictionary
         self._esc = esc
+        self._escs = (esc,)
         self._gateway = gateway
         self._send_frame = send
+        self._image_id = 0
         self._started = False
         self._type = 255
+        self._by_event = True
         self._inhibit_ns = self._event_ns = 0
         self._sync_start = 0
         self._mapped: list[Mapped] = []
@@ -158,11 +162,15 @@ class Tpdo:
         self.triggers = 0
         """The events (of telemetry.Event) that are news to it."""
         self._status_mask = 0
+        self._status: Pack | None = None
+        """Only the status objects at their places; None where a change of them is not what causes it."""
         self._needs_live = False
         self._last_status = -1
         self._last_ns = -NEVER
+        self._held_until = -NEVER
         self._event_due = NEVER
-        self._pending = False
+        self.pending = False
+        """It waits for the inhibit time to end: further events change nothing."""
         self._fresh = False
         self._syncs = 0
         self._sync_waits = False
@@ -212,9 +220,12 @@ class Tpdo:
         cob_id = number(index, COB_ID, INVALID_BIT)
         was_running = self._running
         self.cob_id = cob_id & 0x7FF
+        self._image_id = image_id(self.cob_id, False)
         self.valid = not cob_id & INVALID_BIT
         self._type = number(index, TYPE, 255)
+        self._by_event = self._type in EVENT_TYPES
         self._inhibit_ns = number(index, INHIBIT) * MS // 10
+        self._held_until = self._last_ns + self._inhibit_ns
         self._event_ns = number(index, EVENT_TIMER) * MS
         self._sync_start = number(index, SYNC_START)
         self._mapped = [
@@ -223,14 +234,14 @@ class Tpdo:
         self._compile()
         if self._started and self._running:
             if was_running:
-                self._pending = self._pending and self._type in EVENT_TYPES
+                self.pending = self.pending and self._by_event
                 self._event_due = self._next_event(now)
                 self._set_due()
             else:
                 self.start(now)
         else:
             self._event_due = NEVER
-            self._pending = False
+            self.pending = False
             self._set_due()
 
     def resolve(self, mapping: int) -> Mapped:
@@ -304,14 +315,14 @@ class Tpdo:
     def start(self, now: int) -> None:
         """The node has become OPERATIONAL: event-driven PDOs say once what is."""
         self._started = True
-        self._last_ns = -NEVER
+        self._last_ns = self._held_until = -NEVER
         self._last_status = -1
         self._fresh = True
-        self._pending = False
+        self.pending = False
         self._syncs = 0
         self._sync_waits = self._sync_start != 0
         self._event_due = NEVER
-        if self._running and self._type in EVENT_TYPES:
+        if self._running and self._by_event:
             self._event_due = self._next_event(now)
             self._request(now)
         self._set_due()
@@ -319,19 +330,30 @@ class Tpdo:
     def stop(self) -> None:
         """No PDO outside OPERATIONAL."""
         self._started = False
-        self._pending = False
+        self.pending = False
         self._event_due = self.due = NEVER
+
+    @property
+    def follows_live(self) -> bool:
+        """Whether each live frame is told to it (``on_event``)."""
+        return self._started and self._running and bool(self.triggers & Event.LIVE)
 
     def on_event(self, now: int) -> None:
         """Something of ``triggers`` happened."""
         if not self._started or not self.valid or self._pack is None:
             return
-        if self._status_mask:
-            status = self._pack((self._esc,), self._gateway, now, 0, 0) & self._status_mask
+        if self.pending:
+            if now >= self._held_until:
+                self._send(now)
+            return
+        if self._status is not None:
+            status = self._status(self._escs, self._gateway, now, 0, 0)
             if status == self._last_status:
                 return
             self._last_status = status
-        self._news(now)
+        self._fresh = True
+        if self._by_event:
+            self._request(now)
 
     def on_download(self, variable: Variable, now: int) -> None:
         """An object was written over the bus."""
@@ -367,42 +389,43 @@ class Tpdo:
         if now >= self._event_due:
             self._event_due = self._next_event(now)
             self._request(now)
-        elif self._pending and now >= self._last_ns + self._inhibit_ns:
+        elif self.pending and now >= self._held_until:
             self._send(now)
         self._set_due()
 
     def _news(self, now: int) -> None:
         self._fresh = True
-        if self._type in EVENT_TYPES:
+        if self._by_event:
             self._request(now)
-            self._set_due()
 
     def _request(self, now: int) -> None:
-        if now < self._last_ns + self._inhibit_ns:
-            self._pending = True
-        else:
+        if now >= self._held_until:
             self._send(now)
+        else:
+            self.pending = self._fresh = True
+            self._set_due()
 
     def _send(self, now: int) -> None:
-        self._pending = False
+        self.pending = False
         if self._needs_live and self._esc.live is None:
+            self._set_due()
             return
         assert self._pack is not None
         self._fresh = False
         self._last_ns = now
-        if self._type in EVENT_TYPES:
-            self._event_due = self._next_event(now)
-        bits = self._pack((self._esc,), self._gateway, now, 0, 0)
+        self._held_until = now + self._inhibit_ns
+        self.due = self._event_due = self._next_event(now)
+        bits = self._pack(self._escs, self._gateway, now, 0, 0)
         self._last_status = bits & self._status_mask
         self.sent += 1
-        self._send_frame(CanFrame(self.cob_id, bits.to_bytes(self._length, "little")))
+        self._send_frame(self._image_id, self._length, bits)
 
     def _next_event(self, now: int) -> int:
-        return now + self._event_ns if self._event_ns and self._type in EVENT_TYPES else NEVER
+        return now + self._event_ns if self._event_ns and self._by_event else NEVER
 
     def _set_due(self) -> None:
-        held = self._last_ns + self._inhibit_ns if self._pending else NEVER
-        self.due = min(held, self._event_due)
+        due = self._event_due
+        self.due = self._held_until if self.pending and self._held_until < due else due
 
     def _compile(self) -> None:
         """Compile the plan anew if what it is made from has changed."""
@@ -410,22 +433,27 @@ class Tpdo:
         if made_from == self._compiled:
             return
         self._compiled = made_from
-        self._pack = None
+        self._pack = self._status = None
         self.triggers = self._status_mask = 0
         if not self._mapped:
             return
         plan = message_plan(f"TPDO {self.number + 1}", self.cob_id, self._mapped)
-        self._pack = compile_pack(plan, {"storage": self._dictionary.variables, "shown": self._shown})
+        names = {"storage": self._dictionary.variables, "shown": self._shown}
+        self._pack = compile_pack(plan, names)
         self._length = plan.length
         carries_link = False
+        status = []
         for entry, signal in zip(self._mapped, plan.signals, strict=True):
             if entry.bound is None:
                 if entry.variable.read is not None:  # of a service: the error register, the error code
-                    self._status_mask |= place(signal.pieces, -1)
+                    status.append(signal)
                 continue
             carries_link |= entry.variable.entry.index == LINK and entry.bound.status
             if entry.bound.status:
-                self._status_mask |= place(signal.pieces, -1)
+                status.append(signal)
+        if status:
+            self._status_mask = sum(place(signal.pieces, -1) for signal in status)
+            self._status = compile_pack(replace(plan, signals=tuple(status)), names)
         for pace in plan.paces:
             self.triggers |= _EVENT_OF_PACE[pace]
         if self._status_mask:
