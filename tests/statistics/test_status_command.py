@@ -435,8 +435,9 @@ class Terminal:
         self.text = ""
 
     def until(self, text: str) -> None:
+        """Wait for words, wherever their line is broken."""
         end = time.monotonic() + 30
-        while text not in self.text:
+        while text not in " ".join(re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text).split()):
             assert time.monotonic() < end, self.text
             if select.select([self.master], [], [], 0.1)[0]:
                 self.text += os.read(self.master, 65536).decode("utf-8", "replace")
