@@ -5,7 +5,8 @@
 lint   ruff: mistakes and format
 types  mypy --strict
 unit   pytest on this machine, all but tests/vcan
-vcan   pytest tests/vcan on real vcan interfaces: here if this kernel has them, else in a VM (tests/vm/run)
+vcan   pytest tests/vcan on real vcan interfaces: here if this kernel has them, else in a VM (tests/vm/run), beside ``unit``
+       if both are run and there is more than one processor
 faults the fault programme on real drivers (tests/faults): in User Mode Linux, and on the emulated hardware of QEMU
 soak   random faults for --minutes from one --seed; only when it is asked for
 
@@ -32,7 +33,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import IO, Any, NoReturn
 from xml.etree import ElementTree as ET
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -43,6 +44,9 @@ FAULTS_TIMEOUT_S = {False: 1200, True: 4 * 3600}
 VM_RUN = PROJECT / "tests" / "vm" / "vm_run.py"
 VCAN_TIMEOUT_S = 2400
 STEP_TIMEOUT_S = 2500
+RUNNING: set[subprocess.Popen[bytes]] = set()
+LEAVING: list[int] = []
+IN_ITS_VM = "tests/service/test_under_systemd.py"
 MOST_REPEATED = 4
 """So many failed tests are looked at once more; with more than that something is wrong."""
 SEARCH_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
@@ -103,20 +107,35 @@ def say(line: str) -> None:
 
 
 def call(
-    command: Sequence[str], environment: Mapping[str, str] | None = None, timeout_s: float = STEP_TIMEOUT_S
+    command: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    timeout_s: float = STEP_TIMEOUT_S,
+    output: IO[str] | None = None,
 ) -> int:
-    """Runs a command with our stdout and stderr and the environment's programs; its exit code, 124 if it took too long."""
+    """Runs a command with our stdout and stderr, or ``output`` for both, and the environment's programs.
+
+    Its exit code, 124 if it took too long.
+    """
+    if LEAVING:
+        return 128 + signal.SIGTERM
     say("$ " + shlex.join(command))
     path = os.pathsep.join([str(Path(sys.executable).parent), SEARCH_PATH])
     with subprocess.Popen(
-        command, cwd=PROJECT, env={**os.environ, "PATH": path, **(environment or {})}, stdin=subprocess.DEVNULL
+        command,
+        cwd=PROJECT,
+        env={**os.environ, "PATH": path, **(environment or {})},
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=None if output is None else subprocess.STDOUT,
     ) as process:
+        RUNNING.add(process)
         try:
             return process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             say(f"{command[0]}: no end within {timeout_s:g} s")
             return 124
         finally:  # ours to end, also when we are interrupted
+            RUNNING.discard(process)
             if process.poll() is None:
                 process.terminate()
                 try:
@@ -156,16 +175,17 @@ def pytest(
     arguments: Sequence[str],
     report: Path,
     environment: Mapping[str, str],
+    output: IO[str] | None = None,
 ) -> Result:
     """Runs pytest on ``what``. A few tests that fail are run once more, by themselves, which is told: on a busy machine all is late."""
     start = time.monotonic()
-    code = call([*command, *what, *arguments, f"--junitxml={report}"], environment)
+    code = call([*command, *what, *arguments, f"--junitxml={report}"], environment, output=output)
     suite = read_junit(report)
     repeated: list[str] = []
     if suite is not None and code == 1 and 0 < suite.failed <= MOST_REPEATED and not arguments:
         say(f"\n== {step}: once more: " + ", ".join(suite.failures))
         second = report.with_name(f"again_{report.name}")
-        code = call([*command, *suite.failures, f"--junitxml={second}"], environment)
+        code = call([*command, *suite.failures, f"--junitxml={second}"], environment, output=output)
         better = read_junit(second)
         if better is None or better.passed + better.failed != suite.failed:
             code = code or 1  # one of them was not found again
@@ -189,11 +209,28 @@ def pytest(
     return Result(step, "FAILED" if code or suite.failed else "passed", seconds, detail, suite=suite)
 
 
-def unit(arguments: Sequence[str], scratch: Path) -> Result:
+def unit(arguments: Sequence[str], scratch: Path, but: Sequence[str] = ()) -> Result:
     if missing("pytest"):
         return Result("unit", "not run", reason="pytest is not installed", enable=ENABLE_VENV)
     command = [sys.executable, "-m", "pytest", "-q", "-rs"]
-    return pytest("unit", command, ["tests", "--ignore=tests/vcan"], arguments, scratch / "unit.xml", {})
+    what = ["tests", *(f"--ignore={path}" for path in ("tests/vcan", *but))]
+    return pytest("unit", command, what, arguments, scratch / "unit.xml", {})
+
+
+def side_by_side(scratch: Path) -> list[Result]:
+    """``unit`` on one processor, and what runs in virtual machines on another: ``vcan``, and the service under systemd from ``unit``."""
+    with (scratch / "beside.log").open("w+") as output, ThreadPoolExecutor(1) as beside:
+
+        def in_machines() -> list[Result]:
+            command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider"]
+            service = pytest("systemd", command, [IN_ITS_VM], (), scratch / "systemd.xml", {}, output)
+            return [service, vcan((), scratch, output)]
+
+        machines = beside.submit(in_machines)
+        results = [unit((), scratch, but=[IN_ITS_VM]), *machines.result()]
+        output.seek(0)
+        say("\n== systemd, vcan: what they said\n" + output.read())
+        return results
 
 
 def in_a_vm(scratch: Path) -> dict[str, str]:
@@ -206,7 +243,7 @@ def in_a_vm(scratch: Path) -> dict[str, str]:
     return {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
 
 
-def vcan(arguments: Sequence[str], scratch: Path) -> Result:
+def vcan(arguments: Sequence[str], scratch: Path, output: IO[str] | None = None) -> Result:
     if missing("pytest"):
         return Result("vcan", "not run", reason="pytest is not installed", enable=ENABLE_VENV)
     if not list(PROJECT.glob("tests/vcan/**/test_*.py")):
@@ -227,7 +264,7 @@ def vcan(arguments: Sequence[str], scratch: Path) -> Result:
     }
     command = [sys.executable, str(VM_RUN), f"--timeout={VCAN_TIMEOUT_S}", "--verbose", f"--rw={scratch}", "--"]
     command += [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider"]
-    result = pytest("vcan", command, ["tests/vcan"], arguments, scratch / "vcan.xml", environment)
+    result = pytest("vcan", command, ["tests/vcan"], arguments, scratch / "vcan.xml", environment, output)
     result.detail += f" ({which})"
     return result
 
@@ -377,7 +414,7 @@ def summarize(results: Sequence[Result], strict: bool) -> int:
     skipped = [test for result in results if result.suite for test in result.suite.skipped]
     say("\n== summary")
     for result in results:
-        say(f"{result.step:6} {result.state:8} {result.seconds:7.1f} s  {result.detail}".rstrip())
+        say(f"{result.step:7} {result.state:8} {result.seconds:7.1f} s  {result.detail}".rstrip())
     for result in not_run:
         say(f"not run: {result.step}: {result.reason}\n    to enable it:  {result.enable}")
     for test in skipped:
@@ -392,6 +429,9 @@ def summarize(results: Sequence[Result], strict: bool) -> int:
 
 
 def leave(number: int, _frame: FrameType | None) -> NoReturn:
+    LEAVING.append(number)
+    for process in list(RUNNING):  # those of other threads would be waited for
+        process.terminate()
     sys.exit(128 + number)
 
 
@@ -420,16 +460,18 @@ def main() -> int:
     results: list[Result] = []
     with tempfile.TemporaryDirectory(prefix="kcg-test.", ignore_cleanup_errors=True) as folder:
         scratch = Path(folder)
+        at_once = {"unit", "vcan"} <= set(only) and not pytest_arguments and (os.cpu_count() or 1) > 1
+        at_once = at_once and not missing("pytest")
         for step in STEPS + ON_DEMAND:
-            if step not in only:
+            if step not in only or (at_once and step == "vcan"):
                 continue
-            say(f"\n== {step}")
+            say(f"\n== {step}" + (" and vcan, side by side" if at_once and step == "unit" else ""))
             if step == "lint":
                 found = [lint()]
             elif step == "types":
                 found = [types()]
             elif step == "unit":
-                found = [unit(pytest_arguments, scratch)]
+                found = side_by_side(scratch) if at_once else [unit(pytest_arguments, scratch)]
             elif step == "vcan":
                 found = [vcan(pytest_arguments, scratch)]
             elif step == "faults":

@@ -29,7 +29,7 @@ class Runs:
         self.rounds = list(rounds)
         self.commands: list[Sequence[str]] = []
 
-    def __call__(self, command: Sequence[str], *_others: Any) -> int:
+    def __call__(self, command: Sequence[str], *_others: Any, **_options: Any) -> int:
         self.commands.append(command)
         found = self.rounds.pop(0)
         cases = [CASE.format(name=name, what="" if good else "<failure/>") for name, good in found.items()]
