@@ -52,6 +52,7 @@ def gateway(channel: str, store: Path, node_id: int) -> Iterator[None]:
         gc.freeze()  # what thousands of tests before left behind must not be walked through while the gateway is to answer
         feeder.start()
         runner.start()
+        until(lambda: loop._look_due > 0)  # it has come round: a node that waits for LSS does not say when it listens
         try:
             yield
         finally:
