@@ -84,7 +84,8 @@ def two(report: Report) -> Iterator[Bench]:
 @contextlib.contextmanager
 def eight(report: Report) -> Iterator[Bench]:
     layouts = (Layout.V4, Layout.LEGACY)
-    with bench_of(report, [Identity(i + 1, layouts[i % 2]) for i in range(8)], canopen=None) as bench:
+    identities = [Identity(i + 1, layouts[i % 2]) for i in range(8)]
+    with bench_of(report, identities, rate_hz=25, canopen=None) as bench:  # feeder and judge have the processor, too
         yield bench
 
 
