@@ -323,13 +323,13 @@ def is_good(row: Mapping[str, Any]) -> bool:
 
 
 def again(part: Part, scratch: Path) -> Result:
-    """Repeats faults that were not healed in time, by themselves, up to three times: a machine that has other work makes everything late.
+    """Repeats faults that were not healed in time, by themselves, up to twice: a machine that has other work makes everything late.
 
     What was found at which attempt is kept in the results and told.
     """
     seconds = part.result.seconds
     repeated: set[str] = set()
-    for attempt in (2, 3, 4):
+    for attempt in (2, 3):
         try:
             found = json.loads(part.out.read_text())
         except (OSError, ValueError):
