@@ -351,9 +351,7 @@ class Tpdo:
             if status == self._last_status:
                 return
             self._last_status = status
-        self._fresh = True
-        if self._by_event:
-            self._request(now)
+        self._news(now)
 
     def on_download(self, variable: Variable, now: int) -> None:
         """An object was written over the bus."""
