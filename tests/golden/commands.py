@@ -23,7 +23,7 @@ def cases(text: str) -> dict[str, list[str]]:
     """The lines of each case by its title; what stands in front of the first one under an empty title."""
     found: dict[str, list[str]] = {"": []}
     title = ""
-    for line in text.splitlines():
+    for line in text.removesuffix("\n").split("\n"):
         if line.startswith("## "):
             title = line[3:]
             assert title not in found, f"two cases are called {title!r}"
@@ -88,11 +88,11 @@ def flight_bytes(file: Path, esc: int) -> bytes:
 
 def _edited(text: str, edits: list[str]) -> str:
     """``@ line``: go to the next line that is this; ``- line``: remove the next one that is this; ``+ line``: put this here."""
-    lines = text.split("\n")
-    end = "\r" if lines[0].endswith("\r") else ""
+    newline = "\r\n" if "\r\n" in text else "\n"
+    lines = text.split(newline)
     at = 0
     for edit in edits:
-        mark, content = edit[0], edit[2:] + end
+        mark, content = edit[0], edit[2:]
         if mark == "+":
             lines.insert(at, content)
             at += 1
@@ -102,7 +102,7 @@ def _edited(text: str, edits: list[str]) -> str:
             del lines[at]
         else:
             at += 1
-    return "\n".join(lines)
+    return newline.join(lines)
 
 
 def _run(line: str, folder: Path) -> Iterator[str]:
