@@ -15,6 +15,8 @@ import meaning
 import scenario
 
 HERE = Path(__file__).parent
+LINES = 25
+"""Lines on standard error that are shown."""
 _RESULT = re.compile(r"(\||!|=>) ?")
 _WORD = re.compile(r"'([^']*)'|(\S+)")
 
@@ -111,14 +113,19 @@ def _run(line: str, folder: Path) -> Iterator[str]:
     out, err = io.TextIOWrapper(io.BytesIO(), "utf-8"), io.StringIO()
     code = 0
     if words[0] == "cat":
+        if not (folder / words[1]).is_file():
+            yield "! there is no such file"
+            return
         out.buffer.write((folder / words[1]).read_bytes())
     else:
         with redirect_stdout(out), redirect_stderr(err):
             code = drive.command(words)
     out.flush()
     data = out.buffer.getvalue()  # type: ignore[attr-defined]
-    shown = meaning.FORMS[how](data) if how else data.decode("utf-8").splitlines()
+    shown = meaning.FORMS[how](data) if how and data and code == 0 else data.decode("utf-8").splitlines()
     talk = [text for text in err.getvalue().splitlines() if not text.startswith(("usage: ", "  "))]
+    if len(talk) > LINES:
+        talk[LINES:] = [f"... and {len(talk) - LINES} more lines"]
     yield from (f"| {_neutral(text, folder)}".rstrip() for text in shown)
     yield from (f"! {_neutral(text, folder)}".rstrip() for text in talk)
     yield f"=> {code}"
@@ -128,6 +135,7 @@ def _neutral(text: str, folder: Path) -> str:
     """Without what depends on this machine or on the version."""
     for real, instead in ((f"{folder}/", ""), (str(folder), "."), *drive.FOLDERS.items()):
         text = text.replace(real, instead)
+    text = re.sub(r"\(choose from .*\)", lambda found: found[0].replace("'", ""), text)  # Python's versions differ
     return re.sub(rf"\b{re.escape(drive.VERSION)}\b", "VERSION", text)
 
 
