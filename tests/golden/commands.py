@@ -136,6 +136,7 @@ def _neutral(text: str, folder: Path) -> str:
     for real, instead in ((f"{folder}/", ""), (str(folder), "."), *drive.FOLDERS.items()):
         text = text.replace(real, instead)
     text = re.sub(r"\(choose from .*\)", lambda found: found[0].replace("'", ""), text)  # Python's versions differ
+    text = re.sub(r", in [\d.]+ s\b", ", in TIME", text)
     return re.sub(rf"\b{re.escape(drive.VERSION)}\b", "VERSION", text)
 
 

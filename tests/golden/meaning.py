@@ -74,8 +74,7 @@ def dbc_short(data: bytes) -> list[str]:
     """A line for each message: what there is, and a digest of all of it."""
     lines = []
     for message in sorted(database(data).messages, key=lambda m: (m.is_extended_frame, m.frame_id)):
-        names = " ".join(f"{s.name}@{s.start}|{s.length}" for s in sorted(message.signals, key=lambda s: s.start))
-        lines.append(f"{message.frame_id:03X} {message.name} {message.cycle_time} ms {_digest(_message(message))}: {names}")
+        lines.append(f"{message.frame_id:03X} {message.name} {message.cycle_time} ms {len(message.signals)} signals {_digest(_message(message))}")
     return lines
 
 

@@ -87,7 +87,6 @@ def _in_frames(old: str, new: str) -> Iterator[str]:
         yield f"{len(moved)} {total} come at another time, first {moved[0][0]} at {moved[0][1]} s -> {moved[0][2]} s"
     lost = Counter(frame for frame, _ in gone) - Counter(frame for frame, _, _ in moved)
     if lost:
-        frame, at = next((f, at) for f, at in reversed(gone) if lost[f])
         frame, at = next((f, at) for f, at in gone if lost[f])
         yield f"{lost.total()} {total} are gone, first {frame} at {at} s"
     more = [(frame, at) for frame, times in moved_to.items() for at in times]
@@ -109,7 +108,7 @@ def _in_lines(old: Sequence[str], new: Sequence[str]) -> Iterator[str]:
 
 def _in_cases(old: str, new: str) -> Iterator[str]:
     before, after = commands.cases(old), commands.cases(new)
-    for title in before.keys() | after.keys():
+    for title in dict.fromkeys([*before, *after]):
         if before.get(title) != after.get(title):
             yield title
             yield from (f"    {line}" for line in _in_lines(before.get(title, []), after.get(title, [])))
