@@ -1,6 +1,7 @@
 """Command lines and what they give, as text (README.md). ``play`` writes the results anew."""
 
 import io
+import logging
 import os
 import re
 import sys
@@ -144,15 +145,25 @@ def _neutral(text: str, folder: Path) -> str:
 def _place() -> Iterator[Path]:
     """An empty folder to work in, and surroundings that are the same everywhere."""
     before, folder_before = dict(os.environ), Path.cwd()
-    argv, stdin = sys.argv, sys.stdin
+    argv, stdin, handlers = sys.argv, sys.stdin, logging.root.handlers
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
-        for key in ("LISTEN_FDS", "NOTIFY_SOCKET", "JOURNAL_STREAM", "STATE_DIRECTORY", "RUNTIME_DIRECTORY", "NO_COLOR"):
+        for key in (
+            "LISTEN_FDS",
+            "NOTIFY_SOCKET",
+            "JOURNAL_STREAM",
+            "STATE_DIRECTORY",
+            "RUNTIME_DIRECTORY",
+            "NO_COLOR",
+        ):
             os.environ.pop(key, None)
-        os.environ.update({"HOME": name, "XDG_STATE_HOME": f"{name}/state", "COLUMNS": "100", "TZ": "UTC0", "LC_ALL": "C"})
+        os.environ.update(
+            {"HOME": name, "XDG_STATE_HOME": f"{name}/state", "COLUMNS": "100", "TZ": "UTC0", "LC_ALL": "C"}
+        )
         time.tzset()
         os.chdir(folder)
         sys.argv = ["kontronik-can-gw"]
+        logging.root.handlers = []  # as in a process of its own: pytest has some
         try:
             yield folder
         finally:
@@ -160,4 +171,4 @@ def _place() -> Iterator[Path]:
             os.environ.clear()
             os.environ.update(before)
             time.tzset()
-            sys.argv, sys.stdin = argv, stdin
+            sys.argv, sys.stdin, logging.root.handlers = argv, stdin, handlers

@@ -8,7 +8,7 @@ import re
 import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ def _digest(items: Iterable[object]) -> str:
     return f"{zlib.crc32(repr(list(items)).encode()):08X}"
 
 
-def _number(text: str) -> str:
+def spelled(text: str) -> str:
     """One spelling of a number; any other text as it is."""
     try:
         return str(int(text, 0))
@@ -50,9 +50,13 @@ def _attributes(holder: Any) -> str:
 
 def _message(message: Message) -> list[str]:
     head = f"{message.frame_id:0{8 if message.is_extended_frame else 3}X} {message.name}: {message.length} bytes"
-    lines = [f"{head}{' FD' if message.is_fd else ''} from {','.join(message.senders)}{_attributes(message)} ; {message.comment}"]
+    lines = [
+        f"{head}{' FD' if message.is_fd else ''} from {','.join(message.senders)}{_attributes(message)} ; {message.comment}"
+    ]
     for s in sorted(message.signals, key=lambda signal: signal.name):
-        form = f"{s.start}|{s.length}@{'big' if s.byte_order == 'big_endian' else 'little'}{'-' if s.is_signed else '+'}"
+        form = (
+            f"{s.start}|{s.length}@{'big' if s.byte_order == 'big_endian' else 'little'}{'-' if s.is_signed else '+'}"
+        )
         form += f"{' float' if s.is_float else ''}{' M' if s.is_multiplexer else ''}{f' m{s.multiplexer_ids}' if s.multiplexer_ids else ''}"
         scale = f"({s.scale:g},{s.offset:g}) [{s.minimum}|{s.maximum}] {s.unit or '-'} raw start {s.raw_initial}"
         lines.append(f"  {s.name} {form} {scale} to {','.join(s.receivers)}{_attributes(s)} ; {s.comment}")
@@ -74,7 +78,9 @@ def dbc_short(data: bytes) -> list[str]:
     """A line for each message: what there is, and a digest of all of it."""
     lines = []
     for message in sorted(database(data).messages, key=lambda m: (m.is_extended_frame, m.frame_id)):
-        lines.append(f"{message.frame_id:03X} {message.name} {message.cycle_time} ms {len(message.signals)} signals {_digest(_message(message))}")
+        lines.append(
+            f"{message.frame_id:03X} {message.name} {message.cycle_time} ms {len(message.signals)} signals {_digest(_message(message))}"
+        )
     return lines
 
 
@@ -93,7 +99,7 @@ def eds(data: bytes) -> list[str]:
     found = _sections(data)
     lines = []
     for name in sorted(found.sections(), key=str.upper):
-        keys = {key: _number(value) for key, value in found[name].items() if key not in _OF_THE_DAY and value}
+        keys = {key: spelled(value) for key, value in found[name].items() if key not in _OF_THE_DAY and value}
         lines.append(f"[{name.upper()}] " + " ".join(f"{key}={value}" for key, value in sorted(keys.items())))
     return lines
 
@@ -105,7 +111,7 @@ def dcf(data: bytes) -> list[str]:
     for name in sorted(found.sections(), key=str.upper):
         values = {key: found[name][key] for key in ("ParameterValue", "Denotation") if key in found[name]}
         if values and "Com" not in name:
-            lines.append(f"[{name.upper()}] " + " ".join(f"{key}={_number(v)}" for key, v in values.items()))
+            lines.append(f"[{name.upper()}] " + " ".join(f"{key}={spelled(v)}" for key, v in values.items()))
     return lines
 
 
@@ -119,13 +125,13 @@ def columns(data: bytes) -> dict[str, list[str]]:
             found[name] = [_cell(row.get(name)) for row in rows]
         return found
     head, *lines = list(csv.reader(io.StringIO(text)))
-    return {name: [_number(line[at]) for line in lines] for at, name in enumerate(head)}
+    return {name: [spelled(line[at]) for line in lines] for at, name in enumerate(head)}
 
 
 def _cell(value: object) -> str:
     if isinstance(value, (dict, list)):
         return json.dumps(value, separators=(",", ":"), ensure_ascii=False)
-    return "" if value is None else _number(str(value))
+    return "" if value is None else spelled(str(value))
 
 
 def _runs(values: Sequence[str]) -> str:
@@ -141,8 +147,12 @@ def _runs(values: Sequence[str]) -> str:
 
 
 def table(data: bytes) -> list[str]:
+    """As ``column_lines``."""
+    return column_lines(columns(data))
+
+
+def column_lines(found: Mapping[str, list[str]]) -> list[str]:
     """A line for each column: its values; of a long table some of them and a digest of each eighth. Those that never change share one."""
-    found = columns(data)
     count = len(next(iter(found.values())))
     lines = [f"{count} rows, {len(found)} columns"]
     always: dict[str, list[str]] = {}

@@ -40,7 +40,11 @@ def made(file: Path) -> str:
 
 def changes(file: Path, new: str) -> list[str]:
     """What is different, for people; empty where nothing is."""
-    old = file.read_text(encoding="utf-8") if file.exists() else ""
+    return differences(file, file.read_text(encoding="utf-8") if file.exists() else "", new)
+
+
+def differences(file: Path, old: str, new: str) -> list[str]:
+    """The same of two texts for a file."""
     if old == new:
         return []
     name = str(file.relative_to(HERE))
