@@ -44,7 +44,8 @@ def play(text: str) -> str:
 
 
 def _play_case(lines: list[str], folder: Path) -> Iterator[str]:
-    name, source, body = "", "", []
+    name, source = "", ""
+    body: list[str] = []
     for line in [*lines, "$"]:
         if line.startswith(("--- ", "$")):
             if name:
@@ -122,7 +123,7 @@ def _run(line: str, folder: Path) -> Iterator[str]:
         with redirect_stdout(out), redirect_stderr(err):
             code = drive.command(words)
     out.flush()
-    data = out.buffer.getvalue()  # type: ignore[attr-defined]
+    data = out.buffer.getvalue()
     shown = meaning.FORMS[how](data) if how and data and code == 0 else data.decode("utf-8").splitlines()
     talk = [text for text in err.getvalue().splitlines() if not text.startswith(("usage: ", "  "))]
     if len(talk) > LINES:

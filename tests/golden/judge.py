@@ -35,12 +35,18 @@ from protocol import reference, sheet  # noqa: E402
 NS_PER_BYTE = 11 * 10**9 // 115_200
 INFO_NS = 10 * 10**9
 JIVEPRO = 3
-CONVERSIONS = {("V", "mV"): 1000, ("A", "mA"): 1000, ("us", "ms"): Fraction(1, 1000)}
+CONVERSIONS: dict[tuple[str, str], int | Fraction] = {
+    ("V", "mV"): 1000,
+    ("A", "mA"): 1000,
+    ("us", "ms"): Fraction(1, 1000),
+}
 LIVE = {f.name: f for f in sheet.LIVE_FIELDS}
 INFO = {f.name: f for f in sheet.INFO_FIELDS}
 Values = Mapping[str, int]
 Bytes = tuple[int, bytes | None]
 """(time, bytes that are read; None where the port is lost)."""
+Arrivals = list[tuple[str, str, Values, int]]
+"""Frames that are certain with an input: kind, layout, values, time of the last byte."""
 
 
 class State(NamedTuple):
@@ -63,8 +69,6 @@ class Esc:
     gear: Fraction = Fraction(1)
     cells: int = 0
     timeout: int = 250_000_000
-    arrivals: list[list[tuple[str, str, Values, int]]] = field(default_factory=list)
-    """Of each input: the frames that are certain with it: kind, layout, values, time of the last byte."""
     state: State = State()
     passed: list[State] = field(default_factory=list)
     """States since the time of the last input."""
@@ -94,9 +98,9 @@ class Esc:
             self.state = self.state._replace(live=values, live_ns=max(when, self.state.live_ns or 0))
 
 
-def found_frames(inputs: list[Bytes], timeout: int) -> list[list[tuple[str, str, Values, int]]]:
-    """For each input the frames that no further byte could take away, by brute force."""
-    found: list[list[tuple[str, str, Values, int]]] = [[] for _ in inputs]
+def found_frames(inputs: list[Bytes], timeout: int) -> list[Arrivals | None]:
+    """For each input the frames that no further byte could take away, by brute force; None where the port is lost."""
+    found: list[Arrivals] = [[] for _ in inputs]
     begin = 0
     while begin < len(inputs):
         end = begin
@@ -107,10 +111,10 @@ def found_frames(inputs: list[Bytes], timeout: int) -> list[list[tuple[str, str,
         if end > begin:
             _search(inputs, begin, end, timeout, found)
         begin = end if end > begin else end + 1
-    return found
+    return [None if data is None else arrivals for (_, data), arrivals in zip(inputs, found, strict=True)]
 
 
-def _search(inputs: list[Bytes], begin: int, end: int, timeout: int, found: list[list[Any]]) -> None:
+def _search(inputs: list[Bytes], begin: int, end: int, timeout: int, found: list[Arrivals]) -> None:
     stream = b"".join(data or b"" for _, data in inputs[begin:end])
     ends: list[int] = []
     for _, data in inputs[begin:end]:
@@ -154,29 +158,16 @@ def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | No
             if plain == "max_bec_current" and known["device_and_variant"] >> 10 == JIVEPRO:
                 return None
             return Fraction(known[plain], listed[plain].steps)
-    cells = esc.cells or (info or {}).get("cell_count", 0)
     if name in ("MotorSpeed", "OutputSpeed", "MeanCellVoltage") and not esc.sure:
         raise KeyError(name)
-    gear = esc.pole_pairs * esc.gear
-    of_live = {
-        "OperatingState": lambda v: v["operating_state"],
-        "OperatingStateRaw": lambda v: v["operating_state"],
-        "MotorSpeed": lambda v: Fraction(v["electrical_speed"], esc.pole_pairs),
-        "OutputSpeed": lambda v: v["electrical_speed"] / gear,
-        "BatteryPower": lambda v: Fraction(v["battery_voltage"] * v["battery_current"], 1000),
-        "MeanCellVoltage": lambda v: Fraction(v["battery_voltage"], 100 * cells) if cells else None,
-    }
-    of_info = {
-        "Device": lambda v: v["device_and_variant"] >> 10,
-        "DeviceRaw": lambda v: v["device_and_variant"] >> 10,
-        "Variant": lambda v: v["device_and_variant"] & 1023,
-        "FirmwareMain": lambda v: v["firmware_word"] >> 8,
-        "FirmwareSub": lambda v: v["firmware_word"] & 255,
-    }
-    if name in of_live:
-        return None if live is None else of_live[name](live)
-    if name in of_info:
-        return None if info is None else of_info[name](info)
+    if name in ("OperatingState", "OperatingStateRaw", "MotorSpeed", "OutputSpeed", "BatteryPower", "MeanCellVoltage"):
+        return None if live is None else _of_live(name, esc, live, esc.cells or (info or {}).get("cell_count", 0))
+    if name in ("Device", "DeviceRaw", "Variant", "FirmwareMain", "FirmwareSub"):
+        if info is None:
+            return None
+        pair, firmware = info["device_and_variant"], info["firmware_word"]
+        parts = {"Variant": pair & 1023, "FirmwareMain": firmware >> 8, "FirmwareSub": firmware & 255}
+        return parts.get(name, pair >> 10)
     if name == "Layout":
         return state.layout
     if name == "DataAge":
@@ -184,18 +175,29 @@ def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | No
     raise KeyError(name)
 
 
+def _of_live(name: str, esc: Esc, live: Values, cells: int) -> Fraction | int | None:
+    speed = Fraction(live["electrical_speed"], esc.pole_pairs)
+    if name.endswith("Speed"):
+        return speed if name == "MotorSpeed" else speed / esc.gear
+    if name == "BatteryPower":
+        return Fraction(live["battery_voltage"] * live["battery_current"], 1000)
+    if name == "MeanCellVoltage":
+        return Fraction(live["battery_voltage"], 100 * cells) if cells else None
+    return live["operating_state"]
+
+
 def fits(signal: Signal, raw: float, value: Fraction | int | None, unit: str) -> bool:
     """True where the raw value says this."""
-    texts = {str(text): number for number, text in (signal.choices or {}).items()}
+    texts: dict[str, int] = {str(text): number for number, text in (signal.choices or {}).items()}
     if value is None:
         if signal.is_float and signal.raw_initial is None:
             return raw != raw
         lowest = -1 << signal.length - 1 if signal.is_signed else (1 << signal.length) - 1
         code = lowest if signal.raw_initial is None else signal.raw_initial
-        return raw == texts.get("NotAvailable", code)
-    value = value * CONVERSIONS.get((unit, signal.unit or ""), 1)
+        return bool(raw == texts.get("NotAvailable", int(code)))
+    value = Fraction(value) * CONVERSIONS.get((unit, signal.unit or ""), 1)
     if signal.is_float:
-        return abs(raw * signal.scale + signal.offset - value) <= 1e-6 * abs(value)
+        return bool(abs(raw * signal.scale + signal.offset - float(value)) <= 1e-6 * abs(value))
     ideal = float((value - Fraction(str(signal.offset))) / Fraction(str(signal.scale)))
     numbers = [number for text, number in texts.items() if text not in ("NotAvailable", "Error")]
     limits = (signal.minimum or 0, signal.maximum or 0)
@@ -226,7 +228,7 @@ class Judge:
         self._pdos = _canopen_database()
         self._flags = _flags()
 
-    def given(self, now: int, index: int, arrivals: list[tuple[str, str, Values, int]] | None) -> None:
+    def given(self, now: int, index: int, arrivals: Arrivals | None) -> None:
         """An input of an ESC; None: its port is lost."""
         esc = self._at(now, self.escs[index])
         if arrivals is None:
@@ -308,21 +310,15 @@ class Judge:
         states = esc.passed or [esc.state]
         if name in self._flags:
             word, bit = self._flags[name]
-            good = any(
-                ((known or {}).get(word, 0) >> bit & 1) == raw
-                for s in states
-                for known in ((s.live, s.info)[word[0] == "s"],)
-            )
+            known = [s.live if word in LIVE else s.info for s in states]
+            good = any(((values or {}).get(word, 0) >> bit & 1) == raw for values in known)
         elif name == "EscsOk":
             live = [{s.live is not None for s in e.passed or [e.state]} for e in self.escs]
             good = sum(map(min, live)) <= raw <= sum(map(max, live))
         else:
             plain = re.sub("(?<!^)(?=[A-Z])", "_", name.removesuffix("Percent")).lower()
-            unit = (
-                (LIVE | INFO)[plain].unit.replace("µ", "u")
-                if plain in LIVE | INFO
-                else {"MeanCellVoltage": "V"}.get(name, "")
-            )
+            row = (LIVE | INFO).get(plain, LIVE["battery_voltage"])
+            unit = row.unit.replace("µ", "u")
             try:
                 good = any(fits(signal, raw, expected(name, esc, state, now), unit) for state in states)
                 # CiA 301 has no code for what is not available: as it stands on the wire
@@ -331,12 +327,7 @@ class Judge:
                 return
         self.count["values"] += 1
         if not good:
-            wanted = (
-                ""
-                if name in self._flags
-                else f", not {expected(name, esc, states[-1], now) if name != 'EscsOk' else ''}"
-            )
-            self.wrong.append(f"{scenario.seconds(now)} {message}.{signal.name} = {raw}{wanted}")
+            self.wrong.append(f"{scenario.seconds(now)} {message}.{signal.name} = {raw} with {states}")
 
     def _rhythm(self, now: int, message: Any, raw: Mapping[str, Any]) -> None:
         alive = next((s for s in message.signals if s.name.endswith(("Alive", "AliveCounter"))), None)
@@ -367,29 +358,25 @@ class Judge:
             return
         esc = self._at(now, self.escs[self.node_ids.index(node)])
         state = esc.state
+        live, info = state.live, state.last_info
         wanted: bytes | None = None
+        row = sheet.LIVE_FIELDS[min(sub, 16) - 1] if index == 0x2000 else sheet.INFO_FIELDS[min(sub, 14) + 3]
         if index == 0x2000 and sub <= 16:
-            row = sheet.LIVE_FIELDS[sub - 1]
-            if state.live is not None and (row.name != "bec_current" or bec_current_supplied(state)):
-                wanted = struct.pack(f"<{row.code}", state.live[row.name])
-        elif index == 0x2011 and sub <= 14 and state.last_info is not None:
-            row = sheet.INFO_FIELDS[sub + 3]
-            if row.name == "max_bec_current" and state.last_info["device_and_variant"] >> 10 == JIVEPRO:
-                return
-            wanted = struct.pack(f"<{row.code}", state.last_info[row.name])
-        elif index == 0x2010 and sub in (1, 2, 3, 4, 5) and state.last_info is not None:
-            pair = state.last_info["device_and_variant"]
-            words = (
-                pair >> 10,
-                pair & 1023,
-                *(state.last_info[n] for n in ("firmware_word", "selftest_errors", "cell_count")),
-            )
-            wanted = struct.pack(f"<{'BHHIB'[sub - 1]}", words[sub - 1])
-        elif index == 0x2001 and sub in (1, 2) and esc.sure:
-            if state.live is not None:
+            if live is not None and (row.name != "bec_current" or bec_current_supplied(state)):
+                wanted = struct.pack(f"<{row.code}", live[row.name])
+        elif index == 0x2011 and sub <= 14:
+            if info is not None and (row.name != "max_bec_current" or info["device_and_variant"] >> 10 != JIVEPRO):
+                wanted = struct.pack(f"<{row.code}", info[row.name])
+        elif index == 0x2010 and sub <= 5:
+            names = ("device_and_variant", "device_and_variant", "firmware_word", "selftest_errors", "cell_count")
+            if info is not None:
+                value = info[names[sub - 1]]
+                wanted = struct.pack(f"<{'BHHIB'[sub - 1]}", {1: value >> 10, 2: value & 1023}.get(sub, value))
+        elif index == 0x2001 and sub <= 2 and esc.sure:
+            if live is not None:
                 ratio = esc.pole_pairs * (esc.gear if sub == 2 else 1)
-                wanted = struct.pack("<i", int(Fraction(state.live["electrical_speed"]) / ratio + Fraction(1, 2)))
-        elif index not in (0x2000, 0x2010, 0x2011) or sub > 5:
+                wanted = struct.pack("<i", int(live["electrical_speed"] / Fraction(ratio) + Fraction(1, 2)))
+        else:
             return
         self.count["SDO answers"] += 1
         if data != wanted:
@@ -426,58 +413,63 @@ def _flags() -> dict[str, tuple[str, int]]:
     return found
 
 
+def follow(found: Judge, steps: list[tuple[int, str, Any]]) -> Judge:
+    """What happened, in order: bytes (ESC, what; None: the port is lost), frames <- and ->, SDO transfers."""
+    queues = []
+    for index, esc in enumerate(found.escs):
+        inputs = [(now, what[1]) for now, verb, what in steps if verb == "bytes" and what[0] == index]
+        queues.append(iter(found_frames(inputs, esc.timeout)))
+    for now, verb, what in steps:
+        if verb == "bytes":
+            found.given(now, what[0], next(queues[what[0]]))
+        elif verb == "<-":
+            found.received(scenario.read_frame(what))
+        elif verb == "->":
+            found.sent(now, scenario.read_frame(what))
+        elif verb == "read":
+            found.read(now, *what)
+        elif verb == "write":
+            found.setting(*what)
+    return found
+
+
 def judge_scenario(file: Path) -> Judge:
     """A flight or a dialogue."""
     header, lines = scenario.split(file.read_text(encoding="utf-8"))
     tables = tomllib.loads(header)
-    listed = tables["esc"]
-    escs = [
-        Esc(
-            e.get("name", f"esc{n + 1}").title() if len(listed) > 1 else "",
-            e.get("pole_pairs", 1),
-            Fraction(str(e.get("gear", 1))) if "/" not in str(e.get("gear", 1)) else Fraction(e["gear"]),
-            e.get("cell_count", 0),
-            e.get("telemetry_timeout_ms", 250) * 10**6,
-        )
-        for n, e in enumerate(listed)
-    ]
-    canopen = tables.get("canopen", {})
+    escs = []
+    for number, esc in enumerate(tables["esc"], 1):
+        prefix = esc.get("name", f"esc{number}").title() if len(tables["esc"]) > 1 else ""
+        timeout = esc.get("telemetry_timeout_ms", 250) * 10**6
+        gear = Fraction(str(esc.get("gear", 1)))
+        escs.append(Esc(prefix, esc.get("pole_pairs", 1), gear, esc.get("cell_count", 0), timeout))
+    canopen, dbc = tables.get("canopen", {}), tables.get("dbc", {})
     node_ids = [canopen.get("node_id", 1) + n for n in range(len(escs))] if canopen.get("enabled") else []
     database = None
-    if tables.get("dbc", {}).get("enabled", True):
+    if dbc.get("enabled", True):
         with tempfile.TemporaryDirectory() as folder:
             plain = re.sub(r"^\[golden[^\[]*", "", header, flags=re.MULTILINE)
             (Path(folder) / "a.toml").write_text(plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"'))
             database = _dbc(["-c", f"{folder}/a.toml"])
-    steps = [line.partition(";")[0].split() for line in lines]
-    words = {step[1] for step in steps if step}
-    steady = not words & {"held", "can_state", "can_opened"} and tables.get("dbc", {}).get("on_loss") != "silent"
-    found = Judge(escs, database, node_ids, steady)
-    inputs: list[list[Bytes]] = [[] for _ in escs]
-    for step in filter(None, steps):
-        if step[1] == "uart":
-            inputs[int(step[2]) - 1].append((scenario.nanoseconds(step[0]), scenario.uart_bytes(step[3:])))
-        elif step[1] == "port_lost":
-            inputs[int(step[2]) - 1].append((scenario.nanoseconds(step[0]), None))
-    queues = [iter(found_frames(one, esc.timeout)) for one, esc in zip(inputs, escs, strict=True)]
-    for step in filter(None, steps):
-        now, verb = scenario.nanoseconds(step[0]), step[1]
+    steps: list[tuple[int, str, Any]] = []
+    steady = dbc.get("on_loss") != "silent"
+    for time, verb, *words in filter(None, (line.partition(";")[0].split() for line in lines)):
+        now = scenario.nanoseconds(time)
+        steady = steady and verb not in ("held", "can_state", "can_opened")
         if verb in ("uart", "port_lost"):
-            index = int(step[2]) - 1
-            arrivals = next(queues[index])
-            found.given(now, index, None if verb == "port_lost" else arrivals)
-        elif verb == "<-":
-            found.received(scenario.read_frame(step[2]))
-        elif verb == "->":
-            found.sent(now, scenario.read_frame(step[2]))
+            data = scenario.uart_bytes(words[1:]) if verb == "uart" else None
+            steps.append((now, "bytes", (int(words[0]) - 1, data)))
+        elif verb in ("<-", "->"):
+            steps.append((now, verb, words[0]))
         elif verb in ("read", "write"):
-            index, sub = int(step[3][:4], 16), int(step[3][5:], 16)
-            refused = "!" in step
+            node, index, sub = int(words[0]), int(words[1][:4], 16), int(words[1][5:], 16)
             if verb == "read":
-                found.read(now, int(step[2]), index, sub, None if refused else bytes.fromhex("".join(step[5:6])))
-            elif index == 0x2100 and not refused:
-                found.setting(int(step[2]), sub, bytes.fromhex(step[4]))
-    return found
+                steps.append(
+                    (now, verb, (node, index, sub, None if "!" in words else bytes.fromhex("".join(words[3:4]))))
+                )
+            elif index == 0x2100 and "!" not in words:
+                steps.append((now, verb, (node, sub, bytes.fromhex(words[2]))))
+    return follow(Judge(escs, database, node_ids, steady), steps)
 
 
 def blocks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -496,49 +488,32 @@ def blocks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def judge_capture(file: Path) -> Judge:
-    """A capture and its frames. Where entries are missing, what follows is not judged against them."""
-    entries: list[tuple[int, int, int, bytes]] = []
+    """A capture and its frames."""
+    steps: list[tuple[int, str, Any]] = []
     header: dict[str, Any] = {}
     for kind, payload in blocks(file.read_bytes()):
         if kind == b"H":
             header = json.loads(payload)
         elif kind == b"D":
-            count = int.from_bytes(payload[:4], "little")
-            at = 4 + 16 * count
-            for time, what, _, index, size in struct.iter_unpack("<QBBHI", payload[4:at]):
-                entries.append((time, what, index, payload[at : at + size]))
+            at = 4 + 16 * int.from_bytes(payload[:4], "little")
+            for now, what, _, index, size in struct.iter_unpack("<QBBHI", payload[4:at]):
+                if what in (1, 7):
+                    steps.append((now, "bytes", (index, payload[at : at + size] if what == 1 else None)))
                 at += size
-    names = [e["name"] for e in header["escs"]]
-    escs = [
-        Esc(n.title() if len(names) > 1 else "", e["pole_pairs"], Fraction(e["gear"]), e["cell_count"], e["timeout_ns"])
-        for n, e in zip(names, header["escs"], strict=True)
-    ]
+    listed = header["escs"]
+    escs = []
+    for esc in listed:
+        prefix = esc["name"].title() if len(listed) > 1 else ""
+        escs.append(Esc(prefix, esc["pole_pairs"], Fraction(esc["gear"]), esc["cell_count"], esc["timeout_ns"]))
     database = meaning.database(header["dbc"]["text"].encode("latin-1"))
-    if len(names) > 1:
-        database = _dbc([word for name in names for word in ("--name", name)])
+    if len(listed) > 1:
+        database = _dbc([word for esc in listed for word in ("--name", esc["name"])])
+    first, *lines = file.with_suffix(".txt").read_text(encoding="utf-8").splitlines()
+    for time, verb, frame in (line.split() for line in lines):
+        steps.append((int(first.split()[-5]) + scenario.nanoseconds(time), verb, frame))
+    steps.sort(key=lambda step: step[0])  # stable: bytes come before the frames of the same time
     nodes = [node["node_id"] for node in (header["canopen"] or {}).get("nodes", [])]
-    found = Judge(escs, database, nodes, steady=False)
-    inputs: list[list[Bytes]] = [[] for _ in escs]
-    for time, what, index, data in entries:
-        if what in (1, 7):
-            inputs[index].append((time, data if what == 1 else None))
-    queues = [iter(found_frames(one, esc.timeout)) for one, esc in zip(inputs, escs, strict=True)]
-    text = file.with_suffix(".txt").read_text(encoding="utf-8").splitlines()
-    start = int(text[0].split()[-5])
-    given = iter([entry for entry in entries if entry[1] in (1, 7)])
-    entry = next(given, None)
-    for line in text[1:]:
-        at, verb, frame = line.split()
-        now = start + scenario.nanoseconds(at)
-        while entry is not None and entry[0] <= now:
-            arrivals = next(queues[entry[2]])
-            found.given(entry[0], entry[2], None if entry[1] == 7 else arrivals)
-            entry = next(given, None)
-        if verb == "<-":
-            found.received(scenario.read_frame(frame))
-        else:
-            found.sent(now, scenario.read_frame(frame))
-    return found
+    return follow(Judge(escs, database, nodes, steady=False), steps)
 
 
 def judge_decoded(file: Path) -> Judge:
@@ -558,10 +533,8 @@ def judge_decoded(file: Path) -> Judge:
             for name, row in listed.items():
                 columns[name] = []
                 for frame in frames:
-                    value = fields_of(kind, frame.raw)[name] if frame.kind == kind else None
-                    columns[name].append(
-                        "" if value is None else meaning.spelled(str(value / row.steps if row.steps > 1 else value))
-                    )
+                    value = Fraction(fields_of(kind, frame.raw)[name], row.steps) if frame.kind == kind else None
+                    columns[name].append("" if value is None else meaning.spelled(str(float(value))))
         for name in ("operating_state", "device_and_variant", "firmware_word", "bec_current", "max_bec_current"):
             del columns[name]  # shown as texts, or not on every device
         wanted = meaning.column_lines(columns)[1:]
@@ -570,9 +543,9 @@ def judge_decoded(file: Path) -> Judge:
         for line in wanted:
             found.count["columns"] += 1
             if line.startswith("always "):
-                value, _, names = line.removeprefix("always ").partition(": ")
-                same = {name for other, _, these in always if other == value for name in these.split(", ")}
-                found.wrong += [f"{title}: {name} is not always {value}" for name in {*names.split(", ")} - same]
+                same_value, _, names = line.removeprefix("always ").partition(": ")
+                same = {name for other, _, these in always if other == same_value for name in these.split(", ")}
+                found.wrong += [f"{title}: {name} is not always {same_value}" for name in {*names.split(", ")} - same]
             elif shown[line] != 2:  # as JSON lines and as CSV
                 found.wrong.append(f"{title}: not so: {line}")
     return found

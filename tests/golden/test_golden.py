@@ -1,5 +1,6 @@
 """The golden set: what 0.5.0 made of its inputs, and what is made of them now. `make golden` records it anew; see README.md."""
 
+import re
 from pathlib import Path
 
 import judge
@@ -55,3 +56,8 @@ def test_a_change_is_said_in_words(tmp_path: Path) -> None:
     case = "## one\n$ check\n! old\n=> 2\n\n## two\n$ check\n=> 0\n"
     found = record.differences(record.HERE / "commands/none.txt", case, case.replace("old", "new"))
     assert found == ["commands/none.txt: one", "commands/none.txt:     -! old", "commands/none.txt:     +! new"]
+
+
+def test_only_the_adapter_knows_the_product() -> None:
+    knowing = re.compile(r"^\s*(from|import) kontronik_can_gw", re.MULTILINE)
+    assert [file.name for file in HERE.glob("*.py") if knowing.search(file.read_text(encoding="utf-8"))] == ["drive.py"]
