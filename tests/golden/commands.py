@@ -121,7 +121,11 @@ def _run(line: str, folder: Path) -> Iterator[str]:
         out.buffer.write((folder / words[1]).read_bytes())
     else:
         with redirect_stdout(out), redirect_stderr(err):
-            code = drive.command(words)
+            try:
+                code = drive.command(words)
+            except Exception as error:  # a defect, which is recorded as any other answer
+                code = 1
+                print(f"Traceback: {error!r}", file=err)
     out.flush()
     data = out.buffer.getvalue()
     shown = meaning.FORMS[how](data) if how and data and code == 0 else data.decode("utf-8").splitlines()

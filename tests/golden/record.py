@@ -105,7 +105,8 @@ def _in_frames(old: str, new: str) -> Iterator[str]:
 def _in_lines(old: Sequence[str], new: Sequence[str]) -> Iterator[str]:
     found = [line for line in unified_diff(old, new, n=0, lineterm="") if not re.match(r"---|\+\+\+|@@", line)]
     for line in found[:LINES]:
-        yield line if len(line) < 300 else line[:297] + "..."
+        shown = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in line)
+        yield shown if len(shown) < 300 else shown[:297] + "..."
     if len(found) > LINES:
         yield f"... and {len(found) - LINES} more lines"
 
