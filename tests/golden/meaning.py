@@ -193,6 +193,7 @@ FORMS: dict[str, Callable[[bytes], list[str]]] = {
     "dcf": dcf,
     "table": table,
     "keys": lambda data: [f"{key}: {_cell(value)}" for key, value in sorted(json.loads(data).items())],
+    "last line": lambda data: data.decode("utf-8").splitlines()[-1:],
     "nothing": lambda data: [],
     "columns": lambda data: [re.sub(" {2,}", "  ", line) for line in data.decode("utf-8").splitlines()],
     "size": lambda data: [f"{len(data)} bytes, {zlib.crc32(data):08X}"],
