@@ -1,7 +1,7 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-hardware soak hour bench lint clean
+.PHONY: help demo test test-hardware soak hour bench golden lint clean
 
 help:
 	@echo 'make demo    show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
@@ -10,6 +10,7 @@ help:
 	@echo 'make soak    random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
 	@echo 'make hour    a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
 	@echo 'make bench   speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
+	@echo 'make golden  record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
 	@echo 'make lint    ruff and mypy only'
 	@echo 'make clean   remove .venv and all caches'
 
@@ -36,6 +37,10 @@ hour:
 bench:
 	@tests/bootstrap.sh lint
 	@.venv/bin/python tests/benchmarks/bench.py $(ARGS)
+
+golden:
+	@tests/bootstrap.sh lint
+	@.venv/bin/python tests/golden/record.py $(ARGS)
 
 lint:
 	@tests/bootstrap.sh lint

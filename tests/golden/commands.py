@@ -1,0 +1,179 @@
+"""Command lines and what they give, as text (README.md). ``play`` writes the results anew."""
+
+import io
+import logging
+import os
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import drive
+import meaning
+import scenario
+
+HERE = Path(__file__).parent
+LINES = 25
+"""Lines on standard error that are shown."""
+_RESULT = re.compile(r"(\||!|=>) ?")
+_WORD = re.compile(r"'([^']*)'|(\S+)")
+
+
+def cases(text: str) -> dict[str, list[str]]:
+    """The lines of each case by its title; what stands in front of the first one under an empty title."""
+    found: dict[str, list[str]] = {"": []}
+    title = ""
+    for line in text.removesuffix("\n").split("\n"):
+        if line.startswith("## "):
+            title = line[3:]
+            assert title not in found, f"two cases are called {title!r}"
+        found.setdefault(title, []).append(line)
+    return found
+
+
+def play(text: str) -> str:
+    """The file with the results of now."""
+    out: list[str] = []
+    for lines in cases(text).values():
+        with _place() as folder:
+            out += _play_case(lines, folder)
+    return "\n".join(out) + "\n"
+
+
+def _play_case(lines: list[str], folder: Path) -> Iterator[str]:
+    name, source = "", ""
+    body: list[str] = []
+    for line in [*lines, "$"]:
+        if line.startswith(("--- ", "$")):
+            if name:
+                while body and not body[-1]:
+                    body.pop()
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).write_bytes(_content(source, body))
+            name, source, body = "", "", []
+            if line.startswith("--- "):
+                name, _, source = line[4:].partition(" < ")
+                yield line
+            elif line != "$":
+                yield line
+                yield from _run(line[2:], folder)
+        elif name:
+            body.append(line)
+            yield line
+        elif not _RESULT.match(line):
+            yield line
+
+
+def _content(source: str, body: list[str]) -> bytes:
+    """A file's content: its lines; hexadecimal bytes; a file of inputs/ or captures/ as it is, or with other lines; bytes of a flight."""
+    if not source:
+        return ("\n".join(body) + "\n").encode()
+    if source == "hex":
+        return bytes.fromhex("".join(body))
+    if source == "shipped.eds":
+        base = drive.shipped_eds().encode("latin-1")
+    elif source.startswith("flights/"):
+        file, _, esc = source.partition(" ")
+        return flight_bytes(HERE / file, int(esc or 1))
+    else:
+        base = (HERE / source).read_bytes()
+    return _edited(base.decode("latin-1"), body).encode("latin-1") if body else base
+
+
+def flight_bytes(file: Path, esc: int) -> bytes:
+    """All bytes that an ESC sends in a flight."""
+    lines = scenario.split(file.read_text(encoding="utf-8"))[1]
+    given = [line.split()[3:] for line in lines if line.split()[1:3] == ["uart", str(esc)]]
+    return b"".join(map(scenario.uart_bytes, given))
+
+
+def _edited(text: str, edits: list[str]) -> str:
+    """``@ line``: go to the next line that is this; ``- line``: remove the next one that is this; ``+ line``: put this here."""
+    newline = "\r\n" if "\r\n" in text else "\n"
+    lines = text.split(newline)
+    at = 0
+    for edit in edits:
+        mark, content = edit[0], edit[2:]
+        if mark == "+":
+            lines.insert(at, content)
+            at += 1
+            continue
+        at = lines.index(content, at)
+        if mark == "-":
+            del lines[at]
+        else:
+            at += 1
+    return newline.join(lines)
+
+
+def _run(line: str, folder: Path) -> Iterator[str]:
+    line, _, how = line.partition(" | ")
+    words = [quoted or plain for quoted, plain in _WORD.findall(line)]
+    out, err = io.TextIOWrapper(io.BytesIO(), "utf-8"), io.StringIO()
+    code = 0
+    if words[0] == "cat":
+        if not (folder / words[1]).is_file():
+            yield "! there is no such file"
+            return
+        out.buffer.write((folder / words[1]).read_bytes())
+    else:
+        with redirect_stdout(out), redirect_stderr(err):
+            try:
+                code = drive.command(words)
+            except Exception as error:  # a defect, which is recorded as any other answer
+                code = 1
+                print(f"Traceback: {error!r}", file=err)
+    out.flush()
+    data = out.buffer.getvalue()
+    shown = meaning.FORMS[how](data) if how and data and code == 0 else data.decode("utf-8").splitlines()
+    talk = [text for text in err.getvalue().splitlines() if not text.startswith(("usage: ", "  "))]
+    if len(talk) > LINES:
+        talk[LINES:] = [f"... and {len(talk) - LINES} more lines"]
+    yield from (f"| {_neutral(text, folder)}".rstrip() for text in shown)
+    yield from (f"! {_neutral(text, folder)}".rstrip() for text in talk)
+    yield f"=> {code}"
+
+
+def _neutral(text: str, folder: Path) -> str:
+    """Without what depends on this machine or on the version."""
+    for real, instead in ((f"{folder}/", ""), (str(folder), "."), *drive.FOLDERS.items()):
+        text = text.replace(real, instead)
+    text = re.sub(r"\(choose from .*\)", lambda found: found[0].replace("'", ""), text)  # Python's versions differ
+    text = re.sub(r", in [\d.]+ s\b", ", in TIME", text)
+    return re.sub(rf"\b{re.escape(drive.VERSION)}\b", "VERSION", text)
+
+
+@contextmanager
+def _place() -> Iterator[Path]:
+    """An empty folder to work in, and surroundings that are the same everywhere."""
+    before, folder_before = dict(os.environ), Path.cwd()
+    argv, stdin, handlers = sys.argv, sys.stdin, logging.root.handlers
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name).resolve()
+        for key in (
+            "LISTEN_FDS",
+            "NOTIFY_SOCKET",
+            "JOURNAL_STREAM",
+            "STATE_DIRECTORY",
+            "RUNTIME_DIRECTORY",
+            "NO_COLOR",
+        ):
+            os.environ.pop(key, None)
+        os.environ.update(
+            {"HOME": name, "XDG_STATE_HOME": f"{name}/state", "COLUMNS": "100", "TZ": "UTC0", "LC_ALL": "C"}
+        )
+        time.tzset()
+        os.chdir(folder)
+        sys.argv = ["kontronik-can-gw"]
+        logging.root.handlers = []  # as in a process of its own: pytest has some
+        try:
+            yield folder
+        finally:
+            os.chdir(folder_before)
+            os.environ.clear()
+            os.environ.update(before)
+            time.tzset()
+            sys.argv, sys.stdin, logging.root.handlers = argv, stdin, handlers

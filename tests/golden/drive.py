@@ -1,0 +1,147 @@
+"""The adapter: all that the golden set imports or calls of the product. A rebuilding changes this file and no other of this folder.
+
+The formats of the files are described in README.md; scenario.py and commands.py read and write them.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import kontronik_can_gw
+from kontronik_can_gw.cia301.storage import encode
+from kontronik_can_gw.cli import main
+from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config import parse, shipped
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Mailboxes
+from kontronik_can_gw.offline.inputs import CaptureInput, open_input
+from kontronik_can_gw.offline.replay import in_order
+from kontronik_can_gw.sources import CanState
+
+VERSION = kontronik_can_gw.__version__
+FOLDERS = {str(shipped("dbc").parent): "SHIPPED"}
+"""Folders of this machine that may be named in texts, and what is written instead."""
+
+
+class Frame(NamedTuple):
+    """A CAN frame. ``received``: from the bus."""
+
+    can_id: int
+    data: bytes
+    extended: bool = False
+    fd: bool = False
+    remote: bool = False
+    received: bool = False
+
+
+def _frame(frame: CanFrame, received: bool = False) -> Frame:
+    return Frame(frame.can_id, bytes(frame.data), frame.extended, frame.fd, frame.remote, received)
+
+
+def command(words: Sequence[str]) -> int:
+    """Run one command line in this process; its exit code. It reads and writes the standard streams of ``sys``."""
+    try:
+        return main(words)
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 1
+
+
+def shipped_eds() -> str:
+    """The EDS in the package."""
+    return shipped("eds/kontronik_esc.eds").read_bytes().decode("latin-1")
+
+
+def replayed(path: Path) -> Iterator[tuple[int, Frame]]:
+    """The frames that a capture's gateway received and sent, with the recorded clock in ns."""
+    with open_input(path) as recording:
+        assert isinstance(recording, CaptureInput)
+        for item in recording.frames():
+            yield item.time_ns, _frame(item.frame, item.received)
+
+
+class Drive:
+    """A gateway on an interface that takes every frame at once, with a clock turned by hand (ns from power-on).
+
+    ``tables``: its configuration, as of a TOML file; ``file``: where that stands, other files are looked for beside it.
+    """
+
+    def __init__(self, tables: Mapping[str, Any], file: Path) -> None:
+        loaded = assemble(parse(dict(tables), str(file)))
+        self.warnings = [*loaded.layout.warnings, *loaded.warnings]
+        silent = loaded.config.dbc.on_loss == "silent"
+        self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.canopen)
+        self._waiting = Mailboxes()
+        self._open = True
+
+    @property
+    def deadline(self) -> int:
+        """When ``advance`` is to be called at the latest."""
+        return self._gateway.next_deadline()
+
+    def advance(self, now: int) -> None:
+        self._gateway.advance(now)
+
+    def uart(self, esc: int, data: bytes, now: int) -> None:
+        """Bytes that are read from the port of an ESC (0 ...)."""
+        self._gateway.receive_bytes(esc, data, now)
+
+    def put(self, frame: Frame, now: int) -> None:
+        """A frame from the bus. What no filter lets pass the gateway is never given."""
+        can = CanFrame(frame.can_id, frame.data, frame.extended, frame.fd, remote=frame.remote)
+        if can.key in self._gateway.receive_ids:
+            self._gateway.status.received_frames += 1
+            self._gateway.receive_frame(can, now)
+
+    def happen(self, verb: str, words: Sequence[str], now: int) -> None:
+        """Anything else: see README.md."""
+        gateway = self._gateway
+        esc = int(words[0]) - 1 if words and words[0].isdecimal() else 0
+        match verb:
+            case "start":
+                gateway.start(now, words != ["closed"])
+            case "stop":
+                gateway.stop(now)
+            case "port_opened":
+                gateway.port_opened(esc, now)
+            case "port_lost":
+                gateway.port_lost(esc, now)
+            case "line_errors":
+                gateway.escs[esc].line_errors = int(words[1])
+            case "can_state":
+                self._open = words[0] != "DOWN"
+                gateway.set_can_state(CanState[words[0]], now)
+            case "can_opened":
+                self._open = True
+                gateway.can_opened(now)
+                gateway.can_returned(now)
+            case "overrun":
+                gateway.receive_overrun(now)
+            case "saved":
+                gateway.saved(esc, " ".join(words[1:]) or None, now)
+            case "damaged":
+                gateway.parameters_damaged(esc, now)
+            case _:
+                raise ValueError(f"what is {verb!r}?")
+
+    def take(self) -> list[Frame]:
+        """What was sent since the last call."""
+        frames = in_order(self._gateway.take_frames(), self._waiting)
+        if not self._open:
+            return []
+        self._gateway.status.sent_frames += len(frames)
+        return [_frame(frame) for frame in frames]
+
+    def news(self) -> list[str]:
+        """What the gateway wants stored, or reports beside its frames, since the last call."""
+        gateway = self._gateway
+        found = []
+        for esc, stored in gateway.take_saves():
+            content = json.loads(encode(stored).split(b"\n")[1])
+            found.append(f"store {esc + 1} {json.dumps(content, sort_keys=True)}")
+        found += [f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}" for esc, key in gateway.take_misfits()]
+        for conflict in gateway.take_conflicts():
+            found.append(f"conflict {conflict.can_id:03X} {conflict.whose}{' is over' if conflict.over else ''}")
+        gateway.take_link_changes()
+        return found

@@ -1,0 +1,583 @@
+"""Is what is golden right? Each flight, dialogue and capture against a brute-force search, the sheet and cantools.
+
+UART bytes are searched by tests/protocol/reference.py, fields and scales are those of tests/protocol/sheet.py, frames are decoded by
+cantools. Nothing of the product is used but the DBC of a configuration, as text. ``python tests/golden/judge.py`` says what was judged.
+"""
+
+import io
+import json
+import re
+import struct
+import sys
+import tempfile
+import tomllib
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import redirect_stderr
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parents[1])]
+
+import commands  # noqa: E402
+import drive  # noqa: E402
+import meaning  # noqa: E402
+import scenario  # noqa: E402
+from cantools.database.can import Database  # noqa: E402
+from cantools.database.can.signal import Signal  # noqa: E402
+from protocol import reference, sheet  # noqa: E402
+
+NOT_JUDGED = ("no_start_values.txt",)
+"""Flags without a start value go to 1 on loss, which is a false alarm: a known defect (README.md)."""
+NS_PER_BYTE = 11 * 10**9 // 115_200
+INFO_NS = 10 * 10**9
+JIVEPRO = 3
+CONVERSIONS: dict[tuple[str, str], int | Fraction] = {
+    ("V", "mV"): 1000,
+    ("A", "mA"): 1000,
+    ("us", "ms"): Fraction(1, 1000),
+}
+LIVE = {f.name: f for f in sheet.LIVE_FIELDS}
+INFO = {f.name: f for f in sheet.INFO_FIELDS}
+Values = Mapping[str, int]
+Bytes = tuple[int, bytes | None]
+"""(time, bytes that are read; None where the port is lost)."""
+Arrivals = list[tuple[str, str, Values, int]]
+"""Frames that are certain with an input: kind, layout, values, time of the last byte."""
+
+
+class State(NamedTuple):
+    """What is known of an ESC: the newest data where it is fresh, when the newest came, and what came last."""
+
+    live: Values | None = None
+    live_ns: int | None = None
+    info: Values | None = None
+    info_ns: int = 0
+    last_info: Values | None = None
+    layout: int = 0
+
+
+@dataclass
+class Esc:
+    """An ESC: its settings, what it sent by time, and its state."""
+
+    prefix: str
+    pole_pairs: int = 1
+    gear: Fraction = Fraction(1)
+    cells: int = 0
+    timeout: int = 250_000_000
+    state: State = State()
+    passed: list[State] = field(default_factory=list)
+    """States since the time of the last input."""
+    sure: bool = True
+    """False where settings were changed by what is not followed here."""
+
+    def expire(self, now: int) -> bool:
+        """Forget what is too old."""
+        before = self.state
+        if before.live is not None and before.live_ns is not None and now - before.live_ns > self.timeout:
+            self.lose()
+        if self.state.info is not None and now - self.state.info_ns > INFO_NS:
+            self.state = self.state._replace(info=None)
+        return before is not self.state
+
+    def lose(self) -> None:
+        self.state = self.state._replace(live=None, info=None)
+
+    def take(self, kind: str, layout: str, values: Values, when: int) -> None:
+        """A frame whose last byte came at ``when``."""
+        number = 1 if layout == "v4" else 2
+        if number != self.state.layout:
+            self.state = self.state._replace(layout=number, info=None, last_info=None)
+        if kind == "info":
+            self.state = self.state._replace(info=values, info_ns=when, last_info=values)
+        else:
+            self.state = self.state._replace(live=values, live_ns=max(when, self.state.live_ns or 0))
+
+
+def found_frames(inputs: list[Bytes], timeout: int) -> list[Arrivals | None]:
+    """For each input the frames that no further byte could take away, by brute force; None where the port is lost."""
+    found: list[Arrivals] = [[] for _ in inputs]
+    begin = 0
+    while begin < len(inputs):
+        end = begin
+        while end < len(inputs) and inputs[end][1] is not None:
+            end += 1
+            if end < len(inputs) and inputs[end][0] - inputs[end - 1][0] > timeout:
+                break  # what was unfinished is given up
+        if end > begin:
+            _search(inputs, begin, end, timeout, found)
+        begin = end if end > begin else end + 1
+    return [None if data is None else arrivals for (_, data), arrivals in zip(inputs, found, strict=True)]
+
+
+def _search(inputs: list[Bytes], begin: int, end: int, timeout: int, found: list[Arrivals]) -> None:
+    stream = b"".join(data or b"" for _, data in inputs[begin:end])
+    ends: list[int] = []
+    for _, data in inputs[begin:end]:
+        ends.append((ends[-1] if ends else 0) + len(data or b""))
+    moment = gap = 0
+    for frame in reference.frames_of(stream):
+        moment = max(moment, frame.end)
+        for at in range(gap, frame.offset):
+            moment = max(moment, at + reference.LONGEST_OF.get(stream[at : at + 4], 0))
+        gap = frame.end
+        if moment > len(stream):
+            continue  # it comes to light only when the stream is given up
+        index = next(n for n, size in enumerate(ends) if size >= moment)
+        now = inputs[begin + index][0]
+        when = now - (ends[index] - frame.end) * NS_PER_BYTE
+        if now - when <= timeout:
+            found[begin + index].append((frame.kind, frame.layout, fields_of(frame.kind, frame.raw), when))
+
+
+def fields_of(kind: str, raw: bytes) -> Values:
+    listed = sheet.LIVE_FIELDS if kind == "live" else sheet.INFO_FIELDS
+    return {f.name: struct.unpack_from(f"<{f.code}", raw, f.offset)[0] for f in listed}
+
+
+def bec_current_supplied(state: State) -> bool:
+    """The JIVEPro does not; as long as the device is not known, 0 says nothing."""
+    known = state.info or state.last_info
+    if known is not None and known["device_and_variant"] >> 10 == JIVEPRO:
+        return False
+    return state.info is not None or bool(state.live and state.live["bec_current"])
+
+
+def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | None:
+    """The value that a signal is to have, in the sheet's unit; None: not available. KeyError for what is not judged."""
+    plain = re.sub("(?<!^)(?=[A-Z])", "_", name.removesuffix("Percent")).lower()
+    live, info = state.live, state.info
+    for known, listed in ((live, LIVE), (info, INFO)):
+        if plain in listed and plain != "operating_state":
+            if known is None or (plain == "bec_current" and not bec_current_supplied(state)):
+                return None
+            if plain == "max_bec_current" and known["device_and_variant"] >> 10 == JIVEPRO:
+                return None
+            return Fraction(known[plain], listed[plain].steps)
+    if name in ("MotorSpeed", "OutputSpeed", "MeanCellVoltage") and not esc.sure:
+        raise KeyError(name)
+    if name in ("OperatingState", "OperatingStateRaw", "MotorSpeed", "OutputSpeed", "BatteryPower", "MeanCellVoltage"):
+        return None if live is None else _of_live(name, esc, live, esc.cells or (info or {}).get("cell_count", 0))
+    if name in ("Device", "DeviceRaw", "Variant", "FirmwareMain", "FirmwareSub"):
+        if info is None:
+            return None
+        pair, firmware = info["device_and_variant"], info["firmware_word"]
+        parts = {"Variant": pair & 1023, "FirmwareMain": firmware >> 8, "FirmwareSub": firmware & 255}
+        return parts.get(name, pair >> 10)
+    if name == "Layout":
+        return state.layout
+    if name == "DataAge":
+        return None if state.live_ns is None else max(0, now - state.live_ns) // 10**6
+    raise KeyError(name)
+
+
+def _of_live(name: str, esc: Esc, live: Values, cells: int) -> Fraction | int | None:
+    speed = Fraction(live["electrical_speed"], esc.pole_pairs)
+    if name.endswith("Speed"):
+        return speed if name == "MotorSpeed" else speed / esc.gear
+    if name == "BatteryPower":
+        return Fraction(live["battery_voltage"] * live["battery_current"], 1000)
+    if name == "MeanCellVoltage":
+        return Fraction(live["battery_voltage"], 100 * cells) if cells else None
+    return live["operating_state"]
+
+
+def fits(signal: Signal, raw: float, value: Fraction | int | None, unit: str) -> bool:
+    """True where the raw value says this."""
+    texts: dict[str, int] = {str(text): number for number, text in (signal.choices or {}).items()}
+    if value is None:
+        if signal.is_float and signal.raw_initial is None:
+            return raw != raw
+        lowest = -1 << signal.length - 1 if signal.is_signed else (1 << signal.length) - 1
+        code = lowest if signal.raw_initial is None else signal.raw_initial
+        return bool(raw == texts.get("NotAvailable", int(code)))
+    value = Fraction(value) * CONVERSIONS.get((unit, signal.unit or ""), 1)
+    if signal.is_float:
+        return bool(abs(raw * signal.scale + signal.offset - float(value)) <= 1e-6 * abs(value))
+    ideal = float((value - Fraction(str(signal.offset))) / Fraction(str(signal.scale)))
+    numbers = [number for text, number in texts.items() if text not in ("NotAvailable", "Error")]
+    limits = (signal.minimum or 0, signal.maximum or 0)
+    out_of_range = bool(numbers) and value not in numbers
+    if limits != (0, 0) and not numbers:
+        low, high = (round((limit - signal.offset) / signal.scale) for limit in limits)
+        out_of_range = not min(low, high) - 0.5 <= ideal < max(low, high) + 0.5
+    codes = 1 << signal.length
+    top = codes // 2 - 1 if signal.is_signed else codes - 1
+    if out_of_range or not top - codes < ideal < top + 0.5:
+        return "Error" not in texts or raw == texts["Error"]
+    return abs(raw - ideal) <= 0.5 + 1e-9
+
+
+class Judge:
+    """One golden file. ``wrong``: what does not agree; ``count``: what was judged."""
+
+    def __init__(self, escs: list[Esc], database: Database | None, node_ids: list[int], steady: bool) -> None:
+        self.escs = escs
+        self.database = database
+        self.node_ids = node_ids
+        self.steady = steady
+        self.wrong: list[str] = []
+        self.count: Counter[str] = Counter()
+        self._now = -1
+        self._last: dict[str, tuple[int, int]] = {}
+        self._requests: dict[int, bytes] = {}
+        self._pdos = _canopen_database()
+        self._flags = _flags()
+
+    def given(self, now: int, index: int, arrivals: Arrivals | None) -> None:
+        """An input of an ESC; None: its port is lost."""
+        esc = self._at(now, self.escs[index])
+        if arrivals is None:
+            esc.lose()
+        for arrival in arrivals or ():
+            esc.take(*arrival)
+            esc.passed.append(esc.state)
+        if not arrivals:
+            esc.passed.append(esc.state)
+
+    def _at(self, now: int, esc: Esc) -> Esc:
+        if now != self._now:
+            self._now = now
+            for other in self.escs:
+                other.passed = []
+        if esc.expire(now):
+            esc.passed.append(esc.state)
+        return esc
+
+    def received(self, frame: drive.Frame) -> None:
+        """A frame from the bus: settings that a master writes."""
+        if 0x600 < frame.can_id < 0x680 and len(frame.data) == 8:
+            self._requests[frame.can_id - 0x600] = frame.data
+        if frame.can_id == 0 and frame.data[:1] == b"\x81":
+            for esc in self.escs:
+                esc.sure = False
+
+    def setting(self, node: int, entry: int, data: bytes) -> None:
+        """A confirmed download to 2100h."""
+        if node not in self.node_ids:
+            return
+        esc = self.escs[self.node_ids.index(node)]
+        value = int.from_bytes(data, "little")
+        if entry == 1:
+            esc.pole_pairs = value
+        elif entry == 2:
+            esc.gear = Fraction(value, esc.gear.denominator)
+        elif entry == 3:
+            esc.gear = Fraction(esc.gear.numerator, value)
+        elif entry == 4:
+            esc.timeout = value * 10**6
+        elif entry == 7:
+            esc.cells = value
+
+    def sent(self, now: int, frame: drive.Frame) -> None:
+        """A frame of the gateway."""
+        for esc in self.escs:
+            self._at(now, esc)
+        self.count["frames"] += 1
+        if not frame.extended and 0x580 < frame.can_id < 0x600:
+            self._answer(now, frame)
+        node = frame.can_id & 0x7F
+        if not frame.extended and 0x180 < frame.can_id < 0x400 and node in self.node_ids:
+            self._message(now, frame, self._pdos, frame.can_id - node + 1, self.escs[self.node_ids.index(node)])
+        elif self.database is not None:
+            self._message(now, frame, self.database, frame.can_id, None)
+
+    def _message(self, now: int, frame: drive.Frame, database: Database, can_id: int, owner: Esc | None) -> None:
+        message = next(
+            (m for m in database.messages if (m.frame_id, m.is_extended_frame) == (can_id, frame.extended)), None
+        )
+        if message is None:
+            return
+        if message.length != len(frame.data):
+            self.wrong.append(f"{scenario.seconds(now)} {message.name}: {len(frame.data)} bytes")
+            return
+        raw: Any = message.decode(frame.data, decode_choices=False, scaling=False)
+        for signal in message.signals:
+            if signal.name in raw:
+                esc = owner or next(
+                    (e for e in self.escs if e.prefix and signal.name.startswith(e.prefix)), self.escs[0]
+                )
+                self._signal(now, message.name, signal, raw[signal.name], esc, owner is not None)
+        if owner is None:
+            self._rhythm(now, message, raw)
+
+    def _signal(self, now: int, message: str, signal: Signal, raw: float, esc: Esc, pdo: bool) -> None:
+        name = signal.name.removeprefix(esc.prefix)
+        states = esc.passed or [esc.state]
+        if name in self._flags:
+            word, bit = self._flags[name]
+            known = [s.live if word in LIVE else s.info for s in states]
+            good = any(((values or {}).get(word, 0) >> bit & 1) == raw for values in known)
+        elif name == "EscsOk":
+            live = [{s.live is not None for s in e.passed or [e.state]} for e in self.escs]
+            good = sum(map(min, live)) <= raw <= sum(map(max, live))
+        else:
+            plain = re.sub("(?<!^)(?=[A-Z])", "_", name.removesuffix("Percent")).lower()
+            row = (LIVE | INFO).get(plain, LIVE["battery_voltage"])
+            unit = row.unit.replace("µ", "u")
+            try:
+                good = any(fits(signal, raw, expected(name, esc, state, now), unit) for state in states)
+                # CiA 301 has no code for what is not available: as it stands on the wire
+                good = good or (pdo and any(s.live is not None and raw == s.live.get(plain) for s in states))
+            except KeyError:
+                return
+        self.count["values"] += 1
+        if not good:
+            self.wrong.append(f"{scenario.seconds(now)} {message}.{signal.name} = {raw} with {states}")
+
+    def _rhythm(self, now: int, message: Any, raw: Mapping[str, Any]) -> None:
+        alive = next((s for s in message.signals if s.name.endswith(("Alive", "AliveCounter"))), None)
+        counter = -1 if alive is None else int(raw[alive.name])
+        before, last = self._last.get(message.name, (-1, now))
+        self._last[message.name] = counter, now
+        if not self.steady or now == last:
+            return
+        self.count["distances"] += 1
+        if alive is not None and before >= 0 and counter != (before + 1) % 15:
+            self.wrong.append(f"{scenario.seconds(now)} {message.name}: alive counter {before} -> {counter}")
+        attributes = message.dbc.attributes
+        delay = attributes["GenMsgDelayTime"].value if "GenMsgDelayTime" in attributes else 0
+        if (message.cycle_time and now - last > message.cycle_time * 10**6 + 10**6) or now - last < delay * 10**6:
+            self.wrong.append(f"{scenario.seconds(now)} {message.name}: {(now - last) / 1e6} ms after the one before")
+
+    def _answer(self, now: int, frame: drive.Frame) -> None:
+        node, data = frame.can_id - 0x580, frame.data
+        request = self._requests.pop(node, None)
+        if request is not None and data[0] == 0x60 and request[1:3] == b"\x00\x21" and request[0] & 0xE2 == 0x22:
+            self.setting(node, request[3], request[4 : 8 - (request[0] >> 2 & 3)])
+        if data[0] & 0xE2 == 0x42:
+            self.read(now, node, data[2] << 8 | data[1], data[3], data[4 : 8 - (data[0] >> 2 & 3)])
+
+    def read(self, now: int, node: int, index: int, sub: int, data: bytes | None) -> None:
+        """An upload, expedited; None: it was refused."""
+        if node not in self.node_ids or not sub:
+            return
+        esc = self._at(now, self.escs[self.node_ids.index(node)])
+        state = esc.state
+        live, info = state.live, state.last_info
+        wanted: bytes | None = None
+        row = sheet.LIVE_FIELDS[min(sub, 16) - 1] if index == 0x2000 else sheet.INFO_FIELDS[min(sub, 14) + 3]
+        if index == 0x2000 and sub <= 16:
+            if live is not None and (row.name != "bec_current" or bec_current_supplied(state)):
+                wanted = struct.pack(f"<{row.code}", live[row.name])
+        elif index == 0x2011 and sub <= 14:
+            if info is not None and (row.name != "max_bec_current" or info["device_and_variant"] >> 10 != JIVEPRO):
+                wanted = struct.pack(f"<{row.code}", info[row.name])
+        elif index == 0x2010 and sub <= 5:
+            names = ("device_and_variant", "device_and_variant", "firmware_word", "selftest_errors", "cell_count")
+            if info is not None:
+                value = info[names[sub - 1]]
+                wanted = struct.pack(f"<{'BHHIB'[sub - 1]}", {1: value >> 10, 2: value & 1023}.get(sub, value))
+        elif index == 0x2001 and sub <= 2 and esc.sure:
+            if live is not None:
+                ratio = esc.pole_pairs * (esc.gear if sub == 2 else 1)
+                wanted = struct.pack("<i", int(live["electrical_speed"] / Fraction(ratio) + Fraction(1, 2)))
+        else:
+            return
+        self.count["SDO answers"] += 1
+        if data != wanted:
+            self.wrong.append(
+                f"{scenario.seconds(now)} {index:04X}h:{sub:02X} = {data and data.hex()}, not {wanted and wanted.hex()}"
+            )
+
+
+@cache
+def _canopen_database() -> Database:
+    return _dbc(["--canopen"])
+
+
+def _dbc(words: list[str]) -> Database:
+    with tempfile.TemporaryDirectory() as folder:
+        with redirect_stderr(io.StringIO()):
+            assert drive.command(["dbc", *words, "-o", f"{folder}/out.dbc"]) == 0
+        return meaning.database(Path(f"{folder}/out.dbc").read_bytes())
+
+
+@cache
+def _flags() -> dict[str, tuple[str, int]]:
+    """Names of the shipped flags, in the order of their bits; each has a word of the sheet's row in it."""
+    found: dict[str, tuple[str, int]] = {}
+    for message, word, bits in (
+        ("EscStatus", "operating_errors", sheet.OPERATING_BITS),
+        ("EscInfo", "selftest_errors", sheet.SELFTEST_BITS),
+    ):
+        signals = [s for s in _dbc([]).get_message_by_name(message).signals if s.length == 1]
+        for bit, signal in zip(bits, sorted(signals, key=lambda s: s.start), strict=True):
+            plain = [re.sub("[^a-z]", "", text).removesuffix("s") for text in bit.words]
+            assert any(text in signal.name.lower() for text in plain), f"{signal.name} is not {bit.words}"
+            found[signal.name] = (word, bit.number)
+    return found
+
+
+def follow(found: Judge, steps: list[tuple[int, str, Any]]) -> Judge:
+    """What happened, in order: bytes (ESC, what; None: the port is lost), frames <- and ->, SDO transfers."""
+    queues = []
+    for index, esc in enumerate(found.escs):
+        inputs = [(now, what[1]) for now, verb, what in steps if verb == "bytes" and what[0] == index]
+        queues.append(iter(found_frames(inputs, esc.timeout)))
+    for now, verb, what in steps:
+        if verb == "bytes":
+            found.given(now, what[0], next(queues[what[0]]))
+        elif verb == "<-":
+            found.received(scenario.read_frame(what))
+        elif verb == "->":
+            found.sent(now, scenario.read_frame(what))
+        elif verb == "read":
+            found.read(now, *what)
+        elif verb == "write":
+            found.setting(*what)
+    return found
+
+
+def judge_scenario(file: Path) -> Judge:
+    """A flight or a dialogue."""
+    header, lines = scenario.split(file.read_text(encoding="utf-8"))
+    tables = tomllib.loads(header)
+    escs = []
+    for number, esc in enumerate(tables["esc"], 1):
+        prefix = esc.get("name", f"esc{number}").title() if len(tables["esc"]) > 1 else ""
+        timeout = esc.get("telemetry_timeout_ms", 250) * 10**6
+        gear = Fraction(str(esc.get("gear", 1)))
+        escs.append(Esc(prefix, esc.get("pole_pairs", 1), gear, esc.get("cell_count", 0), timeout))
+    canopen, dbc = tables.get("canopen", {}), tables.get("dbc", {})
+    node_ids = [canopen.get("node_id", 1) + n for n in range(len(escs))] if canopen.get("enabled") else []
+    database = None
+    if dbc.get("enabled", True):
+        with tempfile.TemporaryDirectory() as folder:
+            plain = re.sub(r"^\[golden[^\[]*", "", header, flags=re.MULTILINE)
+            (Path(folder) / "a.toml").write_text(plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"'))
+            database = _dbc(["-c", f"{folder}/a.toml"])
+    steps: list[tuple[int, str, Any]] = []
+    steady = dbc.get("on_loss") != "silent"
+    for time, verb, *words in filter(None, (line.partition(";")[0].split() for line in lines)):
+        now = scenario.nanoseconds(time)
+        steady = steady and verb not in ("held", "can_state", "can_opened")
+        if verb in ("uart", "port_lost"):
+            data = scenario.uart_bytes(words[1:]) if verb == "uart" else None
+            steps.append((now, "bytes", (int(words[0]) - 1, data)))
+        elif verb in ("<-", "->"):
+            steps.append((now, verb, words[0]))
+        elif verb in ("read", "write"):
+            node, index, sub = int(words[0]), int(words[1][:4], 16), int(words[1][5:], 16)
+            if verb == "read":
+                steps.append(
+                    (now, verb, (node, index, sub, None if "!" in words else bytes.fromhex("".join(words[3:4]))))
+                )
+            elif index == 0x2100 and "!" not in words:
+                steps.append((now, verb, (node, sub, bytes.fromhex(words[2]))))
+    return follow(Judge(escs, database, node_ids, steady), steps)
+
+
+def blocks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """The whole blocks of a capture, kind and payload, by the description of the format."""
+    at = 0
+    while (at := data.find(b"KCB1", at)) >= 0:
+        head = data[at : at + 24]
+        if len(head) == 24:
+            kind, packed, _, stored = head[4:5], head[5], head[6:8], int.from_bytes(head[8:12], "little")
+            payload = data[at + 24 : at + 24 + stored]
+            if zlib.crc32(payload, zlib.crc32(head[:20])) == int.from_bytes(head[20:], "little"):
+                yield kind, zlib.decompress(payload) if packed else payload
+                at += 24 + stored
+                continue
+        at += 1
+
+
+def judge_capture(file: Path) -> Judge:
+    """A capture and its frames."""
+    steps: list[tuple[int, str, Any]] = []
+    header: dict[str, Any] = {}
+    for kind, payload in blocks(file.read_bytes()):
+        if kind == b"H":
+            header = json.loads(payload)
+        elif kind == b"D":
+            at = 4 + 16 * int.from_bytes(payload[:4], "little")
+            for now, what, _, index, size in struct.iter_unpack("<QBBHI", payload[4:at]):
+                if what in (1, 7):
+                    steps.append((now, "bytes", (index, payload[at : at + size] if what == 1 else None)))
+                at += size
+    listed = header["escs"]
+    escs = []
+    for esc in listed:
+        prefix = esc["name"].title() if len(listed) > 1 else ""
+        escs.append(Esc(prefix, esc["pole_pairs"], Fraction(esc["gear"]), esc["cell_count"], esc["timeout_ns"]))
+    database = meaning.database(header["dbc"]["text"].encode("latin-1"))
+    if len(listed) > 1:
+        database = _dbc([word for esc in listed for word in ("--name", esc["name"])])
+    first, *lines = file.with_suffix(".txt").read_text(encoding="utf-8").splitlines()
+    for time, verb, frame in (line.split() for line in lines):
+        steps.append((int(first.split()[-5]) + scenario.nanoseconds(time), verb, frame))
+    steps.sort(key=lambda step: step[0])  # stable: bytes come before the frames of the same time
+    nodes = [node["node_id"] for node in (header["canopen"] or {}).get("nodes", [])]
+    return follow(Judge(escs, database, nodes, steady=False), steps)
+
+
+def judge_decoded(file: Path) -> Judge:
+    """The tables of ``decode``: every field of every frame that brute force finds, as the golden text has it."""
+    found = Judge([Esc("")], None, [], steady=False)
+    for title, lines in commands.cases(file.read_text(encoding="utf-8")).items():
+        source = next((line.split(" < ")[1] for line in lines if " < flights/" in line), None)
+        if source is None:
+            continue
+        stream = commands.flight_bytes(HERE / source.split()[0], int(source.split()[1]))
+        frames = reference.frames_of(stream)
+        columns: dict[str, list[str]] = {
+            "offset": [str(frame.offset) for frame in frames],
+            "kind": [frame.kind for frame in frames],
+        }
+        for kind, listed in (("live", LIVE), ("info", INFO)):
+            for name, row in listed.items():
+                columns[name] = []
+                for frame in frames:
+                    value = Fraction(fields_of(kind, frame.raw)[name], row.steps) if frame.kind == kind else None
+                    columns[name].append("" if value is None else meaning.spelled(str(float(value))))
+        for name in ("operating_state", "device_and_variant", "firmware_word", "bec_current", "max_bec_current"):
+            del columns[name]  # shown as texts, or not on every device
+        wanted = meaning.column_lines(columns)[1:]
+        shown = Counter(line.removeprefix("| ") for line in lines)
+        always = [line.removeprefix("always ").partition(": ") for line in shown if line.startswith("always ")]
+        for line in wanted:
+            found.count["columns"] += 1
+            if line.startswith("always "):
+                same_value, _, names = line.removeprefix("always ").partition(": ")
+                same = {name for other, _, these in always if other == same_value for name in these.split(", ")}
+                found.wrong += [f"{title}: {name} is not always {same_value}" for name in {*names.split(", ")} - same]
+            elif shown[line] != 2:  # as JSON lines and as CSV
+                found.wrong.append(f"{title}: not so: {line}")
+    return found
+
+
+def files() -> list[Path]:
+    """Each file that can be judged."""
+    found = [*HERE.glob("flights/*.txt"), *HERE.glob("dialogues/*.txt"), *HERE.glob("captures/*.kcap")]
+    found = [file for file in sorted(found) if file.name not in NOT_JUDGED]
+    return [*found, HERE / "commands/decode.txt"]
+
+
+def judge(file: Path) -> Judge:
+    """Judge one of them."""
+    if file.parent.name == "commands":
+        return judge_decoded(file)
+    return judge_capture(file) if file.suffix == ".kcap" else judge_scenario(file)
+
+
+def main() -> int:
+    """Judge all and say what was judged."""
+    bad = 0
+    for file in files():
+        found = judge(file)
+        bad += len(found.wrong)
+        what = ", ".join(f"{count} {what}" for what, count in found.count.items())
+        print(f"{file.relative_to(HERE)}: {what}; {len(found.wrong)} wrong")
+        print("".join(f"    {line}\n" for line in found.wrong[:8]), end="")
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

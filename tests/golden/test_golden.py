@@ -1,0 +1,63 @@
+"""The golden set: what 0.5.0 made of its inputs, and what is made of them now. `make golden` records it anew; see README.md."""
+
+import re
+from pathlib import Path
+
+import judge
+import pytest
+import record
+
+HERE = record.HERE
+
+
+@pytest.mark.parametrize("file", record.files(), ids=lambda file: str(file.relative_to(HERE)))
+def test_nothing_has_changed(file: Path) -> None:
+    found = record.changes(file, record.made(file))
+    assert not found, "\n".join([*found, "If this is meant: make golden, and commit what it says with the change."])
+
+
+@pytest.mark.parametrize("file", judge.files(), ids=lambda file: str(file.relative_to(HERE)))
+def test_what_is_golden_is_right(file: Path) -> None:
+    found = judge.judge(file)
+    assert found.count.total() > 0
+    assert found.wrong == []
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("flights/v4.txt", "-> 688#000000C0", "-> 688#000000BF"),  # a voltage of 10 mV less
+        ("flights/v4.txt", "-> 688#", "-> 698#"),
+        ("dialogues/sdo.txt", "2000:03 = CBFF", "2000:03 = CBFE"),
+        ("commands/decode.txt", "offset: 0 760", "offset: 0 761"),
+    ],
+)
+def test_the_judge_sees_what_is_wrong(tmp_path: Path, name: str, old: str, new: str) -> None:
+    file = tmp_path / name
+    file.parent.mkdir()
+    text = (HERE / name).read_text(encoding="utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new, 1), encoding="utf-8")
+    assert judge.judge(file).wrong
+
+
+def test_a_change_is_said_in_words(tmp_path: Path) -> None:
+    old = "0.100 -> 688#0102\n0.200 -> 688#0304\n0.300 -> 690#00\n0.400 - \n"
+    new = "0.100 -> 688#0102\n0.200 -> 688#0305\n0.301 -> 690#00\n0.350 -> 701#05\n0.400 -\n"
+    file = record.HERE / "flights/none.txt"
+    assert record.differences(file, old, old) == []
+    assert record.differences(file, old, new) == [
+        "flights/none.txt: 1 of 3 frames differ (688 1x), first at 0.200 s: 688#0304 -> 688#0305",
+        "flights/none.txt: 1 of 3 frames come at another time, first 690#00 at 0.300 s -> 0.301 s",
+        "flights/none.txt: 1 frames are new, first 701#05 at 0.350 s",
+        "flights/none.txt: -0.400 - ",
+        "flights/none.txt: +0.400 -",
+    ]
+    case = "## one\n$ check\n! old\n=> 2\n\n## two\n$ check\n=> 0\n"
+    found = record.differences(record.HERE / "commands/none.txt", case, case.replace("old", "new"))
+    assert found == ["commands/none.txt: one", "commands/none.txt:     -! old", "commands/none.txt:     +! new"]
+
+
+def test_only_the_adapter_knows_the_product() -> None:
+    knowing = re.compile(r"^\s*(from|import) kontronik_can_gw", re.MULTILINE)
+    assert [file.name for file in HERE.glob("*.py") if knowing.search(file.read_text(encoding="utf-8"))] == ["drive.py"]
