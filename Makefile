@@ -1,18 +1,21 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-hardware soak hour bench golden lint clean
+.PHONY: help demo test test-all release soak hour bench golden lint clean
 
 help:
-	@echo 'make demo    show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
-	@echo 'make test    all checks: ruff, mypy, tests, tests on real vcan   (ARGS="--only lint|types|unit|vcan|faults")'
-	@echo 'make test-hardware   the fault programme on real drivers in virtual machines   (ARGS="--long --table --keep FOLDER")'
-	@echo 'make soak    random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
-	@echo 'make hour    a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
-	@echo 'make bench   speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
-	@echo 'make golden  record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
-	@echo 'make lint    ruff and mypy only'
-	@echo 'make clean   remove .venv and all caches'
+	@echo 'make demo      show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
+	@echo 'make test      ruff, mypy, tests, the core of the tests on a real vcan   (ARGS="--only lint|types|unit|vcan -- -k crc")'
+	@echo 'make test-all  what make test leaves out: faults, systemd, browser, broker, CANopen masters of others'
+	@echo '                                        (ARGS="--only faults|tools|masters --keep FOLDER")'
+	@echo 'make release   by hand, on a quiet machine, for hours: faults on emulated hardware, random faults, a recorded hour'
+	@echo '                                        (ARGS="--only qemu|soak|hour --keep FOLDER")'
+	@echo 'make soak      random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
+	@echo 'make hour      a recorded hour through every format, read back and compared   (ARGS="--minutes 6 --escs 3")'
+	@echo 'make bench     speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
+	@echo 'make golden    record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
+	@echo 'make lint      ruff and mypy only'
+	@echo 'make clean     remove .venv and all caches'
 
 demo:
 	@tests/bootstrap.sh demo
@@ -20,15 +23,19 @@ demo:
 
 test:
 	@tests/bootstrap.sh test
-	@.venv/bin/python tests/run.py $(ARGS)
+	@.venv/bin/python tests/run.py test $(ARGS)
 
-test-hardware:
-	@tests/bootstrap.sh hardware
-	@.venv/bin/python tests/run.py --only faults $(ARGS)
+test-all:
+	@tests/bootstrap.sh test-all
+	@.venv/bin/python tests/run.py test-all $(ARGS)
+
+release:
+	@tests/bootstrap.sh release
+	@.venv/bin/python tests/run.py release $(ARGS)
 
 soak:
-	@tests/bootstrap.sh hardware
-	@.venv/bin/python tests/run.py --only soak $(ARGS)
+	@tests/bootstrap.sh release
+	@.venv/bin/python tests/faults/soak.py $(ARGS)
 
 hour:
 	@tests/bootstrap.sh lint
@@ -44,7 +51,7 @@ golden:
 
 lint:
 	@tests/bootstrap.sh lint
-	@.venv/bin/python tests/run.py --only lint --only types
+	@.venv/bin/python tests/run.py test --only lint --only types
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis tests/vm/.cache tests/foreign/.cache build dist

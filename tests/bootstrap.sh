@@ -1,14 +1,15 @@
 #!/bin/sh
-# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test|hardware
-#   demo  the project
-#   lint  and its test tools
-#   test  and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and the CANopen
-#         masters of others that the node is tried with (tests/foreign); what `hardware` installs; systemd; a browser, an MQTT broker
-#   hardware  and the two virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
+# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test|test-all|release
+#   demo      the project
+#   lint      and its test tools
+#   test      and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and small tools that
+#             some tests look through the eyes of
+#   test-all  and User Mode Linux in any case, systemd, a browser, an MQTT broker, the CANopen masters of others (tests/foreign)
+#   release   as `test`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB
 # A second call does nothing. PYTHON: the interpreter to use.
 set -eu
 
-what=${1:?demo, lint, test or hardware}
+what=${1:?demo, lint, test, test-all or release}
 cd "$(dirname "$0")/.."
 venv=.venv/bin/python
 new_enough='import sys; sys.exit(sys.version_info < (3, 11))'
@@ -99,58 +100,57 @@ install_vcan() {
     tests/vm/setup.sh qemu || say "failed; by hand:  sudo tests/vm/setup.sh qemu"
 }
 
-# systemd's own checks of the service, and a real one that runs it in a virtual machine.
-install_systemd() {
-    command -v systemd-analyze >/dev/null && return
-    can_root || { say "no systemd to check the service with:  sudo apt-get install systemd"; return; }
-    apt_update
-    say "systemd, for the tests of the service"
-    as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 \
-        install -y --no-install-recommends systemd </dev/null >/dev/null || say "failed; going on"
-}
-
-# What the reports, the MQTT publisher, the screens, the completion, the manual page and the benchmarks are tried with.
-install_viewers() {
+# install_programs WHY PROGRAM[=PACKAGES]...: the packages of those that are not there, one by one: what cannot be had is left out.
+install_programs() {
     PATH=$PATH:/usr/sbin:/sbin
+    why=$1
     wanted=
-    command -v chromium >/dev/null || command -v google-chrome >/dev/null || wanted="$wanted chromium"
-    command -v mosquitto >/dev/null || wanted="$wanted mosquitto"
-    command -v mosquitto_sub >/dev/null || wanted="$wanted mosquitto-clients"
-    command -v groff >/dev/null || wanted="$wanted groff-base"
-    command -v gcc >/dev/null || wanted="$wanted gcc libc6-dev"
-    for tool in tmux zsh mandoc openssl; do command -v $tool >/dev/null || wanted="$wanted $tool"; done
+    shift
+    for each in "$@"; do command -v "${each%%=*}" >/dev/null || wanted="$wanted $(echo "${each#*=}" | tr , ' ')"; done
     [ -n "$wanted" ] || return 0
     can_root || { say "tests that need them are left out; they come with:  sudo apt-get install$wanted"; return; }
     apt_update
-    say "for the tests:$wanted"
+    say "$why:$wanted"
     for package in $wanted; do
         as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 \
             install -y --no-install-recommends "$package" </dev/null >/dev/null || say "$package: failed; going on"
     done
 }
 
+install_small_tools() {
+    install_programs "what screens, completion, manual page and benchmarks are tried with" \
+        tmux zsh mandoc groff=groff-base openssl gcc=gcc,libc6-dev
+}
+
+install_browser() { command -v google-chrome >/dev/null || install_programs "a browser" chromium; }
+
 # The faults that set clocks and mount file systems are never tried on the machine itself.
-install_hardware() {
+install_vm() { # $1: uml or qemu
     PATH=$PATH:/usr/sbin:/sbin
-    if ! command -v linux.uml >/dev/null; then
-        can_root || { say "cannot install User Mode Linux for the fault programme:  $vm_line"; return; }
-        apt_update
-        say "User Mode Linux for the fault programme"
-        tests/vm/setup.sh uml || say "failed; by hand:  $vm_line"
-    fi
-    if ! command -v qemu-system-x86_64 >/dev/null || ! grep -qs vhci_hcd "${VM_CACHE:-tests/vm/.cache}"/*/modules; then
-        can_root || { say "cannot install QEMU for the fault programme:  sudo tests/vm/setup.sh qemu"; return; }
-        apt_update
-        say "QEMU with a kernel for the fault programme"
-        tests/vm/setup.sh qemu || say "failed; by hand:  sudo tests/vm/setup.sh qemu"
-    fi
+    case $1 in
+        uml) command -v linux.uml >/dev/null && return ;;
+        qemu) command -v qemu-system-x86_64 >/dev/null && grep -qs vhci_hcd "${VM_CACHE:-tests/vm/.cache}"/*/modules && return ;;
+    esac
+    can_root || { say "cannot install what the fault programme needs:  sudo tests/vm/setup.sh $1"; return; }
+    apt_update
+    say "for the fault programme: $1"
+    tests/vm/setup.sh "$1" || say "failed; by hand:  sudo tests/vm/setup.sh $1"
 }
 
 [ -x "$venv" ] && "$venv" -c "$new_enough" 2>/dev/null || make_venv
 case $what in
     demo) install_project demo . ;;
     lint) install_project test '.[test]' ;;
-    hardware) install_project test '.[test]'; install_hardware ;;
-    test) install_project test '.[test]'; install_vcan; install_hardware; install_systemd; install_viewers; tests/foreign/install.sh || say "tests with the masters named above are left out" ;;
-    *) die "$what: demo, lint, test or hardware" ;;
+    test) install_project test '.[test]'; install_vcan; install_small_tools ;;
+    test-all)
+        install_project test '.[test]'
+        install_vcan
+        install_small_tools
+        install_vm uml
+        install_browser
+        install_programs "systemd and a broker" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients
+        tests/foreign/install.sh || say "tests with the masters named above are left out"
+        ;;
+    release) install_project test '.[test]'; install_vcan; install_vm uml; install_vm qemu ;;
+    *) die "$what: demo, lint, test, test-all or release" ;;
 esac

@@ -1,19 +1,25 @@
-"""What ``make test`` makes of tests that fail: a few of them are run once more, and that is told."""
+"""What ``make test`` makes of its steps: nothing that failed, was not run or left no report passes for good, and nothing is run twice."""
 
 import importlib.util
+import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 
-CASE = '<testcase classname="tests.vcan.test_x" name="{name}">{what}</testcase>'
+CASES = {
+    "passed": "<testcase classname='a' name='b'/>",
+    "failed": "<testcase><failure/></testcase>",
+    "broken": "<testcase><error/></testcase>",
+    "skipped": "<testcase><skipped message='no such tool'/></testcase>",
+    "not judged": "<testcase><skipped message='not judged: 31 % steal'/></testcase>",
+}
 
 
 @pytest.fixture(scope="module")
-def run() -> ModuleType:
+def checks() -> ModuleType:
     spec = importlib.util.spec_from_file_location("run_checks", Path(__file__).parent / "run.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -22,60 +28,106 @@ def run() -> ModuleType:
     return module
 
 
-class Runs:
-    """Stands for pytest: each run finds what the next of ``rounds`` says, test by test."""
+@pytest.fixture
+def step(checks: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """A function that runs a shell command as the step "unit"; with ``cases`` it leaves a report."""
 
-    def __init__(self, *rounds: dict[str, bool]) -> None:
-        self.rounds = list(rounds)
-        self.commands: list[Sequence[str]] = []
+    def run(command: str, *cases: str, arguments: tuple[str, ...] = ()) -> Any:
+        report = tmp_path / "made.xml"
+        report.write_text(f"<testsuite>{''.join(CASES[case] for case in cases)}</testsuite>")
+        copy = f"cp {report} {{report}}; " if cases else ": {report}; "
+        monkeypatch.setitem(checks.STEPS, "unit", f"echo ran >>{tmp_path}/ran; {copy}{command}")
+        result = checks.run("unit", 60, tmp_path, tmp_path, arguments, False)
+        assert (tmp_path / "ran").read_text() == "ran\n", "once, whatever came of it"
+        return result
 
-    def __call__(self, command: Sequence[str], *_others: Any, **_options: Any) -> int:
-        self.commands.append(command)
-        found = self.rounds.pop(0)
-        cases = [CASE.format(name=name, what="" if good else "<failure/>") for name, good in found.items()]
-        Path(command[-1].removeprefix("--junitxml=")).write_text(f"<testsuite>{''.join(cases)}</testsuite>")
-        return int(not all(found.values()))
-
-
-def result(run: ModuleType, monkeypatch: pytest.MonkeyPatch, folder: Path, runs: Runs, *arguments: str) -> Any:
-    monkeypatch.setattr(run, "call", runs)
-    return run.pytest("vcan", ["pytest"], ["tests/vcan"], arguments, folder / "vcan.xml", {})
+    return run
 
 
-def test_a_test_that_passes_alone_is_named(run: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    runs = Runs({"a": True, "b[1-x]": False, "c": True}, {"b[1-x]": True})
-    found = result(run, monkeypatch, tmp_path, runs)
-    assert found.state == "passed"
-    assert (found.suite.passed, found.suite.failed) == (3, 0)
-    assert runs.commands[0][1:-1] == ["tests/vcan"]
-    assert runs.commands[1][1:-1] == ["tests/vcan/test_x.py::b[1-x]"]
-    assert "1 at the second attempt: tests/vcan/test_x.py::b[1-x]" in found.detail
-
-
-def test_one_that_fails_again_has_failed(run: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    found = result(run, monkeypatch, tmp_path, Runs({"a": False, "b": False}, {"a": True, "b": False}))
-    assert found.state == "FAILED"
-    assert (found.suite.passed, found.suite.failed) == (1, 1)
-
-
-def test_one_that_is_not_found_again_has_failed(
-    run: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("command", "cases", "counts", "state"),
+    [
+        ("true", ["passed", "passed"], (2, 0, 0), "passed"),
+        ("false", ["passed", "failed", "broken"], (1, 2, 0), "FAILED"),
+        ("true", ["passed", "failed"], (1, 1, 0), "FAILED"),
+        ("true", ["passed", "skipped", "not judged"], (1, 0, 2), "passed"),
+        ("exit 3", ["passed"], (1, 1, 0), "FAILED"),
+        ("exit 2", [], (0, 1, 0), "FAILED"),
+        ("true", [], (0, 1, 0), "FAILED"),
+    ],
+)
+def test_a_step_is_what_its_report_and_its_exit_code_say(
+    step: Any, command: str, cases: list[str], counts: tuple[int, int, int], state: str
 ) -> None:
-    found = result(run, monkeypatch, tmp_path, Runs({"a": False, "b": True}, {}))
-    assert found.state == "FAILED"
-    assert (found.suite.passed, found.suite.failed) == (1, 1)
+    result = step(command, *cases)
+    assert (result.passed, result.failed, len(result.skipped), result.state) == (*counts, state)
 
 
-def test_more_than_a_few_are_not_repeated(run: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    found = result(run, monkeypatch, tmp_path, Runs(dict.fromkeys("abcde", False)))
-    assert (found.state, found.suite.failed) == ("FAILED", 5)
+def test_a_choice_that_fits_no_test_of_a_step_is_no_failure_of_it(step: Any) -> None:
+    assert step("exit 5", arguments=("-k", "crc")).state == "passed"
 
 
-def test_who_picks_tests_sees_them_once(run: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    found = result(run, monkeypatch, tmp_path, Runs({"a": False}), "-k", "a")
-    assert (found.state, found.suite.failed) == ("FAILED", 1)
+@pytest.mark.parametrize(("command", "state"), [("true", "passed"), ("exit 1", "FAILED")])
+def test_a_step_without_tests_is_one_check(
+    checks: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, state: str
+) -> None:
+    monkeypatch.setitem(checks.STEPS, "lint", command)
+    result = checks.run("lint", 60, tmp_path, tmp_path, (), False)
+    assert (result.passed + result.failed, result.state) == (1, state)
 
 
-def test_all_good_is_run_once(run: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    found = result(run, monkeypatch, tmp_path, Runs({"a": True}))
-    assert (found.state, found.detail) == ("passed", "1 passed, 0 failed, 0 skipped")
+def test_a_step_that_does_not_end_is_ended_and_has_failed(
+    checks: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(checks.STEPS, "lint", "sleep 600")
+    result = checks.run("lint", 0.1, tmp_path, tmp_path, (), False)
+    assert (result.state, result.note) == ("FAILED", "no end within 0.1 s")
+
+
+def test_what_is_missing_is_not_run_and_the_remedy_is_named(
+    checks: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(checks.NEEDS, "faults", (("no-such-program",), "sudo make one"))
+    result = checks.run("faults", 60, tmp_path, tmp_path, (), False)
+    assert (result.state, result.note) == ("not run", "there is no no-such-program")
+    assert checks.summarize([result], strict=False) == 0
+    assert checks.summarize([result], strict=True) == 1
+    assert "to enable it:  sudo make one" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("passed", "failed", "skipped", "code", "strict_code"),
+    [
+        (3, 0, [], 0, 0),
+        (3, 1, [], 1, 1),
+        (3, 0, ["a.b: no such tool"], 0, 1),
+        (3, 0, ["uml.x: not judged: 31 % steal"], 0, 0),
+    ],
+)
+def test_the_last_line_has_the_totals(
+    checks: ModuleType,
+    capsys: pytest.CaptureFixture[str],
+    passed: int,
+    failed: int,
+    skipped: list[str],
+    code: int,
+    strict_code: int,
+) -> None:
+    results = [checks.Result("unit", 1.0, passed, failed, skipped), checks.Result("lint", 1.0, 1)]
+    assert checks.summarize(results, strict=False) == code
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == f"{passed + 1} passed, {failed} failed, {len(skipped)} skipped"
+    assert re.fullmatch(r"\d+ passed, \d+ failed, \d+ skipped", last), "what CI reads"
+    assert checks.summarize(results, strict=True) == strict_code
+
+
+def test_every_step_is_in_one_tier_and_a_test_of_each_marker_is_run_somewhere(checks: ModuleType) -> None:
+    steps = [step for lanes in checks.TIERS.values() for lane in lanes for step in lane]
+    assert sorted(steps) == sorted(checks.STEPS)
+    for place in ("--ignore=tests/vcan", "-p no:cacheprovider tests/vcan"):
+        chosen = [
+            found[1]
+            for step in checks.STEPS.values()
+            if place in step and (found := re.search(" -m '?(not extended|extended)", step))
+        ]
+        assert sorted(chosen) == ["extended", "not extended"]

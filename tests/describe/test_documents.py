@@ -246,6 +246,7 @@ def test_the_page_needs_nothing_from_outside_and_no_script_but_its_own() -> None
         assert promise in text
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(_CHROMIUM is None, reason="no Chromium")
 @pytest.mark.parametrize("sought", ["", "undervoltage bec", "fff0h0"])
 def test_the_search_shows_the_rows_that_hold_every_word(tmp_path: Path, sought: str) -> None:

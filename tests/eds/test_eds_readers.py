@@ -98,6 +98,7 @@ def javascript() -> dict[str, Any]:
     return found
 
 
+@pytest.mark.extended
 def test_npm_canopen_reads_the_device(shipped: Eds, javascript: dict[str, Any]) -> None:
     device = shipped.device
     assert tuple(javascript["bitRates"]) == device.bit_rates
@@ -108,6 +109,7 @@ def test_npm_canopen_reads_the_device(shipped: Eds, javascript: dict[str, Any]) 
     assert {int(index): name for index, name in javascript["names"].items()} == shipped.object_names
 
 
+@pytest.mark.extended
 def test_npm_canopen_reads_every_entry_as_we_do(shipped: Eds, javascript: dict[str, Any]) -> None:
     theirs = {(each["index"], each["sub"]): each for each in javascript["entries"]}
     assert set(theirs) == {(entry.index, entry.sub) for entry in shipped.entries}

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,9 @@ AREAS = ("Start", "Serial", "CAN", "Time", "Process", "Disk", "Traffic", "Many")
 WITH_PYTHON = "s with the start of Python"
 """The figure of a fault that ends the process: what its users wait for here."""
 MACHINES = ("UML", "QEMU")
+MAX_STEAL = 0.1
+"""Of the processor time of the machine that runs the virtual one. Where more was taken away, what came late or not at all shows nothing."""
+GOOD, FAILED, NOT_JUDGED = "good", "failed", "not judged"
 
 
 def in_order(machine: str | None = None) -> list[Fault]:
@@ -63,13 +67,25 @@ class Row:
     lost: int = 0
     excused: int = 0
     """Values not sent because the machine as a whole stood still; no loss of the gateway's."""
+    transmitted: int = 0
+    """Bytes that the gateway sent to an ESC."""
+    steal: float = 0.0
+    """The largest share of processor time that was taken from the machine outside, over five seconds, while the fault ran."""
     notes: list[str] = field(default_factory=list)
     """What went wrong, for people."""
     figures: dict[str, float] = field(default_factory=dict)
 
     @property
     def good(self) -> bool:
-        return self.injected > 0 and self.recovered == self.injected and not self.wrong and not self.lost
+        healed = self.injected > 0 and self.recovered == self.injected
+        return healed and not self.wrong and not self.lost and not self.transmitted
+
+    @property
+    def state(self) -> str:
+        """Lateness and loss are not judged on a machine that could not run; a wrong value or a byte to an ESC fails anywhere."""
+        if self.good:
+            return GOOD
+        return NOT_JUDGED if self.steal > MAX_STEAL and not self.wrong and not self.transmitted else FAILED
 
 
 class Report:
@@ -87,12 +103,20 @@ class Report:
         self.rows.append(Row(fault.machine, fault.area, fault.name, fault.limit_s))
         return self.rows[-1]
 
-    @property
-    def good(self) -> bool:
-        return bool(self.rows) and all(row.good for row in self.rows)
-
     def write(self, path: Path) -> None:
-        path.write_text(json.dumps({**self.about, "rows": [asdict(row) for row in self.rows]}, indent=1) + "\n")
+        rows = [{**asdict(row), "state": row.state} for row in self.rows]
+        path.write_text(json.dumps({**self.about, "rows": rows}, indent=1) + "\n")
+
+    def write_junit(self, path: Path) -> None:
+        """Each row as a test; one that was not judged as skipped."""
+        suite = ET.Element("testsuite")
+        for row in self.rows:
+            case = ET.SubElement(suite, "testcase", classname=f"faults.{row.machine}", name=f"{row.area}: {row.name}")
+            if row.state == FAILED:
+                ET.SubElement(case, "failure", message=line(row))
+            elif row.state == NOT_JUDGED:
+                ET.SubElement(case, "skipped", message=f"{NOT_JUDGED}: {row.steal:.0%} steal")
+        ET.ElementTree(suite).write(path)
 
     @staticmethod
     def read(paths: Sequence[Path]) -> "Report":
@@ -100,7 +124,7 @@ class Report:
         merged = Report()
         for path in paths:
             found = json.loads(path.read_text())
-            merged.rows += [Row(**row) for row in found.pop("rows")]
+            merged.rows += [Row(**{key: row[key] for key in row if key != "state"}) for row in found.pop("rows")]
             merged.about |= found
         return merged
 
@@ -108,9 +132,13 @@ class Report:
 def line(row: Row) -> str:
     """One row for the terminal."""
     recovery = "undisturbed" if row.limit_s is None else f"worst {row.worst_s:.2f} s of {row.limit_s:g} s"
-    text = f"{'ok  ' if row.good else 'FAIL'} {row.machine} {row.area}: {row.name}: {row.recovered} of {row.injected}, "
+    text = f"{row.state:10} {row.machine} {row.area}: {row.name}: {row.recovered} of {row.injected}, "
     text += f"{recovery}, wrong {row.wrong}, lost {row.lost}"
     if row.excused:
         text += f", {row.excused} not sent while the machine stood still"
+    if row.transmitted:
+        text += f", {row.transmitted} bytes sent to an ESC"
+    if row.steal > MAX_STEAL:
+        text += f", {row.steal:.0%} steal"
     figures = ", ".join(f"{name} {value:g}" for name, value in row.figures.items())
     return text + (f"; {figures}" if figures else "") + "".join(f"\n       {note}" for note in row.notes)

@@ -1,17 +1,14 @@
 """The faults of the emulated machine, all in one start of it, and their account as JSON.
 
-    python tests/faults/qemu_programme.py --out FILE [--long] [--only WORD]...
+    python tests/faults/qemu_programme.py [--out FILE] [--long] [--only TEXT]...
 
 On any machine with QEMU set up (tests/vm/setup.sh qemu) this starts the emulated one and runs itself in there.
 """
 
-import argparse
 import os
 import re
-import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -21,12 +18,13 @@ HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parent.parent
 sys.path.insert(0, str(HERE))
 
-from fault_report import FAULTS  # noqa: E402
+import outside  # noqa: E402
+from fault_report import Fault, in_order  # noqa: E402
 from feeder import CURRENT, SPEED  # noqa: E402
 from harness import MS, Bench, Identity, Metronome, NotRecovered, Port, Report, line  # noqa: E402
 from qemu_adapters import CanAdapter, CanBus, SerialAdapter  # noqa: E402
 from qemu_faults import BITRATE  # noqa: E402
-from qemu_machine import VIRTIO_PORTS, Monitor, can_up, ip, wait_until  # noqa: E402
+from qemu_machine import Monitor, can_up, ip, wait_until  # noqa: E402
 from qemu_ports import FarPort, UsbPort, WirePort  # noqa: E402
 from signals import from_json, table_of, to_json  # noqa: E402
 
@@ -161,12 +159,10 @@ def leave_plugged() -> None:
         time.sleep(3600)
 
 
-def run_faults(bench: EmulatedBench, name: str, times: int, words: list[str]) -> None:
-    for fault in FAULTS:
-        if fault.machine != "QEMU" or fault.bench != name:
-            continue
-        if words and not any(word in fault.name for word in words):
-            continue
+def run_faults(bench: EmulatedBench, faults: Sequence[Fault], times: int) -> None:
+    for fault in faults:
+        name = f"{fault.area}: {fault.name}"
+        print(outside.BEGIN, name, flush=True)
         begin, replaced = time.monotonic(), bench.replaced
         try:
             if bench.gateway is None and not fault.name.endswith(AT_START):
@@ -181,6 +177,7 @@ def run_faults(bench: EmulatedBench, name: str, times: int, words: list[str]) ->
             recover(bench)
         if bench.replaced > replaced:
             bench.report.row(fault).figures["values replaced by newer ones"] = bench.replaced - replaced
+        print(outside.END, name, flush=True)
         print(f"{line(bench.report.row(fault))}  [{time.monotonic() - begin:.1f} s]", flush=True)
 
 
@@ -210,30 +207,19 @@ def recover(bench: EmulatedBench) -> None:
     bench.leave_out(range(len(bench.ports)), begin - SLACK_NS, time.monotonic_ns())
 
 
-def inside(args: argparse.Namespace) -> int:
-    tables = Path(args.tables)
-    times = LONG if args.long else 1
+def inside(folder: Path, faults: Sequence[Fault], times: int) -> None:
     report = Report()
     kinds: tuple[tuple[str, Callable[[Report, Path], EmulatedBench]], ...]
     kinds = (("machine", MachineBench), ("adapter", AdapterBench))
     for name, kind in kinds:
-        if args.only and not any(
-            word in fault.name
-            for word in args.only
-            for fault in FAULTS
-            if fault.bench == name and fault.machine == "QEMU"
-        ):
+        mine = [fault for fault in faults if fault.bench == name]
+        if not mine:
             continue
-        with kind(report, tables) as bench:
-            run_faults(bench, name, times, args.only)
-            received = sum(port.received() for port in bench.ports)
-            print(f"{name}: {received} bytes were transmitted to the ESCs", flush=True)
+        with kind(report, folder) as bench:
+            run_faults(bench, mine, times)
             if bench.gateway is not None:
-                if args.verbose:
-                    print("\n".join(bench.gateway.lines))
                 bench.stop()
-    report.write(Path(args.out))
-    return 0 if report.good else 1
+        report.write(folder / "report.json")
 
 
 def slower_dbc(escs: int) -> str:
@@ -248,52 +234,25 @@ def slower_dbc(escs: int) -> str:
     return re.sub(r'(BA_ "GenMsgCycleTime" BO_ \d+ )(\d+);', slower, text)
 
 
-def outside(args: argparse.Namespace) -> int:
-    """Make the tables, which takes long in the emulated machine, and start that."""
-    out = Path(args.out).resolve()
-    with tempfile.TemporaryDirectory(prefix="kcg-qemu.") as folder:
-        for escs in (1, 3):
-            text = slower_dbc(escs)
-            Path(folder, f"{escs}.dbc").write_text(text)
-            Path(folder, f"{escs}.json").write_text(to_json(table_of([text], escs)))
-        # python-can imports asammdf where it is installed, and with it numpy and pandas: a minute of the emulated machine.
-        without = Path(folder, "without")
-        without.mkdir()
-        (without / "asammdf.py").write_text('raise ImportError("kept out of the emulated machine")\n')
-        path = os.pathsep.join(filter(None, (str(without), os.environ.get("PYTHONPATH"))))
-        command = [sys.executable, str(PROJECT / "tests" / "vm" / "vm_run.py"), "--backend=qemu", "--verbose"]
-        command += [
-            f"--timeout={TIMEOUT_S[args.long]}",
-            f"--rw={folder}",
-            "--",
-            sys.executable,
-            "-B",
-            str(HERE / Path(__file__).name),
-        ]
-        command += [f"--out={folder}/report.json", f"--tables={folder}", *(f"--only={word}" for word in args.only)]
-        command += [flag for flag, wanted in (("--long", args.long), ("--verbose", args.verbose)) if wanted]
-        sources = [str(PROJECT / name) for name in ("kontronik_can_gw", "tests/faults", "tests/vcan")]
-        subprocess.run(
-            [sys.executable, "-m", "compileall", "-q", *sources], check=False
-        )  # it cannot keep what it compiles
-        environment = {**os.environ, "PYTHONPATH": path}
-        code = subprocess.run(command, check=False, stdin=subprocess.DEVNULL, env=environment).returncode
-        made = Path(folder, "report.json")
-        if made.exists():
-            out.write_bytes(made.read_bytes())
-    return code
+def prepare(folder: Path) -> None:
+    """Make what would take long in the emulated machine: tables of what the gateways send, and byte code."""
+    for escs in (1, 3):
+        text = slower_dbc(escs)
+        Path(folder, f"{escs}.dbc").write_text(text)
+        Path(folder, f"{escs}.json").write_text(to_json(table_of([text], escs)))
+    sources = [str(PROJECT / name) for name in ("kontronik_can_gw", "tests/faults")]
+    subprocess.run([sys.executable, "-m", "compileall", "-q", *sources], check=False)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(usage="qemu_programme.py --out FILE [--long] [--only WORD]...")
-    parser.add_argument("--out", required=True, help="the account, as JSON")
-    parser.add_argument("--long", action="store_true", help=f"each fault {LONG} times as often")
-    parser.add_argument("--only", action="append", default=[], help="faults with this word in their name")
-    parser.add_argument("--verbose", action="store_true", help="print the gateway's log")
-    parser.add_argument("--tables", help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the machine ends too
-    return inside(args) if args.tables and VIRTIO_PORTS.exists() else outside(args)
+    args = outside.parser(__doc__).parse_args()
+    mine = outside.chosen(in_order("QEMU"), args.only)
+    if args.inside is None:
+        return outside.main(
+            args, "qemu_programme.py", mine, backend="qemu", timeout_s=TIMEOUT_S[args.long], prepare=prepare
+        )
+    inside(args.inside, mine, LONG if args.long else 1)
+    return 0
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ import qemu_faults  # noqa: F401  and those of the emulated machine
 from fault_report import WITH_PYTHON, Report, Row, in_order
 
 BEGIN, END = "<!-- faults begin -->", "<!-- faults end -->"
-HEAD = "| machine | fault | injected | recovered | worst recovery | wrong values | values lost |\n|---|---|---|---|---|---|---|\n"
+COLUMNS = ("machine", "fault", "injected", "recovered", "worst recovery", "wrong values", "values lost", "state")
+HEAD = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|\n"
 
 
 def name_of(area: str, name: str) -> str:
@@ -34,9 +35,7 @@ def table(rows: Sequence[Row]) -> str:
         if WITH_PYTHON in row.figures:
             worst += f", {row.figures[WITH_PYTHON]:.2f} {WITH_PYTHON}"
         text += f"| {row.machine} | {name_of(row.area, row.name)} | {row.injected} | {row.recovered} | {worst} "
-        text += f"| {row.wrong} | {row.lost} |\n"
-    if repeated := [name_of(row.area, row.name) for row in rows if "attempts" in row.figures]:
-        text += f"\nRepeated, because at first they took too long on a busy machine: {'; '.join(repeated)}.\n"
+        text += f"| {row.wrong} | {row.lost} | {row.state} |\n"
     return text
 
 

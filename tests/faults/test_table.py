@@ -19,7 +19,7 @@ def test_the_readme_shows_that_all_were_healed_without_a_wrong_or_lost_value() -
     for row in found:
         assert int(row["injected"]) > 0, row
         assert row["recovered"] == row["injected"], row
-        assert (row["wrong values"], row["values lost"]) == ("0", "0"), row
+        assert (row["wrong values"], row["values lost"], row["state"]) == ("0", "0", "good"), row
 
 
 def test_a_table_is_put_between_the_markers_and_read_again() -> None:
@@ -34,6 +34,6 @@ def test_a_table_is_put_between_the_markers_and_read_again() -> None:
 def test_what_went_wrong_is_shown_and_not_good() -> None:
     row = Row("UML", "Serial", "x", 2.0, injected=3, recovered=3, worst_s=0.1, wrong=1)
     assert not row.good
-    assert "| 1 | 0 |" in table([row])
+    assert "| 1 | 0 | failed |" in table([row])
     assert not Row("UML", "Serial", "x", 2.0, injected=3, recovered=2).good
     assert not Row("UML", "Serial", "x", 2.0).good, "never injected"

@@ -18,6 +18,8 @@ from kontronik_can_gw.runtime import mqtt_client
 from kontronik_can_gw.runtime.mqtt_client import Broker, MqttClient, check
 from kontronik_can_gw.telemetry import SECOND
 
+pytestmark = pytest.mark.extended
+
 ONLINE = "k/test/online"
 
 

@@ -37,6 +37,8 @@ from kontronik_can_gw.config import shipped
 from kontronik_can_gw.protocol.states import OperatingError, OperatingState
 from kontronik_can_gw.simulator import ErrorWindow, EscOptions, Faults, Phase
 
+pytestmark = pytest.mark.extended
+
 QUIET = EscOptions(profile=(Phase("off", 1000, 0, OperatingState.MotorOff, 0),))
 FLIES = EscOptions(profile=(Phase("go", 1000, 60, OperatingState.Forward, 1),))
 

@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.extended
+
 HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]
 INSTALLED = Path(sys.prefix, "bin", "kontronik-can-gw")

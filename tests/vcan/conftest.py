@@ -15,6 +15,12 @@ from vcan_tools import GatewayProcess, ip
 _numbers = itertools.count()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker("vcan")
+
+
 def _make(name: str) -> None:
     made = subprocess.run(["ip", "link", "add", name, "type", "vcan"], capture_output=True, text=True, check=False)
     if made.returncode:

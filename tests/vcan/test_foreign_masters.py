@@ -32,6 +32,8 @@ from kontronik_can_gw.config import shipped
 from kontronik_can_gw.protocol.states import OperatingError, OperatingState
 from kontronik_can_gw.simulator import ErrorWindow, EscOptions, Faults, Phase
 
+pytestmark = pytest.mark.extended
+
 Start = Callable[..., GatewayProcess]
 
 EDS = shipped("eds/kontronik_esc.eds")

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from vcan_tools import GatewayProcess, bench, configuration, ip, wait_for
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "mqtt"))
@@ -15,6 +16,8 @@ from mqtt_bench import Mosquitto, Process, Subscriber, kept
 from kontronik_can_gw.protocol.fields import LiveData, rows
 from kontronik_can_gw.protocol.states import OperatingState
 from kontronik_can_gw.simulator import EscOptions, Phase
+
+pytestmark = pytest.mark.extended
 
 FLIES = EscOptions(
     profile=(

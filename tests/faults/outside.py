@@ -1,0 +1,206 @@
+"""The fault programme seen from outside of its virtual machine: starts it, and decides which of its rows can be judged.
+
+The machine that this runs on may itself be a virtual one from which processor time is taken ("steal" in /proc/stat), which nobody
+inside can see. It is sampled while each fault runs. A fault that was late or lost values while much was taken is not judged, and is run
+once at a quieter moment if one comes soon. Nothing else is run twice.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple, Self
+
+from fault_report import FAILED, MAX_STEAL, NOT_JUDGED, Fault, Report, line
+
+PROJECT = Path(__file__).resolve().parents[2]
+BEGIN, END = ">>>", "<<<"
+"""What the programme prints in there, followed by area and name, around each fault."""
+WINDOW_S = 5.0
+QUIET_WITHIN_S = 60.0
+
+
+class Sample(NamedTuple):
+    at_s: float
+    stolen: int
+    total: int
+
+
+def sample(text: str, at_s: float) -> Sample:
+    """Of the first line of /proc/stat: user, nice, system, idle, iowait, irq, softirq, steal."""
+    ticks = [int(word) for word in text.split("\n", 1)[0].split()[1:9]]
+    return Sample(at_s, ticks[7], sum(ticks))
+
+
+def worst_share(samples: Sequence[Sample], begin_s: float, end_s: float) -> float:
+    """The largest share that was taken away over five seconds, or over the whole time if that is shorter."""
+    before = [each for each in samples if each.at_s <= begin_s][-1:]
+    inside = before + [each for each in samples if begin_s < each.at_s <= end_s]
+    worst = 0.0
+    first = 0
+    for last in range(1, len(inside)):
+        while inside[last].at_s - inside[first + 1].at_s >= WINDOW_S:
+            first += 1
+        if inside[last].at_s - inside[first].at_s < min(WINDOW_S, 0.9 * (inside[-1].at_s - inside[0].at_s)):
+            continue
+        ticks = inside[last].total - inside[first].total
+        worst = max(worst, (inside[last].stolen - inside[first].stolen) / ticks if ticks else 0.0)
+    return worst
+
+
+class Steal:
+    """Samples in a thread."""
+
+    def __init__(self) -> None:
+        self.samples: list[Sample] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def take(self) -> None:
+        self.samples.append(sample(Path("/proc/stat").read_text(), time.monotonic()))
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.5):
+            self.take()
+
+    def quiet(self) -> bool:
+        """Wait for five quiet seconds; False if they do not come soon."""
+        end = time.monotonic() + QUIET_WITHIN_S
+        while time.monotonic() < end:
+            time.sleep(WINDOW_S)
+            if worst_share(self.samples, time.monotonic() - WINDOW_S, time.monotonic()) < MAX_STEAL / 2:
+                return True
+        return False
+
+    def __enter__(self) -> Self:
+        self.take()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def run_inside(
+    steal: Steal, script: str, words: Sequence[str], backend: str, timeout_s: float, prepare: Callable[[Path], None]
+) -> Report:
+    """Run a script of this folder in a virtual machine; its rows, with what was taken from us meanwhile."""
+    shares: dict[str, float] = {}
+    begun: dict[str, float] = {}
+
+    def ended(name: str) -> None:
+        steal.take()
+        shares[name] = max(shares.get(name, 0.0), worst_share(steal.samples, begun.pop(name), time.monotonic()))
+
+    with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
+        prepare(Path(folder))
+        command = [
+            sys.executable,
+            str(PROJECT / "tests" / "vm" / "vm_run.py"),
+            f"--backend={backend}",
+            f"--timeout={timeout_s:g}",
+        ]
+        command += [
+            f"--rw={folder}",
+            "--",
+            sys.executable,
+            "-B",
+            str(Path(__file__).with_name(script)),
+            f"--inside={folder}",
+        ]
+        with subprocess.Popen(
+            [*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout
+            for text in process.stdout:
+                mark, _, name = text.rstrip().partition(" ")
+                if mark == BEGIN:
+                    begun[name] = time.monotonic()
+                elif mark == END:
+                    ended(name)
+                else:
+                    print(text, end="", flush=True)
+        for name in list(begun):
+            ended(name)
+        file = Path(folder, "report.json")
+        report = Report.read([file] if file.exists() else [])
+        report.about["exit code"] = process.returncode
+    for row in report.rows:
+        row.steal = shares.get(f"{row.area}: {row.name}", 0.0)
+    return report
+
+
+def judge(run: Callable[[Sequence[str]], Report], quiet: Callable[[], bool]) -> Report:
+    """Run all; what was not judged once more, if there is a quiet moment. ``run`` gets the names of the faults, none for all."""
+    report = run(())
+    deferred = [row for row in report.rows if row.state == NOT_JUDGED]
+    if deferred and quiet():
+        print(f"deferred to a quieter moment: {len(deferred)}", flush=True)
+        later = {row.name: row for row in run([f"{row.area}: {row.name}" for row in deferred]).rows}
+        for row in deferred:
+            if row.name in later:
+                report.rows[report.rows.index(row)] = later[row.name]
+                later[row.name].notes.insert(0, f"deferred to a quieter moment: {row.steal:.0%} steal at first")
+    return report
+
+
+def conclude(report: Report, out: Path | None, junit: Path | None) -> int:
+    """Write it down, and say in the end what failed and what was not judged."""
+    for path, write in ((out, report.write), (junit, report.write_junit)):
+        if path is not None:
+            write(path)
+    states = [row.state for row in report.rows]
+    for state in (NOT_JUDGED, FAILED):
+        for row in report.rows:
+            if row.state == state:
+                print(line(row))
+    print(
+        f"{len(states)} faults: " + ", ".join(f"{states.count(state)} {state}" for state in sorted(set(states))),
+        flush=True,
+    )
+    return int(FAILED in states or not states)
+
+
+def parser(doc: str | None) -> argparse.ArgumentParser:
+    """The options that all parts of the programme have."""
+    made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--out", type=Path, help="what came of it, as JSON")
+    made.add_argument("--junit", type=Path, help="the same as a JUnit report")
+    made.add_argument("--long", action="store_true", help="each fault more often, and longer")
+    made.add_argument("--only", action="append", default=[], help="faults whose area or name holds this text")
+    made.add_argument("--inside", type=Path, help=argparse.SUPPRESS)
+    return made
+
+
+def chosen(faults: Sequence[Fault], only: Sequence[str]) -> list[Fault]:
+    return [each for each in faults if not only or any(text in f"{each.area}: {each.name}" for text in only)]
+
+
+def main(
+    args: argparse.Namespace,
+    script: str,
+    faults: Sequence[Fault],
+    *,
+    backend: str = "uml",
+    timeout_s: float,
+    words: Sequence[str] = (),
+    prepare: Callable[[Path], None] = lambda _folder: None,
+) -> int:
+    """Run these faults by a script of this folder in a virtual machine, and judge."""
+    options = [*words, *(["--long"] if args.long else [])]
+    with Steal() as steal:
+
+        def run(names: Sequence[str]) -> Report:
+            only = [f"--only={text}" for text in names or args.only]
+            report = run_inside(steal, script, [*options, *only], backend, timeout_s, prepare)
+            if not names:
+                for fault in faults:
+                    report.row(fault)  # one that was not reached has failed
+            return report
+
+        return conclude(judge(run, steal.quiet), args.out, args.junit)

@@ -1,0 +1,102 @@
+"""What the runner of the fault programme makes of rows that ran while processor time was taken away."""
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pytest
+from fault_report import FAILED, GOOD, NOT_JUDGED, Report, Row
+from outside import Sample, conclude, judge, sample, worst_share
+
+
+def row(name: str = "x", steal: float = 0.0, **counts: Any) -> Row:
+    return Row("UML", "Serial", name, 2.0, **{"injected": 3, "recovered": 3, "steal": steal, **counts})
+
+
+@pytest.mark.parametrize(
+    ("steal", "counts", "state"),
+    [
+        (0.0, {}, GOOD),
+        (0.5, {}, GOOD),
+        (0.0, {"recovered": 2}, FAILED),
+        (0.1, {"lost": 1}, FAILED),
+        (0.11, {"lost": 1}, NOT_JUDGED),
+        (0.11, {"recovered": 2}, NOT_JUDGED),
+        (0.5, {"wrong": 1}, FAILED),
+        (0.5, {"lost": 1, "wrong": 1}, FAILED),
+        (0.5, {"transmitted": 1}, FAILED),
+        (0.0, {"injected": 0, "recovered": 0}, FAILED),
+    ],
+)
+def test_lateness_and_loss_are_judged_on_a_machine_that_could_run_and_wrong_values_always(
+    steal: float, counts: dict[str, Any], state: str
+) -> None:
+    assert row(steal=steal, **counts).state == state
+
+
+def reports(*rounds: list[Row]) -> tuple[list[Sequence[str]], Any]:
+    """A run that finds these, and the names that it was asked for each time."""
+    asked: list[Sequence[str]] = []
+
+    def run(names: Sequence[str]) -> Report:
+        report = Report()
+        report.rows = rounds[len(asked)]
+        asked.append(names)
+        return report
+
+    return asked, run
+
+
+def test_only_what_was_not_judged_is_deferred_and_only_once() -> None:
+    first = [row("good"), row("failed", lost=1), row("late", 0.3, recovered=2), row("lost", 0.3, lost=1)]
+    asked, run = reports(first, [row("late"), row("lost", 0.4, lost=2)])
+    report = judge(run, lambda: True)
+    assert asked == [(), ["Serial: late", "Serial: lost"]]
+    assert [each.state for each in report.rows] == [GOOD, FAILED, GOOD, NOT_JUDGED]
+    assert report.rows[2].notes == ["deferred to a quieter moment: 30% steal at first"]
+
+
+def test_without_a_quiet_moment_it_stays_not_judged() -> None:
+    asked, run = reports([row("late", 0.3, recovered=2)])
+    assert [each.state for each in judge(run, lambda: False).rows] == [NOT_JUDGED]
+    assert len(asked) == 1
+
+
+def test_states_stand_in_both_reports_and_a_deferred_failure_fails(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = Report()
+    report.rows = [row("good"), row("late", 0.3, recovered=2)]
+    out, junit = tmp_path / "out.json", tmp_path / "out.xml"
+    assert conclude(report, out, junit) == 0
+    report.rows.append(row("wrong", 0.3, wrong=1))
+    assert conclude(report, out, junit) == 1
+    assert [each.state for each in Report.read([out]).rows] == [GOOD, NOT_JUDGED, FAILED]
+    assert [[found.tag for found in case] for case in ET.parse(junit).iter("testcase")] == [
+        [],
+        ["skipped"],
+        ["failure"],
+    ]
+    assert capsys.readouterr().out.endswith("3 faults: 1 failed, 1 good, 1 not judged\n")
+    assert conclude(Report(), None, None) == 1, "nothing was run"
+
+
+def at(*shares: float) -> list[Sample]:
+    """Two samples a second of a machine with two processors, of which such shares were taken."""
+    stolen = itertools.accumulate([0, *(round(100 * share) for share in shares)])
+    return [Sample(n / 2, each, 100 * n) for n, each in enumerate(stolen)]
+
+
+def test_the_worst_five_seconds_count() -> None:
+    assert worst_share(at(*[0.0] * 40), 0, 20) == 0
+    assert worst_share(at(*[0.0] * 20, *[0.5] * 10, *[0.0] * 20), 0, 25) == 0.5
+    assert worst_share(at(*[0.0] * 20, *[0.5] * 2, *[0.0] * 20), 0, 21) == pytest.approx(0.1)
+    assert worst_share(at(*[0.0] * 20, *[0.5] * 2), 10, 11) == 0.5, "a short fault by itself"
+    assert worst_share(at(*[0.5] * 20, *[0.0] * 20), 10, 20) == 0, "what was before is not its own"
+
+
+def test_the_kernels_line_is_read() -> None:
+    text = "cpu  10 20 30 400 50 6 7 80 9 9\ncpu0 1 1 1 1 1 1 1 1 1 1\n"
+    assert sample(text, 1.5) == (1.5, 80, 603)
