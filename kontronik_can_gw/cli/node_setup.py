@@ -110,7 +110,7 @@ def read_stored(config: Config, store: ParameterStore | None) -> Kept:
             if reason is not None:
                 kept.warnings.append(f"{esc.name}: stored parameters: {reason}")
         else:
-            trouble = store.claim(esc.name)
+            trouble = store.lock(esc.name)
             if trouble is not None:
                 kept.warnings.append(f"{esc.name}: parameters could not be stored: {trouble}")
             found, reason = store.load(esc.name)

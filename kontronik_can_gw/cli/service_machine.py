@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from kontronik_can_gw.cli.common import say
-from kontronik_can_gw.cli.service_files import NAME, SYSUSERS
+from kontronik_can_gw.cli.service_files import NAME, SYSUSERS, TMPFILES
 from kontronik_can_gw.errors import RunError, UserError
 
 _EXECUTABLE = re.compile(r"/[\w/.+@~=,:-]+")
@@ -84,6 +84,12 @@ def make_user(group: str) -> None:
         raise RunError(
             f"user {NAME}: could not be made. By hand: sudo useradd --system --groups {group} {NAME}"
         ) from None
+
+
+def make_lock_folder() -> None:
+    """Now; from the next start of the machine on systemd does it."""
+    if shutil.which("systemd-tmpfiles"):
+        call("systemd-tmpfiles", "--create", f"/{TMPFILES}")
 
 
 def reload_devices() -> None:
