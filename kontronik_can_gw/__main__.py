@@ -1,6 +1,6 @@
 """``python -m kontronik_can_gw``, and the program ``kontronik-can-gw``."""
 
-import _signal
+import _signal  # type: ignore[import-not-found]
 import sys
 
 # Ctrl-C ends the program without a word while modules are loaded. (The module signal takes a while to load itself.)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import printable
 
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
@@ -51,16 +52,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _main(words, command)
     except UserError as error:
         for problem in error.problems:
-            _say(command, problem)
+            say(problem, command)
         return error.exit_code
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
-            _say(command, str(_too_few_files()))
+            say(str(_too_few_files()), command)
         elif error.errno == errno.ENOSPC:
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is buffered has nowhere to go
-            _say(command, f"standard output: cannot be written: {error.strerror}")
+            say(f"standard output: cannot be written: {error.strerror}", command)
         else:
             raise
     except KeyboardInterrupt:
@@ -79,8 +80,14 @@ def _main(words: list[str], command: str | None) -> int:
     return code
 
 
-def _say(command: str | None, text: str) -> None:
-    print(f"kontronik-can-gw{'' if command is None else f' {command}'}: {text}", file=sys.stderr)
+def say(text: str, command: str | None = None) -> None:
+    """One line of talk on standard error."""
+    print(printable(f"kontronik-can-gw{'' if command is None else f' {command}'}: {text}"), file=sys.stderr)
+
+
+def show(text: str = "") -> None:
+    """One line for people on standard output."""
+    print(printable(text))
 
 
 @contextmanager

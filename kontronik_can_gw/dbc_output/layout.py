@@ -568,7 +568,7 @@ class _Compiler:
                     f"{where}.{signal.name}: lies outside the message's {message.length} bytes. Move or shorten it."
                 )
                 continue
-            pages = set(signal.multiplexer_ids) if signal.multiplexer_ids else every
+            pages: set[int | None] = set(signal.multiplexer_ids) if signal.multiplexer_ids else every
             left = mask if any(used[page] & mask for page in pages) else 0
             for other, others_mask, others_pages in placed if left else ():
                 if others_mask & left and others_pages & pages:

@@ -232,11 +232,13 @@ def test_a_file_that_its_holder_removes_is_not_mistaken_for_the_lock(
     """The holder removes its file between our opening and our locking: the name is free again, and what we have locked is nothing."""
     path = tmp_path / "x"
     path.touch()
-    real, removed = fcntl.flock, []
+    real = fcntl.flock
+    removed: list[bool] = []
 
     def flock(fd: int, operation: int) -> None:
         if not removed:
-            removed.append(path.unlink())
+            path.unlink()
+            removed.append(True)
         real(fd, operation)
 
     monkeypatch.setattr(fcntl, "flock", flock)

@@ -409,7 +409,7 @@ def test_status_shows_state_configuration_and_log(tmp_path: Path, monkeypatch: p
         "  process        pid 107, restarted 0 times, 27 MB",
     ]
     assert lines[3].startswith("  configuration  /etc/kontronik-can-gw/gateway.toml")
-    assert [line[17:].split("  ", 1)[1] for line in lines[-2:]] == ["warning: esc1: lost [31m", "esc\ufffd"]
+    assert [line[17:].split("  ", 1)[1] for line in lines[-2:]] == ["warning: esc1: lost?[31m", "esc\ufffd"]
 
 
 def test_status_of_a_service_that_cannot_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
