@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data
 import argparse
 import errno
 import io
+import logging
 import os
 import signal
 import sys
@@ -140,8 +141,17 @@ def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.Argumen
     return parser
 
 
+class _Plain(logging.Formatter):
+    """For what libraries log where nothing is set up for it: they quote files too."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(f"kontronik-can-gw: {record.getMessage()}")
+
+
 def _prepare_streams() -> None:
     """No surprises from the three standard streams."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_Plain())
     for number in range(3):
         try:
             os.fstat(number)

@@ -98,7 +98,7 @@ def reload_devices() -> None:
         say("no udevadm here: the udev rules act after the next start")
         return
     call("udevadm", "control", "--reload")
-    call("udevadm", "trigger", "--action=change", "--subsystem-match=usb-serial", "--subsystem-match=tty")
+    call("udevadm", "trigger", "--action=change", "--subsystem-match=tty")
 
 
 def reload_network(channel: str) -> None:

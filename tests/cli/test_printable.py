@@ -36,7 +36,7 @@ class Terminal(io.TextIOWrapper):
     def text(self) -> str:
         self.flush()
         self.seek(0)
-        return self.buffer.read().decode()
+        return bytes(self.buffer.read()).decode()
 
 
 def is_clean(text: str) -> bool:
@@ -116,7 +116,16 @@ def test_a_file_that_is_written_to_a_terminal() -> None:
     pipe = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     with redirect_stdout(pipe):
         write_output("-", text, "utf-8")
-    assert pipe.buffer.getvalue().decode() == text  # type: ignore[attr-defined]
+    assert pipe.buffer.getvalue().decode() == text
+
+
+def test_what_a_library_logs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    main(["schema"])
+    capsys.readouterr()
+    record = logging.LogRecord("cantools", logging.WARNING, "", 0, "overwriting %s", (EVIL,), None)
+    assert logging.lastResort is not None
+    logging.lastResort.handle(record)
+    assert capsys.readouterr().err == f"kontronik-can-gw: overwriting {SHOWN}\n"
 
 
 # --- from end to end
@@ -131,7 +140,8 @@ def folder(tmp_path: Path) -> Path:
     eds = re.sub(r"ParameterName=([^\n]*)", "ParameterName=\\1 a\x1bEVIL\x07\x7fb", EDS)
     (tmp_path / "my.eds").write_text(eds, "ascii")
     (tmp_path / "gateway.toml").write_text(
-        '[can]\ninterface = "virtual"\n[dbc]\nfile = "my.dbc"\n[canopen]\nenabled = true\nnode_id = 5\neds = "my.eds"\nstore = "."\n[[esc]]\nport = "p"\n'
+        '[can]\ninterface = "virtual"\n[dbc]\nfile = "my.dbc"\n'
+        '[canopen]\nenabled = true\nnode_id = 5\neds = "my.eds"\nstore = "."\n[[esc]]\nport = "p"\n'
     )
     return tmp_path
 
