@@ -571,7 +571,7 @@ class _Compiler:
             pages: set[int | None] = set(signal.multiplexer_ids) if signal.multiplexer_ids else every
             left = mask if any(used[page] & mask for page in pages) else 0
             for other, others_mask, others_pages in placed if left else ():
-                if others_mask & left and others_pages & pages:
+                if others_mask & left and others_pages & pages and other != signal.name:
                     self.problems.append(f"{where}.{signal.name}: overlaps {other}. Move one of them.")
                     left &= ~others_mask
             for page in pages:
