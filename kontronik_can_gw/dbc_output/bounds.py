@@ -74,7 +74,7 @@ def check_size(size: int, path: str) -> None:
 def check_bounds(text: str, path: str) -> None:
     """UserError with the first number of a DBC that is out of all bounds: where it is, what it is, what it may be."""
     text = _TEXT.sub(_masked, text)
-    if next(islice(_TOKEN.finditer(text), _MAX_TOKENS, None), None):
+    if len(text) > _MAX_TOKENS and next(islice(_TOKEN.finditer(text), _MAX_TOKENS, None), None):
         raise UserError(f"{path}: has more than {_MAX_TOKENS} words and numbers. Remove messages that are not needed.")
     if found := _MANY_DIGITS.search(text):
         raise UserError(f"{path}: line {_line(text, found)}: a number of more than {_MAX_DIGITS} digits. Correct it.")
