@@ -1,7 +1,13 @@
-"""``python -m kontronik_can_gw``."""
+"""``python -m kontronik_can_gw``, and the program ``kontronik-can-gw``."""
 
+import _signal  # type: ignore[import-not-found]
 import sys
+
+# Ctrl-C ends the program without a word while modules are loaded. (The module signal takes a while to load itself.)
+if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
+    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
 from kontronik_can_gw.cli import main
 
-sys.exit(main())
+if __name__ == "__main__":
+    sys.exit(main())

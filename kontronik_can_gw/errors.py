@@ -1,5 +1,7 @@
 """Mistakes of people, each with its exit code. The command line prints them as plain lines, never as a traceback."""
 
+from kontronik_can_gw.printable import printable
+
 
 class UserError(Exception):
     """Wrong usage, configuration or layout (exit code 2). Holds one line per mistake: what, where, remedy."""
@@ -7,8 +9,8 @@ class UserError(Exception):
     exit_code = 2
 
     def __init__(self, *problems: str) -> None:
-        super().__init__("\n".join(problems))
-        self.problems = problems
+        self.problems = tuple(printable(problem) for problem in problems)  # they quote files
+        super().__init__("\n".join(self.problems))
 
 
 class RunError(UserError):

@@ -12,6 +12,7 @@ NAME = "kontronik_can_gw"
 # A room may import those before it, and itself.
 ORDER = (
     ("protocol",),
+    ("printable",),
     ("errors",),
     ("frames",),
     ("lean",),

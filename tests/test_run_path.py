@@ -80,8 +80,8 @@ from standin import use
 use("unix:{bus}")
 sys.path.pop()
 
-from kontronik_can_gw.runtime import claims
-claims.PREFIX += "{bus}/"  # tests may run side by side, all on "lo"
+from kontronik_can_gw.runtime import locks
+locks.PREFIX += "{bus}/"  # tests may run side by side, all on "lo"
 
 def write():
     with open({file!r}, "w") as file:

@@ -49,6 +49,13 @@ _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 _LISTS = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
 _MANDATORY = (0x1000, 0x1001, 0x1018)
 _LONGEST_NAME = 241
+MAX_BYTES = 2_000_000
+"""Of an EDS; the shipped one has 60 kB, 250 entries, 2 200 lines."""
+_MAX_LINES = 100_000
+_MAX_ENTRIES = 10_000
+_MAX_MAPPED = 0x40
+_MAX_SAID = 400
+"""Characters of a mistake: it quotes the file."""
 _MOST_PROBLEMS = 20
 _PDO_BITS = 64
 
@@ -204,6 +211,8 @@ def load(data: bytes, name: str) -> Eds:
     """Check and read an EDS by CiA 306. UserError with every mistake at once: file, section, key, what is wrong and what to do."""
     if not any(section in data.lower() for section in (b"[fileinfo]", b"[deviceinfo]", b"[mandatoryobjects]")):
         raise UserError(f"{name}: is no EDS: it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects].")
+    if len(data) > MAX_BYTES or data.count(b"\n") > _MAX_LINES:
+        raise UserError(f"{name}: is larger than {MAX_BYTES // 1_000_000} MB or {_MAX_LINES} lines. Is it an EDS?")
     checker = _Checker(name)
     checker.read(data)
     if len(checker.problems) > _MOST_PROBLEMS:
@@ -261,6 +270,9 @@ class _Checker:
     # --- text
 
     def _say(self, section: str, text: str) -> None:
+        section = section[:_MAX_SAID]
+        if len(text) > _MAX_SAID:  # what is wrong and the remedy stand at its ends
+            text = f"{text[: _MAX_SAID // 2]} ... {text[-_MAX_SAID // 2 :]}"
         self.problems.append(f"{self._name}: [{section}] {text}" if section else f"{self._name}: {text}")
 
     def _decode(self, data: bytes) -> str:
@@ -369,7 +381,7 @@ class _Checker:
             right = _right_list(index)
             if right != name and (right == _LISTS[2] or name != _LISTS[1]):
                 self._say(name, f"{key}=0x{index:04X}: belongs into [{right}].")
-        digits = sorted(int(key) for key in numbers if key.isdigit())
+        digits = sorted(number for key in numbers if (number := _place(key)) is not None)
         if count is not None and (count != len(digits) or digits != list(range(1, len(digits) + 1))):
             self._say(
                 name,
@@ -389,6 +401,7 @@ class _Checker:
                     of_object[int(match[2], 16)] = section
             elif (match := _OF_OBJECT.match(section.name)) and match[2].lower() == "value":
                 self._say(section.name, "values belong in a DCF. Write DefaultValue in the object's section.")
+        count = 0
         for index, subs in members.items():
             section_of_index = self._sections.get(f"{index:04x}")
             if section_of_index is None:
@@ -396,6 +409,9 @@ class _Checker:
                     self._say(sub.name, f"there is no section [{index:04X}]. Add it or remove this one.")
                 continue
             self._read_object(index, section_of_index, subs)
+            count += len(self.objects[index].subs)
+            if count > _MAX_ENTRIES:
+                raise UserError(f"{self._name}: has more than {_MAX_ENTRIES} objects and sub-indices. Remove some.")
 
     def _read_object(self, index: int, section: _Section, subs: Mapping[int, _Section]) -> None:
         kind = self._number(section, "ObjectType", VAR)
@@ -465,10 +481,11 @@ class _Checker:
         if stated is not None and stated != len(given):
             self._say(names.name, f"NrOfEntries={stated}, but {len(given)} names are there. Write {len(given)}.")
         for key in given:
-            if not key.isdigit() or int(key) not in range(1, count + 1):
+            number = _place(key)
+            if number is None or not 1 <= number <= count:
                 self._say(names.name, f"{key}: not a sub-index from 1 to {count}.")
             elif names.get(key):
-                variables[int(key)].name = names.get(key)
+                variables[number].name = names.get(key)
         return variables
 
     def _parameter_name(self, section: _Section) -> str:
@@ -627,7 +644,7 @@ class _Checker:
     def _check_mapping(self, item: _Object) -> None:
         count = item.subs[0].default if 0 in item.subs else 0
         bits = 0
-        for sub in range(1, count + 1) if isinstance(count, int) else ():
+        for sub in range(1, min(count, _MAX_MAPPED) + 1) if isinstance(count, int) else ():
             mapping = item.subs.get(sub)
             value = mapping.default if mapping else None
             if mapping is None or not isinstance(value, int) or mapping.relative:
@@ -724,6 +741,11 @@ def _value(line: str) -> str:
 
 def _integer(text: str) -> int | None:
     return int(text, 0) if _NUMBER.match(text) else None
+
+
+def _place(key: str) -> int | None:
+    """The number of a line in a list."""
+    return int(key) if key.isdigit() and len(key) < 10 else None
 
 
 def _spelling(index: int, sub: int | None) -> str:

@@ -6,14 +6,18 @@ Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data
 import argparse
 import errno
 import io
+import logging
 import os
+import signal
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import printable
 
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
@@ -37,34 +41,86 @@ COMMANDS = {
     "completion": "print the completion script of a shell",
 }
 
+_DESCRIPTORS = 64
+"""How many files any command may have open; a gateway needs two more for each ESC."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
-    _prepare_streams()
     words = list(sys.argv[1:] if argv is None else argv)
-    chosen = next((word for word in words if not word.startswith("-")), None)
-    parser = make_parser([] if chosen is None else [chosen])
-    args = parser.parse_args(words)
+    command = next((word for word in words if not word.startswith("-")), None)
     try:
-        code: int = args.main(args)
-        if sys.stdout is not None:  # None where it was closed, as by `>&-`
-            sys.stdout.flush()
+        return _main(words, command)
     except UserError as error:
         for problem in error.problems:
-            print(f"kontronik-can-gw {args.command}: {problem}", file=sys.stderr)
+            say(problem, command)
         return error.exit_code
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except OSError as error:
-        if error.errno != errno.ENOSPC:
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            say(str(_too_few_files()), command)
+        elif error.errno == errno.ENOSPC:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is buffered has nowhere to go
+            say(f"standard output: cannot be written: {error.strerror}", command)
+        else:
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is buffered has nowhere to go
-        print(f"kontronik-can-gw {args.command}: standard output: cannot be written: {error.strerror}", file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
         return 130
+    return RunError.exit_code
+
+
+def _main(words: list[str], command: str | None) -> int:
+    _prepare_streams()
+    need_descriptors()
+    args = make_parser([] if command is None else [command]).parse_args(words)
+    with _interruptible():
+        code: int = args.main(args)
+    if sys.stdout is not None:  # None where it was closed, as by `>&-`
+        sys.stdout.flush()
     return code
+
+
+def say(text: str, command: str | None = None) -> None:
+    """One line of talk on standard error."""
+    print(printable(f"kontronik-can-gw{'' if command is None else f' {command}'}: {text}"), file=sys.stderr)
+
+
+def show(text: str = "") -> None:
+    """One line for people on standard output."""
+    print(printable(text))
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C raises KeyboardInterrupt: before, while modules are loaded, and after, it ends the process (see __main__)."""
+    ended_us = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+    if ended_us:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        if ended_us:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def need_descriptors(more: int = 0) -> None:
+    """Let this process open as many files as it needs, ``more`` than any command does. RunError where it may not."""
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = _DESCRIPTORS + more
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    if hard != resource.RLIM_INFINITY and hard < needed:
+        raise _too_few_files(needed)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+
+
+def _too_few_files(needed: int = _DESCRIPTORS) -> RunError:
+    return RunError(
+        f"too few files may be open at once: `ulimit -n {needed}` or more, for a service LimitNOFILE={needed}."
+    )
 
 
 def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
@@ -85,8 +141,17 @@ def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.Argumen
     return parser
 
 
+class _Plain(logging.Formatter):
+    """For what libraries log where nothing is set up for it: they quote files too."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(f"kontronik-can-gw: {record.getMessage()}")
+
+
 def _prepare_streams() -> None:
     """No surprises from the three standard streams."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_Plain())
     for number in range(3):
         try:
             os.fstat(number)

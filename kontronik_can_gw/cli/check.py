@@ -7,7 +7,7 @@ from pathlib import Path
 from kontronik_can_gw.cia301.nodes import Nodes
 from kontronik_can_gw.cia301.pdo import EVENT_TYPES, Tpdo
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.cli.common import Loaded, load_all
+from kontronik_can_gw.cli.common import Loaded, load_all, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config import as_toml
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
@@ -25,27 +25,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     loaded = load_all(args.config)
     config, layout = loaded.config, loaded.layout
-    print(f"# effective configuration of {args.config}")
-    print(as_toml(config))
+    show(f"# effective configuration of {args.config}")
+    for line in as_toml(config).split("\n"):
+        show(line)
     load = layout.bus_load(config.can.bitrate, config.can.data_bitrate)
     frames = sum(message.rate_hz for message in layout.messages)
     if config.dbc.enabled:
-        print(f"# messages of {layout.node} by {layout.file}")
+        show(f"# messages of {layout.node} by {layout.file}")
         names = [esc.name for esc in config.escs]
         for line in table(layout, names):
-            print(line)
-        print()
+            show(line)
+        show()
     if loaded.canopen is not None:
         nodes = loaded.canopen.nodes(loaded.escs)
-        print(f"# CANopen nodes by {loaded.canopen.eds.name}")
+        show(f"# CANopen nodes by {loaded.canopen.eds.name}")
         for line in node_table(nodes, loaded):
-            print(line)
-        print()
+            show(line)
+        show()
         load += nodes.bits_per_second() / config.can.bitrate
         frames += nodes.frames_per_second()
     if (folder := record_folder(config)) is not None:
-        print(f"# captures: {in_words(config, folder)}")
-    print(
+        show(f"# captures: {in_words(config, folder)}")
+    show(
         f"# bus load {load:.1%} of {config.can.bitrate // 1000} kbit/s: {frames:.0f} frames/s with each ESC at 100 Hz, "
         "worst stuffing; what is sent on change counted by its cycle, no SDO traffic"
     )

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cia301.nodes import CanopenSetup
 from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.cli import say as say
+from kontronik_can_gw.cli import show as show
 from kontronik_can_gw.cli.node_setup import (
     check_cob_ids,
     load_of_stored,
@@ -25,6 +27,7 @@ from kontronik_can_gw.config import Config, MqttConfig, load
 from kontronik_can_gw.dbc_output.layout import Layout, parse_database, read_dbc
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.can_port import check_interface
 from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.telemetry import EscSettings
@@ -33,11 +36,6 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
 
 log = logging.getLogger("kontronik_can_gw")
-
-
-def say(text: str) -> None:
-    """One line of talk."""
-    print(f"kontronik-can-gw: {text}", file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -219,6 +217,8 @@ def canopen_of(loaded: Loaded) -> CanopenSetup:
 
 def write_output(where: str, text: str, encoding: str) -> None:
     """Text to a file, which is then told, or for ``-`` to standard output; line ends as they are. RunError where it cannot be written."""
+    if where == "-" and sys.stdout.isatty():
+        text = printable(text, keep="\r\n\t")
     data = text.encode(encoding)
     if where != "-":
         write_file(Path(where), data)

@@ -126,7 +126,6 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _convert(args: argparse.Namespace, form: str) -> None:
-    import sys
     import time
     from pathlib import Path
 
@@ -171,7 +170,7 @@ def _convert(args: argparse.Namespace, form: str) -> None:
         for line in notes:
             _say(f"{args.input}: {line}")
         for line in damage:
-            print(f"kontronik-can-gw convert: {args.input}: damaged: {line}", file=sys.stderr)
+            _say(f"{args.input}: damaged: {line}")
 
 
 def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None") -> "Input":
@@ -297,9 +296,9 @@ def _nothing(args: argparse.Namespace, recording: "Input", damage: list[str]) ->
 
 
 def _say(text: str) -> None:
-    import sys
+    from kontronik_can_gw.cli import say
 
-    print(f"kontronik-can-gw convert: {text}", file=sys.stderr)
+    say(text, "convert")
 
 
 def _reason(error: OSError) -> str:

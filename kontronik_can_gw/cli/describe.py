@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.printable import printable, printable_json
 
 if TYPE_CHECKING:
     from kontronik_can_gw.offline.describe.facts import Description
@@ -37,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
     """Write the description. UserError for what is wrong with the files, RunError where it cannot be written."""
     from kontronik_can_gw.cli.common import write_output
 
-    write_output(args.output, _text(args), "utf-8")
+    write_output(args.output, printable(_text(args), keep="\n\t"), "utf-8")
     return 0
 
 
@@ -50,9 +51,7 @@ def _text(args: argparse.Namespace) -> str:
         return man_page()
     facts = _facts(args)
     if args.format == "json":
-        import json
-
-        return json.dumps(facts.as_json(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        return printable_json(facts.as_json(), indent=2, allow_nan=False) + "\n"
     from kontronik_can_gw.offline.describe.document import document
     from kontronik_can_gw.offline.describe.html import html
     from kontronik_can_gw.offline.describe.markdown import markdown

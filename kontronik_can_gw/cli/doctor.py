@@ -1,7 +1,6 @@
 """``doctor``: looks at the machine and the configuration, changes nothing, sends nothing, and says what to do."""
 
 import argparse
-import json
 import os
 import shutil
 import sys
@@ -12,10 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cli.common import Loaded, assemble
+from kontronik_can_gw.cli.common import Loaded, assemble, show
 from kontronik_can_gw.cli.node_setup import parameter_folder
 from kontronik_can_gw.config import SHIPPED, Config, load
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.can_port import check_interface
 from kontronik_can_gw.runtime.doctor.findings import Finding, Findings, Severity, count, document
 from kontronik_can_gw.runtime.store import parameter_file
@@ -48,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
 
     findings, code = examine(System(), args.config)
     if args.json:
-        print(json.dumps(document(findings, __version__, str(args.config), code), indent=2, ensure_ascii=False))
+        print(printable_json(document(findings, __version__, str(args.config), code), indent=2))
     else:
         _show(findings)
     return code
@@ -157,14 +157,14 @@ def _show(findings: list[Finding]) -> None:
     width = max(lowest, min(highest, shutil.get_terminal_size().columns))
     if not sys.stdout.isatty():
         for piece in _lines(findings, width):
-            print(piece.word + piece.text)
+            show(piece.word + piece.text)
         return
     from rich.console import Console
     from rich.text import Text
 
     console = Console(highlight=False, soft_wrap=True)
     for piece in _lines(findings, width):
-        console.print(Text.assemble((piece.word, piece.style), piece.text))
+        console.print(Text.assemble((printable(piece.word), piece.style), printable(piece.text)))
 
 
 def _lines(findings: list[Finding], width: int) -> Iterator[_Piece]:

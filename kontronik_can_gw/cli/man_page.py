@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from kontronik_can_gw import __version__
 from kontronik_can_gw.cli import COMMANDS, make_parser
 from kontronik_can_gw.cli.service_files import CONFIGURATIONS, NAME, UNITS
+from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
 
 _DESCRIPTION = (
     (
@@ -30,11 +31,13 @@ _FILES = (
     (f"/{UNITS}/{NAME}.service", "the service; NAME as in kontronik-can-gw@NAME for a further one"),
     (f"/var/lib/{NAME}", "parameters that CANopen masters stored, of a gateway that runs as root or as the service"),
     (f"~/.local/state/{NAME}", "the same, of a gateway that another user runs"),
+    (str(SYSTEM_FOLDER), "locks by which gateways keep each other from the same node-IDs and messages"),
     (f"/run/{NAME}/status.json", "how the service is, for kontronik-can-gw status"),
 )
 _ENVIRONMENT = (
     ("STATE_DIRECTORY", "where parameters are kept; systemd sets it for the service"),
     ("XDG_STATE_HOME", "where parameters are kept without a service, instead of ~/.local/state"),
+    ("XDG_RUNTIME_DIR", "where gateways of a user who is not the service lock node-IDs, instead of /tmp"),
     ("RUNTIME_DIRECTORY", "where status.json is written; systemd sets it for the service"),
     ("NOTIFY_SOCKET, WATCHDOG_USEC, WATCHDOG_PID", "systemd is told when the gateway is ready, and that it works"),
     ("JOURNAL_STREAM", "log lines get the priorities that the journal reads"),

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
 from kontronik_can_gw.cli.common import check_devices, say, stopping_on_signals
-from kontronik_can_gw.cli.status import printable
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.telemetry import SECOND
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
             raise UserError(f"{args.file}: is a capture, which holds its own DBC. Leave -c and --dbc out.")
         yield Recording(opened, args.speed or 1.0, at_once=args.once)
         for line in dict.fromkeys([*opened.damage, *opened.notes]):
-            say(f"warning: {printable(line)}")
+            say(f"warning: {line}")
 
 
 def last_ns(opened: "Input") -> int | None:
@@ -321,7 +321,6 @@ class Recording:
 
 
 def _once(source: Source, monitor: "Monitor", timeout: float) -> int:
-    import json
 
     stop = False
 
@@ -351,7 +350,7 @@ def _once(source: Source, monitor: "Monitor", timeout: float) -> int:
         "file" if source.is_file else "interface": source.name,
         "dbc": _file_of(monitor),
     }
-    print(json.dumps(head | monitor.document(), ensure_ascii=not _is_utf8(sys.stdout.encoding)))
+    print(printable_json(head | monitor.document(), ascii_only=not _is_utf8(sys.stdout.encoding)))
     return 0
 
 
@@ -404,7 +403,7 @@ def _lines(source: Source, monitor: "Monitor", interval: float, stopped: Callabl
         said = [text for text, _ in notices(monitor, source.where())]
         for text in said:
             if _news_of(text) not in told:
-                say(printable(text))
+                say(text)
         if told and not said:
             say(f"{source.name}: frames come")
         told = [_news_of(text) for text in said]

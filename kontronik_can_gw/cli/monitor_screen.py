@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from kontronik_can_gw.cli.status import Line, Piece, compact, duration, printable
+from kontronik_can_gw.cli.status import Line, Piece, compact, duration
 from kontronik_can_gw.dbc_output.layout import normalize
 from kontronik_can_gw.offline.monitor import (
     PERCENT,
@@ -22,6 +22,7 @@ from kontronik_can_gw.offline.monitor import (
     Zone,
     words,
 )
+from kontronik_can_gw.printable import printable
 from kontronik_can_gw.protocol.states import Severity
 from kontronik_can_gw.telemetry import SECOND
 
@@ -92,7 +93,7 @@ def screen(
     width, height = max(20, size[0]), max(4, size[1])
     head = [_title(monitor, where, width)]
     for text, style in notices(monitor, where):
-        head += [[Piece(line, style)] for line in textwrap.wrap(printable(text), width, break_on_hyphens=False)]
+        head += [[Piece(line, style)] for line in textwrap.wrap(text, width, break_on_hyphens=False)]
     body_height = height - len(head) - 1
     shown, pages = _shown(monitor, choice, body_height)
     group = (width - _LABEL) // max(1, len(shown))
@@ -109,12 +110,12 @@ def plain_lines(monitor: Monitor) -> Iterator[str]:
     """A line for each ESC where there is no screen to draw on."""
     mark = "REPLAY  " if monitor.is_replay else ""
     for esc in monitor.escs:
-        parts = [f"{mark}{monitor.watched_s:6.1f} s  {printable(esc.name)}  link {_link(esc)}  state {_state(esc)}"]
+        parts = [f"{mark}{monitor.watched_s:6.1f} s  {esc.name}  link {_link(esc)}  state {_state(esc)}"]
         for source in (*_speeds(esc)[:1], "battery_voltage", "battery_current", "power_stage_temperature"):
             quantity = QUANTITY[source]
             parts.append(f"{source} {number(esc.number(source), quantity.digits)} {quantity.unit}")
         parts += [f"{active.severity.value.upper()} {active.meaning}" for active in esc.alarms]
-        yield "  ".join(parts)
+        yield printable("  ".join(parts))
 
 
 def notices(monitor: Monitor, where: Where) -> Iterator[tuple[str, str]]:
@@ -183,14 +184,14 @@ def bar(value: float | None, scale: Scale, width: int, glyphs: Glyphs) -> Line:
 
 
 def _title(monitor: Monitor, where: Where, width: int) -> Line:
-    name = printable(where.name)
+    name = where.name
     name = name if len(name) <= width // 2 - 2 else f"...{name[5 - width // 2 :]}"
     left: Line = [Piece(f" {name} ", "bold reverse"), Piece(" ")]
     if where.progress:
         left.append(Piece(f"{where.progress}  ", "bold cyan"))
     file = monitor.bus.layout.file.rpartition("/")[2]
     if not where.is_file:
-        left.append(Piece(f"{printable(file)}  ", FAINT))
+        left.append(Piece(f"{file}  ", FAINT))
     state = monitor.gateway_state
     right: Line = []
     if state is not None:
@@ -245,7 +246,7 @@ def _shown(monitor: Monitor, choice: Choice, height: int) -> tuple[Sequence[EscM
 
 def _state(esc: EscMonitor) -> str:
     state = esc.state
-    return "-" if state is None else words(printable(state))
+    return "-" if state is None else words(state)
 
 
 def _short_state(esc: EscMonitor, width: int) -> str:
@@ -258,7 +259,7 @@ def _link(esc: EscMonitor) -> str:
     link = esc.link
     if link is None:
         return "-" if esc.has("link_state") or not esc.is_fresh else "ok"
-    return words(printable(link))
+    return words(link)
 
 
 def _link_style(esc: EscMonitor) -> str:
@@ -297,7 +298,7 @@ def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool)
     width, room = size
     told: list[tuple[Severity, str, str]] = []
     for esc in escs:
-        name = f"{printable(esc.name)} " if named else ""
+        name = f"{esc.name} " if named else ""
         if trouble := _trouble(esc):
             told.append((Severity.ERROR, f"{name}LINK: ", trouble))
         elif normalize(esc.link or "") == "degraded":
@@ -382,13 +383,13 @@ def _rows(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Row]:
         if _trouble(esc):
             state, style = "no telemetry", BAD
         return [
-            Piece(f"{printable(esc.name)}{_mark(esc)}  ", _name_style(esc)),
+            Piece(f"{esc.name}{_mark(esc)}  ", _name_style(esc)),
             Piece(state, style),
         ]
 
     def device(esc: EscMonitor, width: int) -> Line:
         cells = esc.number("cell_count")
-        what = printable(esc.device) or "-"
+        what = esc.device or "-"
         text = what + (f", {cells:.0f} cells" if cells else "")
         return [Piece(text if len(text) <= width else text.replace("firmware ", ""), FAINT)]
 
@@ -524,7 +525,7 @@ def _table_line(cells: Sequence[Line], columns: Sequence[_Column], glyphs: Glyph
 
 def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
     def name(esc: EscMonitor) -> Line:
-        return [Piece(printable(esc.name) + _mark(esc), _name_style(esc))]
+        return [Piece(esc.name + _mark(esc), _name_style(esc))]
 
     def link(esc: EscMonitor) -> Line:
         rate = esc.number("frame_rate")

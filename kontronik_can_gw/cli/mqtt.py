@@ -108,7 +108,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _main(args: argparse.Namespace, notifier: "Notifier") -> int:
     from kontronik_can_gw.offline.mqtt_messages import Topics
-    from kontronik_can_gw.runtime.claims import Claims
+    from kontronik_can_gw.runtime.locks import Locks
     from kontronik_can_gw.runtime.mqtt_client import check
 
     if args.file is None and args.discovery is not None and Path(args.discovery).is_file():
@@ -123,8 +123,8 @@ def _main(args: argparse.Namespace, notifier: "Notifier") -> int:
         log.warning("%s", warning)
     if args.remove_discovery:
         return _remove(broker, topics, settings.discovery or _DEFAULT_DISCOVERY)
-    claims = Claims()
-    if claims.hold([f"{broker.host}:{broker.port}/mqtt/{topics.gateway}"]):
+    locks = Locks()
+    if locks.hold([f"{broker.host}:{broker.port}/mqtt/{topics.gateway}"]):
         raise RunError(
             f"another process on this machine publishes as {topics.gateway} to {broker}. End it, or give another --gateway."
         )
@@ -132,7 +132,7 @@ def _main(args: argparse.Namespace, notifier: "Notifier") -> int:
         with _source(args, given) as source:
             _Run(source, settings, topics, broker, notifier).run()
     finally:
-        claims.close()
+        locks.close()
     return 0
 
 

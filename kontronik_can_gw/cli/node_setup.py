@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.cia301.check import check_eds
-from kontronik_can_gw.cia301.eds import Eds, without
+from kontronik_can_gw.cia301.eds import MAX_BYTES, Eds, without
 from kontronik_can_gw.cia301.eds import load as eds_of
 from kontronik_can_gw.cia301.node import NodeSettings
 from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
@@ -39,7 +39,8 @@ def load_eds(config: Config) -> Eds:
     """The EDS in use, checked."""
     path = config.eds_path
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)  # no more is needed to see that it is too large
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file.") from None
     eds = eds_of(data, str(path))
@@ -109,7 +110,7 @@ def read_stored(config: Config, store: ParameterStore | None) -> Kept:
             if reason is not None:
                 kept.warnings.append(f"{esc.name}: stored parameters: {reason}")
         else:
-            trouble = store.claim(esc.name)
+            trouble = store.lock(esc.name)
             if trouble is not None:
                 kept.warnings.append(f"{esc.name}: parameters could not be stored: {trouble}")
             found, reason = store.load(esc.name)

@@ -3,6 +3,8 @@
 import sys
 from typing import Self
 
+from kontronik_can_gw.printable import printable
+
 
 class Progress:
     """A bar, where a person looks on; else nothing. ``size``: bytes in all, None where nobody knows.
@@ -33,7 +35,7 @@ class Progress:
             console=Console(stderr=True),
             transient=True,
         )
-        self._task = self._progress.add_task(name, total=size)
+        self._task = self._progress.add_task(printable(name), total=size)
 
     def __enter__(self) -> Self:
         if self._progress is not None:

@@ -171,7 +171,7 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     from kontronik_can_gw.offline.inputs import CaptureInput
     from kontronik_can_gw.offline.marking import Marker
     from kontronik_can_gw.runtime.can_port import CanPort, check_interface
-    from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
+    from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
 
     config = recording.bus.config.can if args.config and recording.bus.config else None
     channel = args.channel or (config.channel if config else None)
@@ -185,12 +185,12 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     marker = Marker(layout)
     if not args.unmarked and not marker.can_mark:
         say("warning: no message of this DBC tells the gateway's state: nobody can see that it is a replay")
-    claims = Claims()
+    locks = Locks()
     if interface != "virtual":
-        names = [messages_claim(channel, key) for key in sorted(SignalReader(layout).keys)[:1]]
+        names = [messages_lock(channel, key) for key in sorted(SignalReader(layout).keys)[:1]]
         nodes = capture.setup.canopen.settings if capture is not None and capture.setup.canopen else ()
-        names += [node_claim(channel, node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
-        for taken in claims.hold(names):
+        names += [node_lock(channel, node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
+        for taken in locks.hold(names):
             raise in_use(taken)
     port = CanPort(can)
     count = 0
@@ -207,7 +207,7 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
             count += 1
     finally:
         port.close()
-        claims.close()
+        locks.close()
     late = f", at most {pace.latest_ns / 1e6:.1f} ms late" if pace.speed else ""
     return f"{count} frames to {channel}{late}"
 

@@ -49,7 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Report on args.input. UserError for wrong usage, RunError where something cannot be read or written."""
-    import sys
 
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.common import say, write_output
@@ -96,9 +95,9 @@ def main(args: argparse.Namespace) -> int:
             written = write_pngs(flight, Path(args.png), title)
             say(f"{args.png}: {', '.join(file.name for file in written)} written")
     for line in recording.notes:
-        print(f"kontronik-can-gw report: {args.input}: {line}", file=sys.stderr)
+        say(f"{args.input}: {line}", "report")
     for line in damage:
-        print(f"kontronik-can-gw report: {args.input}: damaged: {line}", file=sys.stderr)
+        say(f"{args.input}: damaged: {line}", "report")
     return 0
 
 

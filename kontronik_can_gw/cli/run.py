@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.cli import need_descriptors
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import (
     Loaded,
@@ -120,6 +121,7 @@ class _Run:
         sys.setswitchinterval(_LOCK_SWITCH_S)
         with stopping_on_signals(self._stop, self._reload):
             loaded = load_all(self._file, ParameterStore)
+            need_descriptors(2 * len(loaded.config.esc))
             self._open(loaded, self._wait or loaded.config.run.wait_for_devices)
             while True:
                 assert self._loop is not None

@@ -15,6 +15,7 @@ from kontronik_can_gw.cli.service_machine import (
     call,
     check_executable,
     check_rights,
+    make_lock_folder,
     make_user,
     own_executable,
     reload_devices,
@@ -150,6 +151,7 @@ def _install(args: argparse.Namespace) -> int:
         say(f"{own}: new, an example")
     if live:
         make_user(choices.group)
+        make_lock_folder()
         call("systemctl", "daemon-reload")
         reload_devices()
         if args.network is not None:

@@ -21,6 +21,7 @@ NAME = "kontronik-can-gw"
 CONFIGURATIONS = f"etc/{NAME}"
 UNITS = "etc/systemd/system"
 SYSUSERS = f"etc/sysusers.d/{NAME}.conf"
+TMPFILES = f"etc/tmpfiles.d/{NAME}.conf"
 NETWORK = "etc/systemd/network"
 WANTS = f"{UNITS}/multi-user.target.wants"
 EXAMPLE = "example"
@@ -103,6 +104,7 @@ def planned(choices: Choices, root: Path) -> list[PlannedFile]:
     }
     files = [
         _made(SYSUSERS, "sysusers.conf", common),
+        _made(TMPFILES, "tmpfiles.conf", {}),
         _made(f"{UNITS}/{NAME}.service", "gateway.service", plain),
         _made(f"{UNITS}/{NAME}@.service", "gateway.service", template),
         _made(f"etc/udev/rules.d/70-{NAME}.rules", "udev.rules", {}),
@@ -132,6 +134,7 @@ def installed(root: Path) -> list[Path]:
     """Every file that an install may have written and that is there."""
     patterns = (
         SYSUSERS,
+        TMPFILES,
         f"{UNITS}/{NAME}.service",
         f"{UNITS}/{NAME}@.service",
         f"{UNITS}/{NAME}.service.d/prometheus.conf",

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from kontronik_can_gw.cli.common import say
-from kontronik_can_gw.cli.service_files import NAME, SYSUSERS
+from kontronik_can_gw.cli.service_files import NAME, SYSUSERS, TMPFILES
 from kontronik_can_gw.errors import RunError, UserError
 
 _EXECUTABLE = re.compile(r"/[\w/.+@~=,:-]+")
@@ -86,13 +86,19 @@ def make_user(group: str) -> None:
         ) from None
 
 
+def make_lock_folder() -> None:
+    """Now; from the next start of the machine on systemd does it."""
+    if shutil.which("systemd-tmpfiles"):
+        call("systemd-tmpfiles", "--create", f"/{TMPFILES}")
+
+
 def reload_devices() -> None:
     """Let the rules act on what is plugged in already."""
     if shutil.which("udevadm") is None:
         say("no udevadm here: the udev rules act after the next start")
         return
     call("udevadm", "control", "--reload")
-    call("udevadm", "trigger", "--action=change", "--subsystem-match=usb-serial", "--subsystem-match=tty")
+    call("udevadm", "trigger", "--action=change", "--subsystem-match=tty")
 
 
 def reload_network(channel: str) -> None:

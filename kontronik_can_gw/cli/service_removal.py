@@ -12,6 +12,7 @@ from kontronik_can_gw.cli.service_files import NAME, WANTS
 from kontronik_can_gw.cli.service_machine import call, check_rights, output, run
 from kontronik_can_gw.cli.service_status import properties
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.runtime.locks import is_held
 
 
 def uninstall(args: argparse.Namespace) -> int:
@@ -24,7 +25,10 @@ def uninstall(args: argparse.Namespace) -> int:
         if args.purge:
             raise UserError("--purge removes everything: not with --instance")
         units = [files.unit(args.instance), files.mqtt_unit(args.instance)]
-        return _disable(args, units, [link for link in links if link.name in units], live)
+        code = _disable(args, units, [link for link in links if link.name in units], live)
+        if live and not args.dry_run:
+            _remove_runtime_folders(root, f"{NAME}-{args.instance}")
+        return code
     found = files.installed(root)
     doomed = _kept_data(root) if args.purge else []
     if args.dry_run:
@@ -43,6 +47,7 @@ def uninstall(args: argparse.Namespace) -> int:
     for path in doomed:
         _remove_tree(path)
     if live:
+        _remove_runtime_folders(root, f"{NAME}*")
         call("systemctl", "daemon-reload")
         if shutil.which("udevadm"):
             call("udevadm", "control", "--reload")
@@ -78,6 +83,17 @@ def _running() -> list[str]:
 def _kept_data(root: Path) -> list[Path]:
     states = (p for p in root.glob(f"var/lib/{NAME}*") if p.name == NAME or p.name.startswith(f"{NAME}-"))
     return [path for path in (root / files.CONFIGURATIONS, *sorted(states)) if path.exists()]
+
+
+def _remove_runtime_folders(root: Path, pattern: str) -> None:
+    """What the units keep when they stop."""
+    held = (root / "proc/locks").read_text()
+    for path in sorted((root / "run").glob(pattern)):
+        with contextlib.suppress(OSError):
+            if any(is_held(file.lstat(), held) for file in path.glob("lock/*")):
+                say(f"{path}: kept, a gateway that is no service has locks there")
+            else:
+                shutil.rmtree(path)
 
 
 def _remove_file(path: Path) -> None:

@@ -7,9 +7,11 @@ from datetime import datetime
 from pathlib import Path
 
 from kontronik_can_gw.cli import service_files as files
+from kontronik_can_gw.cli import show
 from kontronik_can_gw.cli.service_files import NAME
 from kontronik_can_gw.cli.service_machine import check_systemd, output, run
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.printable import printable
 
 NOT_RUNNING = 3
 """Exit code, as systemctl's."""
@@ -58,27 +60,27 @@ def _show_unit(unit: str, lines: int) -> bool:
     shown = properties(unit)
     state = shown.get("ActiveState", "unknown")
     if shown.get("LoadState") == "not-found":
-        print(f"{unit}: not installed. See: kontronik-can-gw service install --help")
+        show(f"{unit}: not installed. See: kontronik-can-gw service install --help")
         return False
     since = f" since {shown['StateChangeTimestamp']}" if shown.get("StateChangeTimestamp") else ""
     at_start = (
         "starts with the machine" if shown.get("UnitFileState") == "enabled" else "does not start with the machine"
     )
-    print(f"{unit}: {state} ({shown.get('SubState', '')}){since}; {at_start}")
+    show(f"{unit}: {state} ({shown.get('SubState', '')}){since}; {at_start}")
     if text := shown.get("StatusText"):
-        print(f"  says           {text}")
+        show(f"  says           {text}")
     words = [f"pid {shown['MainPID']}"] if shown.get("MainPID", "0") != "0" else []
     words.append(f"restarted {shown.get('NRestarts') or 0} times")
     if (memory := shown.get("MemoryCurrent", "")).isdecimal() and int(memory) < 1 << 60:
         words.append(f"{int(memory) >> 20} MB")
     if shown.get("Result", "success") != "success":
         words.append(f"last ended by {shown['Result']}, status {shown.get('ExecMainStatus', '?')}")
-    print(f"  process        {', '.join(words)}")
+    show(f"  process        {', '.join(words)}")
     name = unit.removeprefix(NAME).removeprefix("@").removesuffix(".service") or None
     for number, line in enumerate(_judge(Path("/") / files.configuration(name))):
-        print(f"  {'' if number else 'configuration':<13}  {line}")
+        show(f"  {'' if number else 'configuration':<13}  {line}")
     for number, line in enumerate(_log(unit, lines)):
-        print(f"  {'' if number else 'log':<13}  {line}")
+        show(f"  {'' if number else 'log':<13}  {line}")
     return state in ("active", "reloading")
 
 
@@ -111,5 +113,4 @@ def _entry(text: str) -> str:
         word = _PRIORITIES[int(entry.get("PRIORITY", 6))]
     except (ValueError, KeyError, TypeError, IndexError, OverflowError, OSError):
         return ""
-    clean = "".join(c if c.isprintable() else " " for c in str(message))
-    return f"{time:%Y-%m-%d %H:%M:%S}  {word + ': ' if word else ''}{clean}"
+    return f"{time:%Y-%m-%d %H:%M:%S}  {word + ': ' if word else ''}{printable(str(message))}"

@@ -8,12 +8,13 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.config import load
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.protocol.states import OperatingError, SelfTestError
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS, pid_namespace, start_ticks
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -42,11 +43,16 @@ class NotRunning(RunError):
     exit_code = NOT_RUNNING
 
 
-class Piece(NamedTuple):
-    """Words in one style (as rich names it; '' for none)."""
+@dataclass(frozen=True)
+class Piece:
+    """Words in one style (as rich names it; '' for none), printable whatever they are made of."""
 
     text: str
     style: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.text.isprintable():
+            object.__setattr__(self, "text", printable(self.text))
 
 
 Line = list[Piece]
@@ -130,11 +136,6 @@ def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e18
 
 
-def printable(text: str) -> str:
-    """Without what a terminal might obey."""
-    return "".join(c if c.isprintable() else "?" for c in text)
-
-
 def main(args: argparse.Namespace) -> int:
     from rich.console import Console
 
@@ -160,7 +161,7 @@ def main(args: argparse.Namespace) -> int:
     if not args.json and all(each.document is None for each in seen):
         raise NotRunning(*(each.sentence for each in seen))
     if args.json:
-        print(json.dumps({"gateways": [_as_json(each) for each in seen]}, ensure_ascii=False))
+        print(printable_json({"gateways": [_as_json(each) for each in seen]}))
     elif args.once or not console.is_terminal or console.is_dumb_terminal:
         for line in _joined([screen(each) for each in seen]):
             if console.is_terminal:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kontronik_can_gw.dbc_output import units
+from kontronik_can_gw.dbc_output.bounds import MAX_BYTES, check_bounds, check_size
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.sources import Group, Source, sources
@@ -38,6 +39,10 @@ _ALIVE_ENDINGS = (
 )
 _LARGEST_FLOAT = int(struct.unpack("<f", b"\xff\xff\x7f\x7f")[0])
 _CRC_ENDINGS = ("crc", "crc8", "checksum")
+_MAX_REASON = 300
+"""Characters: cantools may quote the whole file."""
+_MAX_PAGES = 1024
+"""Multiplexer values of a message of ours."""
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 EXPECTED_LIVE_HZ = 100
 """What a UART is expected to bring, for the computed bus load only; the gateway sends as frames come."""
@@ -219,16 +224,15 @@ def load_database(path: Path) -> "Database":
 def read_dbc(path: Path) -> bytes:
     """The bytes of a DBC file. UserError with one line where it cannot be read."""
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            return file.read(MAX_BYTES + 1)  # no more is needed to see that it is too large
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def parse_database(raw: bytes, path: str) -> "Database":
     """Read the bytes of a DBC file. UserError with one line that names ``path`` for what is no DBC."""
-    with without_asammdf():
-        import cantools.database
-
+    check_size(len(raw), path)
     if b"\0" in raw:
         raise UserError(f"{path}: is a binary file, not a DBC")
     try:
@@ -237,11 +241,15 @@ def parse_database(raw: bytes, path: str) -> "Database":
         text = raw.decode("cp1252", errors="replace")
     if not text.strip():
         raise UserError(f"{path}: is empty, not a DBC")
+    check_bounds(text, path)
+    with without_asammdf():
+        import cantools.database
+
     text = _spelled_out(text, path)
     try:
         database = cantools.database.load_string(text, database_format="dbc", strict=False, sort_signals=None)
     except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
         raise UserError(f"{path}: is not a DBC that can be read: {reason}") from None
     if not isinstance(database, cantools.database.Database):
         raise UserError(f"{path}: is not a CAN database")
@@ -269,15 +277,15 @@ def _spelled_out(text: str, path: str) -> str:
         return _MASKED.sub(lambda found: strings[int(found[1])], masked)
 
     text = _STRING.sub(mask, text)
-    tables = dict(re.findall(r"^\s*VAL_TABLE_\s+(\w+)\s+([^;]*?)\s*;", text, re.MULTILINE))
+    tables = dict(re.findall(r"^[ \t]*VAL_TABLE_\s+(\w+)\s+([^;]*)", text, re.MULTILINE))
     text = re.sub(
-        r"^(\s*VAL_\s+\d+\s+\w+\s+)([A-Za-z_]\w*)(\s*;)",
+        r"^([ \t]*VAL_\s+\d+\s+\w+\s+)([A-Za-z_]\w*)(\s*;)",
         lambda found: f"{found[1]}{tables.get(found[2], found[2])}{found[3]}",
         text,
         flags=re.MULTILINE,
     )
     listed = re.findall(
-        r"^\s*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?(\"\0\d+\0\")\s+ENUM\s+([^;]*);", text, re.MULTILINE
+        r"^[ \t]*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?(\"\0\d+\0\")\s+ENUM\s+([^;]*)", text, re.MULTILINE
     )
     numbers = {
         shown(name): {shown(value[0]): str(n) for n, value in enumerate(re.finditer(_MASKED, values))}
@@ -290,7 +298,7 @@ def _spelled_out(text: str, path: str) -> str:
             raise UserError(f"{path}: attribute {name}: {value} is none of its values {', '.join(numbers[name])}")
         return f"{found[1]}{found[2]}{found[3]}{numbers.get(name, {}).get(value, found[4])}{found[5]}"
 
-    text = re.sub(r"^(\s*BA_\s+)(\"\0\d+\0\")(\s+[^\";]*?)(\"\0\d+\0\")(\s*;)", number, text, flags=re.MULTILINE)
+    text = re.sub(r"^([ \t]*BA_\s+)(\"\0\d+\0\")(\s[^\";]*)(\"\0\d+\0\")(\s*;)", number, text, flags=re.MULTILINE)
     return shown(text)
 
 
@@ -467,12 +475,17 @@ class _Compiler:
         if message.is_container or message.length == 0 or not message.signals:
             self.problems.append(f"{where}: has no signal that could be sent. Remove it or give it signals.")
             return None
+        if message.length > FD_LENGTHS[-1]:
+            return None
         send_type, cycle_ms, delay_ms = self._timing(message, where)
         multiplexers = [s for s in message.signals if s.is_multiplexer]
         if len(multiplexers) > 1 or any(s.is_multiplexer and s.multiplexer_ids for s in message.signals):
             self.problems.append(f"{where}: has more than one level of multiplexing; one is supported.")
             return None
         pages: set[int] = {page for s in message.signals for page in s.multiplexer_ids or ()}
+        if len(pages) > _MAX_PAGES:
+            self.problems.append(f"{where}: has {len(pages)} multiplexer values; {_MAX_PAGES} are supported.")
+            return None
         signals: list[SignalPlan] = []
         for signal in message.signals:
             for page in signal.multiplexer_ids or (None,):
@@ -525,7 +538,7 @@ class _Compiler:
                     raise ValueError
                 return round(float(value))
             except (ValueError, OverflowError):
-                self.problems.append(f"{where}: {name} is {value!r}, which is no time in ms.")
+                self.problems.append(f"{where}: {name} is {str(value)[:40]!r}, which is no time in ms.")
                 return 0
 
         cycle, delay = number("GenMsgCycleTime"), number("GenMsgDelayTime")
@@ -544,25 +557,32 @@ class _Compiler:
         return send_type, cycle, delay
 
     def _check_overlap(self, message: "Message", where: str) -> None:
-        owners: dict[tuple[int, int | None], str] = {}
-        reported: set[tuple[str, str]] = set()
-        pages: set[int | None] = {None} | {page for s in message.signals for page in s.multiplexer_ids or ()}
+        used: Counter[int | None] = Counter()
+        """Bits in use, as a mask for each page."""
+        placed: list[tuple[str, int, set[int | None]]] = []
+        every: set[int | None] = {None} | {page for s in message.signals for page in s.multiplexer_ids or ()}
         for signal in message.signals:
-            bits = _bits(signal)
-            if max(bits) >= message.length * 8:
+            mask = sum(1 << bit for bit in _bits(signal)) if signal.length <= message.length * 8 else -1
+            if mask < 0 or mask.bit_length() > message.length * 8:
                 self.problems.append(
                     f"{where}.{signal.name}: lies outside the message's {message.length} bytes. Move or shorten it."
                 )
-            for page in signal.multiplexer_ids or pages:
-                for bit in bits:
-                    other = owners.setdefault((bit, page), signal.name)
-                    if other != signal.name and (other, signal.name) not in reported:
-                        reported.add((other, signal.name))
-                        self.problems.append(f"{where}.{signal.name}: overlaps {other}. Move one of them.")
+                continue
+            pages: set[int | None] = set(signal.multiplexer_ids) if signal.multiplexer_ids else every
+            left = mask if any(used[page] & mask for page in pages) else 0
+            for other, others_mask, others_pages in placed if left else ():
+                if others_mask & left and others_pages & pages and other != signal.name:
+                    self.problems.append(f"{where}.{signal.name}: overlaps {other}. Move one of them.")
+                    left &= ~others_mask
+            for page in pages:
+                used[page] |= mask
+            placed.append((signal.name, mask, pages))
 
     def _signal(self, message: "Message", signal: "Signal", page: int | None) -> SignalPlan | None:
         where = f"{self.file}: {message.name}.{signal.name}"
         length, signed, is_float = signal.length, signal.is_signed, signal.is_float
+        if length > message.length * 8:
+            return None  # which _check_overlap reports
         if is_float and length not in (32, 64):
             self.problems.append(f"{where}: a float of {length} bits cannot be sent; 32 and 64 can.")
             return None

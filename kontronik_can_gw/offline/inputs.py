@@ -180,10 +180,6 @@ def _captures(paths: Sequence[Path], layout: BusLayout | None) -> "CaptureInput"
     return made
 
 
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)[:400]
-
-
 def _parts(path: Path) -> list[Path] | None:
     """The captures that a folder, or the beginning of a name, means; None for a plain file."""
     if path.is_dir():
@@ -223,9 +219,9 @@ class CaptureInput(_Base):
             found = self.setup.database()
             self.setup.gateway(Layout("", "", ()) if found is None else found[1], 0)
         except UserError as error:
-            raise UserError(*(f"{self._paths[0]}: {_printable(problem)}" for problem in error.problems)) from None
+            raise UserError(*(f"{self._paths[0]}: {problem[:400]}" for problem in error.problems)) from None
         except Exception as error:  # a header may hold anything
-            raise UserError(f"{self._paths[0]}: {_printable(str(error))}") from None
+            raise UserError(f"{self._paths[0]}: {str(error)[:400]}") from None
         name = str(self._paths[0])
         if len(self._paths) > 1:
             name = f"{self._paths[0].parent}/{self._paths[0].stem.rpartition('-')[0]}"

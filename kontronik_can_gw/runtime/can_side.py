@@ -14,9 +14,9 @@ from kontronik_can_gw.frames import CanFrame, frame_of
 from kontronik_can_gw.gateway import Conflict, Gateway
 from kontronik_can_gw.mailboxes import Mailboxes, Sent, are_images, stand_alone
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
-from kontronik_can_gw.runtime.claims import Claims, in_use, messages_claim, node_claim
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
+from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.snapshot import CanFacts, name_in_words
@@ -64,8 +64,8 @@ class CanSide:
         """A frame that is to go out so long after its turn began is old by now."""
         self._turn_ns = 0
         self._retry = Retry(LONGEST_RETRY_NS)
-        self._claims = Claims()
-        self._claimed: list[str] = []
+        self._locks = Locks(report=lambda text: conditions.say(logging.WARNING, text))
+        self._locked: list[str] = []
         self._receive_ids: frozenset[int] | None = None
         """What the open port was told to receive."""
         self._busy_until: int | None = None
@@ -131,7 +131,7 @@ class CanSide:
 
         Where another gateway has one of our node-IDs or sends our messages it is a RunError in any case.
         """
-        self._claim(at_start=True)
+        self._lock(at_start=True)
         try:
             self._open(now)
         except RunError as error:
@@ -153,7 +153,7 @@ class CanSide:
     def close(self) -> None:
         """Close everything."""
         self._close_port()
-        self._claims.close()
+        self._locks.close()
         if self._monitor is not None:
             self._selector.unregister(self._monitor.fileno())
             self._monitor.close()
@@ -180,20 +180,20 @@ class CanSide:
         if not self._conditions.is_on(self._interface_condition):  # otherwise it is said when a frame is sent
             self._conditions.say(logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open")
 
-    def _claim(self, at_start: bool = False) -> None:
+    def _lock(self, at_start: bool = False) -> None:
         """Have what only one gateway may have on this interface."""
         if self.config.interface == "virtual":  # is in this process only
             return
         channel = self.config.channel
-        names = [node_claim(channel, node_id) for node_id in self._gateway.node_ids if node_id != UNCONFIGURED]
+        names = [node_lock(channel, node_id) for node_id in self._gateway.node_ids if node_id != UNCONFIGURED]
         if (first := self._gateway.first_message_id) is not None:
-            names.append(messages_claim(channel, first))
-        if names == self._claimed:
+            names.append(messages_lock(channel, first))
+        if names == self._locked:
             return
-        self._claimed = names
-        all_taken = self._claims.hold(names)
+        self._locked = names
+        all_taken = self._locks.hold(names)
         if all_taken:
-            self._claimed = []  # to be tried again
+            self._locked = []  # to be tried again
         for taken in all_taken:
             if at_start:
                 raise in_use(taken)
@@ -306,7 +306,7 @@ class CanSide:
         self.port.set_receive_ids(ids)
         if not had_fd and (fd := self.port.fileno()) is not None:
             self._selector.register(fd, selectors.EVENT_READ, self.serve)
-        self._claim()
+        self._lock()
 
     def serve(self, now: int, events: int = selectors.EVENT_READ) -> None:
         """The port is readable, or can be sent to again."""

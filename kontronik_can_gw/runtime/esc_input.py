@@ -25,6 +25,8 @@ from kontronik_can_gw.telemetry import SECOND, LinkState
 
 LONGEST_RETRY_NS = SECOND
 DIAGNOSIS_NS = 3 * SECOND
+SETTINGS_NS = SECOND // 2
+"""While another program has echo on, what the ESC sends goes back to it."""
 
 
 class EscInput:
@@ -59,6 +61,7 @@ class EscInput:
         self._diagnosed: set[str] = set()
         self._counted: dict[str, int] = {}
         self._count_due = 0
+        self._settings_due = 0
         self._served = True
         self._seen_waiting = False
         self._lost_counters = (0, 0)
@@ -201,12 +204,14 @@ class EscInput:
             told.say(logging.INFO, said)
 
     def report(self, now: int) -> None:
-        """Count line errors once a second; say why nothing comes."""
+        """Count line errors once a second, look at the port's settings twice; say why nothing comes."""
         if self.port is None:
             return
         if now >= self._count_due:
             self._count_due = now + SECOND
             self._count(self.port.line_errors())
+        if now >= self._settings_due:
+            self._settings_due = now + SETTINGS_NS
             if not self.port.settings_hold():
                 text = f"{self.name}: another program changed the settings of {self.port.path}: set to 115200 8E1 again"
                 self._conditions.event(f"{self.name}: settings", text, now)

@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from typing import TextIO
 
+from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.threads import start_beside_the_loop
 
 CAPACITY = 1000
@@ -32,7 +33,8 @@ class BackgroundHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Let the line be written; never waits for the stream."""
         try:
-            line = self.format(record) + "\n"
+            record.msg, record.args = printable(record.getMessage()), ()  # what it quotes makes no line of its own
+            line = printable(self.format(record), keep="\n\t") + "\n"
         except Exception:  # a faulty message is no reason to end
             line = f"{record.msg!r} cannot be formatted\n"
         with self._ready:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.claims import Claims
+from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.snapshot import STALE_NS, Document, with_rates
 from kontronik_can_gw.runtime.threads import start_beside_the_loop
 from kontronik_can_gw.telemetry import SECOND
@@ -54,8 +54,8 @@ class Statistics:
     def __init__(self, file: Path | None, prometheus: tuple[str, int] | None) -> None:
         self._file = None if file is None else _StatusFile(file)
         self._server = None if prometheus is None else _server_at(prometheus)
-        self._claims = Claims()
-        if file is not None and self._claims.hold([f"{os.path.realpath(file)}/statistics/0"]):
+        self._locks = Locks()
+        if file is not None and self._locks.hold([f"{os.path.realpath(file)}/statistics/0"]):
             if self._server is not None:
                 self._server.stop_listening()
             raise RunError(f"statistics.file {file}: another gateway writes it. Give this one its own.")
@@ -117,7 +117,7 @@ class Statistics:
         if self._thread is None or self._closed:
             return
         self._closed = True
-        self._claims.close()
+        self._locks.close()
         os.eventfd_write(self._wake, 1)
         self._thread.join(_CLOSE_S)
         if self._server is not None:

@@ -10,8 +10,6 @@ the old one (the new one, if only the last step failed).
 """
 
 import contextlib
-import errno
-import fcntl
 import os
 import re
 import threading
@@ -20,6 +18,7 @@ from pathlib import Path
 
 from kontronik_can_gw.cia301.storage import Stored, decode
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.runtime.locks import Taken, lock_file
 from kontronik_can_gw.runtime.threads import start_beside_the_loop
 
 CAPACITY = 32
@@ -41,9 +40,9 @@ class ParameterStore:
         self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         # Names whose file could not be used and is still in its place: it is moved aside before a new one takes that.
         self._unusable: set[str] = set()
-        self._claims: list[int] = []
+        self._lock_files: list[int] = []
 
-    def claim(self, name: str) -> str | None:
+    def lock(self, name: str) -> str | None:
         """Keep other gateways from a node's file until ``close``: RunError where one has it.
 
         Where no lock can be made nothing can be saved either: the reason, to be told.
@@ -51,19 +50,13 @@ class ParameterStore:
         path = self._path(name)
         try:
             _make_folder(path.parent)
-            lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            self._lock_files.append(lock_file(str(path.with_suffix(".lock"))))
+        except Taken:
+            raise RunError(
+                f"{path}: is in use by another gateway. Give this one its own canopen.store, or its ESC another name."
+            ) from None
         except OSError as error:
             return f"{path}: {_reason(error)}"
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(lock)
-            if error.errno in (errno.EAGAIN, errno.EACCES):
-                raise RunError(
-                    f"{path}: is in use by another gateway. Give this one its own canopen.store, or its ESC another name."
-                ) from None
-            return f"{path}: {_reason(error)}"
-        self._claims.append(lock)
         return None
 
     def load(self, name: str) -> tuple[Stored, str | None]:
@@ -132,9 +125,9 @@ class ParameterStore:
             if self._event >= 0:
                 os.close(self._event)
                 self._event = -1
-        for lock in self._claims:
+        for lock in self._lock_files:
             os.close(lock)
-        self._claims = []
+        self._lock_files = []
         return thread is None or not thread.is_alive()
 
     def _path(self, name: str) -> Path:

@@ -82,12 +82,12 @@ def ours(master: int, slave: int, path: str, folder: Path, all_frames: list[byte
 
     from kontronik_can_gw.cli.common import load_all
     from kontronik_can_gw.gateway import Gateway
-    from kontronik_can_gw.runtime import claims
+    from kontronik_can_gw.runtime import locks
     from kontronik_can_gw.runtime.loop import Loop
     from kontronik_can_gw.runtime.statistics import Statistics
     from kontronik_can_gw.runtime.store import ParameterStore
 
-    claims.PREFIX += f"bench/{os.getpid()}/"
+    locks.PREFIX += f"bench/{os.getpid()}/"
     file = folder / "gateway.toml"
     file.write_text(config_text([path], "lo", FIVE, folder))
     loaded = load_all(file, ParameterStore)

@@ -124,9 +124,9 @@ def child(arguments: list[str]) -> int:
     use(args.bus)
     escs = Escs(args.links, seed=1)
 
-    from kontronik_can_gw.runtime import claims, loop
+    from kontronik_can_gw.runtime import locks, loop
 
-    claims.PREFIX += f"bench/{uuid.uuid4().hex[:8]}/"
+    locks.PREFIX += f"bench/{uuid.uuid4().hex[:8]}/"
 
     class Driven(loop.Loop):
         """The loop, but that time goes on by turns."""

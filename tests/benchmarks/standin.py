@@ -58,10 +58,10 @@ def main(arguments: list[str]) -> int:
         return 0
     from kontronik_can_gw.cli import main as run
     from kontronik_can_gw.dbc_output import prepare
-    from kontronik_can_gw.runtime import claims
+    from kontronik_can_gw.runtime import locks
 
     prepare.REFUSE_LOAD = math.inf  # 64 ESCs need several buses' worth
-    claims.PREFIX += f"bench/{os.getpid()}/"  # other benchmarks may run beside this one, each on a bus of its own
+    locks.PREFIX += f"bench/{os.getpid()}/"  # other benchmarks may run beside this one, each on a bus of its own
     return run(rest)
 
 

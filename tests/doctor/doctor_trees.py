@@ -103,6 +103,7 @@ class Tree(System):
     def systemd(self, **shown: str) -> None:
         """systemd with our unit, which shows these properties besides the usual ones."""
         self.folder("/run/systemd/system")
+        self.folder("/run/kontronik-can-gw/lock", 0o777)  # for it cannot be given to the service's user
         self.file("/etc/passwd", "root:x:0:0::/:/bin/sh\nkontronik-can-gw:x:990:990::/:/bin/false\n")
         usual = {
             "LoadState": "loaded",

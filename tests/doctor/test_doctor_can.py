@@ -1,6 +1,7 @@
 """What `doctor` says of a CAN interface. The documents are those of `ip -json -details -statistics link show`."""
 
 import json
+import os
 import platform
 from collections.abc import Callable
 from pathlib import Path
@@ -10,9 +11,9 @@ import pytest
 from doctor_trees import Tree, grave, only
 
 from kontronik_can_gw.config import CanConfig
-from kontronik_can_gw.runtime.claims import PREFIX, messages_claim, node_claim
 from kontronik_can_gw.runtime.doctor.can_interface import check_can
 from kontronik_can_gw.runtime.doctor.findings import Finding, Severity
+from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER, file_name, messages_lock, node_lock
 
 Change = Callable[[dict[str, Any]], object]
 PLAIN = CanConfig()
@@ -271,9 +272,18 @@ def test_a_kernel_without_socketcan_is_told_with_the_package(tmp_path: Path) -> 
 
 def test_another_gateway_on_this_interface_is_noted(tree: Tree) -> None:
     interface(tree, controller())
-    names = [node_claim("can0", 10), node_claim("can0", 2), messages_claim("can0", 0x680), node_claim("can1", 7)]
-    lines = [f"0000: 00000002 00000000 00000000 0002 01 4711 @{PREFIX}{name}" for name in names]
-    tree.file("/proc/net/unix", "Num RefCount Protocol Flags Type St Inode Path\n" + "\n".join(lines) + "\n")
+    tree.file("/proc/self/ns/net", "")
+    namespace = tree.path("/proc/self/ns/net").stat().st_ino
+    names = [node_lock("can0", 10), node_lock("can0", 2), messages_lock("can0", 0x680), node_lock("can1", 7)]
+    files = [file_name(name, namespace) for name in names] + [file_name(node_lock("can0", 3), namespace + 1)]
+    left = file_name(node_lock("can0", 4), namespace)
+    lines = []
+    for file in [*files, left]:
+        tree.file(f"{SYSTEM_FOLDER}/{file}", "")
+        status = tree.path(f"{SYSTEM_FOLDER}/{file}").stat()
+        place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+        lines.append(f"1: FLOCK  ADVISORY  WRITE 90 {place} 0 EOF")
+    tree.file("/proc/locks", "\n".join(lines[:-1]) + "\n")
     tree.process(90, "python3", "-m", "kontronik_can_gw", "run")
     found = only(check(tree), "can.gateway")
     assert found.severity is Severity.NOTE

@@ -130,6 +130,17 @@ def test_how_the_service_fares_is_told(tree: Tree, shown: dict[str, str], severi
     assert word in found.command
 
 
+@pytest.mark.parametrize("mode", [None, 0o755])
+def test_a_service_that_cannot_lock_node_ids_is_warned_of(tree: Tree, mode: int | None) -> None:
+    tree.systemd()
+    tree.path("/run/kontronik-can-gw/lock").rmdir()
+    if mode is not None:
+        tree.folder("/run/kontronik-can-gw/lock", mode)
+    found = only(machine(tree), "machine.locks")
+    assert found.severity is Severity.WARNING
+    assert "systemd-tmpfiles --create" in found.command
+
+
 def test_a_service_that_does_not_start_by_itself_is_noted(tree: Tree) -> None:
     tree.systemd(UnitFileState="disabled")
     assert only(machine(tree), "machine.service_enabled").severity is Severity.NOTE

@@ -1,9 +1,12 @@
 """One ESC's port in the loop: which adapter is opened, what is counted, what is said. Time is passed in, ports are scripted."""
 
+import fcntl
 import logging
+import os
 import selectors
 import termios
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,6 +38,8 @@ class Port:
         self.reads: list[bytes | Exception] = []
         self.counts: dict[str, int] = {"parity": 5}
         self.waits_to_be_read = False
+        self.looks = 0
+        self.hold = True
         self.pipe = PtyEsc()
 
     def fileno(self) -> int:
@@ -53,7 +58,8 @@ class Port:
         return dict(self.counts)
 
     def settings_hold(self) -> bool:
-        return True
+        self.looks += 1
+        return self.hold
 
     def discard(self) -> None:
         pass
@@ -326,6 +332,65 @@ def test_settings_that_another_program_changes_are_set_again() -> None:
             assert after[4] == termios.B115200
         finally:
             port.close()
+
+
+def test_settings_are_looked_at_twice_a_second(
+    there: dict[str, Identity | None], caplog: pytest.LogCaptureFixture
+) -> None:
+    """While another program has echo on, an ESC hears what it sends."""
+    there["/dev/ttyUSB0"] = LEFT
+    bench = Bench("/dev/ttyUSB0")
+    bench.escs[0].open(0, wait=False)
+    looks = []
+    for now in range(0, 3 * SECOND, 100 * MS):
+        bench.port().hold = now != 1500 * MS
+        before = bench.port().looks
+        bench.escs[0].report(now)
+        if bench.port().looks > before:
+            looks.append(now // MS)
+    assert looks == [0, 500, 1000, 1500, 2000, 2500]
+    assert sum("changed the settings of /dev/ttyUSB0" in message for message in caplog.messages) == 1
+    bench.close()
+
+
+def test_echo_is_off_before_anything_else_is_done_to_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal that was just made echoes; what comes before that is off goes back to the ESC."""
+    done: list[str] = []
+
+    def watched(module: Any, name: str) -> None:
+        real = getattr(module, name)
+
+        def call(*words: Any, **more: Any) -> Any:
+            on_port = words[0] == esc.path or (isinstance(words[0], int) and words[0] in opened)
+            if on_port and name == "tcsetattr":
+                done.append("echo on" if words[2][3] & (termios.ECHO | termios.ECHONL) else "echo off")
+            elif on_port:
+                done.append(name)
+            result = real(*words, **more)
+            if on_port and name == "open":
+                opened.add(result)
+            return result
+
+        monkeypatch.setattr(module, name, call)
+
+    opened: set[int] = set()
+    with PtyEsc() as esc:
+        changed = termios.tcgetattr(esc.fileno())
+        changed[3] |= termios.ECHO
+        termios.tcsetattr(esc.fileno(), termios.TCSANOW, changed)
+        for module, names in (
+            (os, ("open", "read", "close")),
+            (termios, ("tcgetattr", "tcsetattr", "tcflush", "tcdrain", "tcsendbreak")),
+            (fcntl, ("ioctl", "flock", "fcntl")),
+        ):
+            for name in names:
+                watched(module, name)
+        port = serial_port.SerialPort(esc.path)
+        port.close()
+    assert done[:3] == ["open", "tcgetattr", "echo off"]
+    assert "echo on" not in done
+    assert done.count("open") == 2, "once to switch echo off, once to use it: the first stays open until then"
+    assert "close" not in done[: [n for n, name in enumerate(done) if name == "open"][1]]
 
 
 def test_the_mini_uart_of_a_raspberry_pi_is_known_by_its_device_tree(tmp_path: Path) -> None:

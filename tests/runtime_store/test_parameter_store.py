@@ -786,17 +786,17 @@ def test_the_simulated_loss_of_power_finds_what_a_careless_writer_does(missing: 
 
 def test_a_node_belongs_to_one_gateway_until_that_closes(tmp_path: Path) -> None:
     first, second = ParameterStore(tmp_path / "store"), ParameterStore(tmp_path / "store")
-    first.claim("esc1")
+    first.lock("esc1")
     with pytest.raises(RunError, match=r"esc1\.params: is in use by another gateway"):
-        second.claim("esc1")
-    second.claim("esc2")
+        second.lock("esc1")
+    second.lock("esc2")
     first.close(1)
-    second.claim("esc1")
+    second.lock("esc1")
     second.close(1)
 
 
 def test_where_no_lock_can_be_made_the_gateway_runs_all_the_same(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     store = ParameterStore(tmp_path / "file" / "store")
-    store.claim("esc1")
+    store.lock("esc1")
     store.close(1)

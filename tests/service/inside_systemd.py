@@ -23,6 +23,7 @@ PROGRAM = str(Path(sys.prefix, "bin", "kontronik-can-gw"))
 CONFIGURATION = Path("/etc/kontronik-can-gw/gateway.toml")
 UNIT = "kontronik-can-gw.service"
 LINK = "/run/esc"
+LOCKS = "/run/kontronik-can-gw/lock"
 VALUES = 0x698
 FORBIDDEN = "/dev/not_a_serial_port"
 Facts = dict[str, Any]
@@ -108,7 +109,7 @@ def trial(facts: Facts) -> None:
     facts["oom"] = Path(f"/proc/{pid}/oom_score_adj").read_text().strip()
     facts["folders"] = {
         path: [oct(Path(path).stat().st_mode & 0o777), Path(path).owner()]
-        for path in ("/run/kontronik-can-gw", "/var/lib/kontronik-can-gw")
+        for path in ("/run/kontronik-can-gw", LOCKS, "/var/lib/kontronik-can-gw")
         if Path(path).exists()
     }
 
@@ -154,6 +155,9 @@ def trial(facts: Facts) -> None:
     facts["after uninstall"] = [shown(), left_over()]
     facts["install again"] = service("install", "--now")
     facts["running in the end"] = shown()
+    facts["locks"] = sorted(path.name.partition(".")[2] for path in Path(LOCKS).iterdir())
+    run("systemctl", "stop", UNIT)
+    facts["locks after a stop"] = [path.name for path in Path(LOCKS).iterdir()] if Path(LOCKS).is_dir() else None
     facts["purge"] = service("uninstall", "--purge")
     facts["after purge"] = [shown(), left_over(), run("id", "kontronik-can-gw")["code"]]
     facts["status in the end"] = service("status")
@@ -199,6 +203,7 @@ def probe() -> None:
         "abstract socket": lambda: socket.socket(socket.AF_UNIX).bind("\0kontronik-can-gw/probe"),
         "state folder": lambda: Path(os.environ["STATE_DIRECTORY"], "x").write_text("x"),
         "runtime folder": lambda: Path(os.environ["RUNTIME_DIRECTORY"], "x").write_text("x"),
+        "lock folder": lambda: Path(LOCKS, "x").write_text("x"),
         "other processes": lambda: Path("/proc/1/stat").read_text(),
         "machine-id": lambda: Path("/etc/machine-id").read_text(),
         "ctypes": lambda: __import__("ctypes").CFUNCTYPE(None)(print),

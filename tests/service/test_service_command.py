@@ -18,6 +18,7 @@ CONFIGURATION = "etc/kontronik-can-gw/gateway.toml"
 FILES = [
     CONFIGURATION,
     "etc/sysusers.d/kontronik-can-gw.conf",
+    "etc/tmpfiles.d/kontronik-can-gw.conf",
     "etc/systemd/network/50-kontronik-can-gw-can0.link.example",
     "etc/systemd/network/50-kontronik-can-gw-can0.network.example",
     f"{UNITS}/kontronik-can-gw.service",
@@ -233,6 +234,7 @@ def test_a_dry_run_shows_everything_and_does_nothing(root: Path, option: str) ->
     assert (done.returncode, added(root)) == (0, [])
     assert [line.split(":")[0].split("image/")[1] for line in done.stdout.splitlines() if line.startswith("#####")] == [
         "etc/sysusers.d/kontronik-can-gw.conf",
+        "etc/tmpfiles.d/kontronik-can-gw.conf",
         f"{UNITS}/kontronik-can-gw.service",
         f"{UNITS}/kontronik-can-gw@.service",
         "etc/udev/rules.d/70-kontronik-can-gw.rules",
@@ -407,7 +409,7 @@ def test_status_shows_state_configuration_and_log(tmp_path: Path, monkeypatch: p
         "  process        pid 107, restarted 0 times, 27 MB",
     ]
     assert lines[3].startswith("  configuration  /etc/kontronik-can-gw/gateway.toml")
-    assert [line[17:].split("  ", 1)[1] for line in lines[-2:]] == ["warning: esc1: lost [31m", "esc\ufffd"]
+    assert [line[17:].split("  ", 1)[1] for line in lines[-2:]] == ["warning: esc1: lost?[31m", "esc\ufffd"]
 
 
 def test_status_of_a_service_that_cannot_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

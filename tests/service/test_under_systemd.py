@@ -105,8 +105,14 @@ def test_telemetry_of_a_port_of_its_group_reaches_the_bus(facts: Facts) -> None:
 def test_its_folders_are_its_own(facts: Facts) -> None:
     assert facts["folders"] == {
         "/run/kontronik-can-gw": ["0o755", "kontronik-can-gw"],
+        "/run/kontronik-can-gw/lock": ["0o755", "kontronik-can-gw"],
         "/var/lib/kontronik-can-gw": ["0o700", "kontronik-can-gw"],
     }
+
+
+def test_the_folder_of_locks_outlives_the_service_that_stops(facts: Facts) -> None:
+    assert any("vcan0" in name and "messages" in name for name in facts["locks"])
+    assert facts["locks after a stop"] == []
 
 
 def test_a_killed_process_is_started_again(facts: Facts) -> None:
@@ -162,7 +168,7 @@ def test_several_gateways_run_side_by_side(facts: Facts) -> None:
 
 def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> None:
     needed = [
-        *("CAN socket", "netlink", "abstract socket", "state folder", "runtime folder", "terminal"),
+        *("CAN socket", "netlink", "abstract socket", "state folder", "runtime folder", "lock folder", "terminal"),
         *("ctypes", "other processes", "machine-id"),
     ]
     refused = {

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw.cli.service_files import Choices, PlannedFile, planned
+from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
 ENABLE = "no systemd-analyze on this machine: sudo apt-get install systemd"
@@ -20,7 +21,10 @@ MOST_EXPOSED = 2.0
 def files(root: Path, **more: Any) -> dict[str, PlannedFile]:
     """All files by their names."""
     usual: dict[str, Any] = {"executable": "/bin/true", "home_visible": False, "group": "dialout"}
-    return {Path(file.path).name: file for file in planned(Choices(**(usual | more)), root)}
+    made = {Path(file.path).name: file for file in planned(Choices(**(usual | more)), root)}
+    return made | {
+        Path(file.path).parent.name: file for file in planned(Choices(**(usual | more)), root) if ".d/" in file.path
+    }
 
 
 def units(folder: Path, prometheus: bool = False) -> list[Path]:
@@ -130,6 +134,19 @@ def test_it_speaks_can_and_nothing_of_the_internet(tmp_path: Path) -> None:
     assert loopback == {"RestrictAddressFamilies": ["AF_INET AF_INET6"], "IPAddressAllow": ["localhost"]}
 
 
+def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it(tmp_path: Path) -> None:
+    """In the plain unit's runtime folder, which systemd would remove with it; every instance and the publisher write there."""
+    made = files(tmp_path, mqtt=True)
+    lines = [line for line in made["tmpfiles.d"].text.splitlines() if line.startswith("d ")]
+    assert f"d {SYSTEM_FOLDER} 0755 kontronik-can-gw kontronik-can-gw -" in lines
+    for name in (*NAMES, "kontronik-can-gw-mqtt.service", "kontronik-can-gw-mqtt@.service"):
+        unit = settings(made[name].text)
+        assert unit["ReadWritePaths"] == [f"-{SYSTEM_FOLDER}"]
+        assert unit.get("RuntimeDirectoryPreserve", ["yes"]) == ["yes"]
+        assert "lock" not in "".join(unit.get("RuntimeDirectory", []))
+    assert "RuntimeDirectoryPreserve" in settings(made[NAMES[0]].text)
+
+
 def test_a_program_in_a_home_folder_is_seen_but_not_written(tmp_path: Path) -> None:
     for visible, value in ((False, "yes"), (True, "read-only")):
         assert settings(files(tmp_path, home_visible=visible)[NAMES[0]].text)["ProtectHome"] == [value]
@@ -138,7 +155,7 @@ def test_a_program_in_a_home_folder_is_seen_but_not_written(tmp_path: Path) -> N
 def test_the_group_of_serial_ports_is_the_systems(tmp_path: Path) -> None:
     made = files(tmp_path, group="uucp")
     assert settings(made[NAMES[0]].text)["SupplementaryGroups"] == ["uucp"]
-    assert "m kontronik-can-gw uucp\n" in made["kontronik-can-gw.conf"].text
+    assert "m kontronik-can-gw uucp\n" in made["sysusers.d"].text
 
 
 def test_nothing_is_left_to_be_filled_in(tmp_path: Path) -> None:
@@ -183,7 +200,7 @@ def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
     """By the grammar of the keys in use, and by udev itself where it can (udevadm verify, systemd 254)."""
     text = files(tmp_path)["70-kontronik-can-gw.rules"].text
     lines = [line.removeprefix("#") for line in text.splitlines() if re.match("#?[A-Z]+(==|=)", line)]
-    assert len(lines) == 7
+    assert len(lines) == 6
     for line in lines:
         for part in line.split(", "):
             assert RULE.fullmatch(part), part
@@ -196,9 +213,9 @@ def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr + done.stdout
 
 
-def test_udev_rules_make_adapters_quick_and_keep_modem_manager_away(tmp_path: Path) -> None:
+def test_udev_rules_keep_modem_manager_away(tmp_path: Path) -> None:
     text = files(tmp_path)["70-kontronik-can-gw.rules"].text
-    assert 'SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"\n' in text
+    assert "latency_timer" not in text  # the gateway asks for it once echo is off, and nothing before that
     ignored = [line for line in text.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
     assert [line.split(",")[0] for line in ignored] == ['SUBSYSTEM=="usb"', 'SUBSYSTEM=="tty"']
     assert all("0403" in line for line in ignored)

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.claims import Claims
+from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.snapshot import STALE_NS
 from kontronik_can_gw.runtime.statistics import PERIOD_NS, Report, Statistics
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -241,7 +241,7 @@ def test_a_file_that_another_gateway_writes_is_refused(file: Path) -> None:
 
 
 def test_a_file_that_became_another_gateways_is_left_alone(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Claims, "hold", lambda _self, _names: [])  # as of gateways in different network namespaces
+    monkeypatch.setattr(Locks, "hold", lambda _self, _names: [])  # as of gateways in different network namespaces
     first, second = Statistics(file, None), Statistics(file, None)
     put(first, file, 1)
     until(lambda: first.reports(0) == [])

@@ -4,10 +4,10 @@ import platform
 from importlib import import_module
 
 from kontronik_can_gw.config import CanConfig
-from kontronik_can_gw.runtime.claims import PREFIX
 from kontronik_can_gw.runtime.doctor.can_link import Link, can_interfaces, link_of
 from kontronik_can_gw.runtime.doctor.findings import Finding, Findings
 from kontronik_can_gw.runtime.doctor.system import System
+from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER, is_held, lock_folder, lock_name
 
 SHORTEST_QUEUE = 8
 """Frames: more than the gateway's own share, which is all that it ever has in there."""
@@ -243,13 +243,20 @@ def _statistics(findings: Findings, link: Link) -> None:
 
 
 def _other_gateways(system: System, findings: Findings, channel: str) -> None:
-    lines = [line.split() for line in (system.text("/proc/net/unix") or "").splitlines()]
-    names = sorted({words[-1][1:] for words in lines if words and words[-1].startswith(f"@{PREFIX}{channel}/")})
-    claims = [name.removeprefix(f"{PREFIX}{channel}/") for name in names]
-    if not claims:
+    """By the locks that are held: a file may be left by a gateway that was killed."""
+    namespace = system.status("/proc/self/ns/net")
+    held = system.text("/proc/locks") or ""
+    found = []
+    for path in {SYSTEM_FOLDER, lock_folder()}:
+        for file in system.names(str(path)):
+            status = system.status(str(path / file))
+            name = lock_name(file, 0 if namespace is None else namespace.st_ino)
+            if name is not None and name.startswith(f"{channel}/") and status is not None and is_held(status, held):
+                found.append(name.removeprefix(f"{channel}/"))
+    if not found:
         return
-    nodes = [number for what, _, number in (claim.partition("/") for claim in claims) if what == "node"]
-    messages = [number for what, _, number in (claim.partition("/") for claim in claims) if what == "messages"]
+    nodes = sorted({number for what, _, number in (name.partition("/") for name in found) if what == "node"})
+    messages = sorted({number for what, _, number in (name.partition("/") for name in found) if what == "messages"})
     what = [f"CANopen node {', '.join(sorted(nodes, key=int))}"] if nodes and all(n.isdigit() for n in nodes) else []
     what += [f"the messages from {', '.join(messages)}h on"] if messages else []
     running = ", ".join(str(process) for process in system.processes if process.is_gateway)

@@ -224,15 +224,12 @@ def _ask_gateway(gateway: bool) -> tuple[str, str]:
 
 def _power_and_latency(system: System, findings: Findings, tty: str, adapter: Adapter, gateway: bool) -> None:
     latency = system.number(f"/sys/class/tty/{tty}/device/latency_timer")
-    if latency is not None and latency > 1:
+    if latency is not None and latency > 1 and gateway:  # which has asked for less, in vain
         text = f"latency timer {latency} ms: the adapter holds bytes back that long"
-        if gateway:  # which has asked for less, in vain
-            findings.warning("port.latency", text, "A udev rule sets it to 1 ms:", SERVICE_INSTALL)
-        else:
-            remedy = "The gateway asks for 1 ms when it opens the port; a udev rule makes sure:"
-            findings.note("port.latency", text, remedy, SERVICE_INSTALL)
+        findings.warning("port.latency", text, "", f"echo 1 | sudo tee /sys/class/tty/{tty}/device/latency_timer")
     elif latency is not None:
-        findings.ok("port.latency", f"latency timer {latency} ms")
+        asks = "; the gateway asks for 1 ms when it opens the port" if latency > 1 else ""
+        findings.ok("port.latency", f"latency timer {latency} ms{asks}")
     control = f"{adapter.usb}/power/control"
     if adapter.usb and system.text(control) == "auto":
         findings.note(

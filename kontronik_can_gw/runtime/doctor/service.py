@@ -5,6 +5,7 @@ from pathlib import PurePath
 
 from kontronik_can_gw.runtime.doctor.findings import Findings
 from kontronik_can_gw.runtime.doctor.system import System, User
+from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
 
 NAME = "kontronik-can-gw"
 _FOLDER = f"/etc/{NAME}"
@@ -90,6 +91,10 @@ def check_service(system: System, findings: Findings, unit: Unit | None) -> None
         findings.warning("machine.service", text, "Its log says why:", log)
     else:
         findings.ok("machine.service", f"{unit.name} is active")
+    folder = system.status(str(SYSTEM_FOLDER))
+    if folder is None or (unit.user is not None and not unit.user.may(folder, 7)):
+        text = f"{SYSTEM_FOLDER}, where gateways lock node-IDs, is not there or not the service's"
+        findings.warning("machine.locks", text, "", f"sudo systemd-tmpfiles --create /etc/tmpfiles.d/{NAME}.conf")
     if not unit.enabled:
         text = f"{unit.name} does not start when the machine does"
         findings.note("machine.service_enabled", text, "", f"sudo systemctl enable {unit.name}")

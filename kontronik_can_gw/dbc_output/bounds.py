@@ -1,0 +1,200 @@
+"""What a DBC may ask for, judged before cantools reads it: one number in a file must not cost gigabytes or a minute.
+
+cantools makes an object of each page of a multiplexer, writes masks of one character a bit and counts ranges out, so the numbers that
+make it do so are looked at first. A DBC is syntax first: cantools reads a number only after it has parsed the whole file, so the patterns
+need be exact for well-formed text only.
+"""
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import NamedTuple
+
+from kontronik_can_gw.errors import UserError
+
+MAX_BYTES = 8_000_000
+"""The largest of 130 real files has 0.8 MB, mostly comments."""
+_MAX_TOKENS = 500_000
+"""The largest real file has 182 000."""
+_MAX_DIGITS = 400
+_MAX_MESSAGE_BYTES = 1785
+"""SAE J1939's transport protocol; a CAN FD frame has 64."""
+_MAX_BITS = _MAX_MESSAGE_BYTES * 8
+
+
+class _Bound(NamedTuple):
+    """What a number may be, in words and as limits."""
+
+    what: str
+    low: int
+    high: int
+
+
+_ID = _Bound("CAN id", 0, 0xFFFF_FFFF)
+_LENGTH = _Bound("length in bytes", 0, _MAX_MESSAGE_BYTES)
+_START = _Bound("start bit", 0, _MAX_BITS - 1)
+_BITS = _Bound("length in bits", 0, _MAX_BITS)
+_PAGE = _Bound("multiplexer value", 0, 0xFFFF_FFFF)
+_MESSAGES = _Bound("number of messages", 0, 10_000)
+_NODES = _Bound("number of nodes", 0, 2_000)
+_SIGNALS = _Bound("number of signals", 0, 4_096)
+_TABLES = _Bound("length of the value tables that VAL_ names, in characters", 0, MAX_BYTES)
+_PAGES = _Bound("number of multiplexer values in all", 0, 65_536)
+_POWERS = _Bound("exponent", 0, 4_200)
+_NESTING = _Bound("depth of multiplexers", 0, 8)
+
+_TEXT = re.compile(r'"(?:\\"|[^"])*"|//[^\n]*')
+_TOKEN = re.compile(r"\w+|[^\w\s]")
+_MANY_DIGITS = re.compile(rf"\d[\d_]{{{_MAX_DIGITS}}}")
+_POWER = re.compile(r"(?<![\w.])[\d_.]+[eE][-+]?([\d_]+)")
+_NUMBER_TEXT = re.compile(r'"\s*[-+]?[\d_.]+(?:[eE][-+]?[\d_]+)?\s*"')
+"""cantools takes the number out of an attribute's string too."""
+_INTEGER = re.compile(r"[-+]?\d+")
+_NUMBER = r"([-+]?\d+)"
+_NODE_LIST = re.compile(r"BU_\s*:(?=([\w\s]*))")
+_MESSAGE_OR_SIGNAL = re.compile(
+    rf"BO_\s*{_NUMBER}\s*(\w+)\s*:\s*{_NUMBER}|SG_\s+(\w+)(?:\s+(\w+))?\s*:\s*{_NUMBER}\s*\|\s*{_NUMBER}"
+)
+_RANGES = re.compile(rf"SG_MUL_VAL_\s*{_NUMBER}\s*(\w+)\s+(\w+)([^;]*)")
+_VALUE_TABLE = re.compile(r"VAL_TABLE_\s+(\w+)([^;]*)")
+_VALUES = re.compile(rf"VAL_\s*{_NUMBER}\s*(\w+)([^;]*)")
+_TABLE_NAME = re.compile(r"\s*([A-Za-z_]\w*)\s*\Z")
+
+
+def check_size(size: int, path: str) -> None:
+    """UserError for a file that is larger than any DBC."""
+    if size > MAX_BYTES:
+        raise UserError(
+            f"{path}: is larger than {MAX_BYTES // 1_000_000} MB. Is it a DBC? Give one with fewer comments."
+        )
+
+
+def check_bounds(text: str, path: str) -> None:
+    """UserError with the first number of a DBC that is out of all bounds: where it is, what it is, what it may be."""
+    text = _TEXT.sub(_masked, text)
+    if len(text) > _MAX_TOKENS and next(islice(_TOKEN.finditer(text), _MAX_TOKENS, None), None):
+        raise UserError(f"{path}: has more than {_MAX_TOKENS} words and numbers. Remove messages that are not needed.")
+    if found := _MANY_DIGITS.search(text):
+        raise UserError(f"{path}: line {_line(text, found)}: a number of more than {_MAX_DIGITS} digits. Correct it.")
+    for bound, number, where in _numbers(text):
+        if not bound.low <= number <= bound.high:
+            raise UserError(f"{path}: {where}{bound.what} is {number}, not {bound.low} to {bound.high}. Correct it.")
+
+
+def _masked(found: re.Match[str]) -> str:
+    """A string without what it says (its length is kept: value tables are measured by it), a comment as a blank."""
+    if found[0].startswith("//"):
+        return " "
+    return found[0] if _NUMBER_TEXT.fullmatch(found[0]) else f'"{"_" * (len(found[0]) - 2)}"'
+
+
+def _line(text: str, found: re.Match[str]) -> int:
+    return text.count("\n", 0, found.start()) + 1
+
+
+@dataclass
+class _Message:
+    """How a message is multiplexed, by names of signals."""
+
+    name: str
+    multiplexers: list[str] = field(default_factory=list)
+    values: Counter[str] = field(default_factory=Counter)
+    """On how many pages a signal is."""
+    parents: dict[str, str] = field(default_factory=dict)
+    """Multiplexers that SG_MUL_VAL_ names."""
+    texts: Counter[str] = field(default_factory=Counter)
+    """Sizes of value tables: each text of a multiplexer's makes a page."""
+
+    def pages(self) -> tuple[int, int]:
+        """How deep multiplexers are nested, and how many pages and signals on pages there are in all."""
+        children: defaultdict[str | None, list[str]] = defaultdict(list)
+        for name in self.values.keys() - set(self.multiplexers):
+            children[self._parent(name)].append(name)
+        inner: defaultdict[str | None, list[str]] = defaultdict(list)
+        for name in self.multiplexers:
+            inner[self._parent(name)].append(name)
+
+        def size(name: str, depth: int) -> tuple[int, int]:
+            deepest, total = depth, self.texts[name] + sum(self.values[child] for child in children[name])
+            for child in inner[name] if depth <= _NESTING.high else ():
+                nested, more = size(child, depth + 1)
+                deepest, total = max(deepest, nested), total + self.values[child] * (1 + more)
+            return deepest, total
+
+        sizes = [size(name, 1) for name in inner[None]]
+        return max((depth for depth, _ in sizes), default=0), sum(total for _, total in sizes)
+
+    def _parent(self, name: str) -> str | None:
+        """As cantools has it: the only multiplexer is everybody's; where there are several SG_MUL_VAL_ decides."""
+        if len(self.multiplexers) == 1:
+            return None if name == self.multiplexers[0] else self.multiplexers[0]
+        return self.parents.get(name)
+
+
+def _numbers(text: str) -> Iterator[tuple[_Bound, int, str]]:
+    """Each number, what it is, and where."""
+    for found in _POWER.finditer(text):
+        yield _POWERS, int(found[1].replace("_", "") or "0"), f"line {_line(text, found)}: "
+    for found in _NODE_LIST.finditer(text):
+        yield _NODES, len(found[1].split()), ""
+    messages: defaultdict[int, list[_Message]] = defaultdict(list)
+    message, signals, count = _Message(""), 0, 0
+    for found in _MESSAGE_OR_SIGNAL.finditer(text):
+        if found[1]:
+            message, signals, count = _Message(found[2]), 0, count + 1
+            messages[int(found[1])].append(message)
+            yield _MESSAGES, count, ""
+            yield _ID, int(found[1]), f"{message.name}: "
+            yield _LENGTH, int(found[3]), f"{message.name}: "
+            continue
+        name, mark, signals = found[4], found[5] or "", signals + 1
+        yield _SIGNALS, signals, f"{message.name}: "
+        yield _START, int(found[6]), f"{message.name}.{name}: "
+        yield _BITS, int(found[7]), f"{message.name}.{name}: "
+        if mark.endswith("M"):
+            message.multiplexers.append(name)
+        if mark.startswith("m") and (value := _INTEGER.search(mark)):
+            yield _PAGE, int(value[0]), f"{message.name}.{name}: "
+            message.values[name] += 1
+    yield from _ranges(text, messages)
+    yield from _value_tables(text, messages)
+    total = 0
+    for message in (each for same_id in messages.values() for each in same_id):
+        nesting, pages = message.pages()
+        total += pages
+        yield _NESTING, nesting, f"{message.name}: "
+        yield _PAGES, total, f"{message.name}: "
+
+
+def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> Iterator[tuple[_Bound, int, str]]:
+    """SG_MUL_VAL_: as cantools has it, the second number of each pair stands after one more character."""
+    total = 0
+    for found in _RANGES.finditer(text):
+        can_id, name, parent = int(found[1]), found[2], found[3]
+        numbers = _INTEGER.findall(found[4])
+        values = 0
+        for first, last in zip(numbers[::2], numbers[1::2], strict=False):
+            low, high = int(first), int(last[1:] or "0")
+            yield _PAGE, low, f"SG_MUL_VAL_ of {name}: "
+            yield _PAGE, high, f"SG_MUL_VAL_ of {name}: "
+            values += max(0, high - low + 1)
+        total += values
+        yield _PAGES, total, f"SG_MUL_VAL_ of {name}: "
+        for message in messages.get(can_id, ()):
+            message.values[name] += values
+            message.parents[name] = parent
+
+
+def _value_tables(text: str, messages: Mapping[int, list[_Message]]) -> Iterator[tuple[_Bound, int, str]]:
+    """A table that many signals name takes as much as if it were written for each."""
+    tables = {found[1]: (len(found[2]), found[2].count('"') // 2) for found in _VALUE_TABLE.finditer(text)}
+    size = 0
+    for found in _VALUES.finditer(text):
+        named = _TABLE_NAME.match(found[3])
+        length, texts = tables.get(named[1], (0, 0)) if named else (0, found[3].count('"') // 2)
+        size += length
+        yield _TABLES, size, f"VAL_ of {found[2]}: "
+        for message in messages.get(int(found[1]), ()):
+            message.texts[found[2]] = texts

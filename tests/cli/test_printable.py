@@ -1,0 +1,180 @@
+"""What files, logs and buses say reaches no terminal and no log as a command: escape sequences, controls, turned directions."""
+
+import io
+import json
+import logging
+import re
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from kontronik_can_gw.cli import main, say, show
+from kontronik_can_gw.cli.common import write_output
+from kontronik_can_gw.cli.doctor import _show
+from kontronik_can_gw.cli.status import Piece, _rich
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.printable import printable, printable_json
+from kontronik_can_gw.runtime.doctor.findings import Findings
+from kontronik_can_gw.runtime.log_writer import BackgroundHandler
+
+EVIL = "a\x1b]0;x\x07\x9b31m\u202eb\u2066\x7f\r\nINFO fake"
+SHOWN = "a?]0;x??31m?b????INFO fake"
+DBC = shipped("dbc/kontronik_esc.dbc").read_text("utf-8")
+EDS = shipped("eds/kontronik_esc.eds").read_text("ascii")
+
+
+class Terminal(io.TextIOWrapper):
+    def __init__(self) -> None:
+        super().__init__(io.BytesIO(), encoding="utf-8", newline="")
+
+    def isatty(self) -> bool:
+        return True
+
+    def text(self) -> str:
+        self.flush()
+        self.seek(0)
+        return bytes(self.buffer.read()).decode()
+
+
+def is_clean(text: str) -> bool:
+    return all(c.isprintable() or c in "\n\t" for c in text)
+
+
+def program(*words: object) -> tuple[int, str, str]:
+    """Both streams of a command within this process; without an exception."""
+    out, talk = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(talk):
+        code = main([str(word) for word in words])
+    return code, out.getvalue(), talk.getvalue()
+
+
+def test_what_a_terminal_obeys_is_shown_as_a_question_mark() -> None:
+    assert printable(EVIL) == SHOWN
+    assert printable("Größe 5 µΩ ‰ 温度 €") == "Größe 5 µΩ ‰ 温度 €"
+    assert printable("a\tb\n\x1b", keep="\n\t") == "a\tb\n?"
+
+
+def test_json_keeps_what_it_was_and_shows_it_escaped() -> None:
+    text = printable_json({EVIL: [EVIL, "µ", "\U000e0001"]}, indent=1)
+    assert is_clean(text)
+    assert "µ" in text
+    assert json.loads(text) == {EVIL: [EVIL, "µ", "\U000e0001"]}
+
+
+# --- the places where text goes out
+
+
+def test_talk_lines_and_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    say(EVIL)
+    show(EVIL)
+    assert capsys.readouterr() == (f"{SHOWN}\n", f"kontronik-can-gw: {SHOWN}\n")
+    assert UserError(EVIL, "b").problems == (SHOWN, "b")
+
+
+@pytest.mark.parametrize("style", ["", "bold"])
+def test_screens(style: str) -> None:
+    terminal = Terminal()
+    Console(file=terminal, force_terminal=True, color_system=None, width=99).print(_rich([Piece(EVIL, style)]))
+    assert re.sub(r"\x1b\[\d*m", "", terminal.text()).rstrip("\n") == SHOWN
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_findings_of_doctor(is_terminal: bool) -> None:
+    findings = Findings(EVIL)
+    findings.error("x", EVIL, EVIL, EVIL)
+    out = Terminal() if is_terminal else io.StringIO()
+    with redirect_stdout(out):
+        _show(findings.found)
+    text = re.sub(r"\x1b\[[\d;]*m", "", out.text() if isinstance(out, Terminal) else out.getvalue())
+    assert is_clean(text)
+    assert text.count("fake") == 4
+
+
+def test_a_log_line_is_one_line() -> None:
+    stream = io.StringIO()
+    handler = BackgroundHandler(stream, longest_end_s=60)
+    handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
+    handler.emit(logging.LogRecord("x", logging.WARNING, "", 0, "said %s", (EVIL,), None))
+    try:
+        raise ValueError(EVIL)
+    except ValueError as error:
+        handler.emit(logging.LogRecord("x", logging.ERROR, "", 0, "b", (), (ValueError, error, error.__traceback__)))
+    handler.close()
+    assert stream.getvalue().startswith(f"WARNING said {SHOWN}\nERROR b\nTraceback")
+    assert is_clean(stream.getvalue())
+
+
+def test_a_file_that_is_written_to_a_terminal() -> None:
+    text = f'VERSION "{EVIL}"\n'
+    terminal = Terminal()
+    with redirect_stdout(terminal):
+        write_output("-", text, "utf-8")
+    assert is_clean(terminal.text().replace("\r", ""))
+    pipe = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    with redirect_stdout(pipe):
+        write_output("-", text, "utf-8")
+    assert pipe.buffer.getvalue().decode() == text
+
+
+def test_what_a_library_logs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    main(["schema"])
+    capsys.readouterr()
+    record = logging.LogRecord("cantools", logging.WARNING, "", 0, "overwriting %s", (EVIL,), None)
+    assert logging.lastResort is not None
+    logging.lastResort.handle(record)
+    assert capsys.readouterr().err == f"kontronik-can-gw: overwriting {SHOWN}\n"
+
+
+# --- from end to end
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A configuration whose DBC and EDS are full of it."""
+    evil = "a\x1bEVIL\x07\x9b\u202eb"
+    dbc = re.sub(r'(CM_ (?:SG_|BO_)?[^"]*"|NotAvailable" 0x|VAL_ 1664 OperatingState 1 ")', rf"\1{evil}", DBC)
+    (tmp_path / "my.dbc").write_text(dbc)
+    eds = re.sub(r"ParameterName=([^\n]*)", "ParameterName=\\1 a\x1bEVIL\x07\x7fb", EDS)
+    (tmp_path / "my.eds").write_text(eds, "ascii")
+    (tmp_path / "gateway.toml").write_text(
+        '[can]\ninterface = "virtual"\n[dbc]\nfile = "my.dbc"\n'
+        '[canopen]\nenabled = true\nnode_id = 5\neds = "my.eds"\nstore = "."\n[[esc]]\nport = "p"\n'
+    )
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "words", [["check"], ["describe"], ["describe", "--format", "json"], ["describe", "--format", "html"]]
+)
+def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> None:
+    code, out, talk = program(*words, "-c", folder / "gateway.toml")
+    assert code == 0, talk
+    assert "?EVIL?" in out or "\\u001bEVIL\\u0007" in out
+    assert is_clean(out + talk)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("my.dbc", f'BO_ 1 X: 8 "{EVIL}"', ["dbc", "--from"]),
+        ("my.dbc", f"VERSION {EVIL}", ["describe", "--dbc"]),
+        ("x.toml", f'[can]\nchannel = "{EVIL[:3]}\n', ["check", "-c"]),
+        ("x.toml", '"\\u001b]0;x" = 1\n', ["check", "-c"]),
+        ("x.log", f"(1.0) can0 {EVIL}\n", ["convert", "--to", "csv", "--quiet"]),
+        ("x.kcap", EVIL, ["replay", "--to", "log"]),
+        ("\x1b]0;x\x07.bin", "", ["decode"]),
+    ],
+)
+def test_what_is_wrong_with_hostile_files(name: str, content: str, words: list[str], tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_text(content)
+    out, talk = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(talk):
+        try:
+            main([*words, str(path), *(["-"] if words[0] == "convert" else [])])
+        except SystemExit as end:
+            pytest.fail(f"usage: {end.code} {talk.getvalue()}")
+    assert is_clean(out.getvalue() + talk.getvalue())

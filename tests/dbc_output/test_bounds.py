@@ -1,0 +1,117 @@
+"""A DBC that asks for too much: one line, before cantools sees it."""
+
+from pathlib import Path
+
+import cantools.database
+import pytest
+
+from kontronik_can_gw.dbc_output.bounds import MAX_BYTES
+from kontronik_can_gw.dbc_output.layout import DbcSettings, load_database, parse_database
+from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.telemetry import EscSettings
+
+HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
+SIGNAL = 'SG_ s : 0|8@1+ (1,0) [0|0] "" A\n'
+PAGED = 'BO_ 1 Msg: 8 A\n SG_ m M : 0|32@1+ (1,0) [0|0] "" A\n SG_ s m0 : 32|8@1+ (1,0) [0|0] "" A\n'
+ATTRIBUTE = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\n'
+
+
+def nested(depth: int, width: int) -> str:
+    """Multiplexers in a chain, each page of each with all pages of the next: ``width`` to the power of ``depth`` pages."""
+    signals = [f' SG_ s{n} m0M : {n}|1@1+ (1,0) [0|0] "" A\n' for n in range(1, depth)]
+    ranges = [f"SG_MUL_VAL_ 1 s{n} s{n - 1} 0-{width - 1};\n" for n in range(1, depth)]
+    return "".join(['BO_ 1 Msg: 8 A\n SG_ s0 M : 0|1@1+ (1,0) [0|0] "" A\n', *signals, *ranges])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"BO_ 1 Msg: 400000000 A\n {SIGNAL}", "Msg: length in bytes is 400000000, not 0 to 1785"),
+        (f"BO_ 1 Msg: // 8\n 400000000 A\n {SIGNAL}", "Msg: length in bytes is 400000000"),
+        (f"BO_ 1 Msg: 8 A\n {SIGNAL.replace('|8@', '|4294967295@')}", "Msg.s: length in bits is 4294967295"),
+        (
+            f"BO_ 1 Msg: 8 A\n {SIGNAL.replace(': 0|', ': 4294967295|')}",
+            "Msg.s: start bit is 4294967295, not 0 to 14279",
+        ),
+        (f"BO_ 1 Msg: 8 A\n {SIGNAL.replace(': 0|', ': -1|')}", "Msg.s: start bit is -1"),
+        (f"BO_ 99999999999 Msg: 8 A\n {SIGNAL}", "Msg: CAN id is 99999999999"),
+        (f"BO_ -1 Msg: 8 A\n {SIGNAL}", "Msg: CAN id is -1"),
+        (PAGED.replace("m0", "m99999999999"), "Msg.s: multiplexer value is 99999999999"),
+        (PAGED + "SG_MUL_VAL_ 1 s m 0-3000000;", "SG_MUL_VAL_ of s: number of multiplexer values in all is 3000001"),
+        (PAGED + "SG_MUL_VAL_ 1 s m 0 93000000;", "SG_MUL_VAL_ of s: number of multiplexer values in all is 3000001"),
+        (PAGED + "SG_MUL_VAL_ 1 s m 0-40000, 0-40000;", "number of multiplexer values in all is 80002"),
+        (PAGED + "VAL_ 1 m" + ' 1 "x"' * 70_000 + ";", "Msg: number of multiplexer values in all is 70001"),
+        (nested(5, 16), "Msg: number of multiplexer values in all is 88740"),
+        (nested(20, 2), "Msg: depth of multiplexers is 9"),
+        ("".join(f"BO_ {n} M{n}: 8 A\n" for n in range(10_001)), "number of messages is 10001"),
+        ("BO_ 1 Msg: 8 A\n" + f" {SIGNAL}" * 4_097, "Msg: number of signals is 4097"),
+        ("BU_:" + " A" * 2_001, "number of nodes is 2001"),
+        ("BO_ 1 Msg: 8 A\n" + " ," * 500_000, "more than 500000 words"),
+        (SIGNAL.replace("(1,", f"({'1' * 5000},"), "line 5: a number of more than 400 digits"),
+        (ATTRIBUTE + 'BA_ "GenMsgCycleTime" BO_ 1 1e999999999;', "line 6: exponent is 999999999, not 0 to 4200"),
+        (ATTRIBUTE + 'BA_DEF_DEF_ "GenMsgCycleTime" " 1e999_999_999";', "line 6: exponent is 999999999"),
+        ('VAL_TABLE_ T 0 "' + "x" * 10_000 + '";\n' + "VAL_ 1 s T;\n" * 801, "value tables that VAL_ names"),
+        (" " * MAX_BYTES, "is larger than 8 MB"),
+    ],
+)
+def test_what_is_out_of_bounds_is_one_line_and_cantools_is_not_called(
+    text: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cantools.database, "load_string", lambda *_, **__: pytest.fail("cantools was called"))
+    with pytest.raises(UserError) as caught:
+        parse_database((HEAD + text).encode(), "my.dbc")
+    (line,) = caught.value.problems
+    assert line.startswith("my.dbc: ")
+    assert said in line
+    assert len(line) < 200
+
+
+def test_a_file_without_end_is_read_up_to_the_limit() -> None:
+    with pytest.raises(UserError, match="larger than 8 MB"):
+        load_database(Path("/dev/zero"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"BO_ 3221225472 VECTOR__INDEPENDENT_SIG_MSG: 0 A\n {SIGNAL}BO_ 1 Msg: 8 A\n {SIGNAL}",
+        f"BO_ 1 J1939Transport: 1785 A\n {SIGNAL.replace('|8@', '|13824@')}",
+        PAGED + "SG_MUL_VAL_ 1 s m 0-255, 1000-1010;",
+        nested(3, 4),
+        f'BO_ 1 Msg: 8 A\n {SIGNAL}CM_ "SG_MUL_VAL_ 1 s m 0-3000000; BO_ 1 Msg: 400000000 A {"1" * 500}";',
+        f'BO_ 1 Msg: 8 A\n {SIGNAL}CM_ BO_ 1 "part 1E123456, http://x";',
+    ],
+)
+def test_what_real_files_have_is_read(text: str) -> None:
+    assert parse_database((HEAD + text).encode(), "my.dbc").messages
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"BO_ 1 Msg: 8 A\n {SIGNAL.replace('|8@1+', '|14280@1-')}", "s: lies outside the message's 8 bytes"),
+        (f"BO_ 1 Msg: 1785 A\n {SIGNAL.replace('|8@1+', '|14280@1-')}", "CAN FD has no frames of 1785 bytes"),
+        (PAGED + "SG_MUL_VAL_ 1 s m 0-2000;", "Msg: has 2001 multiplexer values; 1024 are supported"),
+        (
+            ATTRIBUTE + f'BO_ 1 Msg: 8 A\n {SIGNAL}BA_ "GenMsgCycleTime" BO_ 1 1e4000;',
+            "GenMsgCycleTime is '1000",
+        ),
+        (
+            "BO_ 1 Msg: 8 A\n" + "".join(f" {SIGNAL.replace('s', f's{n}')}" for n in range(1_000)),
+            "s999: overlaps s0",
+        ),
+    ],
+)
+def test_what_only_our_messages_must_not_ask_for_is_said_shortly(text: str, said: str) -> None:
+    with pytest.raises(UserError) as caught:
+        prepare(parse_database((HEAD + text).encode(), "my.dbc"), "my.dbc", [EscSettings("esc1")], DbcSettings())
+    assert any(said in line for line in caught.value.problems)
+    assert len(caught.value.problems) < 3_000
+    assert all(len(line) < 500 for line in caught.value.problems)
+
+
+def test_what_cantools_quotes_of_a_file_is_cut_short() -> None:
+    with pytest.raises(UserError) as caught:
+        parse_database((HEAD + "BO_ x" * 10_000).encode(), "my.dbc")
+    assert len(caught.value.problems[0]) < 400

@@ -1,0 +1,315 @@
+"""Node-IDs and messages belong to one gateway on a machine; nobody but a gateway can take one."""
+
+import errno
+import fcntl
+import os
+import selectors
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config import parse
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime import locks
+from kontronik_can_gw.runtime.can_side import CanSide
+from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.locks import (
+    Locks,
+    Taken,
+    file_name,
+    in_use,
+    lock_file,
+    lock_name,
+    messages_lock,
+    network_namespace,
+    node_lock,
+)
+
+CHANNEL = "can0"
+NODE = node_lock(CHANNEL, 5)
+ME, SERVICE, STRANGER = os.geteuid(), 61234, 61235
+
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="to give files to other users is root's")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The system's folder, of this test alone."""
+    path = tmp_path / "run" / "lock"
+    monkeypatch.setattr(locks, "SYSTEM_FOLDER", path)
+    return path
+
+
+def file_of(name: str) -> Path:
+    return locks.SYSTEM_FOLDER / file_name(name, network_namespace())
+
+
+def make(name: str, uid: int = ME, mode: int = 0o600) -> Path:
+    path = file_of(name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch(mode)
+    if uid != ME:
+        os.chown(path, uid, uid)
+    return path
+
+
+def test_what_one_has_another_cannot_have_until_it_is_given_back() -> None:
+    first, second = Locks(), Locks()
+    names = [node_lock(CHANNEL, 5), node_lock(CHANNEL, 6), messages_lock(CHANNEL, 0x680)]
+    assert first.hold(names) == []
+    assert first.hold(names) == []
+    assert second.hold([node_lock(CHANNEL, 6), node_lock(CHANNEL, 7)]) == [node_lock(CHANNEL, 6)]
+    assert first.hold([node_lock(CHANNEL, 5)]) == []
+    assert second.hold([node_lock(CHANNEL, 6), node_lock(CHANNEL, 7)]) == []
+    first.close()
+    assert second.hold([node_lock(CHANNEL, 5)]) == []
+    second.close()
+    assert list(locks.SYSTEM_FOLDER.iterdir()) == []
+
+
+def test_a_lock_ends_with_the_process_whatever_ends_it() -> None:
+    code = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from kontronik_can_gw.runtime import locks\n"
+        "locks.SYSTEM_FOLDER = Path(sys.argv[2])\n"
+        "mine = locks.Locks()\n"
+        "print(mine.hold([sys.argv[1]]), flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    mine = Locks()
+    with subprocess.Popen(
+        [sys.executable, "-c", code, NODE, str(locks.SYSTEM_FOLDER)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "[]\n"
+        assert mine.hold([NODE]) == [NODE]
+        other.kill()
+        other.wait()
+    assert mine.hold([NODE]) == []
+    mine.close()
+
+
+@pytest.mark.parametrize("name", [NODE, node_lock("/dev/serial/by-id/usb-A%2F_1@115200", 127), f"{'x' * 300}/node/1"])
+def test_a_file_name_stands_for_one_lock_in_one_network_namespace(name: str) -> None:
+    file = file_name(name, 4026531840)
+    assert "/" not in file
+    assert len(file) < 250
+    assert file != file_name(name + "0", 4026531840)
+    assert file != file_name(name, 4026531841)
+    assert lock_name(file, 4026531841) is None
+    assert len(name) > 255 or lock_name(file, 4026531840) == name
+
+
+@pytest.mark.parametrize("channel", ["can0", "/dev/ttyACM0@115200"])
+def test_what_is_said_names_interface_number_and_remedy(channel: str) -> None:
+    assert str(in_use(node_lock(channel, 12))).startswith(f"CANopen node 12 on {channel}: another gateway")
+    assert f"CAN {channel}: another gateway" in str(in_use(messages_lock(channel, 0x680)))
+    assert "from 680h on" in str(in_use(messages_lock(channel, 0x680)))
+
+
+@pytest.mark.parametrize("dbc", [True, False])
+def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_opens_the_bus(dbc: bool) -> None:
+    tables = {
+        "can": {"channel": CHANNEL},
+        "dbc": {"enabled": dbc},
+        "canopen": {"enabled": not dbc, "node_id": 42, "store": "/nowhere"},
+        "esc": [{"port": "p"}],
+    }
+    loaded = assemble(parse(tables, "test"))
+    sides = []
+    try:
+        for _ in range(2):
+            gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
+            selector = selectors.DefaultSelector()
+            sides.append(CanSide(loaded.config.can, gateway, selector, Conditions()))
+        sides[0].open(0, wait=True)
+        with pytest.raises(RunError, match=f"messages from 680h|CANopen node 42 on {CHANNEL}"):
+            sides[1].open(0, wait=True)
+        sides[0].close()
+        sides[1].open(0, wait=True)
+    finally:
+        for side in sides:
+            side.close()
+
+
+# --- others
+
+
+def test_a_socket_of_any_user_keeps_nobody_from_starting() -> None:
+    """Names of abstract sockets are anybody's: they stood for node-IDs once."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
+        stranger.bind(f"\0kontronik-can-gw/{NODE}")
+        mine = Locks()
+        assert mine.hold([NODE]) == []
+        mine.close()
+
+
+def test_a_link_is_not_followed_and_not_obeyed(tmp_path: Path) -> None:
+    target = tmp_path / "target"
+    target.write_text("kept")
+    make(NODE).unlink()
+    file_of(NODE).symlink_to(target)
+    said: list[str] = []
+    mine = Locks(report=said.append)
+    with target.open() as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert mine.hold([NODE]) == []
+    mine.close()
+    assert "cannot be locked" in said[0]
+    assert target.read_text() == "kept"
+
+
+@pytest.mark.parametrize("kind", ["fifo", "folder", "hard link"])
+def test_what_is_no_plain_file_is_reported_and_not_obeyed(kind: str, tmp_path: Path) -> None:
+    path = make(NODE)
+    if kind == "hard link":
+        os.link(path, tmp_path / "other")
+    else:
+        path.unlink()
+        (os.mkfifo if kind == "fifo" else os.mkdir)(path)
+    said: list[str] = []
+    mine = Locks(report=said.append)
+    assert mine.hold([NODE, node_lock(CHANNEL, 6)]) == []
+    mine.close()
+    assert len(said) == 1
+
+
+@needs_root
+@pytest.mark.parametrize(
+    ("folders_owner", "files_owner", "obeyed"),
+    [(0, 0, True), (SERVICE, SERVICE, True), (SERVICE, 0, True), (0, STRANGER, False), (SERVICE, STRANGER, False)],
+)
+def test_only_what_is_roots_or_the_services_is_obeyed(folders_owner: int, files_owner: int, obeyed: bool) -> None:
+    path = make(NODE, files_owner)
+    os.chown(path.parent, folders_owner, folders_owner)
+    path.parent.chmod(0o1777)
+    said: list[str] = []
+    mine = Locks(report=said.append)
+    with path.open() as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert mine.hold([NODE]) == ([NODE] if obeyed else [])
+    mine.close()
+    assert bool(said) is not obeyed
+
+
+@needs_root
+def test_the_service_can_lock_what_root_has_made(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    os.chown(folder, SERVICE, SERVICE)
+    fd = lock_file(str(folder / "x"))
+    assert (folder / "x").stat().st_uid == SERVICE
+    os.close(fd)
+
+
+@needs_root
+def test_a_users_gateway_reports_the_services_lock_and_obeys_roots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    roots = node_lock(CHANNEL, 6)
+    with make(NODE, SERVICE).open() as service, make(roots).open() as root:
+        said: list[str] = []
+        mine = Locks(tmp_path / "mine", said.append)
+        for file in (service, root):
+            fcntl.flock(file, fcntl.LOCK_EX)
+        assert mine.hold([NODE, roots, node_lock(CHANNEL, 7)]) == [roots]
+        mine.close()
+    assert said == [f"{NODE}: a gateway of user {SERVICE} has this too; this one goes on. End one of them."]
+
+
+def test_a_file_that_its_holder_removes_is_not_mistaken_for_the_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The holder removes its file between our opening and our locking: the name is free again, and what we have locked is nothing."""
+    path = tmp_path / "x"
+    path.touch()
+    real = fcntl.flock
+    removed: list[bool] = []
+
+    def flock(fd: int, operation: int) -> None:
+        if not removed:
+            path.unlink()
+            removed.append(True)
+        real(fd, operation)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    fd = lock_file(str(path))
+    assert os.path.samestat(os.fstat(fd), path.stat())
+    with pytest.raises(Taken):
+        lock_file(str(path))
+    os.close(fd)
+
+
+# --- folders
+
+
+@pytest.mark.parametrize(
+    ("uid", "writable", "runtime", "expected"),
+    [
+        (0, set(), "/run/user/0", "SYSTEM"),
+        (1000, {"SYSTEM"}, "/run/user/1000", "SYSTEM"),
+        (1000, {"/run/user/1000"}, "/run/user/1000", "/run/user/1000/kontronik-can-gw/lock"),
+        (1000, set(), "/run/user/0", "/tmp/kontronik-can-gw-1000"),
+        (1000, set(), "relative", "/tmp/kontronik-can-gw-1000"),
+        (1000, set(), None, "/tmp/kontronik-can-gw-1000"),
+    ],
+)
+def test_the_folder_is_the_services_or_the_users_own(
+    uid: int, writable: set[str], runtime: str | None, expected: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder.mkdir(parents=True)
+    allowed = {str(folder) if name == "SYSTEM" else name for name in writable}
+    monkeypatch.setattr(os, "geteuid", lambda: uid)
+    monkeypatch.setattr(os, "access", lambda path, _mode: str(path) in allowed)
+    if runtime is None:
+        monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    else:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", runtime)
+    assert str(locks.lock_folder()) == (str(folder) if expected == "SYSTEM" else expected)
+
+
+def broken(kind: str, path: Path) -> None:
+    if kind == "link":
+        (path.parent / "elsewhere").mkdir()
+        path.symlink_to(path.parent / "elsewhere")
+    elif kind == "file":
+        path.touch()
+    elif kind == "open to all":
+        path.mkdir()
+        path.chmod(0o777)
+    elif kind == "a stranger's":
+        path.mkdir()
+        os.chown(path, STRANGER, STRANGER)
+
+
+@pytest.mark.parametrize("kind", ["link", "file", "open to all", pytest.param("a stranger's", marks=needs_root)])
+def test_a_users_folder_that_others_can_change_is_reported_once_and_done_without(kind: str, tmp_path: Path) -> None:
+    broken(kind, tmp_path / "mine")
+    said: list[str] = []
+    mine = Locks(tmp_path / "mine", said.append)
+    assert mine.hold([NODE]) == mine.hold([NODE, node_lock(CHANNEL, 6)]) == []
+    mine.close()
+    assert len(said) == 1
+    assert "Nothing keeps a second gateway" in said[0]
+
+
+def test_where_nothing_can_be_written_the_gateway_goes_on_and_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    said: list[str] = []
+    mine = Locks(report=said.append)
+    assert mine.hold([NODE]) == mine.hold([NODE, node_lock(CHANNEL, 6)]) == []
+    mine.close()
+    assert len(said) == 1
+    assert "Read-only file system" in said[0]
