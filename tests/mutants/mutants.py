@@ -8,6 +8,7 @@ in proportion to the unmutated tests. --compare exits with 1 where a package's s
 """
 
 import argparse
+import builtins
 import gc
 import importlib
 import json
@@ -16,23 +17,20 @@ import resource
 import signal
 import sys
 import tempfile
-import threading
 import time
 import warnings
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import CodeType, FrameType, ModuleType
+from types import CodeType, ModuleType
 from typing import Any, NoReturn
 
-from mutations import Mutation, mutations
+from mutations import Mutation, mutations, noting_lines
 
 PROJECT = Path(__file__).resolve().parents[2]
 SAMPLE, EXAMPLES = 100, 25
 LIMIT_FACTOR, LEAST_LIMIT_S, COLLECTION_LIMIT_S = 20, 2.0, 60.0  # CPU time
 BLOCKED_S = 900  # wall time after which a mutant that waits is given up, undecided
-ENOUGH_LINES = 10_000  # of one function in one test: what it executes after that, it has executed before
 MEMORY = 6 << 30
 NOT_DECIDED = (70, -signal.SIGALRM)
 PACKAGES = {
@@ -41,19 +39,18 @@ PACKAGES = {
     "cia301": (("cia301", "cia305"), ("tests/cia301", "tests/cia305", "tests/eds")),
 }
 Result = dict[str, Any]
-_settrace = sys.settrace  # a test may replace it
+NOTE = "_note_of_mutants"
 
 
 class Watch:
     """A pytest plugin: chooses and orders tests, limits each one's CPU time, notes what it takes and the lines it executes."""
 
-    def __init__(self, limits: Mapping[str, float] | None = None, traced: str = "") -> None:
-        self.limits, self.traced = limits, traced
+    def __init__(self, limits: Mapping[str, float] | None = None) -> None:
+        self.limits = limits
         self.seconds: dict[str, float] = {}
         self.failed: list[str] = []
-        self.lines: dict[str, set[tuple[str, int]]] = {"": set()}  # by test; "": while all was imported
-        self.here = self.lines[""]
-        self.executed = Counter[CodeType]()
+        self.executed: set[tuple[str, int]] = set()
+        self.lines: dict[str, set[tuple[str, int]]] = {}  # by test; "": while all was imported
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
         if self.limits is not None:
@@ -63,37 +60,19 @@ class Watch:
             _derandomise(getattr(item.obj, "__func__", item.obj))
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        self.here, self.executed = self.lines.setdefault(nodeid, set()), Counter()
+        self.pytest_runtest_logfinish("")
         self.seconds[nodeid] = -time.process_time()
         limit_cpu(COLLECTION_LIMIT_S if self.limits is None else self.limits[nodeid])
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        self.seconds[nodeid] += time.process_time()
+        self.seconds[nodeid] = self.seconds.get(nodeid, 0.0) + time.process_time()
+        self.lines.setdefault(nodeid, set()).update(self.executed)
+        self.executed.clear()
         limit_cpu(COLLECTION_LIMIT_S)
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         if report.failed:
             self.failed.append(report.nodeid)
-
-    def pytest_runtest_setup(self) -> None:
-        if self.traced:
-            threading.settrace(self._trace)
-            _settrace(self._trace)
-
-    pytest_sessionstart = pytest_runtest_call = pytest_runtest_setup
-
-    def _trace(self, frame: FrameType, _event: str, _argument: Any) -> Callable[..., Any] | None:
-        code, here, executed = frame.f_code, self.here, self.executed
-        if not code.co_filename.startswith(self.traced) or executed[code] > ENOUGH_LINES:
-            return None
-
-        def each_line(frame: FrameType, _event: str, _argument: Any) -> Callable[..., Any]:
-            here.add((code.co_filename, frame.f_lineno))
-            executed[code] += 1
-            frame.f_trace_lines = executed[code] <= ENOUGH_LINES
-            return each_line
-
-        return each_line(frame, "", None)
 
 
 def _derandomise(test: Any) -> None:
@@ -139,27 +118,37 @@ def _run(watch: Watch, tests: Sequence[str], mutant: Mutation | None, result: in
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         for stream in (0, 1, 2) if mutant else (0, 1):
             os.dup2(os.open(os.devnull, os.O_RDWR), stream)
-        if mutant:
-            _mutate(mutant)
+        _import_otherwise(watch, mutant)
         options = ["-q", "-p", "no:cacheprovider", "--assert=plain", "--tb=no", *(["-x"] if mutant else [])]
         status = int(pytest.main([*options, *tests], plugins=[watch]))
-        _settrace(None)
         if not mutant:
             others = [name for name, module in sys.modules.items() if _is_of_others(module)]
-            found = {"seconds": watch.seconds, "lines": watch.lines, "failed": watch.failed, "others": others}
+            found = {
+                "seconds": {test: s for test, s in watch.seconds.items() if test},
+                "lines": watch.lines,
+                "failed": watch.failed,
+                "others": others,
+            }
             os.write(result, repr(found).encode())
     finally:
         os._exit(status)
 
 
-def _mutate(mutant: Mutation) -> None:
-    """What is imported from now on."""
-    mutant.put_in()
+def _import_otherwise(watch: Watch, mutant: Mutation | None) -> None:
+    """From now on the mutant's file is imported with it; without a mutant, in the first run, the project's notes its lines."""
     whole = SourceFileLoader.get_code
+    setattr(builtins, NOTE, watch.executed.add)
 
     def get_code(self: SourceFileLoader, name: str) -> CodeType | None:
-        return compile(mutant.tree, self.path, "exec") if name == mutant.module else whole(self, name)
+        if mutant and name == mutant.module:
+            return compile(mutant.tree, self.path, "exec")
+        if not mutant and watch.limits is None and name.startswith("kontronik_can_gw."):
+            file = str(Path(self.path).relative_to(PROJECT))
+            return compile(noting_lines(Path(self.path).read_text(), file, NOTE), self.path, "exec")
+        return whole(self, name)
 
+    if mutant:
+        mutant.put_in()
     SourceFileLoader.get_code = get_code  # type: ignore[method-assign,assignment]
 
 
@@ -170,7 +159,7 @@ def _is_of_others(module: ModuleType) -> bool:
 
 def unmutated(tests: Sequence[str]) -> Result:
     """Which test executes which lines and takes how long; and that all pass in the order in which mutants meet them."""
-    status, known = in_child(Watch(traced=f"{PROJECT}/kontronik_can_gw/"), tests)
+    status, known = in_child(Watch(), tests)
     if status == 0:
         for name in known["others"]:  # so that a mutant's process has them from the start
             try:
@@ -187,16 +176,16 @@ def unmutated(tests: Sequence[str]) -> Result:
 
 
 def is_killed(mutant: Mutation, known: Result) -> bool:
-    lines = {(str(PROJECT / mutant.file), line) for line in mutant.lines}
-    at_import = not lines.isdisjoint(known["lines"][""])
-    seconds = known["seconds"]
-    chosen = [test for test in seconds if at_import or not lines.isdisjoint(known["lines"][test])]
-    limits = {
-        test: max(LEAST_LIMIT_S, LIMIT_FACTOR * seconds[test]) for test in sorted(chosen, key=seconds.__getitem__)
-    }
+    place, seconds, lines = (str(mutant.file), mutant.line), known["seconds"], known["lines"]
+    seeing = {test for test in seconds if place in lines[test] or place in lines[""]}
+    files = sorted({test.partition("::")[0] for test in seeing})
+    # what a fixture or a cache executes is noted for the first test only: the others of these files follow
+    chosen = [test for test in seconds if test.partition("::")[0] in files]
+    chosen.sort(key=lambda test: (test not in seeing, seconds[test]))
+    limits = {test: max(LEAST_LIMIT_S, LIMIT_FACTOR * seconds[test]) for test in chosen}
     if not limits:
         return False
-    status, _ = in_child(Watch(limits), sorted({test.partition("::")[0] for test in limits}), mutant)
+    status, _ = in_child(Watch(limits), files, mutant)
     if status in NOT_DECIDED:
         print(f"  not decided, counted as surviving: {mutant.key} {mutant}", flush=True)
     return status not in (0, *NOT_DECIDED)

@@ -31,14 +31,14 @@ _Place = tuple[ast.AST, str, int | None, ast.AST]  # the parent, its field, the 
 
 @dataclass(frozen=True, eq=False)
 class Mutation:
-    """``after`` in the place of a node. ``lines`` of its statement (or of its head): a test that executes none cannot see it."""
+    """``after`` in the place of a node. ``line``: where its statement begins; a test that does not execute that cannot see it."""
 
     file: Path
     tree: ast.Module
     function: str
     place: _Place
     after: ast.AST
-    lines: range
+    line: int
     key: str
 
     def __str__(self) -> str:
@@ -60,34 +60,43 @@ class Mutation:
 def mutations(file: Path, source: str) -> Iterator[Mutation]:
     """All mutations of a file in the order of its source."""
     tree, seen = ast.parse(source), Counter[str]()
-    for function, lines, place in _places(tree, "", range(1)):
+    for function, line, place in _places(tree, "", 0):
         for kind, after in _instead(place[3]):
             identity = f"{file}|{function}|{kind}|{_text(place[3])}|{_text(after)}"
             seen[identity] += 1
             key = hashlib.sha256(f"{identity}|{seen[identity]}".encode()).hexdigest()[:10]
-            yield Mutation(file, tree, function or "<module>", place, after, lines, key)
+            yield Mutation(file, tree, function or "<module>", place, after, line, key)
 
 
-def _places(node: ast.AST, function: str, lines: range) -> Iterator[tuple[str, range, _Place]]:
-    """All that code reads: function, lines of the statement, place. What only people or type checkers read is left out."""
+def noting_lines(source: str, file: str, name: str) -> ast.Module:
+    """The source with a call of ``name`` (file, line) in front of each statement."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        for field, body in ast.iter_fields(node):
+            if isinstance(body, list) and body and isinstance(body[0], ast.stmt):
+                noted: list[ast.stmt] = []
+                for at, statement in enumerate(body):
+                    is_docstring = (
+                        at == 0 and isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+                    )
+                    call = f"{name}(({file!r}, {statement.lineno}))"
+                    noted += [statement] if is_docstring else [*ast.parse(call).body, statement]
+                setattr(node, field, noted)
+    return tree
+
+
+def _places(node: ast.AST, function: str, line: int) -> Iterator[tuple[str, int, _Place]]:
+    """All that code reads: function, line of the statement, place. What only people or type checkers read is left out."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         function = f"{function}.{node.name}".lstrip(".")
     for name, value in ast.iter_fields(node):
         for index, child in enumerate(value) if isinstance(value, list) else [(None, value)]:
             if name in _UNTOUCHED or not isinstance(child, ast.AST) or _is_type(node, name, index):
                 continue
-            of_child = _lines(child) or lines
+            of_child = child.lineno if isinstance(child, ast.stmt) else line
             yield function, of_child, (node, name, index, child)
             if not _is_for_people(child):
                 yield from _places(child, function, of_child)
-
-
-def _lines(node: ast.AST) -> range | None:
-    if not isinstance(node, ast.stmt | ast.ExceptHandler):
-        return None
-    first = min(each.lineno for each in (node, *getattr(node, "decorator_list", ())))
-    body = getattr(node, "body", None)
-    return range(first, max(body[0].lineno, first + 1) if body else (node.end_lineno or first) + 1)
 
 
 def _is_for_people(node: ast.AST) -> bool:

@@ -5,7 +5,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from mutations import Mutation, mutations
+from mutations import Mutation, mutations, noting_lines
 from put_in_faults import PROJECT, Fault, faults
 
 FILE = Path("kontronik_can_gw/some.py")
@@ -73,7 +73,7 @@ def test_a_key_does_not_depend_on_what_stands_elsewhere() -> None:
     assert len({mutant.key for mutant in mutants(more)}) == len(mutants(more))
 
 
-def test_a_mutant_is_seen_by_the_lines_of_its_statement() -> None:
+def test_a_mutant_is_at_the_line_of_its_statement() -> None:
     source = """\
         if a < (
             b
@@ -82,7 +82,26 @@ def test_a_mutant_is_seen_by_the_lines_of_its_statement() -> None:
                 1
             )
     """
-    assert {tuple(mutant.lines) for mutant in mutants(source)} == {(1, 2, 3), (4, 5, 6)}
+    assert {mutant.line for mutant in mutants(source)} == {1, 4}
+
+
+def test_each_statement_that_is_executed_is_noted() -> None:
+    source = """\
+        "docstring"
+        if 1 < 2:
+            x = [
+                1
+            ]
+        elif x:
+            y = 2
+        for z in x:
+            w = z
+        else:
+            v = 3
+    """
+    seen: list[tuple[str, int]] = []
+    exec(compile(noting_lines(textwrap.dedent(source), "f", "note"), "f", "exec"), {"note": seen.append})
+    assert seen == [("f", line) for line in (2, 3, 8, 9, 11)]
 
 
 @pytest.mark.parametrize("fault", faults(), ids=lambda fault: fault.what)
