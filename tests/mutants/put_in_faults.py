@@ -72,7 +72,19 @@ def faults(path: Path = LIST) -> list[Fault]:
 
 def run(tests: tuple[str, ...], folder: Path, limit_s: float) -> tuple[int, float]:
     """pytest's status in a copy of the project, and the CPU time it took."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no", *tests]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--tb=no",
+        "-m",
+        "not extended",
+        *tests,
+    ]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"}
     before = _children_s()
     process = subprocess.run(
