@@ -1,0 +1,119 @@
+"""Live frames as a read mostly brings them: one, whole and alone. The gateway asks ``receive_live`` first, then ``receive``."""
+
+import zlib
+
+import pytest
+from protocol.reference import ambiguous
+
+from kontronik_can_gw.protocol import InfoData, Layout, LiveData, encode
+from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry
+
+STEP = 10 * MS
+FLIGHT = [
+    LiveData(electrical_speed=20_000, battery_voltage=2400, battery_current=100, operating_state=21),
+    LiveData(electrical_speed=20_000, battery_voltage=2300, battery_current=-50),  # regeneration: drawn is nothing
+    LiveData(electrical_speed=0, battery_voltage=2410, battery_current=7, bec_current=1200, throttle=-100),
+    LiveData(electrical_speed=1, battery_voltage=2390, battery_current=300, operating_errors=1 << 31),
+    LiveData(),
+]
+
+
+def read(telemetry: EscTelemetry, data: bytes, now: int) -> bool:
+    """As the gateway gives what it has read; True if it was taken as one live frame."""
+    if telemetry.receive_live(data, now):
+        return True
+    telemetry.receive(data, now)
+    return False
+
+
+def started() -> tuple[EscTelemetry, int]:
+    telemetry = EscTelemetry(EscSettings(), 0)
+    telemetry.receive(encode(LiveData(), Layout.V4), SECOND)
+    return telemetry, SECOND
+
+
+def test_values_counters_energy_and_run_time() -> None:
+    telemetry, now = started()
+    length = len(encode(LiveData(), Layout.V4))
+    energy = run_time = 0
+    before = LiveData()
+    for number, data in enumerate(FLIGHT * 20, 1):
+        now += STEP
+        energy += max(0, before.battery_voltage * before.battery_current) * STEP
+        run_time += STEP if before.electrical_speed else 0
+        assert read(telemetry, encode(data, Layout.V4), now)
+        assert (telemetry.live, telemetry.last_live, telemetry.live_values) == (data, data, tuple(data))
+        assert telemetry.live_ns == now
+        assert telemetry.energy == energy
+        assert telemetry.run_time == run_time
+        counters = telemetry.counters
+        assert counters.live_v4 == counters.headers == 1 + number
+        assert counters.bytes == (1 + number) * length
+        assert counters.pending == counters.dropped_bytes == 0
+        before = data
+
+
+def test_no_energy_while_time_stands_still_or_goes_back() -> None:
+    telemetry, now = started()
+    frame = encode(FLIGHT[0], Layout.V4)
+    read(telemetry, frame, now + STEP)
+    energy, run_time = telemetry.energy, telemetry.run_time
+    assert read(telemetry, frame, now + STEP)
+    assert read(telemetry, frame, now)
+    assert (telemetry.energy, telemetry.run_time, telemetry.live_ns) == (energy, run_time, now + STEP)
+
+
+def test_frames_between_damage_are_at_their_places() -> None:
+    """What is found after damage is dropped for the right reason, and nothing of it is counted twice."""
+    telemetry, now = started()
+    frame = encode(FLIGHT[0], Layout.V4)
+    broken = frame[:10] + bytes((frame[10] ^ 1,)) + frame[11:]
+    for data in (broken, frame, frame, b"\x55" * 7, frame, frame[:20], frame[20:], frame):
+        now += STEP
+        read(telemetry, data, now)
+    counters = telemetry.counters
+    assert counters.bytes == counters.dropped_bytes + (1 + 5) * len(frame)
+    assert (counters.live, counters.crc_errors, counters.headers) == (6, 1, 7)
+    assert (counters.dropped_crc, counters.dropped_noise) == (len(broken), 7)
+    assert telemetry.live == FLIGHT[0]
+    assert telemetry.live_ns == now
+
+
+FRAME = encode(FLIGHT[0], Layout.V4)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        FRAME[:-1],
+        FRAME + FRAME,
+        FRAME + b"K",
+        FRAME[1:] + b"K",
+        FRAME[:-1] + bytes((FRAME[-1] ^ 0x80,)),
+        b"KODX" + FRAME[4:-4] + zlib.crc32(b"KODX" + FRAME[4:-4]).to_bytes(4, "little"),
+        encode(InfoData(), Layout.V4),
+        encode(FLIGHT[0], Layout.LEGACY),
+        encode(InfoData(), Layout.LEGACY),
+    ],
+)
+def test_of_anything_else_nothing_has_happened(data: bytes) -> None:
+    telemetry, now = started()
+    before = telemetry.counters.copy()
+    assert not telemetry.receive_live(data, now + STEP)
+    assert (telemetry.counters, telemetry.live, telemetry.live_ns) == (before, LiveData(), now)
+
+
+def test_where_two_layouts_match_it_is_the_shorter() -> None:
+    telemetry, now = started()
+    assert not read(telemetry, ambiguous("live"), now + STEP)
+    assert (telemetry.counters.live_v4, telemetry.counters.live_legacy) == (1, 1)
+
+
+def test_not_while_bytes_are_pending_or_there_is_no_live_frame_yet() -> None:
+    assert not EscTelemetry(EscSettings(), 0).receive_live(FRAME, SECOND)
+    telemetry, now = started()
+    telemetry.receive(b"KOD", now)
+    assert not read(telemetry, FRAME, now + STEP)
+    assert telemetry.counters.live == 2
+    assert telemetry.live == FLIGHT[0]
