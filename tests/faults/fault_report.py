@@ -64,6 +64,8 @@ class Row:
     recovered: int = 0
     worst_s: float = 0.0
     wrong: int = 0
+    old: int = 0
+    """Those of the wrong values that were right, but too late on the bus, or an age that was told too young."""
     lost: int = 0
     excused: int = 0
     """Values not sent because the machine as a whole stood still; no loss of the gateway's."""
@@ -85,7 +87,8 @@ class Row:
         """Lateness and loss are not judged on a machine that could not run; a wrong value or a byte to an ESC fails anywhere."""
         if self.good:
             return GOOD
-        return NOT_JUDGED if self.taken > MAX_TAKEN and not self.wrong and not self.transmitted else FAILED
+        only_late = self.wrong == self.old and not self.transmitted
+        return NOT_JUDGED if self.taken > MAX_TAKEN and only_late else FAILED
 
 
 class Report:

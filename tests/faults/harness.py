@@ -439,7 +439,7 @@ class Bench:
         lost, excused = self.account()  # of before; nobody's fault is the programme's too
         row.lost += lost
         row.excused += excused
-        wrong = self.watch.wrong_count
+        wrong, old = self.watch.wrong_count, self.watch.old_count
         injection = Injection(self, fault, range(len(self.ports)) if escs is None else escs)
         row.injected += 1
         failed = True
@@ -466,6 +466,7 @@ class Bench:
                 )
             fresh_wrong = self.watch.wrong_count - wrong
             row.wrong += fresh_wrong
+            row.old += self.watch.old_count - old
             if fresh_wrong and len(row.notes) < 8:
                 for each in self.watch.wrong[-min(fresh_wrong, 3) :]:
                     late = (each.at_ns - injection.begin_ns) / SECOND

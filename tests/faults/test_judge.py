@@ -89,6 +89,7 @@ def test_values_marked_as_not_available_are_never_wrong(judge: Judge) -> None:
 def test_an_old_value_is_wrong_and_its_age_is_said(judge: Judge) -> None:
     judge.take(SPEED_ID, of_live(judge, SPEED_ID, 10), START + 10 * PERIOD + 400 * MS)
     assert settled(judge) == ["old: frame 10, sent 0.400 s before"]
+    assert (judge.wrong_count, judge.old_count) == (1, 1)
 
 
 def test_an_old_value_is_excused_by_a_standstill_of_the_whole_machine_only(judge: Judge) -> None:
@@ -102,7 +103,7 @@ def test_a_value_that_was_never_sent_is_wrong_whatever_stood_still(judge: Judge)
     data[0] ^= 1
     judge.take(SPEED_ID, bytes(data), START + 10 * PERIOD + MS)
     judge.settle(lambda _begin, _end: 100 * SECOND)
-    assert judge.wrong_count == 1
+    assert (judge.wrong_count, judge.old_count) == (1, 0)
     assert "never sent" in judge.wrong[0].why
 
 
