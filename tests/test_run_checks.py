@@ -14,7 +14,7 @@ CASES = {
     "failed": "<testcase><failure/></testcase>",
     "broken": "<testcase><error/></testcase>",
     "skipped": "<testcase><skipped message='no such tool'/></testcase>",
-    "not judged": "<testcase><skipped message='not judged: 31 % steal'/></testcase>",
+    "not judged": "<testcase><skipped message='not judged: 31 % of the processor time was taken'/></testcase>",
 }
 
 
@@ -101,7 +101,7 @@ def test_what_is_missing_is_not_run_and_the_remedy_is_named(
         (3, 0, [], 0, 0),
         (3, 1, [], 1, 1),
         (3, 0, ["a.b: no such tool"], 0, 1),
-        (3, 0, ["uml.x: not judged: 31 % steal"], 0, 0),
+        (3, 0, ["uml.x: not judged: 31 % of the processor time was taken"], 0, 0),
     ],
 )
 def test_the_last_line_has_the_totals(

@@ -87,6 +87,8 @@ class Judge:
         """The newest ones, settled."""
         self.wrong_count = 0
         """Settled ones; see ``settle``."""
+        self.old_count = 0
+        """Of them those that were right, but late."""
         self.late_count = 0
         """Values that were old only because the machine stood still."""
         self.frames = 0
@@ -201,6 +203,7 @@ class Judge:
                     self.escs[each.esc].seen[each.n] |= each.follows
             else:
                 self.wrong_count += 1
+                self.old_count += each.since_ns is not None
                 if stood:
                     each = each._replace(why=f"{each.why}; the machine stood still for {stood // MS} ms of it")
                 self.wrong.append(each)
@@ -212,6 +215,7 @@ class Judge:
         for each in old:
             self.wrong.remove(each)
             self.wrong_count -= 1
+            self.old_count -= 1
             if each.follows:
                 self.escs[each.esc].seen[each.n] |= each.follows
         return len(old)

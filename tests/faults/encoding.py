@@ -26,6 +26,8 @@ class Identity(NamedTuple):
     cells: int = 6
     alarms: bool = False
     """Let alarm bits come and go, a change each 128 frames."""
+    errors: int = PROGRAMMING_ALLOWED
+    """Error bits that are set besides."""
 
 
 def mix(n: int, salt: int) -> int:
@@ -39,7 +41,7 @@ def mix(n: int, salt: int) -> int:
 def live(identity: Identity, n: int) -> LiveData:
     """The live frame number n of an ESC."""
     a, b, c, d = (mix(n, identity.salt * 8 + i) for i in range(4))
-    errors = PROGRAMMING_ALLOWED
+    errors = identity.errors
     if identity.alarms and n >> 7 & 1:
         errors |= 1 << (n >> 8) % 12
     return LiveData(

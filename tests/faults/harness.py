@@ -157,11 +157,17 @@ class Port(Protocol):
     def received(self) -> int:
         """Bytes that the gateway has sent to the ESC so far."""
 
+    @property
+    def echoed(self) -> int:
+        """Bytes that the kernel has echoed to the ESC so far, between the plug-in and the gateway's setting of the port."""
+
     def close(self) -> None: ...
 
 
 class PtyPort:
     """A fed ESC on a pseudo terminal behind a symbolic link; it may be unplugged and plugged in again."""
+
+    echoed = 0  # a pseudo terminal is made without echo
 
     def __init__(self, link: Path, identity: Identity, rate_hz: float = 50, plugged: bool = True) -> None:
         self.link = link
@@ -296,7 +302,7 @@ class Bench:
         self.losses: list[tuple[int, str]] = []
         """When each value was sent that was lost, and which it was."""
         self._accounted = [0 for _ in ports]
-        self._received = 0
+        self._received = self._echoed = 0
         self._excluded: list[list[tuple[int, int]]] = [[] for _ in ports]
 
     def write_configuration(self, options: str = "", esc_options: str = "") -> None:
@@ -433,7 +439,7 @@ class Bench:
         lost, excused = self.account()  # of before; nobody's fault is the programme's too
         row.lost += lost
         row.excused += excused
-        wrong = self.watch.wrong_count
+        wrong, old = self.watch.wrong_count, self.watch.old_count
         injection = Injection(self, fault, range(len(self.ports)) if escs is None else escs)
         row.injected += 1
         failed = True
@@ -460,6 +466,7 @@ class Bench:
                 )
             fresh_wrong = self.watch.wrong_count - wrong
             row.wrong += fresh_wrong
+            row.old += self.watch.old_count - old
             if fresh_wrong and len(row.notes) < 8:
                 for each in self.watch.wrong[-min(fresh_wrong, 3) :]:
                     late = (each.at_ns - injection.begin_ns) / SECOND
@@ -475,6 +482,10 @@ class Bench:
             received, self._received = self._received, sum(port.received() for port in self.ports)
             if self._received > received:
                 row.transmitted += self._received - received
+            echoed, self._echoed = self._echoed, sum(port.echoed for port in self.ports)
+            if self._echoed > echoed:
+                name = "bytes echoed by the kernel before the port was set"
+                row.figures[name] = row.figures.get(name, 0) + self._echoed - echoed
             if not failed and injection.in_time:
                 row.recovered += 1
             row.worst_s = max(row.worst_s, injection.recovery_s)

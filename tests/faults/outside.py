@@ -1,11 +1,12 @@
 """The fault programme seen from outside of its virtual machine: starts it, and decides which of its rows can be judged.
 
-The machine that this runs on may itself be a virtual one from which processor time is taken ("steal" in /proc/stat), which nobody
-inside can see. It is sampled while each fault runs. A fault that was late or lost values while much was taken is not judged, and is run
-once at a quieter moment if one comes soon. Nothing else is run twice.
+Processor time that the virtual machine wants and does not get is taken by the host of this machine ("steal" in /proc/stat) or by other
+work on it (run queue, /proc/PID/schedstat); nobody inside can see that. Both are sampled while each fault runs. A fault that was late or
+lost values while much was taken is not judged, and is run once at a quieter moment if one comes soon. Nothing else is run twice.
 """
 
 import argparse
+import contextlib
 import subprocess
 import sys
 import tempfile
@@ -15,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from fault_report import FAILED, MAX_STEAL, NOT_JUDGED, Fault, Report, line
+from fault_report import FAILED, MAX_TAKEN, NOT_JUDGED, Fault, Report, line
 
 PROJECT = Path(__file__).resolve().parents[2]
 BEGIN, END = ">>>", "<<<"
@@ -28,12 +29,20 @@ class Sample(NamedTuple):
     at_s: float
     stolen: int
     total: int
+    waited_s: float = 0.0
+    """For a processor, by all that belongs to the virtual machine."""
+
+    def share(self, since: "Sample") -> float:
+        """What was taken since an earlier one."""
+        ticks, seconds = self.total - since.total, self.at_s - since.at_s
+        stolen = (self.stolen - since.stolen) / ticks if ticks else 0.0
+        return stolen + ((self.waited_s - since.waited_s) / seconds if seconds else 0.0)
 
 
-def sample(text: str, at_s: float) -> Sample:
-    """Of the first line of /proc/stat: user, nice, system, idle, iowait, irq, softirq, steal."""
+def sample(text: str, at_s: float, waited_s: float = 0.0) -> Sample:
+    """Of the first line of /proc/stat: user, nice, system, idle, iowait, irq, softirq, load."""
     ticks = [int(word) for word in text.split("\n", 1)[0].split()[1:9]]
-    return Sample(at_s, ticks[7], sum(ticks))
+    return Sample(at_s, ticks[7], sum(ticks), waited_s)
 
 
 def worst_share(samples: Sequence[Sample], begin_s: float, end_s: float) -> float:
@@ -47,21 +56,45 @@ def worst_share(samples: Sequence[Sample], begin_s: float, end_s: float) -> floa
             first += 1
         if inside[last].at_s - inside[first].at_s < min(WINDOW_S, 0.9 * (inside[-1].at_s - inside[0].at_s)):
             continue
-        ticks = inside[last].total - inside[first].total
-        worst = max(worst, (inside[last].stolen - inside[first].stolen) / ticks if ticks else 0.0)
+        worst = max(worst, inside[last].share(inside[first]))
     return worst
 
 
-class Steal:
+class Load:
     """Samples in a thread."""
 
     def __init__(self) -> None:
         self.samples: list[Sample] = []
+        self.machine: int | None = None
+        """The process that has started the virtual machine, in a session of its own."""
+        self._waits: dict[str, int] = {}
+        self._waited_ns = 0
+        self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def take(self) -> None:
-        self.samples.append(sample(Path("/proc/stat").read_text(), time.monotonic()))
+        with self._lock:
+            self._add_waits()
+            waited_s = self._waited_ns / 1e9
+            self.samples.append(sample(Path("/proc/stat").read_text(), time.monotonic(), waited_s))
+
+    def _add_waits(self) -> None:
+        """What each thread of the virtual machine has waited since the last time; its processes come and go."""
+        sessions: dict[str, list[Path]] = {}
+        mine = ""
+        for stat in Path("/proc").glob("[0-9]*/stat") if self.machine else ():
+            with contextlib.suppress(OSError):
+                _, parent, _, session, *_ = stat.read_text().rpartition(")")[2].split()
+                sessions.setdefault(session, []).append(stat.parent)
+                if parent == str(self.machine) and session == stat.parent.name:
+                    mine = session
+        for process in sessions.get(mine, ()):
+            for file in process.glob("task/*/schedstat"):
+                with contextlib.suppress(OSError, IndexError):
+                    waited = int(file.read_text().split()[1])
+                    self._waited_ns += waited - self._waits.get(str(file), 0)
+                    self._waits[str(file)] = waited
 
     def _run(self) -> None:
         while not self._stop.wait(0.5):
@@ -72,7 +105,7 @@ class Steal:
         end = time.monotonic() + QUIET_WITHIN_S
         while time.monotonic() < end:
             time.sleep(WINDOW_S)
-            if worst_share(self.samples, time.monotonic() - WINDOW_S, time.monotonic()) < MAX_STEAL / 2:
+            if worst_share(self.samples, time.monotonic() - WINDOW_S, time.monotonic()) < MAX_TAKEN / 2:
                 return True
         return False
 
@@ -87,15 +120,15 @@ class Steal:
 
 
 def run_inside(
-    steal: Steal, script: str, words: Sequence[str], backend: str, timeout_s: float, prepare: Callable[[Path], None]
+    load: Load, script: str, words: Sequence[str], backend: str, timeout_s: float, prepare: Callable[[Path], None]
 ) -> Report:
     """Run a script of this folder in a virtual machine; its rows, with what was taken from us meanwhile."""
     shares: dict[str, float] = {}
     begun: dict[str, float] = {}
 
     def ended(name: str) -> None:
-        steal.take()
-        shares[name] = max(shares.get(name, 0.0), worst_share(steal.samples, begun.pop(name), time.monotonic()))
+        load.take()
+        shares[name] = max(shares.get(name, 0.0), worst_share(load.samples, begun.pop(name), time.monotonic()))
 
     with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
         prepare(Path(folder))
@@ -117,6 +150,7 @@ def run_inside(
             [*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
         ) as process:
             assert process.stdout
+            load.machine = process.pid
             for text in process.stdout:
                 mark, _, name = text.rstrip().partition(" ")
                 if mark == BEGIN:
@@ -131,7 +165,7 @@ def run_inside(
         report = Report.read([file] if file.exists() else [])
         report.about["exit code"] = process.returncode
     for row in report.rows:
-        row.steal = shares.get(f"{row.area}: {row.name}", 0.0)
+        row.taken = shares.get(f"{row.area}: {row.name}", 0.0)
     return report
 
 
@@ -145,7 +179,9 @@ def judge(run: Callable[[Sequence[str]], Report], quiet: Callable[[], bool]) -> 
         for row in deferred:
             if row.name in later:
                 report.rows[report.rows.index(row)] = later[row.name]
-                later[row.name].notes.insert(0, f"deferred to a quieter moment: {row.steal:.0%} steal at first")
+                later[row.name].notes.insert(
+                    0, f"deferred to a quieter moment: {row.taken:.0%} of the processor time was taken at first"
+                )
     return report
 
 
@@ -193,14 +229,14 @@ def main(
 ) -> int:
     """Run these faults by a script of this folder in a virtual machine, and judge."""
     options = [*words, *(["--long"] if args.long else [])]
-    with Steal() as steal:
+    with Load() as load:
 
         def run(names: Sequence[str]) -> Report:
             only = [f"--only={text}" for text in names or args.only]
-            report = run_inside(steal, script, [*options, *only], backend, timeout_s, prepare)
+            report = run_inside(load, script, [*options, *only], backend, timeout_s, prepare)
             if not names:
                 for fault in faults:
                     report.row(fault)  # one that was not reached has failed
             return report
 
-        return conclude(judge(run, steal.quiet), args.out, args.junit)
+        return conclude(judge(run, load.quiet), args.out, args.junit)

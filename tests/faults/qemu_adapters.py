@@ -81,7 +81,8 @@ def sampled(wire: list[int], sent_at: int, line: Line) -> Iterator[tuple[int, in
 
 
 class SerialAdapter(UsbDevice):
-    """An FT232BM. ``received_from_host`` and ``breaks_from_host`` tell of all that would have gone out to the ESC."""
+    """An FT232BM. ``received_from_host`` and ``breaks_from_host`` tell of all that would have gone out to the ESC, and ``echoed``
+    of what came before the host had set the line as an ESC's: the kernel's echo on a fresh port."""
 
     def __init__(self, port: int, serial_number: str) -> None:
         super().__init__(port, 0x0403, 0x6001, 0x0400, ("FTDI", "FT232BM with a wire", serial_number), (0x81, 0x02))
@@ -89,8 +90,14 @@ class SerialAdapter(UsbDevice):
         self.latency_ms = 16
         self.received_from_host = b""
         self.breaks_from_host = 0
+        self.echoed = 0
+        self._is_set = False
         self._just_reset = False
         self._overrun = 0
+
+    def plug(self) -> None:
+        self.line, self._is_set = Line(9600, "N"), False
+        super().plug()
 
     def put(self, data: bytes, line: Line = ESC_LINE) -> None:
         """Bytes from an ESC whose UART is set to ``line``."""
@@ -140,7 +147,10 @@ class SerialAdapter(UsbDevice):
             time.sleep(self.latency_ms / 1000)
 
     def taken(self, endpoint: int, data: bytes) -> None:
-        self.received_from_host += data
+        if self._is_set:
+            self.received_from_host += data
+        else:
+            self.echoed += len(data)
 
     def control(self, kind: int, request: int, value: int, index: int, length: int, data: bytes) -> bytes | None:
         if request == 0:  # reset, or clear a buffer: 1 the one of what was received
@@ -150,9 +160,11 @@ class SerialAdapter(UsbDevice):
         elif request == 3:  # baud rate: 3 MHz over a divisor with eighths
             eighths = (0, 4, 2, 1, 3, 5, 6, 7)[value >> 14 | (index & 1) << 2]
             self.line = Line(_nearest(3_000_000 / ((value & 0x3FFF) + eighths / 8 or 1)), self.line.parity)
+            self._is_set = self._is_set or self.line == ESC_LINE
         elif request == 4:  # data bits, parity, stop bits, break
             self.line = Line(self.line.baud, "NOEMS"[value >> 8 & 7])
             self.breaks_from_host += value >> 14 & 1
+            self._is_set = self._is_set or self.line == ESC_LINE
         elif request == 5:  # modem status
             return b"\x01\x60"
         elif request == 9:

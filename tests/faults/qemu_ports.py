@@ -9,8 +9,10 @@ from collections.abc import Callable
 from encoding import Identity
 from feeder import FedEsc
 from qemu_adapters import ESC_LINE, Line, SerialAdapter
-from qemu_machine import FarEnd, Monitor, serial_ports, wait_until
+from qemu_machine import FarEnd, Monitor, line_setting, serial_ports, wait_until
 
+AS_SET = (115_200, 8, "E", 1, False)
+"""How the gateway sets a port: without echo. Until then the kernel echoes on one that was never used, as a USB port is at each plug-in."""
 RATE_HZ = 10
 INFO_EVERY = 20
 
@@ -28,6 +30,8 @@ class FarPort:
         self.fed = FedEsc(self.write, identity, RATE_HZ, INFO_EVERY)
         self._reader = reader
         self._known: int | None = None  # the process that has it open
+        self._is_set = False
+        self._before_set = 0  # bytes sent until then: what may have been echoed
 
     @property
     def path(self) -> str:
@@ -41,6 +45,9 @@ class FarPort:
             if not self._is_open(reader):
                 return False
             self._known = reader
+        self._is_set = self._is_set or line_setting(self.device) == AS_SET
+        if not self._is_set:
+            self._before_set += len(data)
         return self.far.put(data) == len(data)
 
     def closed(self) -> None:
@@ -56,8 +63,12 @@ class FarPort:
             pass
         return False
 
+    @property
+    def echoed(self) -> int:
+        return min(len(self.far.received), self._before_set)
+
     def received(self) -> int:
-        return len(self.far.received)
+        return len(self.far.received) - self.echoed
 
     def close(self) -> None:
         self.far.close()
@@ -78,6 +89,7 @@ class UsbPort(FarPort):
 
     def unplug(self) -> None:
         self.closed()
+        self._is_set = False
         before, self.device = self.device, ""
         self._monitor.unplug_serial()
         wait_until(lambda: before not in serial_ports(), 5, f"{before} gone")
@@ -137,6 +149,10 @@ class WirePort:
         self.adapter.plug()
         wait_until(lambda: serial_ports() - before, 5, "the played adapter's device file")
         (self.device,) = serial_ports() - before
+
+    @property
+    def echoed(self) -> int:
+        return self.adapter.echoed
 
     def received(self) -> int:
         """Bytes, and breaks, which are as bad."""

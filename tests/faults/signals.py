@@ -1,9 +1,9 @@
 """Where the values stand in the frames of a DBC: tables made from it by cantools once, for whoever decodes many frames in slow Python."""
 
+import contextlib
+import io
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -109,18 +109,25 @@ def table_of(texts: Sequence[str], escs: int) -> Table:
 
 def table_of_configuration(config: Path, canopen: bool, escs: int) -> Table:
     """The table of what ``kontronik-can-gw dbc`` says that a configuration sends."""
-    command = [sys.executable, "-m", "kontronik_can_gw", "dbc", "-c", str(config)]
-    commands = [command, [*command, "--canopen"]] if canopen else [command]
-    texts = [subprocess.run(words, check=True, capture_output=True, text=True).stdout for words in commands]
-    return table_of(texts, escs)
+    return table_of(texts_of(["-c", str(config)], canopen), escs)
 
 
 def table_of_shipped(escs: int, canopen: bool = True) -> Table:
     """The table of the shipped layouts expanded to so many ESCs, nodes from 1 on."""
-    command = [sys.executable, "-m", "kontronik_can_gw", "dbc", "--esc", str(escs)]
-    commands = [command, [*command, "--canopen"]] if canopen else [command]
-    texts = [subprocess.run(words, check=True, capture_output=True, text=True).stdout for words in commands]
-    return table_of(texts, escs)
+    return table_of(texts_of(["--esc", str(escs)], canopen), escs)
+
+
+def texts_of(words: Sequence[str], canopen: bool) -> list[str]:
+    """What ``kontronik-can-gw dbc`` prints, of the nodes too if there are any; in this process, as a start takes long in a VM."""
+    from kontronik_can_gw.cli import main
+
+    texts = []
+    for options in ([], ["--canopen"]) if canopen else ([],):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            assert main(["dbc", *words, *options]) == 0
+        texts.append(printed.getvalue())
+    return texts
 
 
 def to_json(table: Table) -> str:

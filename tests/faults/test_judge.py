@@ -7,6 +7,7 @@ import pytest
 from bus_watch import MS, SECOND, Judge
 from encoding import Identity, live, live_values, mix
 from feeder import CURRENT, SPEED, FedEsc
+from qemu_adapters import SerialAdapter
 from signals import Message, Table, from_json, table_of_shipped, to_json
 
 from kontronik_can_gw.protocol.codec import Layout
@@ -88,6 +89,7 @@ def test_values_marked_as_not_available_are_never_wrong(judge: Judge) -> None:
 def test_an_old_value_is_wrong_and_its_age_is_said(judge: Judge) -> None:
     judge.take(SPEED_ID, of_live(judge, SPEED_ID, 10), START + 10 * PERIOD + 400 * MS)
     assert settled(judge) == ["old: frame 10, sent 0.400 s before"]
+    assert (judge.wrong_count, judge.old_count) == (1, 1)
 
 
 def test_an_old_value_is_excused_by_a_standstill_of_the_whole_machine_only(judge: Judge) -> None:
@@ -101,7 +103,7 @@ def test_a_value_that_was_never_sent_is_wrong_whatever_stood_still(judge: Judge)
     data[0] ^= 1
     judge.take(SPEED_ID, bytes(data), START + 10 * PERIOD + MS)
     judge.settle(lambda _begin, _end: 100 * SECOND)
-    assert judge.wrong_count == 1
+    assert (judge.wrong_count, judge.old_count) == (1, 0)
     assert "never sent" in judge.wrong[0].why
 
 
@@ -159,6 +161,22 @@ def test_every_value_message_of_the_shipped_layouts_is_followed(table: Table) ->
 
 def test_a_table_survives_being_written_down(table: Table) -> None:
     assert from_json(to_json(table)) == table
+
+
+def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gateways_from_then_on() -> None:
+    adapter = SerialAdapter(0, "x")
+
+    def set_line(divisor: int, parity_and_bits: int) -> None:
+        adapter.control(0x40, 3, divisor, 0, 0, b"")
+        adapter.control(0x40, 4, parity_and_bits, 0, 0, b"")
+
+    set_line(312, 0x0008)  # 9600 8N1, at the opening
+    adapter.taken(2, b"echo")
+    set_line(26, 0x0208)  # 115200 8E1
+    adapter.taken(2, b"A")
+    set_line(312, 0x0008)  # by another program
+    adapter.taken(2, b"B")
+    assert (adapter.echoed, adapter.received_from_host) == (4, b"AB")
 
 
 def test_no_two_frames_of_an_esc_look_alike_in_any_message_within_the_time_out() -> None:

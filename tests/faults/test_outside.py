@@ -11,12 +11,12 @@ from fault_report import FAILED, GOOD, NOT_JUDGED, Report, Row
 from outside import Sample, conclude, judge, sample, worst_share
 
 
-def row(name: str = "x", steal: float = 0.0, **counts: Any) -> Row:
-    return Row("UML", "Serial", name, 2.0, **{"injected": 3, "recovered": 3, "steal": steal, **counts})
+def row(name: str = "x", taken: float = 0.0, **counts: Any) -> Row:
+    return Row("UML", "Serial", name, 2.0, **{"injected": 3, "recovered": 3, "taken": taken, **counts})
 
 
 @pytest.mark.parametrize(
-    ("steal", "counts", "state"),
+    ("taken", "counts", "state"),
     [
         (0.0, {}, GOOD),
         (0.5, {}, GOOD),
@@ -25,15 +25,18 @@ def row(name: str = "x", steal: float = 0.0, **counts: Any) -> Row:
         (0.11, {"lost": 1}, NOT_JUDGED),
         (0.11, {"recovered": 2}, NOT_JUDGED),
         (0.5, {"wrong": 1}, FAILED),
+        (0.5, {"wrong": 2, "old": 1}, FAILED),
+        (0.0, {"wrong": 2, "old": 2}, FAILED),
+        (0.5, {"wrong": 2, "old": 2}, NOT_JUDGED),
         (0.5, {"lost": 1, "wrong": 1}, FAILED),
         (0.5, {"transmitted": 1}, FAILED),
         (0.0, {"injected": 0, "recovered": 0}, FAILED),
     ],
 )
 def test_lateness_and_loss_are_judged_on_a_machine_that_could_run_and_wrong_values_always(
-    steal: float, counts: dict[str, Any], state: str
+    taken: float, counts: dict[str, Any], state: str
 ) -> None:
-    assert row(steal=steal, **counts).state == state
+    assert row(taken=taken, **counts).state == state
 
 
 def reports(*rounds: list[Row]) -> tuple[list[Sequence[str]], Any]:
@@ -55,7 +58,7 @@ def test_only_what_was_not_judged_is_deferred_and_only_once() -> None:
     report = judge(run, lambda: True)
     assert asked == [(), ["Serial: late", "Serial: lost"]]
     assert [each.state for each in report.rows] == [GOOD, FAILED, GOOD, NOT_JUDGED]
-    assert report.rows[2].notes == ["deferred to a quieter moment: 30% steal at first"]
+    assert report.rows[2].notes == ["deferred to a quieter moment: 30% of the processor time was taken at first"]
 
 
 def test_without_a_quiet_moment_it_stays_not_judged() -> None:
@@ -97,6 +100,10 @@ def test_the_worst_five_seconds_count() -> None:
     assert worst_share(at(*[0.5] * 20, *[0.0] * 20), 10, 20) == 0, "what was before is not its own"
 
 
+def test_waiting_behind_other_work_counts_like_steal() -> None:
+    assert worst_share([Sample(n / 2, 0, 100 * n, 0.1 * n) for n in range(40)], 0, 19) == pytest.approx(0.2)
+
+
 def test_the_kernels_line_is_read() -> None:
     text = "cpu  10 20 30 400 50 6 7 80 9 9\ncpu0 1 1 1 1 1 1 1 1 1 1\n"
-    assert sample(text, 1.5) == (1.5, 80, 603)
+    assert sample(text, 1.5) == (1.5, 80, 603, 0.0)

@@ -7,6 +7,7 @@ import itertools
 import os
 import subprocess
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("vcan")
 
 
-def _make(name: str) -> None:
+@contextmanager
+def fresh_vcan() -> Iterator[str]:
+    name = f"kcg{os.getpid() % 10000}n{next(_numbers)}"
     made = subprocess.run(["ip", "link", "add", name, "type", "vcan"], capture_output=True, text=True, check=False)
     if made.returncode:
         said = made.stderr.strip() or "ip link add failed"
@@ -30,15 +33,22 @@ def _make(name: str) -> None:
             pytest.fail(reason)
         pytest.skip(reason)
     ip("link", "set", name, "mtu", "72", "up")
+    yield name
+    subprocess.run(["ip", "link", "del", name], capture_output=True, check=False)
 
 
 @pytest.fixture
 def vcan() -> Iterator[str]:
     """The name of a fresh virtual CAN interface (CAN FD capable), up."""
-    name = f"kcg{os.getpid() % 10000}n{next(_numbers)}"
-    _make(name)
-    yield name
-    subprocess.run(["ip", "link", "del", name], capture_output=True, check=False)
+    with fresh_vcan() as name:
+        yield name
+
+
+@pytest.fixture(scope="module")
+def module_vcan() -> Iterator[str]:
+    """One for all tests of a module."""
+    with fresh_vcan() as name:
+        yield name
 
 
 @pytest.fixture

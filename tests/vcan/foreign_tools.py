@@ -25,7 +25,7 @@ def need(there: bool, what: str) -> None:
         pytest.skip(f"{what} is not installed: run tests/foreign/install.sh")
 
 
-def zencan(interface: str, command: str, seconds: float = 30) -> str:
+def zencan(interface: str, command: str, seconds: float = 120) -> str:
     """What zencan-cli prints for one command. It exits with 0 even when it reports an error."""
     run = subprocess.run(
         [str(ZENCAN), interface, "-c", command], capture_output=True, text=True, check=True, timeout=seconds
@@ -52,7 +52,7 @@ class NodeMaster:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
-        assert self._ready.wait(20), "node_master.js did not start"
+        assert self._ready.wait(60), "node_master.js did not start"
 
     def _read(self) -> None:
         assert self._process.stdout
@@ -69,7 +69,7 @@ class NodeMaster:
         """The result of a call; raises Refused."""
         assert self._process.stdin
         self._process.stdin.write(json.dumps({"call": call, **arguments}) + "\n")
-        answer = self._answers.get(timeout=30)
+        answer = self._answers.get(timeout=120)
         if "error" in answer:
             raise Refused(answer["error"], answer.get("code"))
         return answer["result"]

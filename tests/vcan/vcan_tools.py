@@ -1,6 +1,13 @@
-"""The bench: a gateway process, candump, simulated ESCs, and the comparison of what was sent with what was recorded."""
+"""The bench of the end-to-end tests: ESCs, a gateway process, witnesses of the bus, a master.
+
+No test here passes or fails by how fast the machine is. It waits for an event, with a limit that no working machine reaches, and
+judges order, values and counts. A ``Chain`` sends an ESC's next frame when the bus has shown the one before; what has to be shown
+to not happen is followed by something that has to.
+"""
 
 import re
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -8,19 +15,28 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Self, cast
+from typing import NamedTuple, Self, cast
 
 import canopen
-import cantools.database
-from cantools.database.can import Database
+from bus_watch import SECOND, BusWatch
+from encoding import Identity
+from feeder import CURRENT, SPEED
+from harness import PtyPort
+from signals import table_of_configuration
 
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.offline import pty
-from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
+from kontronik_can_gw.protocol.fields import InfoData, LiveData
 from kontronik_can_gw.protocol.states import OperatingState
 from kontronik_can_gw.simulator import EscOptions, Phase, Sent, SimulatedEsc
 
-SNA = "NotAvailable"
+LIMIT_S = 60.0
+NEVER_STALE = "telemetry_timeout_ms = 60000"
+"""For an [[esc]]: a machine that stands still for a while makes no telemetry loss."""
+
+
+NO_LIMIT_NS = 3600 * 10**9
+"""The judge of a chain looks at what a value is and in which order it comes, not at its age."""
 
 
 def ip(*words: str) -> None:
@@ -28,14 +44,13 @@ def ip(*words: str) -> None:
     subprocess.run(["ip", *words], check=True)
 
 
-def wait_for(condition: Callable[[], bool], seconds: float, what: str) -> float:
-    """Wait until something holds; the seconds it took. AssertionError when it does not come."""
-    begin = time.monotonic()
+def wait_for(condition: Callable[[], object], what: object) -> None:
+    """Wait until something holds. AssertionError when it does not come; ``what`` may be a function that says what is there instead."""
+    end = time.monotonic() + LIMIT_S
     while not condition():
-        if time.monotonic() - begin > seconds:
-            raise AssertionError(f"{what}: not within {seconds} s")
+        if time.monotonic() > end:
+            raise AssertionError(f"{what() if callable(what) else what}: not within {LIMIT_S:g} s")
         time.sleep(0.005)
-    return time.monotonic() - begin
 
 
 class GatewayProcess:
@@ -43,7 +58,7 @@ class GatewayProcess:
 
     def __init__(self, config: Path, *options: str) -> None:
         command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), *options]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -57,48 +72,63 @@ class GatewayProcess:
     def log(self) -> str:
         return "\n".join(self.lines)
 
-    def wait_for_line(self, text: str, seconds: float = 20) -> float:
+    def wait_for_line(self, text: str) -> None:
         """Wait until a log line holds ``text``."""
 
         def seen() -> bool:
             if self.process.poll() is not None:
-                self._reader.join(2)
+                self._reader.join(LIMIT_S)
                 assert text in self.log, f"the gateway ended with {self.process.returncode}:\n{self.log}"
             return text in self.log
 
-        return wait_for(seen, seconds, f"log line {text!r} in:\n{self.log}")
+        wait_for(seen, lambda: f"log line {text!r} in:\n{self.log}")
 
-    def end(self, signal_number: int = 15, seconds: float = 5) -> int:
+    def wait(self) -> int:
+        """The exit code, when all that it logged has been read."""
+        code = self.process.wait(LIMIT_S)
+        self._reader.join(LIMIT_S)
+        return code
+
+    def end(self, signal_number: int = 15) -> int:
         """Send a signal and wait for the exit code."""
         self.process.send_signal(signal_number)
-        code = self.process.wait(seconds)
-        self._reader.join(2)
-        return code
+        return self.wait()
 
     def kill(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait()
-        self._reader.join(2)
-        for stream in (self.process.stdout, self.process.stderr):
-            if stream:
-                stream.close()
+        self.wait()
+        if self.process.stderr:
+            self.process.stderr.close()
 
 
 class Recorded(NamedTuple):
-    """A line of candump."""
+    """A frame, and when the kernel had it."""
 
     time: float
     can_id: int
     data: bytes
 
 
+MARK = 0x7F2
+"""An id of nobody: what was sent before it has been recorded when it has."""
+
+
+def send_mark(interface: str, number: int) -> None:
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
+        bus.bind((interface,))
+        bus.send(struct.pack("=IB3x8s", MARK, 4, number.to_bytes(4, "little")))
+
+
 class Candump:
-    """``candump -L`` of an interface."""
+    """``candump -L`` of an interface, from the first frame that is sent in its block to the last."""
 
     def __init__(self, interface: str) -> None:
         command = ["candump", "-D", "-L", "-r", "4194304", f"{interface},0:0,#FFFFFFFF"]
         self.frames: list[Recorded] = []
+        self._interface = interface
+        self._marks = 0
+        self._mark = 0
         self._process = subprocess.Popen(["stdbuf", "-oL", *command], stdout=subprocess.PIPE, text=True)
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -108,16 +138,31 @@ class Candump:
         for line in self._process.stdout:
             found = re.match(r"\((\d+\.\d+)\) \S+ ([0-9A-F]+)#(#\d)?([0-9A-F]*)", line)
             assert found, line
-            self.frames.append(Recorded(float(found[1]), int(found[2], 16), bytes.fromhex(found[4])))
+            frame = Recorded(float(found[1]), int(found[2], 16), bytes.fromhex(found[4]))
+            if frame.can_id == MARK:
+                self._mark = int.from_bytes(frame.data, "little")
+            else:
+                self.frames.append(frame)
 
     def of(self, can_id: int) -> list[Recorded]:
         return [frame for frame in list(self.frames) if frame.can_id == can_id]
 
+    def catch_up(self) -> None:
+        """Wait until all that was sent so far is recorded."""
+        self._marks += 1
+        send_mark(self._interface, self._marks)
+        wait_for(lambda: self._mark >= self._marks, "candump")
+
     def __enter__(self) -> Self:
+        while not self._mark:  # until it listens
+            self._marks += 1
+            send_mark(self._interface, self._marks)
+            time.sleep(0.02)
         return self
 
-    def __exit__(self, *_: object) -> None:
-        time.sleep(0.1)  # what the kernel still holds for it
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self.catch_up()
         self._process.terminate()
         self._process.wait()
         self._thread.join(5)
@@ -125,8 +170,128 @@ class Candump:
             self._process.stdout.close()
 
 
+def configuration(interface: str, ports: Sequence[str], dbc: str = "", esc: str = NEVER_STALE) -> str:
+    """A configuration text for these ports."""
+    parts = [f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 1000000\n{dbc}\n']
+    parts += [f'[[esc]]\nport = "{port}"\npole_pairs = 7\ngear = 9.8\n{esc}\n' for port in ports]
+    return "\n".join(parts)
+
+
+@contextmanager
+def gateway_process(file: Path, toml: str, *options: str) -> Iterator[GatewayProcess]:
+    """A gateway that has opened everything, with this configuration text, killed at the end if it still runs."""
+    file.write_text(toml)
+    process = GatewayProcess(file, *options)
+    try:
+        process.wait_for_line(f"esc{toml.count('[[esc]]')}: /")
+        process.wait_for_line("CAN socketcan")
+        yield process
+    finally:
+        process.kill()
+
+
+# --- ESCs whose frames are sent one by one
+
+
+class Witness(BusWatch):
+    """Judges all values on a bus (tests/faults/bus_watch.py), and keeps the frames."""
+
+    recorded: list[Recorded]
+
+    def take(self, can_id: int, data: bytes, at_ns: int) -> None:
+        self.recorded.append(Recorded(at_ns / SECOND, can_id, data))
+        super().take(can_id, data, at_ns)
+
+    def of(self, can_id: int) -> list[Recorded]:
+        return [frame for frame in list(self.recorded) if frame.can_id == can_id]
+
+
+class Chain:
+    """ESCs that say what is expected of them, the gateway, and a judge of each value on the bus."""
+
+    def __init__(
+        self, interface: str, folder: Path, identities: Sequence[Identity], toml: str = "", esc: str = NEVER_STALE
+    ) -> None:
+        self.interface = interface
+        self.ports = [PtyPort(folder / f"port{i + 1}", identity) for i, identity in enumerate(identities)]
+        self.escs = [port.fed for port in self.ports]
+        for fed in self.escs:
+            fed.info_every = 10
+        self.config = folder / "gateway.toml"
+        self.toml = configuration(interface, [port.path for port in self.ports], toml, esc)
+        self.config.write_text(self.toml)
+        table = table_of_configuration(self.config, "[canopen]" in toml, len(identities))
+        self.watch = Witness(interface, table, self.escs, slack_ns=NO_LIMIT_NS, ignore_local=False)
+        self.watch.recorded = []
+        self.watch.start()
+        self.gateway: GatewayProcess | None = None
+
+    @contextmanager
+    def running(self, *options: str) -> Iterator[GatewayProcess]:
+        with gateway_process(self.config, self.toml, *options) as self.gateway:
+            yield self.gateway
+
+    def feed(self, *escs: int, times: int = 1) -> None:
+        """The next live frame of these ESCs, of all unless given, each time as soon as the bus has shown the ones before."""
+        assert self.gateway is not None
+        chosen = [self.escs[esc] for esc in escs] or self.escs
+        for _ in range(times):
+            numbers = [len(fed.sent) for fed in chosen]
+            held_up = self.gateway.log.count("suspended")
+            for fed, number in zip(chosen, numbers, strict=True):
+                while len(fed.sent) == number:  # an info frame now and then
+                    fed.send_one()
+
+            def shown(numbers: Sequence[int] = numbers, held_up: int = held_up) -> bool:
+                assert self.gateway is not None
+                seen = all(fed.seen[n] == SPEED | CURRENT for fed, n in zip(chosen, numbers, strict=True))
+                return (
+                    seen or self.gateway.log.count("suspended") > held_up
+                )  # then it may throw frames away, and says so
+
+            wait_for(shown, f"frames {numbers} on the bus")
+
+    def signal(self, message: str, signal: str) -> int | None:
+        """The newest raw value of a signal of the gateway's own messages."""
+        return self.watch.value(message, signal)
+
+    def catch_up(self) -> None:
+        """Wait until all that was sent so far has been judged."""
+        begin = len(self.watch.recorded)
+        send_mark(self.interface, begin)
+        wait_for(lambda: any(f.can_id == MARK for f in self.watch.recorded[begin:]), "the mark")
+
+    def check(self) -> None:
+        """No value was wrong, and nothing was sent to an ESC."""
+        self.catch_up()
+        self.watch.settle(lambda _begin, _end: 0)
+        assert not self.watch.wrong, self.watch.wrong
+        assert [port.received() for port in self.ports] == [0] * len(self.ports), "something was sent to an ESC"
+
+    def close(self) -> None:
+        self.watch.close()
+        for port in self.ports:
+            port.close()
+
+
+@contextmanager
+def chain(
+    interface: str, folder: Path, *identities: Identity, toml: str = "", esc: str = NEVER_STALE
+) -> Iterator[Chain]:
+    """A chain, whose values are checked when all went well."""
+    made = Chain(interface, folder, identities, toml, esc)
+    try:
+        yield made
+        made.check()
+    finally:
+        made.close()
+
+
+# --- simulated ESCs in real time
+
+
 class Bench:
-    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent when."""
+    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent."""
 
     def __init__(self, escs: Sequence[EscOptions], seed: int = 1) -> None:
         self.ports = [pty.PtyEsc() for _ in escs]
@@ -153,7 +318,7 @@ class Bench:
     def stop(self) -> None:
         self._stop.set()
         if self._thread:
-            self._thread.join(5)
+            self._thread.join(LIMIT_S)
 
     def live(self, index: int) -> list[tuple[float, LiveData]]:
         return [(when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, LiveData)]
@@ -179,76 +344,17 @@ def bench(*escs: EscOptions) -> Iterator[Bench]:
     assert [port.received for port in made.ports] == [0] * len(escs), "something was transmitted to an ESC"
 
 
-def configuration(interface: str, ports: Sequence[str], dbc: str = "", esc: str = "") -> str:
-    """A configuration text for these ports."""
-    parts = [f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 1000000\n{dbc}\n']
-    parts += [f'[[esc]]\nport = "{port}"\npole_pairs = 7\ngear = 9.8\n{esc}\n' for port in ports]
-    return "\n".join(parts)
-
-
-def database_of(config: Path) -> Database:
-    """What ``kontronik-can-gw dbc -c`` writes for a configuration, loaded strictly: the logger's view."""
-    command = [sys.executable, "-m", "kontronik_can_gw", "dbc", "-c", str(config)]
-    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    loaded = cantools.database.load_string(text, "dbc", strict=True)
-    assert isinstance(loaded, Database)
-    return loaded
-
-
-def snake(signal_name: str, prefix: str) -> str:
-    """``Esc1BatteryVoltage`` -> ``battery_voltage``."""
-    text = signal_name.removeprefix(prefix).removesuffix("Percent")
-    return re.sub(r"(?<!^)(?=[A-Z])", "_", text).lower()
-
-
-def expected(data: LiveData | InfoData) -> dict[str, Any]:
-    """Field name to physical value as a logger should see it."""
-    values: dict[str, Any] = {n: row.physical(getattr(data, n)) for n, row in rows(type(data)).items()}
-    if isinstance(data, LiveData):
-        values["operating_state_raw"] = data.operating_state
-        for bit in range(24):
-            values[f"bit{bit}"] = data.operating_errors >> bit & 1
-    else:
-        values |= {"device": data.device, "device_raw": data.device, "variant": data.variant}
-        values |= {"firmware_main": data.firmware_word >> 8, "firmware_sub": data.firmware_word & 255}
-    return values
-
-
-def agrees(decoded: dict[str, Any], data: LiveData | InfoData, prefix: str) -> bool:
-    """True if every signal that is a field of the frame has exactly its value."""
-    wanted = expected(data)
-    found = {snake(name, prefix): value for name, value in decoded.items()}
-    common = [name for name in found if name in wanted]
-    return all(abs(found[name] - wanted[name]) < 1e-6 for name in common)
-
-
 # --- CANopen
 
 EDS = shipped("eds/kontronik_esc.eds")
 SERIAL = 0x00100200
-"""Of the first node. Few ones: each costs a fastscan a time-out."""
 LIVELY = (Phase("up", 0.5, 90, OperatingState.Forward, 0.5), Phase("down", 0.5, 30, OperatingState.Forward, 0.5))
 """A flight in which no two frames are alike."""
 
 
-def canopen_configuration(
-    interface: str, ports: Sequence[str], store: Path, node_id: int = 1, canopen: str = "", dbc: str = "", esc: str = ""
-) -> str:
-    """A configuration text with CANopen nodes from ``node_id`` on; the DBC output is on too unless ``dbc`` says otherwise."""
-    table = f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{store}"\n{canopen}'
-    return configuration(interface, ports, f"{dbc}\n{table}", esc)
-
-
-@contextmanager
-def gateway_process(file: Path, toml: str) -> Iterator[GatewayProcess]:
-    """A gateway that has opened everything, with this configuration text, killed at the end if it still runs."""
-    file.write_text(toml)
-    process = GatewayProcess(file)
-    try:
-        process.wait_for_line(f"esc{toml.count('[[esc]]')}: /dev/pts")
-        yield process
-    finally:
-        process.kill()
+def canopen_table(store: Path, node_id: int = 1, more: str = "") -> str:
+    """The table of a configuration that makes each ESC a node, from ``node_id`` on."""
+    return f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{store}"\n{more}\n'
 
 
 class Master:
@@ -264,7 +370,7 @@ class Master:
         if node_id in self.network:
             return cast(canopen.RemoteNode, self.network[node_id])
         node = canopen.RemoteNode(node_id, self._objects)
-        node.sdo.RESPONSE_TIMEOUT = 2  # a slow machine is not what is tested
+        node.sdo.RESPONSE_TIMEOUT = LIMIT_S
         self.network.add_node(node)
         return node
 
@@ -291,18 +397,3 @@ class Master:
 
     def __exit__(self, *_: object) -> None:
         self.network.disconnect()
-
-
-@contextmanager
-def nodes_running(
-    interface: str, folder: Path, *escs: EscOptions, options: str = "", dbc: str = "", esc: str = "", node_id: int = 1
-) -> Iterator[tuple[Bench, Candump, GatewayProcess, Master]]:
-    """Simulated ESCs (not started yet), their gateway with CANopen nodes, a recording of the bus, and a master."""
-    with bench(*escs) as run, Candump(interface) as dump, Master(interface) as master:
-        toml = canopen_configuration(
-            interface, [port.path for port in run.ports], folder / "store", node_id, options, dbc, esc
-        )
-        with gateway_process(folder / "gateway.toml", toml) as gateway:
-            if node_id < 128:
-                wait_for(lambda: bool(dump.of(0x700 + node_id)), 5, "a boot-up")
-            yield run, dump, gateway, master
