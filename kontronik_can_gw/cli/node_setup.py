@@ -84,19 +84,6 @@ def plain_setup(config: Config) -> CanopenSetup:
     return CanopenSetup(load_eds(config), tuple(settings), (Stored(),) * len(settings), tuple(config.escs))
 
 
-def check_cob_ids(nodes: Nodes, eds: str) -> None:
-    """Two nodes, or two services, with one COB-ID: as where an EDS gives EMCY or a PDO an id without $NODEID."""
-    users: dict[int, str] = {}
-    problems = [
-        f"{eds}: COB-ID {cob_id:03X}h is that of {users[cob_id]} and of {what}. Change one default (or add $NODEID)."
-        for node in nodes.nodes
-        for cob_id, what in node.cob_ids()
-        if users.setdefault(cob_id, what) != what
-    ]
-    if problems:
-        raise UserError(*problems)
-
-
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:
     """What masters stored. Without a store its files are only looked at."""
     kept = Kept()

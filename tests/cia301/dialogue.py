@@ -64,6 +64,12 @@ def default(index: int, sub: int, value: float | bytes, relative: bool | None = 
 
 NO_HEARTBEAT = default(0x1017, 0, 0)
 NO_PDOS: Changes = {(0x1800 + n, 1): {"default": OFF, "relative": False} for n in range(6)}
+SPARE: Changes = {
+    (index, sub): {"default": value}
+    for n in (4, 5)
+    for index, sub, value in ((0x1A00 + n, 0, 1), (0x1A00 + n, 1, 0x20000210))
+}
+"""The two spare PDOs with battery voltage mapped, so that they need only a COB-ID to exist."""
 QUIET: Changes = {**NO_HEARTBEAT, **NO_PDOS}
 """Changes that leave only frames that are asked for, and EMCY."""
 

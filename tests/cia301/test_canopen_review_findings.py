@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from dialogue import NO_PDOS, Bench, default, play
+from dialogue import NO_PDOS, SPARE, Bench, default, play
 from test_dictionary_walk import bench_of, plain, text, with_key, with_object
 
 from kontronik_can_gw.cia301.check import check_eds
@@ -199,7 +199,7 @@ def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -
 
 def test_stored_ids_hold_at_every_reset_whatever_the_pdos_had_before() -> None:
     stored = Stored(communication={0x101400: u32(0x191)})
-    bench = Bench(stored=[stored], changes=NO_PDOS)
+    bench = Bench(stored=[stored], changes={**NO_PDOS, **SPARE})
     assert bench.write(0x1014, 0, 0x80000191) is None
     assert bench.write(0x1805, 1, 0x40000191) is None
     for _ in range(2):
@@ -209,7 +209,7 @@ def test_stored_ids_hold_at_every_reset_whatever_the_pdos_had_before() -> None:
 
 def test_a_reset_of_all_frees_the_ids_of_all_first() -> None:
     stored = Stored(communication={0x180501: u32(0x400001F5)})
-    bench = Bench(2, stored=[stored, Stored()], changes=NO_PDOS)
+    bench = Bench(2, stored=[stored, Stored()], changes={**NO_PDOS, **SPARE})
     assert bench.write(0x1805, 1, 0xC00001F5) is None
     assert bench.write(0x1805, 1, 0x400001F5, node=2) is None
     bench.put(0, "82 00")

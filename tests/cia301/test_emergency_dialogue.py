@@ -602,14 +602,3 @@ def test_an_info_frame_is_no_emergency() -> None:
     bench = Bench(changes=QUIET)
     bench.uart(info(selftest_errors=1))
     assert bench.take() == []
-
-
-def test_a_node_without_1014h_sends_none() -> None:
-    eds = Bench(changes=QUIET).setup.eds
-    entries = tuple(e for e in eds.entries if e.index not in (0x1014, 0x1015))
-    bench = Bench(eds=type(eds)(eds.data, eds.name, entries, eds.object_names, eds.device))
-    bench.uart(live(operating_errors=1))
-    assert bench.take() == []
-    assert bench.number(0x1001) == 5
-    assert bench.gateway.nodes is not None
-    assert bench.gateway.nodes.cob_ids()[0] == "NMT"

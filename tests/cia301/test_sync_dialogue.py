@@ -258,12 +258,3 @@ def test_a_sync_pdo_with_live_values_stays_away_while_telemetry_is_lost() -> Non
     """,
         Bench(changes=changes),
     )
-
-
-def test_without_1005h_there_is_no_sync() -> None:
-    bench = Bench(changes=QUIET)
-    eds = bench.setup.eds
-    without = type(eds)(
-        eds.data, eds.name, tuple(e for e in eds.entries if e.index != 0x1005), eds.object_names, eds.device
-    )
-    assert Bench(eds=without).listened_to == {0, 0x601, 0x7E5}
