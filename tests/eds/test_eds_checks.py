@@ -589,7 +589,7 @@ def test_a_compact_error_history_begins_empty() -> None:
 
 def test_values_of_compact_sub_objects_stand_in_a_section_of_their_own() -> None:
     eds = reader.load(with_object(f"{COMPACT}CompactSubObj=3\r\n").encode(), "mine.eds")
-    text = reader.dcf(eds, 1, 500_000, {(0x2200, 3): 7, (0x2200, 1): 5}, "left")
+    text = reader.dcf(eds, 1, 500_000, {(0x2200, 3): 7, (0x2200, 1): 5}, "left", "left.dcf")
     assert "CompactSubObj=3\r\n\r\n[2200Value]\r\nNrOfEntries=2\r\n1=0x0005\r\n3=0x0007\r\n" in text
 
 
@@ -607,25 +607,25 @@ def test_values_of_compact_sub_objects_stand_in_a_section_of_their_own() -> None
 )
 def test_values_of_every_type_in_the_dcf(data_type: int, value: float | bytes, written: str) -> None:
     eds = reader.load(with_object(variable(data_type)).encode(), "mine.eds")
-    text = reader.dcf(eds, 1, 500_000, {(0x2200, 0): value}, "left")
+    text = reader.dcf(eds, 1, 500_000, {(0x2200, 0): value}, "left", "left.dcf")
     assert text.endswith(f"AccessType=rw\r\nParameterValue={written}\r\n\r\n")
 
 
 def test_domains_are_left_out_of_the_dcf() -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
-    assert "ParameterValue" not in reader.dcf(eds, 1, 500_000, {(0x1021, 0): b"abc"}, "left")
+    assert "ParameterValue" not in reader.dcf(eds, 1, 500_000, {(0x1021, 0): b"abc"}, "left", "left.dcf")
 
 
 @pytest.mark.parametrize("value", ["Gaß".encode("latin-1"), b"a\r\nb", b" a", b"a ; b", b"a\x00"])
 def test_a_text_that_a_dcf_cannot_hold_is_named(value: bytes) -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
     with pytest.raises(UserError, match=r"kontronik_esc\.eds: \[2010sub6\] the text .* of Device name cannot stand"):
-        reader.dcf(eds, 1, 500_000, {(0x2010, 6): value}, "left")
+        reader.dcf(eds, 1, 500_000, {(0x2010, 6): value}, "left", "left.dcf")
 
 
 def test_a_dcf_is_not_taken_for_an_eds() -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
-    found = problems(reader.dcf(eds, 1, 500_000, {(0x1017, 0): 500}, "left"))
+    found = problems(reader.dcf(eds, 1, 500_000, {(0x1017, 0): 500}, "left", "left.dcf"))
     assert len(found) == 2
     assert "this is a DCF" in found[0]
 

@@ -63,7 +63,7 @@ def test_no_key_is_without_a_value() -> None:
 
 def test_numbers_of_objects_are_hexadecimal_and_the_node_id_stands_in_front() -> None:
     keys = ("DataType", "ObjectType", "SubNumber", "LowLimit", "HighLimit", "DefaultValue")
-    texts = {"KONTRONIK ESC gateway", "generic"}
+    texts = {"KONTRONIK ESC gateway", "generic", "0"}
     found = [line.split("=", 1)[1] for line in LINES if line.split("=", 1)[0] in keys]
     assert len(found) > 500
     assert {value for value in found if not re.fullmatch(r"(\$NODEID\+)?0x[0-9A-F]+", value)} == texts
@@ -112,7 +112,7 @@ def test_device_info(shipped: Eds, entries: dict[tuple[int, int], Entry]) -> Non
     assert device.vendor_number == entries[0x1018, 1].default == 0
     assert device.product_number == entries[0x1018, 2].default
     assert device.revision_number == entries[0x1018, 3].default
-    assert entries[0x1018, 4].default is None
+    assert entries[0x1018, 4].default == 0
 
 
 def test_all_objects_of_the_design_are_there_and_no_other(shipped: Eds) -> None:
@@ -136,11 +136,16 @@ def test_fields_stand_in_wire_order_with_their_types(
         assert entry.name == expected
         assert entry.data_type == TYPE_OF_WIRE[row.wire], name
         assert (entry.access, entry.mappable) == ("ro", True)
-        assert (entry.low, entry.high, entry.default) == (None, None, None)
+        assert (entry.low, entry.high, entry.default) == (None, None, 0)
 
 
 def test_there_are_as_many_logged_extremes_as_the_design_says() -> None:
     assert len(extremes()) == 0x0E
+
+
+def test_every_entry_but_a_domain_has_a_default(shipped: Eds) -> None:
+    """Readers fail (gocanopen) or warn (dcf2c) without."""
+    assert [entry.index for entry in shipped.entries if entry.default is None] == [0x1021]
 
 
 def test_unit_codes_agree_with_the_field_table(entries: dict[tuple[int, int], Entry]) -> None:
@@ -230,7 +235,7 @@ def test_settings_have_the_ranges_and_defaults_of_the_configuration(
         ((0x2100, 5), (0, 2, 0)),
         ((0x2100, 6), (0, 0xFFFFFFFF, 0x00FDFFFF)),
         ((0x2100, 8), (1, 0xFFFF, 5)),
-        ((0x2101, 2), (1, 127, None)),
+        ((0x2101, 2), (1, 127, 0)),
         ((0x1005, 0), (0, 0xFFFFFFFF, 0x80)),
         ((0x1F80, 0), (0, 0xFFFFFFFF, 4)),
     ],
@@ -257,6 +262,7 @@ def test_cob_ids_follow_the_node_id(entries: dict[tuple[int, int], Entry]) -> No
         (0x1801, 1): 0x40000280,
         (0x1802, 1): 0x40000380,
         (0x1803, 1): 0x40000480,
+        (0x2101, 2): 0,
     }
     assert {entries[index, 1].default for index in (0x1804, 0x1805)} == {0xC0000000}
 
@@ -373,7 +379,7 @@ def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
         (0x2100, 1): 7,
         (0x6079, 0): 24420,
     }
-    text = reader.dcf(shipped, 5, 250_000, values, "left")
+    text = reader.dcf(shipped, 5, 250_000, values, "left", "left.dcf")
     assert text.count("\r\n") == text.count("\n")
     source = io.StringIO(text)
     source.name = "left.dcf"
@@ -395,10 +401,12 @@ def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
 
 
 def test_the_dcf_keeps_every_line_of_the_eds_in_its_place(shipped: Eds) -> None:
-    text = reader.dcf(shipped, 5, 250_000, {(0x1017, 0): 500, (0x2100, 8): 9}, "left")
+    text = reader.dcf(shipped, 5, 250_000, {(0x1017, 0): 500, (0x2100, 8): 9}, "left", "left.dcf")
     lines = text.split("\r\n")
     start = lines.index("[DeviceComissioning]")
     del lines[start : lines.index("", start) + 1]
+    assert lines[1:3] == ["FileName=left.dcf", "LastEDS=kontronik_esc.eds"]
+    lines[1:3] = ["FileName=kontronik_esc.eds"]
     assert [line for line in lines if not line.startswith("ParameterValue=")] == LINES
     assert [line for line in lines if line.startswith("ParameterValue=")] == [
         "ParameterValue=0x01F4",
