@@ -108,8 +108,8 @@ class Dictionary:
         self._indices = frozenset(entry.index for entry in eds.entries)
         self.read_only = False
         """True: nothing may be written over the bus."""
-        self.changed: Callable[[Variable, int], None] = lambda _variable, _now: None
-        """Told of each value that was written over the bus."""
+        self.written: Callable[[Variable, bool, int], None] = lambda _variable, _changed, _now: None
+        """Called after each download; the flag says whether the value is another one."""
 
     def get(self, index: int, sub: int = 0) -> Variable | None:
         """The variable, None where there is none."""
@@ -179,9 +179,10 @@ class Dictionary:
         if variable.check is not None:
             assert isinstance(value, int)
             variable.check(value)
+        changed = self.value(variable, now) != value
         variable.value = value
         done = True if variable.written is None else variable.written(now)
-        self.changed(variable, now)
+        self.written(variable, changed, now)
         return done
 
     # --- power-on and storage

@@ -147,6 +147,7 @@ _COMMUNICATION: Mapping[int, _Shape] = {
     0x1017: _var(_U16),
     0x1018: _list(RECORD, _U32, 4, 1),
     0x1019: _var(_U8),
+    0x1020: _list(ARRAY, _U32, 2, 1, 2),
     0x1021: _Shape((DOMAIN, VAR), {0: (_DOMAIN_TYPE,)}),
     0x1022: _var(_U8, _U16),  # copies of the table differ in the width
     0x1029: _list(ARRAY, _U8, 0xFE, 1),

@@ -34,6 +34,9 @@ EMERGENCY, SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x80, 0x600, 0x580
 COMMUNICATION_PROFILE, APPLICATION_PROFILE = (0x1000, 0x1FFF), (0x2000, 0xFFFF)
 CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
 """Objects of services whose values have rules beyond type and limits (those of PDOs have their own)."""
+VERIFY = 0x1020
+_NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTICS})
+"""Objects that can be written and are no part of a configuration."""
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 _SELF_START_OFF = 4
 _MOST_SAVES = 4
@@ -204,7 +207,7 @@ class Node:
         ]
         self._bind_services(eds)
         self._bind_sources()
-        dictionary.changed = self._on_download
+        dictionary.written = self._on_download
 
     # --- life
 
@@ -249,6 +252,8 @@ class Node:
                 self._enter(NmtState.OPERATIONAL, now)
         if self.misfits:
             self._around.passed_over(self, self.misfits)
+        if self.misfits or self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id) != self._stored.application:
+            self._configuration_changed()  # 1020h was stored with other application parameters
         self._around.routes_changed()
         self._around.state_changed()
         self._set_due()
@@ -585,9 +590,16 @@ class Node:
 
     # --- parameters
 
-    def _on_download(self, variable: Variable, now: int) -> None:
+    def _on_download(self, variable: Variable, changed: bool, now: int) -> None:
         for tpdo in self.tpdos:
             tpdo.on_download(variable, now)
+        if changed and variable.entry.index not in _NO_CONFIGURATION:
+            self._configuration_changed()
+
+    def _configuration_changed(self) -> None:
+        """1020h no longer names the configuration: its master downloads it anew."""
+        for variable in self.dictionary.subs(VERIFY):
+            variable.value = 0
 
     def _configure_or_default(self, tpdo: Tpdo, now: int) -> None:
         """Stored PDO parameters that no longer make sense with this EDS give way to the defaults; without a free COB-ID there is no PDO."""
@@ -655,9 +667,12 @@ class Node:
         stored = self._wanted
         if part in (1, 2):
             stored = replace(stored, communication=self.dictionary.to_store(*COMMUNICATION_PROFILE, self.node_id))
+        application = self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id)
         if part in (1, 3):
-            application = self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id)
             stored = replace(stored, application=application, node_id=self._bus_node_id)
+        whole = self.dictionary.to_store(*COMMUNICATION_PROFILE, self.node_id), application
+        if (stored.communication, stored.application) != whole:
+            stored = _unverified(stored)
         self._save(self.sdo.waiting, stored)
 
     def _restore(self, part: int) -> None:
@@ -667,7 +682,7 @@ class Node:
             stored = replace(stored, communication={})
         if part in (1, 3):
             stored = replace(stored, application={})
-        self._save(self.sdo.waiting, stored)
+        self._save(self.sdo.waiting, _unverified(stored))
 
     # --- binding
 
@@ -878,6 +893,12 @@ class Node:
     def _reset_statistics(self) -> bool:
         self.esc.reset_statistics()
         return True
+
+
+def _unverified(stored: Stored) -> Stored:
+    """Without 1020h: these parameters are not all of the configuration that it names."""
+    left = {number: data for number, data in stored.communication.items() if number >> 8 != VERIFY}
+    return replace(stored, communication=left)
 
 
 def _only_zero(value: int) -> None:

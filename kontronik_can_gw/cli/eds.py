@@ -8,7 +8,7 @@ from kontronik_can_gw.cia301.abort import SdoAbort
 from kontronik_can_gw.cia301.bindings import bindings
 from kontronik_can_gw.cia301.dictionary import Value
 from kontronik_can_gw.cia301.eds import dcf
-from kontronik_can_gw.cia301.node import Node
+from kontronik_can_gw.cia301.node import VERIFY, Node
 from kontronik_can_gw.cia301.nodes import CanopenSetup
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.cli.common import canopen_of, load_all, write_output
@@ -16,7 +16,9 @@ from kontronik_can_gw.cli.node_setup import shipped_canopen
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.telemetry import EscSettings
 
-_STATES_AND_COMMANDS = frozenset({0x1001, 0x1002, 0x1003, 0x1010, 0x1011, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE})
+_STATES_AND_COMMANDS = frozenset(
+    {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, VERIFY, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE}
+)
 """Objects that tell what is at the moment, or do something when they are written."""
 
 

@@ -115,7 +115,7 @@ def test_the_dcf_of_the_defaults_has_the_default_of_every_object_that_is_configu
         assert not isinstance(value, float)
         if value is not None:
             defaults[entry.index, entry.sub] = value + node_id if entry.relative and isinstance(value, int) else value
-    left_out = {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, 0x1021, 0x2010, 0x2102, 0x603F}
+    left_out = {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, 0x1020, 0x1021, 0x2010, 0x2102, 0x603F}
     expected = {key: value for key, value in defaults.items() if key[0] not in left_out and key not in TELEMETRY}
     own = {(0x100A, 0), *((0x2101, sub) for sub in (1, 3, 4))}
     assert set(found) == set(expected)

@@ -116,7 +116,7 @@ def test_device_info(shipped: Eds, entries: dict[tuple[int, int], Entry]) -> Non
 
 
 def test_all_objects_of_the_design_are_there_and_no_other(shipped: Eds) -> None:
-    single = "1000 1001 1002 1003 1005 1008 1009 100A 1010 1011 1014 1015 1016 1017 1018 1019 1021 1022 1029 1200 1F80"
+    single = "1000 1001 1002 1003 1005 1008 1009 100A 1010 1011 1014 1015 1016 1017 1018 1019 1020 1021 1022 1029 1200 1F80"
     own = "2000 2001 2002 2010 2011 2020 2021 2100 2101 2102 603F 606C 6079"
     pdos = [base + n for base in (0x1800, 0x1A00) for n in range(6)]
     assert sorted(shipped.object_names) == sorted([int(text, 16) for text in f"{single} {own}".split()] + pdos)
@@ -196,7 +196,7 @@ def test_what_may_be_written(entries: dict[tuple[int, int], Entry]) -> None:
     writable = {at for at, entry in entries.items() if "w" in entry.access}
     expected = {(index, 0) for index in (0x1003, 0x1005, 0x1014, 0x1015, 0x1017, 0x1019, 0x1F80)}
     expected |= {(index, sub) for index in (0x1010, 0x1011) for sub in (1, 2, 3)}
-    expected |= {(index, sub) for index in (0x1016, 0x1029) for sub in (1, 2)}
+    expected |= {(index, sub) for index in (0x1016, 0x1020, 0x1029) for sub in (1, 2)}
     expected |= {(0x1800 + n, sub) for n in range(6) for sub in (1, 2, 3, 5, 6)}
     expected |= {(0x1A00 + n, sub) for n in range(6) for sub in range(9)}
     expected |= {(0x2100, sub) for sub in range(1, 9)} | {(0x2101, 2), (0x2102, 1)}
@@ -248,7 +248,7 @@ def test_limits_and_defaults(
 
 def test_object_codes(entries: dict[tuple[int, int], Entry]) -> None:
     arrays = {index for (index, _), entry in entries.items() if entry.object_type == ARRAY}
-    assert arrays == {0x1003, 0x1010, 0x1011, 0x1016, 0x1029, 0x2002}
+    assert arrays == {0x1003, 0x1010, 0x1011, 0x1016, 0x1020, 0x1029, 0x2002}
     assert [index for (index, _), entry in entries.items() if entry.object_type == DOMAIN] == [0x1021]
 
 
