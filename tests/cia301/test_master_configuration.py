@@ -81,7 +81,7 @@ class _Wire(canopen.Network):
     """A master's network whose frames a bench takes and answers at once."""
 
     def __init__(self, bench: Bench) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
+        super().__init__()
         self._bench = bench
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
@@ -92,7 +92,7 @@ class _Wire(canopen.Network):
 
 def test_the_canopen_package_saves_a_pdo_that_it_did_not_read_before() -> None:
     bench = Bench(changes=NO_HEARTBEAT)
-    node = _Wire(bench).add_node(1, str(EDS))  # type: ignore[no-untyped-call]
+    node = _Wire(bench).add_node(1, str(EDS))
     pdo = node.tpdo[5]
     pdo.cob_id, pdo.enabled, pdo.rtr_allowed, pdo.trans_type, pdo.event_timer = 0x1F1, True, True, 254, 100
     pdo.add_variable(0x2000, 2)

@@ -5,9 +5,10 @@ Equal input gives equal output.
 
 from typing import Any
 
-from dialogue import MS, NO_HEARTBEAT, Bench, default, info, live, shipped_eds
+from dialogue import NO_HEARTBEAT, Bench, default, info, live, shipped_eds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from script import MS
 
 from kontronik_can_gw.cia301.dictionary import Variable
 from kontronik_can_gw.frames import CanFrame

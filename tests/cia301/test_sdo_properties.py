@@ -306,7 +306,7 @@ def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(ste
         now = bench.now + gap
         expected = model.wait(now)
         if raw[7] % 4:
-            bench.wait_until(now)
+            bench.pass_time(now)
             assert [code_of(answer) for answer in bench.answers] == expected
             expected = []
         bench.now = now
@@ -339,13 +339,13 @@ def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(ste
 def test_random_traffic_leaves_a_pacing_server_in_order_too(steps: list[Step], segment_ns: int) -> None:
     bench, model = Bench(segment_ns), Model()
     for how, raw, gap in steps:
-        bench.wait_until(bench.now + gap)
+        bench.pass_time(bench.now + gap)
         data = model.fitting(raw) if how < 14 else raw
         assert len(bench.request(data)) <= 5  # a time-out and a burst
         model.wait(bench.now)
         model.hear(data, bench.now)
     bench.server.confirm(None, bench.now)
-    bench.wait_until(bench.now + 200_000 * MS)
+    bench.pass_time(bench.now + 200_000 * MS)
     assert not bench.server.busy
     assert bench.server.next_deadline() is None
 
@@ -575,7 +575,7 @@ def test_paced_segments_keep_their_distance_and_carry_the_data(
             due = bench.server.next_deadline()
             assert due is not None
             bench.answers = []
-            bench.wait_until(due)
+            bench.pass_time(due)
             bursts[due] = bursts.get(due, 0) + len(bench.answers)
             frames += bench.answers
         assert [frame[0] & 0x7F for frame in frames] == list(range(1, len(frames) + 1))
@@ -609,7 +609,7 @@ class Wire(canopen.Network):
         answers = list(self.bench.request(bytes(data)))
         while (deadline := self.bench.server.next_deadline()) is not None and deadline < self.bench.now + 1000 * MS:
             self.bench.answers = []
-            self.bench.wait_until(deadline)
+            self.bench.pass_time(deadline)
             answers += self.bench.answers
         for answer in answers:
             self.notify(0x581, bytearray(answer), 0.0)

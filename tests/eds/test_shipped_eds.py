@@ -116,7 +116,9 @@ def test_device_info(shipped: Eds, entries: dict[tuple[int, int], Entry]) -> Non
 
 
 def test_all_objects_of_the_design_are_there_and_no_other(shipped: Eds) -> None:
-    single = "1000 1001 1002 1003 1005 1008 1009 100A 1010 1011 1014 1015 1016 1017 1018 1019 1020 1021 1022 1029 1200 1F80"
+    single = (
+        "1000 1001 1002 1003 1005 1008 1009 100A 1010 1011 1014 1015 1016 1017 1018 1019 1020 1021 1022 1029 1200 1F80"
+    )
     own = "2000 2001 2002 2010 2011 2020 2021 2100 2101 2102 603F 606C 6079"
     pdos = [base + n for base in (0x1800, 0x1A00) for n in range(6)]
     assert sorted(shipped.object_names) == sorted([int(text, 16) for text in f"{single} {own}".split()] + pdos)

@@ -4,6 +4,7 @@ from functools import cache
 
 import pytest
 from dialogue import Bench, changed, info, live, shipped_eds
+from test_dictionary_walk import text, with_key
 
 from kontronik_can_gw.cia301.check import check_eds
 from kontronik_can_gw.cia301.dictionary import _IF_ABSENT, key
@@ -175,3 +176,40 @@ def test_a_default_pdo_that_maps_nothing_is_refused() -> None:
 
 def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
     check_eds(shipped_eds(), EscSettings(), range(1, 128))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "said"),
+    [
+        ("1200sub1", "DefaultValue", "$NODEID+0x640", "1200h:01 COB-ID client to server: must be $NODEID+0x600"),
+        ("1001", "AccessType", "rw", "1001h:00 Error register: is shown by the node, so it must be read only"),
+        ("1001", "AccessType", "wo", "must be read only"),
+        ("100A", "AccessType", "rw", "must be read only"),
+        ("1018sub1", "AccessType", "rw", "must be read only"),
+        ("2010sub6", "AccessType", "rw", "must be read only"),
+        ("2101sub1", "AccessType", "rw", "must be read only"),
+        ("1005", "DefaultValue", "0x40000080", "1005h:00 COB-ID SYNC message: DefaultValue 0x40000080"),
+        ("1014", "DefaultValue", "0x601", "1014h:00 COB-ID EMCY"),
+        ("1019", "DefaultValue", "1", "1019h:00"),
+        ("1F80", "DefaultValue", "0x1", "1F80h:00"),
+    ],
+)
+def test_defaults_that_a_download_would_be_refused_are_refused_at_start(
+    section: str, key: str, value: str, said: str
+) -> None:
+    assert said in "\n".join(problems(with_key(text(), section, key, value).encode()))
+
+
+def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:
+    changed = with_key(text(), "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
+    check_eds(load(changed.encode(), "my.eds"), EscSettings(), [1])
+    assert "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3" in problems(changed.encode(), (3,))[0]
+
+
+def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:
+    changed = with_key(with_key(text(), "2100sub4", "DataType", "0x0005"), "2100sub4", "HighLimit", "0xFF")
+    changed = with_key(changed, "2100sub4", "DefaultValue", "0xFA")
+    eds = load(changed.encode(), "my.eds")
+    check_eds(eds, EscSettings())
+    with pytest.raises(UserError, match="2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says"):
+        check_eds(eds, [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
