@@ -3,7 +3,6 @@
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -314,32 +313,6 @@ def plain(data_type: int, **keys: str) -> str:
         **keys,
     }
     return "\n".join(f"{key}={value}" for key, value in lines.items())
-
-
-@pytest.mark.parametrize("index", sorted({e.index for e in shipped_eds().entries} - {0x1000, 0x1001, 0x1018}))
-def test_each_optional_object_can_be_dropped(index: int) -> None:
-    gone = {index}
-    if 0x1800 <= index < 0x1A00:
-        gone.add(index + 0x200)
-    if 0x1A00 <= index < 0x1C00:
-        gone.add(index - 0x200)
-    if index >= 0x2000:  # and the PDOs that carry it
-        gone |= {0x1800, 0x1801, 0x1802, 0x1803, 0x1A00, 0x1A01, 0x1A02, 0x1A03}
-    eds = replace(shipped_eds(), entries=tuple(e for e in shipped_eds().entries if e.index not in gone))
-    check_eds(eds, EscSettings())
-    bench = Bench(eds=eds)
-    bench.start()
-    for other in gone:
-        assert bench.read(other) == NO_OBJECT
-    bench.uart(uart(INFO, Layout.V4))
-    bench.uart(uart(LIVE._replace(operating_errors=1), Layout.V4))
-    bench.put(0x80, "")
-    bench.put(0x705, "05")
-    bench.wait(2000)
-    for entry in eds.entries:
-        bench.read(entry.index, entry.sub)
-    bench.put(0, "81 01")
-    assert 0x701 in {frame.can_id for frame in bench.take()}
 
 
 def test_an_eds_without_an_object_is_what_1021h_gives() -> None:

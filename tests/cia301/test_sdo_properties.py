@@ -373,22 +373,6 @@ class Client:
             raise Refused(Abort(int.from_bytes(answer[4:], "little")).name)
         return answer
 
-    def download(self, data: bytes, cuts: Sequence[int], tell_size: bool) -> None:
-        size = len(data).to_bytes(4, "little") if tell_size else bytes(4)
-        assert self.ask(bytes((0x20 | tell_size,)) + self.multiplexer + size) == b"\x60" + self.multiplexer + bytes(4)
-        toggle, at, turn = 0, 0, 0
-        while True:
-            count = cuts[turn % len(cuts)] if cuts else 7
-            turn += 1
-            part = data[at : at + count]
-            at += count
-            last = at >= len(data)
-            answer = self.ask(bytes((toggle << 4 | (7 - len(part)) << 1 | last,)) + part)
-            assert answer == bytes((0x20 | toggle << 4,)) + bytes(7)
-            toggle ^= 1
-            if last:
-                return
-
     def upload(self) -> bytes:
         answer = self.ask(b"\x40" + self.multiplexer)
         assert answer[1:4] == self.multiplexer
@@ -488,17 +472,6 @@ DATA = st.builds(lambda size, seed: random.Random(seed).randbytes(size), SIZES, 
 def losing(seed: int, percent: int) -> Callable[[], bool]:
     chance = random.Random(seed)
     return lambda: chance.randrange(100) < percent
-
-
-@settings(max_examples=100, deadline=None)
-@given(DATA, st.lists(st.integers(1, 7), max_size=5), st.booleans())
-def test_segmented_transfers_carry_any_data_both_ways(data: bytes, cuts: list[int], tell_size: bool) -> None:
-    bench = Bench()
-    client = Client(bench)
-    client.download(data, cuts, tell_size)
-    assert bench.objects.written == [(0x2003, 0, data)]
-    assert client.upload() == data
-    assert not bench.server.busy
 
 
 @settings(max_examples=150, deadline=None)
