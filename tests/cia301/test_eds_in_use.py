@@ -4,7 +4,7 @@ from functools import cache
 
 import pytest
 from dialogue import Bench, changed, info, live, shipped_eds
-from test_dictionary_walk import text, with_key
+from eds_text import SHIPPED, with_key
 
 from kontronik_can_gw.cia301.check import check_eds
 from kontronik_can_gw.cia301.dictionary import _IF_ABSENT, key
@@ -202,17 +202,17 @@ def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
 def test_defaults_that_a_download_would_be_refused_are_refused_at_start(
     section: str, key: str, value: str, said: str
 ) -> None:
-    assert said in "\n".join(problems(with_key(text(), section, key, value).encode()))
+    assert said in "\n".join(problems(with_key(SHIPPED, section, key, value).encode()))
 
 
 def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:
-    changed = with_key(text(), "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
+    changed = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
     check_eds(load(changed.encode(), "my.eds"), EscSettings(), [1])
     assert "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3" in problems(changed.encode(), (3,))[0]
 
 
 def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:
-    changed = with_key(with_key(text(), "2100sub4", "DataType", "0x0005"), "2100sub4", "HighLimit", "0xFF")
+    changed = with_key(with_key(SHIPPED, "2100sub4", "DataType", "0x0005"), "2100sub4", "HighLimit", "0xFF")
     changed = with_key(changed, "2100sub4", "DefaultValue", "0xFA")
     eds = load(changed.encode(), "my.eds")
     check_eds(eds, EscSettings())

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 from dialogue import NO_HEARTBEAT, OFF, QUIET, SPARE, Bench, default, info, live, shipped_eds, tpdo
+from eds_text import SHIPPED, variable, with_object
 from script import MS
-from test_dictionary_walk import bench_of, plain, text, with_object
+from test_dictionary_walk import bench_of
 
 from kontronik_can_gw.cia301.bindings import bindings
 from kontronik_can_gw.cia301.dictionary import Dictionary
@@ -245,8 +246,8 @@ def test_the_bec_current_of_a_jivepro_stays_unknown_when_its_info_is_old() -> No
 
 
 def test_objects_from_a000h_on_are_stored_too() -> None:
-    swapped = text().replace("[ManufacturerObjects]", "[Kept]").replace("[OptionalObjects]", "[ManufacturerObjects]")
-    changed = with_object(swapped, 0xA000, plain(0x05, DefaultValue="1"))
+    swapped = SHIPPED.replace("[ManufacturerObjects]", "[Kept]").replace("[OptionalObjects]", "[ManufacturerObjects]")
+    changed = with_object(swapped, 0xA000, variable(0x05, DefaultValue="1"))
     changed = changed.replace("[ManufacturerObjects]", "[OptionalObjects]").replace("[Kept]", "[ManufacturerObjects]")
     bench = bench_of(changed)
     assert bench.write(0xA000, 0, b"\x05") is None

@@ -16,6 +16,8 @@ import pytest
 from cantools.database.can import Database
 from cantools.database.namedsignalvalue import NamedSignalValue
 from dbc_rules import ENUMS, RULES, parse
+from eds_text import SHIPPED as EDS_TEXT
+from eds_text import variable, with_object
 from test_dbc_in_other_tools import frame, raw_value
 
 from kontronik_can_gw import canopen_dbc
@@ -39,7 +41,6 @@ from kontronik_can_gw.simulator import BYTE_NS, Dropout, ErrorWindow, EscOptions
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_canopen.dbc"
-EDS_TEXT = shipped("eds/kontronik_esc.eds").read_bytes().decode("ascii")
 EDS = reader.load(EDS_TEXT.encode(), "kontronik_esc.eds")
 ONE = (EscSettings("esc1"),)
 PAIR = (EscSettings("left"), EscSettings("right_r", pole_pairs=7, gear=Fraction(5, 2)))
@@ -479,20 +480,10 @@ def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
 
 def with_objects(*sections: tuple[int, str, int, str]) -> Eds:
     """The shipped EDS with mappable plain variables: index, name, data type, default."""
-    text = EDS_TEXT.replace("\r\n", "\n")
-    listed = re.search(r"\[ManufacturerObjects\]\nSupportedObjects=(\d+)\n((?:\d+=.*\n)+)", text)
-    assert listed
-    count = int(listed[1])
-    more = "".join(f"{count + n}={index:#x}\n" for n, (index, *_) in enumerate(sections, 1))
-    text = text.replace(
-        listed[0], f"[ManufacturerObjects]\nSupportedObjects={count + len(sections)}\n{listed[2]}{more}"
-    )
+    text = EDS_TEXT
     for index, name, data_type, default in sections:
-        text += (
-            f"\n[{index:04X}]\nParameterName={name}\nObjectType=0x7\nDataType=0x{data_type:04X}\nAccessType=rw\n"
-            f"DefaultValue={default}\nPDOMapping=1\n"
-        )
-    return reader.load(text.replace("\n", "\r\n").encode(), "mine.eds")
+        text = with_object(text, index, variable(data_type, name=name, DefaultValue=default, PDOMapping=1))
+    return reader.load(text.encode(), "mine.eds")
 
 
 def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() -> None:

@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import eds_text
 import pytest
+from eds_text import SHIPPED, variable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,24 +16,10 @@ from kontronik_can_gw.cia301 import eds as reader
 from kontronik_can_gw.cia301.eds import Entry
 from kontronik_can_gw.errors import UserError
 
-SHIPPED = (Path(__file__).parents[2] / "eds" / "kontronik_esc.eds").read_bytes().decode("ascii")
-VARIABLE = "ParameterName={name}\r\nObjectType=0x7\r\nDataType=0x{type:04X}\r\nAccessType={access}\r\n"
 
-
-def with_object(text: str, index: int = 0x2200) -> str:
-    """The shipped EDS with one manufacturer object more, of which ``text`` is the section's content."""
-    count = int(SHIPPED.split("[ManufacturerObjects]\r\nSupportedObjects=")[1].split("\r\n")[0])
-    longer = SHIPPED.replace(
-        f"[ManufacturerObjects]\r\nSupportedObjects={count}",
-        f"[ManufacturerObjects]\r\nSupportedObjects={count + 1}\r\n{count + 1}=0x{index:04X}",
-    )
-    return f"{longer}\r\n[{index:04X}]\r\n{text}\r\n"
-
-
-def variable(data_type: int, access: str = "rw", **keys: object) -> str:
-    """The content of a section."""
-    lines = [f"{key}={value}\r\n" for key, value in keys.items()]
-    return VARIABLE.format(name="Test object", type=data_type, access=access) + "".join(lines)
+def with_object(content: str, index: int = 0x2200) -> str:
+    """The shipped EDS with one manufacturer object more."""
+    return eds_text.with_object(SHIPPED, index, content)
 
 
 def problems(text: str | bytes) -> tuple[str, ...]:
