@@ -301,12 +301,12 @@ class Bench:
             case "<-", [cob_id, *data]:
                 flags = {name: True for name in data if name in FLAGS}
                 frame = bytes_of(" ".join(word for word in data if word not in FLAGS))
-                self.gateway.receive_frame(CanFrame(int(cob_id, 16), frame, **flags), self.now)
+                self.put(int(cob_id, 16), frame, **flags)
             case "uart", [esc, "rubbish"]:
-                self.gateway.receive_bytes(int(esc), b"rubbish", self.now)
+                self.uart(b"rubbish", int(esc))
             case "uart", [esc, kind, *fields]:
                 values = {name: int(value, 0) for name, value in (field.split("=") for field in fields)}
-                self.gateway.receive_bytes(int(esc), (live if kind == "live" else info)(**values), self.now)
+                self.uart((live if kind == "live" else info)(**values), int(esc))
             case (("read" | "write"), _):
                 return self._say_sdo(verb, rest)
             case "port", ["lost", esc]:

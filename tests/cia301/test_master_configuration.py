@@ -13,7 +13,6 @@ from dialogue import NO_HEARTBEAT, Bench, default, live
 from kontronik_can_gw.cia301.check import check_eds
 from kontronik_can_gw.cia301.eds import load
 from kontronik_can_gw.config import shipped
-from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.telemetry import EscSettings
 
 EDS = shipped("eds/kontronik_esc.eds")
@@ -85,8 +84,8 @@ class _Wire(canopen.Network):
         self._bench = bench
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        self._bench.gateway.receive_frame(CanFrame(can_id, bytes(data), remote=remote), self._bench.now)
-        for frame in self._bench.gateway.take_frames():
+        self._bench.put(can_id, bytes(data), remote=remote)
+        for frame in self._bench.take():
             self.notify(frame.can_id, bytearray(frame.data), 0.0)
 
 

@@ -17,7 +17,6 @@ from kontronik_can_gw.cia301.storage import Stored, encode
 from kontronik_can_gw.cli.common import Loaded, assemble
 from kontronik_can_gw.config import parse, shipped
 from kontronik_can_gw.dbc_output.layout import Layout
-from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.protocol.fields import device_and_variant
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number
 from kontronik_can_gw.telemetry import EscSettings
@@ -68,8 +67,7 @@ def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_i
     bench.take()
     for n in range(300):
         bench.wait(20)
-        bench.gateway.receive_frame(CanFrame((0x701, 0x081, 0x581)[n % 3], bytes(8)), bench.now)
-        bench._collect()
+        bench.put((0x701, 0x081, 0x581)[n % 3], bytes(8))
     assert [frame.data[:4] for frame in bench.take()] == [b"\x50\x81\x11\xff"]
     assert bench.gateway.status.id_conflicts == 300
     begun = bench.gateway.take_conflicts()
@@ -85,14 +83,10 @@ def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_i
 def test_what_only_looks_like_an_id_of_the_node_is_no_collision() -> None:
     bench = Bench(changes=QUIET)
     bench.take()
-    for frame in (
-        CanFrame(0x701, b"", remote=True),
-        CanFrame(0x701, b"", extended=True),
-        CanFrame(0x601, bytes(8)),
-        CanFrame(0x080, b""),
-        CanFrame(0x7E4, bytes(8)),
-    ):
-        bench.gateway.receive_frame(frame, bench.now)
+    bench.put(0x701, b"", remote=True)
+    bench.put(0x701, b"", extended=True)
+    for cob_id, size in ((0x601, 8), (0x080, 0), (0x7E4, 8)):
+        bench.put(cob_id, bytes(size))
     assert bench.gateway.status.id_conflicts == 0
     assert bench.gateway.take_conflicts() == []
 
@@ -128,11 +122,12 @@ def test_all_pdos_that_a_uart_frame_causes_carry_that_frame() -> None:
     }
     bench = Bench(changes=mapped).start()
     speeds = range(1, 200)
-    bench.gateway.receive_bytes(0, b"".join(live(electrical_speed=s) for s in speeds[:20]), 10 * MS)  # in one read
+    bench.now = 10 * MS
+    bench.uart(b"".join(live(electrical_speed=s) for s in speeds[:20]))  # in one read
     for speed in speeds[20:]:
         bench.now += 10 * MS
         bench.uart(live(electrical_speed=speed))
-    frames = bench.gateway.take_frames() + bench.take()
+    frames = bench.take()
     told = [(f.can_id, int.from_bytes(f.data, "little")) for f in frames if len(f.data) == 4]
     assert told == [(0x181 + 0x100 * n, speed) for speed in speeds for n in range(4)]
 
