@@ -23,7 +23,7 @@ from fractions import Fraction
 from functools import cache
 from typing import Any
 
-from script import MS, bytes_of, hexadecimal, ms, play_lines
+from script import MS, bytes_of, hexadecimal, ms
 
 from kontronik_can_gw.cia301.eds import Eds, load, without
 from kontronik_can_gw.cia301.node import Node, NodeSettings
@@ -283,11 +283,7 @@ class Bench:
         assert answer == expected
         return None
 
-    # --- dialogues
-
-    def talk(self, text: str) -> None:
-        """Play a dialogue."""
-        play_lines(self, [(f"line {n}", line) for n, line in enumerate(text.splitlines(), 1)])
+    # --- dialogues (script.Talker)
 
     def jump(self, now: int) -> None:
         """Let time pass without being served: the program hung."""
