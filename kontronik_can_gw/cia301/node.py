@@ -22,7 +22,7 @@ from kontronik_can_gw.cia301.heartbeat import NEVER
 from kontronik_can_gw.cia301.nmt import Command, NmtState
 from kontronik_can_gw.cia301.pdo import COB_ID, COMMUNICATION, INVALID_BIT, MAPPING, MOST, Tpdo, restricted
 from kontronik_can_gw.cia301.sdo import SdoServer
-from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.cia301.storage import VERIFY, Stored
 from kontronik_can_gw.cia305.lss import UNCONFIGURED, LssSlave
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.protocol.states import Device, device_text
@@ -34,7 +34,6 @@ EMERGENCY, SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x80, 0x600, 0x580
 COMMUNICATION_PROFILE, APPLICATION_PROFILE = (0x1000, 0x1FFF), (0x2000, 0xFFFF)
 CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
 """Objects of services whose values have rules beyond type and limits (those of PDOs have their own)."""
-VERIFY = 0x1020
 _NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTICS})
 """Objects that can be written and are no part of a configuration."""
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
@@ -672,7 +671,7 @@ class Node:
             stored = replace(stored, application=application, node_id=self._bus_node_id)
         whole = self.dictionary.to_store(*COMMUNICATION_PROFILE, self.node_id), application
         if (stored.communication, stored.application) != whole:
-            stored = _unverified(stored)
+            stored = stored.unverified()
         self._save(self.sdo.waiting, stored)
 
     def _restore(self, part: int) -> None:
@@ -682,7 +681,7 @@ class Node:
             stored = replace(stored, communication={})
         if part in (1, 3):
             stored = replace(stored, application={})
-        self._save(self.sdo.waiting, _unverified(stored))
+        self._save(self.sdo.waiting, stored.unverified())
 
     # --- binding
 
@@ -893,12 +892,6 @@ class Node:
     def _reset_statistics(self) -> bool:
         self.esc.reset_statistics()
         return True
-
-
-def _unverified(stored: Stored) -> Stored:
-    """Without 1020h: these parameters are not all of the configuration that it names."""
-    left = {number: data for number, data in stored.communication.items() if number >> 8 != VERIFY}
-    return replace(stored, communication=left)
 
 
 def _only_zero(value: int) -> None:

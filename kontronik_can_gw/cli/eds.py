@@ -8,8 +8,9 @@ from kontronik_can_gw.cia301.abort import SdoAbort
 from kontronik_can_gw.cia301.bindings import bindings
 from kontronik_can_gw.cia301.dictionary import Value
 from kontronik_can_gw.cia301.eds import dcf
-from kontronik_can_gw.cia301.node import VERIFY, Node
+from kontronik_can_gw.cia301.node import Node
 from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cia301.storage import VERIFY
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.cli.common import canopen_of, load_all, write_output
 from kontronik_can_gw.cli.node_setup import shipped_canopen

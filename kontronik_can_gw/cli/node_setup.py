@@ -137,20 +137,20 @@ def with_stored(
             said.append(
                 f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: it cannot be this node's"
             )
-            kept[number] = replace(kept[number], node_id=None)
+            kept[number] = replace(kept[number], node_id=None).unverified()
     setup = replace(plain, stored=tuple(kept))
     while clash := [n for n in _clashing_nodes(setup.nodes(escs, foreign), foreign) if kept[n] != Stored()]:
         for number in clash:
             ids = {key for key in kept[number].communication if key >> 8 in _WITH_COB_ID}
             if ids:
                 left = {key: value for key, value in kept[number].communication.items() if key not in ids}
-                kept[number] = replace(kept[number], communication=left)
+                kept[number] = replace(kept[number], communication=left).unverified()
                 said.append(f"{names[number]}: the stored COB-IDs are passed over: one is used otherwise now")
             elif kept[number].node_id is not None:
                 said.append(
                     f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: its COB-IDs are used otherwise"
                 )
-                kept[number] = replace(kept[number], node_id=None)
+                kept[number] = replace(kept[number], node_id=None).unverified()
             else:
                 kept[number] = Stored()
         setup = replace(plain, stored=tuple(kept))

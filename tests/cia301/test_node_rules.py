@@ -302,6 +302,17 @@ def test_nothing_a_master_stored_keeps_the_gateway_from_starting(tmp_path: Path,
     assert loaded.warnings or any(node.misfits for node in nodes)  # said at start, or by the node when it boots
 
 
+@pytest.mark.parametrize("clashing", [Stored(2), Stored(communication={0x101400: u32(0x82)})])
+def test_1020h_does_not_stay_where_something_stored_with_it_gave_way(tmp_path: Path, clashing: Stored) -> None:
+    verify = {0x102001: u32(15685), 0x102002: u32(43_200_000), 0x101700: b"\xf4\x01"}
+    for stored, expected in ((Stored(7), 15685), (clashing, 0)):
+        keep(tmp_path, esc1=Stored(stored.node_id, {**stored.communication, **verify}))
+        loaded = setup_of(tmp_path)
+        assert loaded.canopen is not None
+        dictionary = loaded.canopen.nodes(loaded.escs).nodes[0].dictionary
+        assert (dictionary.number(0x1020, 1), dictionary.number(0x1017)) == (expected, 500)
+
+
 def test_swapped_node_ids_are_kept(tmp_path: Path) -> None:
     keep(tmp_path, esc1=Stored(2), esc2=Stored(1))
     loaded = setup_of(tmp_path)
