@@ -183,7 +183,7 @@ class _NodeMessages:
             if tpdo.valid and tpdo.mapped:
                 yield self._tpdo(tpdo)
         yield self._heartbeat()
-        cob_id = self._node.dictionary.number(0x1014, otherwise=1 << 31)
+        cob_id = self._node.emergency_id
         if not cob_id >> 31:
             yield self._emergency(cob_id & 0x7FF)
 

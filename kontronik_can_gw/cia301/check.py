@@ -14,6 +14,7 @@ from kontronik_can_gw.cia301.node import (
     SDO_REQUEST,
     NodeSettings,
     configured_settings,
+    default_ids,
     range_of,
 )
 from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
@@ -59,8 +60,10 @@ def check_eds(eds: Eds, escs: EscSettings | Sequence[EscSettings], node_ids: Ite
         )
     ]
     if not problems:
-        for node_id in node_ids:
+        numbers = list(node_ids) or [1]  # where all wait for LSS any node-ID may come
+        for node_id in numbers:
             problems += [f"{eds.name}: {what}" for what in _defaults(eds, settings, node_id)]
+        problems += [f"{eds.name}: {what}" for what in _shared_ids(dictionary, numbers)]
     if problems:
         raise UserError(*dict.fromkeys(problems))
 
@@ -143,3 +146,22 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
                 f"TPDO {tpdo.number + 1}: the defaults of {COMMUNICATION + tpdo.number:04X}h and "
                 f"{MAPPING + tpdo.number:04X}h do not make a PDO of node {node_id} ({error})."
             )
+        if tpdo.valid and not tpdo.mapped:
+            yield (
+                f"TPDO {tpdo.number + 1}: {MAPPING + tpdo.number:04X}h maps nothing, so {COMMUNICATION + tpdo.number:04X}h:01 "
+                "cannot be valid. Map objects, or set bit 31 of its DefaultValue."
+            )
+
+
+def _shared_ids(dictionary: Dictionary, node_ids: Sequence[int]) -> Iterator[str]:
+    """COB-IDs that two defaults have, of one node or of two; each pair of objects once."""
+    sync = dictionary.number(0x1005) & 0x7FF
+    users = {sync: (0x1005, "1005h:00")}
+    found = set()
+    for node_id in node_ids:
+        for index, sub, cob_id in default_ids(dictionary, node_id):
+            who = f"{index:04X}h:{sub:02X} of node {node_id}"
+            other, whose = users.setdefault(cob_id, (index, who))
+            if whose != who and (other, index) not in found:
+                found.add((other, index))
+                yield f"COB-ID {cob_id:03X}h is that of {whose} and of {who}. Change one DefaultValue (or add $NODEID)."

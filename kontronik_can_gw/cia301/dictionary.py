@@ -31,6 +31,18 @@ def key(index: int, sub: int) -> int:
     return index << 8 | sub
 
 
+_IF_ABSENT = {
+    key(0x1005, 0): 0x80,
+    key(0x1017, 0): 1000,
+    key(0x1018, 2): 0x4B4F4E01,
+    key(0x1018, 3): 0x00010000,
+    key(0x1029, 2): 1,
+    key(0x1F80, 0): 4,
+    key(0x2100, 6): 0x00FDFFFF,
+}
+"""Defaults of the shipped EDS that are not 0: what holds for an object that the EDS in use has dropped."""
+
+
 class Variable:
     """One entry at work. ``check`` may refuse a new value; ``written`` follows one, and returns False if the confirmation comes later."""
 
@@ -96,17 +108,19 @@ class Dictionary:
         self._indices = frozenset(entry.index for entry in eds.entries)
         self.read_only = False
         """True: nothing may be written over the bus."""
-        self.changed: Callable[[Variable, int], None] = lambda _variable, _now: None
-        """Told of each value that was written over the bus."""
+        self.written: Callable[[Variable, bool, int], None] = lambda _variable, _changed, _now: None
+        """Called after each download; the flag says whether the value is another one."""
 
     def get(self, index: int, sub: int = 0) -> Variable | None:
         """The variable, None where there is none."""
         return self.variables.get(key(index, sub))
 
-    def number(self, index: int, sub: int = 0, otherwise: int = 0) -> int:
-        """The whole number that a variable holds; ``otherwise`` where the EDS has no such variable."""
+    def number(self, index: int, sub: int = 0, otherwise: int | None = None) -> int:
+        """The whole number that a variable holds. Where the EDS has no such variable ``otherwise``, None: the shipped EDS's default."""
         variable = self.get(index, sub)
-        return otherwise if variable is None or not isinstance(variable.value, int) else variable.value
+        if variable is not None and isinstance(variable.value, int):
+            return variable.value
+        return _IF_ABSENT.get(key(index, sub), 0) if otherwise is None else otherwise
 
     def subs(self, index: int) -> Iterator[Variable]:
         """Variables of an array or record, from sub-index 1 on."""
@@ -165,9 +179,10 @@ class Dictionary:
         if variable.check is not None:
             assert isinstance(value, int)
             variable.check(value)
+        changed = self.value(variable, now) != value
         variable.value = value
         done = True if variable.written is None else variable.written(now)
-        self.changed(variable, now)
+        self.written(variable, changed, now)
         return done
 
     # --- power-on and storage

@@ -14,6 +14,7 @@ import re
 import struct
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import PurePath
 
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.lean import without_asammdf
@@ -146,6 +147,7 @@ _COMMUNICATION: Mapping[int, _Shape] = {
     0x1017: _var(_U16),
     0x1018: _list(RECORD, _U32, 4, 1),
     0x1019: _var(_U8),
+    0x1020: _list(ARRAY, _U32, 2, 1, 2),
     0x1021: _Shape((DOMAIN, VAR), {0: (_DOMAIN_TYPE,)}),
     0x1022: _var(_U8, _U16),  # copies of the table differ in the width
     0x1029: _list(ARRAY, _U8, 0xFE, 1),
@@ -799,13 +801,18 @@ def _shorter_list(lines: list[str], indices: Container[int]) -> list[str]:
 
 
 def dcf(
-    eds: Eds, node_id: int, bitrate: int, values: Mapping[tuple[int, int], int | float | bytes], node_name: str
+    eds: Eds,
+    node_id: int,
+    bitrate: int,
+    values: Mapping[tuple[int, int], int | float | bytes],
+    node_name: str,
+    file_name: str,
 ) -> str:
     """The EDS as the DCF of one node (CiA 306, clause 5): its text with a ParameterValue for each of ``values``, and [DeviceComissioning].
 
-    ``bitrate`` in bit/s. Values are as they are in the node, with the node-ID worked in. Domains are left out: a DCF names files
-    for them. Real numbers are written as decimals, which the canopen library reads. Lines end in CR LF. KeyError for a value that has no
-    entry, UserError for a text that an INI file cannot hold.
+    ``bitrate`` in bit/s. ``file_name`` is the DCF's; LastEDS names the EDS. Values are as they are in the node, with the node-ID worked in.
+    Domains are left out: a DCF names files for them. Real numbers are written as decimals, which the canopen library reads. Lines end in
+    CR LF. KeyError for a value that has no entry, UserError for a text that an INI file cannot hold.
     """
     entries = {(entry.index, entry.sub): entry for entry in eds.entries}
     texts = {
@@ -816,7 +823,11 @@ def dcf(
     result: list[str] = []
     for name, lines in _blocks(eds.data.decode("ascii")):
         added: list[str] = []
-        if name.lower() == "deviceinfo":
+        if name.lower() == "fileinfo":
+            last = PurePath(eds.name).name.encode("ascii", "replace").decode("ascii")
+            lines = [line for line in lines if _key(line) not in ("filename", "lasteds")]
+            lines[1:1] = [f"FileName={file_name}", f"LastEDS={last}"]
+        elif name.lower() == "deviceinfo":
             added = _commissioning(node_id, bitrate, values.get((0x1018, 4)), node_name)
         elif match := _OBJECT.match(name):
             index, sub = int(match[1], 16), int(match[2] or "0", 16)
@@ -840,7 +851,8 @@ def _commissioning(node_id: int, bitrate: int, serial: float | bytes | None, nod
         "NetNumber=0",
         "CANopenManager=0",
     ]
-    return [*lines, f"LSS_SerialNumber=0x{serial:08X}"] if isinstance(serial, int) else lines
+    # 0: not known, so nothing that an LSS master could look for
+    return [*lines, f"LSS_SerialNumber=0x{serial:08X}"] if isinstance(serial, int) and serial else lines
 
 
 def _compact_values(index: int, texts: Mapping[tuple[int, int], str]) -> list[str]:

@@ -22,7 +22,7 @@ from kontronik_can_gw.cia301.heartbeat import NEVER
 from kontronik_can_gw.cia301.nmt import Command, NmtState
 from kontronik_can_gw.cia301.pdo import COB_ID, COMMUNICATION, INVALID_BIT, MAPPING, MOST, Tpdo, restricted
 from kontronik_can_gw.cia301.sdo import SdoServer
-from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.cia301.storage import VERIFY, Stored
 from kontronik_can_gw.cia305.lss import UNCONFIGURED, LssSlave
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.protocol.states import Device, device_text
@@ -30,10 +30,12 @@ from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus, Grou
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry, Event, LinkState
 
 SAVE, LOAD, RESET = (int.from_bytes(word, "little") for word in (b"save", b"load", b"rset"))
-SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x600, 0x580, 0x7E5, 0x7E4
+EMERGENCY, SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x80, 0x600, 0x580, 0x7E5, 0x7E4
 COMMUNICATION_PROFILE, APPLICATION_PROFILE = (0x1000, 0x1FFF), (0x2000, 0xFFFF)
 CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
 """Objects of services whose values have rules beyond type and limits (those of PDOs have their own)."""
+_NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTICS})
+"""Objects that can be written and are no part of a configuration."""
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 _SELF_START_OFF = 4
 _MOST_SAVES = 4
@@ -121,6 +123,18 @@ def configured_settings(base: EscSettings) -> dict[int, int]:
     return {sub: given for sub, given, default in listed if given != default}
 
 
+def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int, int]]:
+    """Valid COB-IDs of emergencies and PDOs by their defaults: index, sub-index, id."""
+    if dictionary.get(0x1014) is None:
+        yield 0x1014, 0, EMERGENCY + node_id
+    for number, variable in dictionary.variables.items():
+        index, sub = number >> 8, number & 0xFF
+        if index == 0x1014 or (index in range(COMMUNICATION, MAPPING) and sub == COB_ID):
+            cob_id = int(variable.default(node_id))
+            if not cob_id & INVALID_BIT:
+                yield index, sub, cob_id & 0x7FF
+
+
 def make_dictionary(eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored) -> Dictionary:
     """The dictionary of a node before its first reset, the configuration's values as power-on values and the stored ones in place.
 
@@ -192,7 +206,7 @@ class Node:
         ]
         self._bind_services(eds)
         self._bind_sources()
-        dictionary.changed = self._on_download
+        dictionary.written = self._on_download
 
     # --- life
 
@@ -232,11 +246,13 @@ class Node:
         else:
             self._send(heartbeat.COB_ID + self.node_id, bytes([NmtState.INITIALISING]))
             self._enter(NmtState.PRE_OPERATIONAL, now)
-            otherwise = 0 if self.settings.self_start else _SELF_START_OFF
+            otherwise = 0 if self.settings.self_start else None
             if not self.dictionary.number(0x1F80, otherwise=otherwise) & _SELF_START_OFF:
                 self._enter(NmtState.OPERATIONAL, now)
         if self.misfits:
             self._around.passed_over(self, self.misfits)
+        if self.misfits or self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id) != self._stored.application:
+            self._configuration_changed()  # 1020h was stored with other application parameters
         self._around.routes_changed()
         self._around.state_changed()
         self._set_due()
@@ -248,14 +264,7 @@ class Node:
 
     def future_ids(self, node_id: int) -> set[int]:
         """COB-IDs that this node would choose by its defaults with another node-ID."""
-        found = set()
-        for number, variable in self.dictionary.variables.items():
-            is_cob_id = number == key(0x1014, 0) or (
-                number >> 8 in range(COMMUNICATION, MAPPING) and number & 0xFF == COB_ID
-            )
-            if is_cob_id and not (cob_id := int(variable.default(node_id))) & INVALID_BIT:
-                found.add(cob_id & 0x7FF)
-        return found
+        return {cob_id for _, _, cob_id in default_ids(self.dictionary, node_id)}
 
     def routes(self) -> Iterator[tuple[int, Callable[[bytes, int], None]]]:
         """COB-IDs this node listens to, and who takes them."""
@@ -264,8 +273,7 @@ class Node:
             return
         yield nmt.COB_ID, self._on_nmt
         yield SDO_REQUEST + self.node_id, self._on_sdo
-        if self.dictionary.get(0x1005) is not None:
-            yield self.dictionary.number(0x1005) & 0x7FF, self._on_sync
+        yield self.dictionary.number(0x1005) & 0x7FF, self._on_sync
         for node_id in self.consumer.node_ids:
             yield heartbeat.COB_ID + node_id, partial(self._on_heartbeat, node_id)
 
@@ -276,8 +284,7 @@ class Node:
         yield LSS_ANSWER, "LSS"
         if self.node_id == UNCONFIGURED:
             return
-        if self.dictionary.get(0x1005) is not None:
-            yield self.dictionary.number(0x1005) & 0x7FF, "SYNC"
+        yield self.dictionary.number(0x1005) & 0x7FF, "SYNC"
         yield SDO_REQUEST + self.node_id, f"SDO requests to CANopen node {self.node_id}"
         yield from self.transmit_ids()
 
@@ -288,8 +295,8 @@ class Node:
         who = f"CANopen node {self.node_id}"
         yield heartbeat.COB_ID + self.node_id, f"the heartbeat of {who}"
         yield SDO_ANSWER + self.node_id, f"SDO answers of {who}"
-        if not self._emergency_id & INVALID_BIT:
-            yield self._emergency_id & 0x7FF, f"emergencies of {who}"
+        if not self.emergency_id & INVALID_BIT:
+            yield self.emergency_id & 0x7FF, f"emergencies of {who}"
         for tpdo in self.tpdos:
             if tpdo.valid:
                 yield tpdo.cob_id, f"TPDO {tpdo.number + 1} of {who}"
@@ -298,10 +305,9 @@ class Node:
         """COB-IDs that a master can choose: (who uses it, id). All nodes may have the same SYNC, so it is one user."""
         if self.node_id == UNCONFIGURED:
             return
-        if self.dictionary.get(0x1005) is not None:
-            yield sync, self.dictionary.number(0x1005) & 0x7FF
-        if not self._emergency_id & INVALID_BIT:
-            yield self, self._emergency_id & 0x7FF
+        yield sync, self.dictionary.number(0x1005) & 0x7FF
+        if not self.emergency_id & INVALID_BIT:
+            yield self, self.emergency_id & 0x7FF
         for tpdo in self.tpdos:
             if tpdo.valid:
                 yield tpdo, tpdo.cob_id
@@ -411,8 +417,9 @@ class Node:
 
     @property
     def identity(self) -> tuple[int, int, int, int]:
-        number = self.dictionary.number
-        return number(0x1018, 1), number(0x1018, 2), number(0x1018, 3), number(0x1018, 4)
+        number, settings = self.dictionary.number, self.settings
+        vendor_id, serial = number(0x1018, 1), number(0x1018, 4, otherwise=settings.serial)
+        return vendor_id, number(0x1018, 2), number(0x1018, 3), serial
 
     @property
     def claimed_node_id(self) -> int:
@@ -495,14 +502,15 @@ class Node:
         self._send(LSS_ANSWER, data)
 
     def _send_emergency(self, data: bytes) -> bool:
-        if self._emergency_id & INVALID_BIT:
+        if self.emergency_id & INVALID_BIT:
             return False
-        self._send(self._emergency_id & 0x7FF, data)
+        self._send(self.emergency_id & 0x7FF, data)
         return True
 
     @property
-    def _emergency_id(self) -> int:
-        return self.dictionary.number(0x1014, otherwise=INVALID_BIT)
+    def emergency_id(self) -> int:
+        """1014h; that of the predefined connection set where the EDS has dropped it."""
+        return self.dictionary.number(0x1014, otherwise=EMERGENCY + self.node_id)
 
     # --- states
 
@@ -568,7 +576,7 @@ class Node:
         if events & Event.INFO and esc.info is not None and self.settings.device is not None:
             found.set(GatewayError.OTHER_DEVICE, esc.info.device != self.settings.device, now)
         if self._live and esc.live is None and link in (LinkState.LOST, LinkState.PORT_ERROR):
-            self._behave(self.dictionary.number(0x1029, 2, otherwise=1), now)
+            self._behave(self.dictionary.number(0x1029, 2), now)
         self._live = esc.live is not None
 
     def _set_due(self) -> None:
@@ -581,9 +589,16 @@ class Node:
 
     # --- parameters
 
-    def _on_download(self, variable: Variable, now: int) -> None:
+    def _on_download(self, variable: Variable, changed: bool, now: int) -> None:
         for tpdo in self.tpdos:
             tpdo.on_download(variable, now)
+        if changed and variable.entry.index not in _NO_CONFIGURATION:
+            self._configuration_changed()
+
+    def _configuration_changed(self) -> None:
+        """1020h no longer names the configuration: its master downloads it anew."""
+        for variable in self.dictionary.subs(VERIFY):
+            variable.value = 0
 
     def _configure_or_default(self, tpdo: Tpdo, now: int) -> None:
         """Stored PDO parameters that no longer make sense with this EDS give way to the defaults; without a free COB-ID there is no PDO."""
@@ -626,7 +641,7 @@ class Node:
 
     def _apply_settings(self, now: int) -> None:
         settings = esc_settings(self.dictionary, self._base)
-        self.emergencies.mask = self.dictionary.number(at.SETTINGS, 6, otherwise=0xFFFFFFFF)
+        self.emergencies.mask = self.dictionary.number(at.SETTINGS, 6)
         if self.esc.live is not None:
             self.emergencies.set_word(self.esc.live.operating_errors, now, force=True)
         if settings != self.esc.settings:
@@ -651,9 +666,12 @@ class Node:
         stored = self._wanted
         if part in (1, 2):
             stored = replace(stored, communication=self.dictionary.to_store(*COMMUNICATION_PROFILE, self.node_id))
+        application = self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id)
         if part in (1, 3):
-            application = self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id)
             stored = replace(stored, application=application, node_id=self._bus_node_id)
+        whole = self.dictionary.to_store(*COMMUNICATION_PROFILE, self.node_id), application
+        if (stored.communication, stored.application) != whole:
+            stored = stored.unverified()
         self._save(self.sdo.waiting, stored)
 
     def _restore(self, part: int) -> None:
@@ -663,7 +681,7 @@ class Node:
             stored = replace(stored, communication={})
         if part in (1, 3):
             stored = replace(stored, application={})
-        self._save(self.sdo.waiting, stored)
+        self._save(self.sdo.waiting, stored.unverified())
 
     # --- binding
 
@@ -804,7 +822,7 @@ class Node:
 
     def _check_emergency_cob_id(self, value: int) -> None:
         """1014h: bits 0..30 cannot change while it is valid; no 29-bit or restricted id, none that is taken."""
-        old, valid = self._emergency_id, not value & INVALID_BIT
+        old, valid = self.emergency_id, not value & INVALID_BIT
         if value & 0x7FFFF800 or (valid and restricted(value & 0x7FF)):
             raise SdoAbort(Abort.VALUE)
         if valid and not old & INVALID_BIT and old != value:

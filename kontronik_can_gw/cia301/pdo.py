@@ -23,7 +23,7 @@ from kontronik_can_gw.telemetry import MS, SECOND, EscTelemetry, Event
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
 MOST = 512
 COB_ID, TYPE, INHIBIT, EVENT_TIMER, SYNC_START = 1, 2, 3, 5, 6
-INVALID_BIT, NO_RTR_BIT, FRAME_BIT = 1 << 31, 1 << 30, 1 << 29
+INVALID_BIT, FRAME_BIT = 1 << 31, 1 << 29
 EVENT_TYPES = (254, 255)
 _MAX_BITS = 64
 _BOOLEAN = 0x01
@@ -114,7 +114,8 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePla
 
 
 def _check_cob_id(value: int, taken: Callable[[int], bool]) -> None:
-    if value & FRAME_BIT or not value & NO_RTR_BIT or value & 0x1FFFF800:
+    # Bit 30, no RTR, may be 0: most masters write it so. An RTR is not answered either way.
+    if value & FRAME_BIT or value & 0x1FFFF800:
         raise SdoAbort(Abort.VALUE)
     if value & INVALID_BIT:
         return
@@ -217,12 +218,12 @@ class Tpdo:
         """Take over what the dictionary says. A PDO that begins to exist in OPERATIONAL begins like at its start."""
         number = self._dictionary.number
         index = COMMUNICATION + self.number
-        cob_id = number(index, COB_ID, INVALID_BIT)
+        cob_id = number(index, COB_ID)
         was_running = self._running
         self.cob_id = cob_id & 0x7FF
         self._image_id = image_id(self.cob_id, False)
         self.valid = not cob_id & INVALID_BIT
-        self._type = number(index, TYPE, 255)
+        self._type = number(index, TYPE)
         self._by_event = self._type in EVENT_TYPES
         self._inhibit_ns = number(index, INHIBIT) * MS // 10
         self._held_until = self._last_ns + self._inhibit_ns
@@ -255,7 +256,7 @@ class Tpdo:
     def check(self, taken: Callable[[int], bool]) -> None:
         """Whether the parameters as they are make a PDO. SdoAbort if not."""
         number = self._dictionary.number
-        cob_id = number(COMMUNICATION + self.number, COB_ID, INVALID_BIT)
+        cob_id = number(COMMUNICATION + self.number, COB_ID)
         if sum(bits_of(entry.variable) for entry in self._mapped) > _MAX_BITS:
             raise SdoAbort(Abort.PDO_LENGTH)
         self.check_type(self._type)
@@ -264,9 +265,10 @@ class Tpdo:
     def check_cob_id(self, value: int, taken: Callable[[int], bool]) -> None:
         """A new 180xh:1.
 
-        SdoAbort 06090030h for RTR, 29 bits, restricted ids, and a change while the PDO exists; 06040043h for an id in use.
+        SdoAbort 06090030h for 29 bits, restricted ids, a change while the PDO exists, and a PDO with nothing mapped;
+        06040043h for an id in use.
         """
-        if self.valid and not value & INVALID_BIT and value & 0x7FF != self.cob_id:
+        if not value & INVALID_BIT and (not self._mapped or (self.valid and value & 0x7FF != self.cob_id)):
             raise SdoAbort(Abort.VALUE)
         _check_cob_id(value, taken)
 
@@ -298,11 +300,9 @@ class Tpdo:
             raise SdoAbort(Abort.PDO_LENGTH)
 
     def check_entry(self, mapping: int) -> None:
-        """A new 1A0xh:1..8. The PDO must not exist and sub-index 0 must be 0 (06010003h)."""
-        if self.valid:
+        """A new 1A0xh:1..8. The PDO must not exist and sub-index 0 must be 0, else 06010000h."""
+        if self.valid or self._dictionary.number(MAPPING + self.number):
             raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
-        if self._dictionary.number(MAPPING + self.number):
-            raise SdoAbort(Abort.SUB0_NOT_ZERO)
         if mapping:
             self.resolve(mapping)
 

@@ -13,10 +13,11 @@ import json
 import re
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 VERSION = 1
+VERIFY = 0x1020
 COMMUNICATION = range(0x1000, 0x2000)
 APPLICATION = range(0x2000, 0x10000)
 
@@ -36,6 +37,11 @@ class Stored:
     """Objects 1000h..1FFFh."""
     application: Mapping[int, bytes] = field(default_factory=dict)
     """Objects 2000h..FFFFh."""
+
+    def unverified(self) -> "Stored":
+        """Without 1020h: these parameters are not, or no longer, all of the configuration that it names."""
+        left = {number: data for number, data in self.communication.items() if number >> 8 != VERIFY}
+        return replace(self, communication=left)
 
 
 def encode(stored: Stored) -> bytes:

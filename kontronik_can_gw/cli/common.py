@@ -16,7 +16,6 @@ from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
 from kontronik_can_gw.cli.node_setup import (
-    check_cob_ids,
     load_of_stored,
     parameter_folder,
     plain_setup,
@@ -111,7 +110,6 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     if config.canopen.enabled:
         plain = plain_setup(config)
         nodes = plain.nodes(plain.esc_settings(config.escs))
-        check_cob_ids(nodes, plain.eds.name)
         taken, bits = nodes.cob_ids(), nodes.bits_per_second()
         kept = read_stored(config, store)
         escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)

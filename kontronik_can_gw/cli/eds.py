@@ -10,15 +10,17 @@ from kontronik_can_gw.cia301.dictionary import Value
 from kontronik_can_gw.cia301.eds import dcf
 from kontronik_can_gw.cia301.node import Node
 from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cia301.storage import VERIFY
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.cli.common import canopen_of, load_all, write_output
 from kontronik_can_gw.cli.node_setup import shipped_canopen
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.telemetry import EscSettings
 
-_STATES_AND_COMMANDS = frozenset({0x1001, 0x1002, 0x1003, 0x1010, 0x1011, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE})
+_STATES_AND_COMMANDS = frozenset(
+    {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, VERIFY, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE}
+)
 """Objects that tell what is at the moment, or do something when they are written."""
-_SERIAL_NUMBER = (0x1018, 4)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,19 +53,18 @@ def main(args: argparse.Namespace) -> int:
         setup, escs = canopen_of(loaded), loaded.escs
     text = setup.eds.data.decode("latin-1")  # any bytes come back as they were
     if args.node_id is not None:
-        text = _dcf(setup, escs, args.node_id, serial_known=args.config is not None)
+        text = _dcf(setup, escs, args.node_id, Path(args.output).name)
     write_output(args.output, text, "latin-1")
     return 0
 
 
-def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, serial_known: bool) -> str:
+def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, file_name: str) -> str:
     nodes = setup.nodes(escs).nodes
     for node, esc in zip(nodes, escs, strict=True):
         if node.node_id == node_id:
-            values = active_values(node)
-            if not serial_known:
-                values.pop(_SERIAL_NUMBER, None)
-            return dcf(setup.eds, node_id, node.settings.bitrate, values, esc.name)
+            if file_name == "-" or not file_name.isascii() or not file_name.isprintable() or ";" in file_name:
+                file_name = f"{Path(setup.eds.name).stem}_{node_id}.dcf"
+            return dcf(setup.eds, node_id, node.settings.bitrate, active_values(node), esc.name, file_name)
     there = [str(node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
     known = (
         f"There are {', '.join(there)}" if len(there) > 1 else f"There is {there[0]}" if there else "All wait for LSS"

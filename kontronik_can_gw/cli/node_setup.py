@@ -84,19 +84,6 @@ def plain_setup(config: Config) -> CanopenSetup:
     return CanopenSetup(load_eds(config), tuple(settings), (Stored(),) * len(settings), tuple(config.escs))
 
 
-def check_cob_ids(nodes: Nodes, eds: str) -> None:
-    """Two nodes, or two services, with one COB-ID: as where an EDS gives EMCY or a PDO an id without $NODEID."""
-    users: dict[int, str] = {}
-    problems = [
-        f"{eds}: COB-ID {cob_id:03X}h is that of {users[cob_id]} and of {what}. Change one default (or add $NODEID)."
-        for node in nodes.nodes
-        for cob_id, what in node.cob_ids()
-        if users.setdefault(cob_id, what) != what
-    ]
-    if problems:
-        raise UserError(*problems)
-
-
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:
     """What masters stored. Without a store its files are only looked at."""
     kept = Kept()
@@ -150,20 +137,20 @@ def with_stored(
             said.append(
                 f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: it cannot be this node's"
             )
-            kept[number] = replace(kept[number], node_id=None)
+            kept[number] = replace(kept[number], node_id=None).unverified()
     setup = replace(plain, stored=tuple(kept))
     while clash := [n for n in _clashing_nodes(setup.nodes(escs, foreign), foreign) if kept[n] != Stored()]:
         for number in clash:
             ids = {key for key in kept[number].communication if key >> 8 in _WITH_COB_ID}
             if ids:
                 left = {key: value for key, value in kept[number].communication.items() if key not in ids}
-                kept[number] = replace(kept[number], communication=left)
+                kept[number] = replace(kept[number], communication=left).unverified()
                 said.append(f"{names[number]}: the stored COB-IDs are passed over: one is used otherwise now")
             elif kept[number].node_id is not None:
                 said.append(
                     f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: its COB-IDs are used otherwise"
                 )
-                kept[number] = replace(kept[number], node_id=None)
+                kept[number] = replace(kept[number], node_id=None).unverified()
             else:
                 kept[number] = Stored()
         setup = replace(plain, stored=tuple(kept))

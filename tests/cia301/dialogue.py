@@ -17,13 +17,15 @@ but what is written may be sent. Text behind ";" is a comment.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from difflib import ndiff
+from fractions import Fraction
 from functools import cache
 from typing import Any
 
-from kontronik_can_gw.cia301.eds import Eds, load
+from script import MS, bytes_of, hexadecimal, ms
+
+from kontronik_can_gw.cia301.eds import Eds, load, without
 from kontronik_can_gw.cia301.node import Node, NodeSettings
 from kontronik_can_gw.cia301.nodes import CanopenSetup
 from kontronik_can_gw.cia301.storage import Stored
@@ -33,13 +35,15 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol import codec
 from kontronik_can_gw.protocol.fields import InfoData, LiveData
+from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import EscSettings
 
-MS = 1_000_000
 EMPTY = Layout("", "", ())
 OFF = 0xC0000000
 """A COB-ID of a TPDO that does not exist."""
+
+FLAGS = ("extended", "fd", "remote")
 
 Changes = Mapping[tuple[int, int], Mapping[str, Any]]
 _SAVE, _LOAD = b"save", b"load"
@@ -64,6 +68,12 @@ def default(index: int, sub: int, value: float | bytes, relative: bool | None = 
 
 NO_HEARTBEAT = default(0x1017, 0, 0)
 NO_PDOS: Changes = {(0x1800 + n, 1): {"default": OFF, "relative": False} for n in range(6)}
+SPARE: Changes = {
+    (index, sub): {"default": value}
+    for n in (4, 5)
+    for index, sub, value in ((0x1A00 + n, 0, 1), (0x1A00 + n, 1, 0x20000210))
+}
+"""The two spare PDOs with battery voltage mapped, so that they need only a COB-ID to exist."""
 QUIET: Changes = {**NO_HEARTBEAT, **NO_PDOS}
 """Changes that leave only frames that are asked for, and EMCY."""
 
@@ -99,6 +109,14 @@ class Bench:
     ) -> None:
         node_ids = range(1, nodes + 1) if node_ids is None else node_ids
         base = tuple(EscSettings(f"esc{n}", **(escs or {})) for n in range(len(node_ids)))
+        self._arguments = {
+            "changes": changes,
+            "eds": eds,
+            "node_ids": node_ids,
+            "layout": layout,
+            "escs": escs,
+            **settings,
+        }
         self.setup = CanopenSetup(
             changed(eds or shipped_eds(), changes or {}),
             tuple(NodeSettings(i, serial=77 + n, **settings) for n, i in enumerate(node_ids)),
@@ -106,6 +124,7 @@ class Bench:
             base,
         )
         self.gateway = Gateway(self.setup.esc_settings(base), layout, 0, canopen=self.setup)
+        self.on_disk = list(self.setup.stored)
         self.now = 0
         self.heard: list[tuple[int, CanFrame]] = []
         """What was sent and not looked at yet, with its time."""
@@ -124,6 +143,10 @@ class Bench:
         """COB-IDs that the nodes take."""
         assert self.gateway.nodes is not None
         return self.gateway.nodes.receive_ids
+
+    def restart(self) -> None:
+        """The program ends and starts again with what is on disk; time begins anew."""
+        self.__init__(**self._arguments, stored=self.on_disk)  # type: ignore[misc]
 
     # --- step by step
 
@@ -166,8 +189,10 @@ class Bench:
     def answer_saves(self, error: str | None = None) -> list[tuple[int, Stored]]:
         """Store what waits to be stored, or let it fail."""
         saves = self.gateway.take_saves()
-        for esc, _ in saves:
+        for esc, stored in saves:
             self.gateway.saved(esc, error, self.now)
+            if error is None:
+                self.on_disk[esc] = stored
         self._collect()
         return saves
 
@@ -258,97 +283,171 @@ class Bench:
         assert answer == expected
         return None
 
-    # --- dialogues
+    # --- dialogues (script.Talker)
 
-    def talk(self, text: str, **names: Any) -> None:
-        """Play a dialogue. ``names``: what its "do" lines may use besides ``gateway``, ``bench`` and ``now``."""
-        expected = [_normal(line) for raw in text.splitlines() if (line := raw.partition(";")[0].strip())]
-        actual: list[str] = []
-        for line in expected:
-            time, what = line.split(maxsplit=1)
-            self.pass_time(max(self.now, round(float(time) * MS)))
-            self._write_down(actual)
-            if what.startswith("->"):
-                continue
-            assert round(float(time) * MS) == self.now, f"lines in the order of time: {line}"
-            actual.append(f"{time} {self._play(what, names)}")
-            self._collect()
-            self._write_down(actual)
-        compared = [_with_wildcards(was, wanted) for was, wanted in zip(actual, expected, strict=False)]
-        compared += actual[len(compared) :]
-        if compared != expected:
-            raise AssertionError("expected (-) and heard (+):\n" + "\n".join(ndiff(expected, compared)))
+    def jump(self, now: int) -> None:
+        """Let time pass without being served: the program hung."""
+        self.now = now
+        self.gateway.advance(now)
 
-    def _play(self, what: str, names: Mapping[str, Any]) -> str:
+    def say(self, what: str) -> str:
+        """Do what a line says. The line as it should read: another one where an answer or a state is not as expected."""
         verb, _, rest = what.partition(" ")
-        if verb == "<-":
-            cob_id, _, data = rest.partition(" ")
-            self.gateway.receive_frame(CanFrame(int(cob_id, 16), bytes.fromhex(data)), self.now)
-        elif verb == "uart":
-            esc, kind, *fields = rest.split()
-            values = {name: int(value, 0) for name, value in (field.split("=") for field in fields)}
-            self.gateway.receive_bytes(int(esc), (live if kind == "live" else info)(**values), self.now)
-        elif verb == "do":
-            scope = {"gateway": self.gateway, "bench": self, "now": self.now, **names}
-            exec(rest, scope)
-        elif verb in ("read", "write"):
-            return self._play_sdo(verb, rest)
-        else:
-            assert verb == "-", f"what is {what!r}?"
+        match verb, rest.split():
+            case "<-", [cob_id, *data]:
+                flags = {name: True for name in data if name in FLAGS}
+                frame = bytes_of(" ".join(word for word in data if word not in FLAGS))
+                self.put(int(cob_id, 16), frame, **flags)
+            case "uart", [esc, "rubbish"]:
+                self.uart(b"rubbish", int(esc))
+            case "uart", [esc, kind, *fields]:
+                values = {name: int(value, 0) for name, value in (field.split("=") for field in fields)}
+                self.uart((live if kind == "live" else info)(**values), int(esc))
+            case (("read" | "write"), _):
+                return self._say_sdo(verb, rest)
+            case "port", ["lost", esc]:
+                self.gateway.port_lost(int(esc), self.now)
+            case "port", ["opened", esc]:
+                self.gateway.port_opened(int(esc), self.now)
+            case "can", ["returned"]:
+                self.gateway.can_returned(self.now)
+            case "can", ["overrun"]:
+                self.gateway.receive_overrun(self.now)
+            case "can", [state]:
+                self.can_state(state)
+            case "damaged", [esc]:
+                self.gateway.parameters_damaged(int(esc), self.now)
+            case "disk", ["takes"]:
+                self.gateway.take_saves()
+            case "disk", ["done" | "fails" as how, *esc]:
+                error = "disk full" if how == "fails" else None
+                if esc:
+                    self.gateway.saved(int(esc[0]), error, self.now)
+                else:
+                    self.answer_saves(error)
+            case "stored", [node, *_]:
+                return f"stored {node} {_stored_text(self.on_disk[int(node) - 1])}".rstrip()
+            case "restart", []:
+                self.restart()
+            case "state", [node, _]:
+                return f"state {node} {self.nodes[int(node) - 1].state:02X}"
+            case "listens", _:
+                return f"listens {' '.join(f'{cob_id:03X}' for cob_id in sorted(self.listened_to))}"
+            case "rejected", [node, *_]:
+                keys = sorted(self.nodes[int(node) - 1].misfits)
+                return " ".join(["rejected", node, *(f"{number >> 8:04X}:{number & 0xFF:02X}" for number in keys)])
+            case _:
+                raise AssertionError(f"what is {what!r}?")
         return what
 
-    def _play_sdo(self, verb: str, rest: str) -> str:
+    def _say_sdo(self, verb: str, rest: str) -> str:
         match = re.fullmatch(r"(\d+) ([0-9A-F]{4}):([0-9A-F]{2})((?: [0-9A-F]{2})*)(?: [=!].*)?", rest)
         assert match is not None, f"what is {rest!r}?"
         node, index, sub = int(match[1]), int(match[2], 16), int(match[3], 16)
         data = bytes.fromhex(match[4])
-        told = f"{verb} {node} {match[2]}:{match[3]}"
+        said = f"{verb} {node} {match[2]}:{match[3]}"
         if verb == "read":
             found = self.read(index, sub, node)
-            return f"{told} ! {found:08X}" if isinstance(found, int) else f"{told} = {_hex(found)}".rstrip()
+            return f"{said} ! {found:08X}" if isinstance(found, int) else f"{said} = {hexadecimal(found)}".rstrip()
         refused = self.write(index, sub, data, node)
-        return f"{told} {_hex(data)}" + ("" if refused is None else f" ! {refused:08X}")
+        return f"{said} {hexadecimal(data)}" + ("" if refused is None else f" ! {refused:08X}")
 
     def _collect(self) -> None:
         self.heard += [(self.now, frame) for frame in self.gateway.take_frames()]
 
-    def _write_down(self, actual: list[str]) -> None:
+    def heard_lines(self) -> list[str]:
+        """What was sent since the last call, as lines."""
+        self._collect()
+        lines = []
         for time, frame in self.heard:
-            flags = "".join(f" {name}" for name in ("extended", "fd", "remote") if getattr(frame, name))
-            actual.append(f"{_ms(time)} -> {frame.can_id:03X} {_hex(frame.data)}{flags}".rstrip())
+            flags = "".join(f" {name}" for name in FLAGS if getattr(frame, name))
+            lines.append(f"{ms(time)} -> {frame.can_id:03X} {hexadecimal(frame.data)}{flags}".rstrip())
         self.heard = []
+        return lines
 
 
-def play(text: str, bench: Bench | None = None, **names: Any) -> Bench:
-    """A dialogue with one quiet node that has booted (see QUIET), or with another bench."""
-    bench = bench or Bench(changes=QUIET)
-    bench.talk(text, **names)
-    return bench
+def _stored_text(stored: Stored) -> str:
+    """``node-id 7 1017:00=F401 2100:01=05``."""
+    values = sorted({**stored.communication, **stored.application}.items())
+    texts = [f"{number >> 8:04X}:{number & 0xFF:02X}={data.hex().upper()}" for number, data in values]
+    return " ".join(["node-id", str(stored.node_id), *texts] if stored.node_id is not None else texts)
 
 
-def repeated(text: Callable[[int], str], times: Sequence[int]) -> str:
-    """Lines for each of some times."""
-    return "\n".join(text(time) for time in times)
+def _stored(words: Sequence[str]) -> Stored:
+    values = {}
+    for word in words[2:] if words[:1] == ["node-id"] else words:
+        place, _, data = word.partition("=")
+        values[int(place[:4], 16) << 8 | int(place[5:], 16)] = bytes.fromhex(data)
+    return Stored(
+        int(words[1]) if words[:1] == ["node-id"] else None,
+        {number: data for number, data in values.items() if number < 0x200000},
+        {number: data for number, data in values.items() if number >= 0x200000},
+    )
 
 
-def _ms(time: int) -> str:
-    return f"{round(time / MS, 3):g}" if time < 100_000 * MS else f"{time // MS}"
+def bench_of(options: Sequence[str]) -> Bench:
+    """A bench with the options of a dialogue (see ``dialogues/README.txt``)."""
+    changes: dict[tuple[int, int], Any] = {}
+    arguments: dict[str, Any] = {}
+    kept: Changes = QUIET
+    started = False
+    for option in options:
+        match option.split():
+            case ["nodes", count]:
+                arguments["nodes"] = int(count)
+            case ["node-ids", *ids]:
+                arguments["node_ids"] = [int(node_id) for node_id in ids]
+            case ["heartbeat"]:
+                kept = {key: change for key, change in kept.items() if key != (0x1017, 0)}
+            case ["pdos"]:
+                kept = {key: change for key, change in kept.items() if key[0] < 0x1800}
+            case ["spare"]:
+                changes.update(SPARE)
+            case ["tpdo", number, "type", kind, "inhibit", inhibit, "timer", timer, "maps", *mapped]:
+                changes.update(tpdo(int(number), int(kind), int(inhibit), int(timer), *(int(m, 16) for m in mapped)))
+            case ["boot"]:
+                arguments["boot"] = False
+            case ["started"]:
+                started = True
+            case ["self-start" | "read-only" as flag]:
+                arguments[flag.replace("-", "_")] = True
+            case ["device", name]:
+                arguments["device"] = Device[name]
+            case ["bitrate", value]:
+                arguments["bitrate"] = int(value)
+            case ["esc", *settings]:
+                arguments["escs"] = {key: _setting(value) for key, value in (each.split("=") for each in settings)}
+            case ["stored", *words]:
+                arguments.setdefault("stored", []).append(_stored(words))
+            case ["drop", *indices]:
+                arguments["eds"] = load(without(shipped_eds().data, {int(index, 16) for index in indices}), "my.eds")
+            case [place, "=", value] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
+                relative = value.startswith("$NODEID+")
+                change = {"default": int(value.removeprefix("$NODEID+"), 16), "relative": relative}
+                changes.setdefault((int(place[:4], 16), int(place[5:], 16)), {}).update(change)
+            case [place, *attributes] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
+                change = {key: _attribute(value) for key, value in (each.split("=") for each in attributes)}
+                changes.setdefault((int(place[:4], 16), int(place[5:], 16)), {}).update(change)
+            case _:
+                raise AssertionError(f"what is 'with {option}'?")
+    bench = Bench(changes={**kept, **changes}, **arguments)
+    return bench.start() if started else bench
 
 
-def _hex(data: bytes) -> str:
-    return data.hex(" ").upper()
+def _setting(text: str) -> int | Fraction:
+    return Fraction(text) if "/" in text else int(text)
 
 
-def _normal(line: str) -> str:
-    time, what = line.split(maxsplit=1)
-    if what.startswith("do "):
-        return f"{float(time):g} {what}"
-    return f"{float(time):g} " + " ".join(what.split())
+def _attribute(text: str) -> Any:
+    return {"none": None, "yes": True}[text] if text in ("none", "yes") else int(text, 0) if text[0].isdigit() else text
 
 
-def _with_wildcards(was: str, wanted: str) -> str:
-    """``was`` with ".." where ``wanted`` has it."""
-    one, other = was.split(), wanted.split()
-    if len(one) != len(other) or ".." not in other:
-        return was
-    return " ".join(".." if b == ".." else a for a, b in zip(one, other, strict=True))
+def tpdo(number: int, kind: int = 254, inhibit: int = 0, timer: int = 0, *mapped: int) -> Changes:
+    """A TPDO with its shipped COB-ID, mapped to battery voltage where nothing is named."""
+    mapped = mapped or (0x20000210,)
+    index = 0x1800 + number - 1
+    values = {(index, 2): kind, (index, 3): inhibit, (index, 5): timer, (index + 0x200, 0): len(mapped)}
+    values |= {(index + 0x200, n): entry for n, entry in enumerate(mapped, 1)}
+    changes: dict[tuple[int, int], Any] = {place: {"default": value} for place, value in values.items()}
+    changes[index, 1] = {"default": 0x40000080 + 0x100 * number, "relative": True}
+    return changes

@@ -1,15 +1,14 @@
 """A small object dictionary and an SDO server whose time is turned by hand, for the tests of the server."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+
+from script import bytes_of, hexadecimal, ms
 
 from kontronik_can_gw.cia301.abort import Abort, SdoAbort
 from kontronik_can_gw.cia301.sdo import SdoServer
 
 MS = 1_000_000
-
-Line = tuple[float, str, str]
-"""Time in ms, ">" to the server or "<" from it, the bytes in hexadecimal."""
 
 
 @dataclass
@@ -88,42 +87,82 @@ class Dictionary:
 
 
 class Bench:
-    """A server with everything it was told and said."""
+    """A server whose time is turned by hand; a talker of dialogues (see script.py)."""
 
     def __init__(self, segment_ns: int = 0) -> None:
         self.objects = Dictionary()
         self.server = SdoServer(self.objects, self._sent, segment_ns)
         self.now = 0
-        self.log: list[Line] = []
         self.answers: list[bytes] = []
+        """Those of the last request, and what followed it."""
+        self._heard: list[str] = []
+        self._tickets: list[int] = []
 
     def _sent(self, data: bytes) -> None:
         assert len(data) == 8
         self.answers.append(data)
-        self.log.append((self.now / MS, "<", data.hex(" ")))
+        self._heard.append(f"{ms(self.now)} -> {hexadecimal(data)}")
 
-    def wait_until(self, now: int) -> None:
+    def pass_time(self, until: int) -> None:
         """Let time pass as the runtime does: from deadline to deadline."""
-        while (deadline := self.server.next_deadline()) is not None and deadline <= now:
+        while (deadline := self.server.next_deadline()) is not None and deadline <= until:
             self.now = max(self.now, deadline)
             self.server.advance(self.now)
             following = self.server.next_deadline()
             assert following is None or following > self.now, "a deadline that advance does not settle"
+        self.now = until
+
+    def jump(self, now: int) -> None:
         self.now = now
+        self.server.advance(now)
 
     def request(self, data: bytes) -> list[bytes]:
         """One request now, and what is answered at once."""
         self.answers = []
-        self.log.append((self.now / MS, ">", data.hex(" ")))
         self.server.receive(data, self.now)
+        if self.server.waiting is not None:
+            self._tickets.append(self.server.waiting)
         return self.answers
 
-    def play(self, lines: Iterable[Line]) -> None:
-        """Say the client's lines at their times and expect exactly the server's, no more and no other."""
-        lines = list(lines)
-        for time, direction, data in lines:
-            self.wait_until(round(time * MS))
-            if direction == ">":
-                self.request(bytes.fromhex(data))
-        expected = [(time, direction, bytes.fromhex(data).hex(" ")) for time, direction, data in lines]
-        assert self.log == expected, "\n".join(["said:", *map(str, self.log), "expected:", *map(str, expected)])
+    def heard_lines(self) -> list[str]:
+        heard, self._heard = self._heard, []
+        return heard
+
+    def say(self, what: str) -> str:
+        verb, _, rest = what.partition(" ")
+        match verb, rest.split():
+            case "<-", _:
+                self.request(bytes_of(rest))
+            case "written", _:
+                texts = [f"{index:04X}:{sub:02X}={data.hex().upper()}" for index, sub, data in self.objects.written]
+                return " ".join(["written", *texts])
+            case "checks", _:
+                return " ".join(
+                    ["checks", *(f"{index:04X}:{sub:02X}={size}" for index, sub, size in self.objects.checks)]
+                )
+            case "uploads", _:
+                return f"uploads {self.objects.uploads}"
+            case "server", _:
+                return f"server {'busy' if self.server.busy else 'idle'}"
+            case "deadline", _:
+                deadline = self.server.next_deadline()
+                return f"deadline {'none' if deadline is None else ms(deadline)}"
+            case "value", [place, "=", *data]:
+                self.objects.entries[int(place[:4], 16), int(place[5:], 16)].value = bytes_of(" ".join(data))
+            case "reset", []:
+                self.server.reset()
+            case "confirm", []:
+                self.server.confirm(None, self.now)
+            case "confirm", ["!", code]:
+                self.server.confirm(Abort[code], self.now)
+            case "confirm", ["the", "first"]:
+                assert len(set(self._tickets)) == len(self._tickets) > 1
+                self.server.confirm(None, self.now, self._tickets[0])
+            case _:
+                raise AssertionError(f"what is {what!r}?")
+        return what
+
+
+def sdo_bench_of(options: Sequence[str]) -> Bench:
+    """``segment N``: pauses of a block upload, ms a segment."""
+    return Bench(sum(int(option.removeprefix("segment ")) for option in options) * MS)

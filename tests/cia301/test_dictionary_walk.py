@@ -1,13 +1,12 @@
 """A walk by SDO over the whole index space: size, access and limits of each object, and the values of 2000h in each state of the link."""
 
-import re
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import pytest
 from dialogue import QUIET, Bench, info, live, shipped_eds
+from eds_text import SHIPPED, variable, with_key, with_object
 
 from kontronik_can_gw.cia301.check import check_eds
 from kontronik_can_gw.cia301.eds import Entry, load, without
@@ -129,7 +128,7 @@ def test_the_defaults_are_those_of_the_eds() -> None:
     for (index, sub), entry in entries().items():
         if entry.access == "wo" or (index >= 0x2000 and entry.access == "ro"):
             continue
-        if entry.default is None or (index, bool(sub)) == (0x1003, True) or (index, sub) in ((0x1018, 4), (0x2101, 2)):
+        if entry.default is None or (index, bool(sub)) == (0x1003, True) or (index, sub) in ((0x1018, 4), (0x100A, 0)):
             continue
         data = bench.read(index, sub)
         assert isinstance(data, bytes)
@@ -276,70 +275,10 @@ def test_read_only_refuses_every_download() -> None:
 # --- another EDS
 
 
-def text() -> str:
-    return shipped("eds/kontronik_esc.eds").read_bytes().decode("ascii")
-
-
-def with_key(source: str, section: str, key: str, value: str) -> str:
-    """The text with another value of a key, or with the key."""
-    start = source.index(f"[{section}]")
-    end = source.find("\r\n[", start)
-    part = source[start : end if end >= 0 else None]
-    changed = re.sub(rf"(?m)^{key}=.*?\r$", f"{key}={value}\r", part)
-    if changed == part and f"{key}={value}\r" not in part:
-        changed = part.rstrip() + f"\r\n{key}={value}\r\n"
-    return source.replace(part, changed)
-
-
-def with_object(source: str, index: int, lines: str) -> str:
-    """The text with one more manufacturer object."""
-    count = int(re.search(r"\[ManufacturerObjects\]\r\nSupportedObjects=(\d+)", source)[1])  # type: ignore[index]
-    source = with_key(source, "ManufacturerObjects", "SupportedObjects", str(count + 1))
-    source = with_key(source, "ManufacturerObjects", str(count + 1), f"0x{index:04X}")
-    return source.rstrip() + f"\r\n\r\n[{index:04X}]\r\n" + "\r\n".join(lines.split()) + "\r\n"
-
-
 def bench_of(source: str, **settings: Any) -> Bench:
     eds = load(source.encode("ascii"), "other.eds")
     check_eds(eds, EscSettings())
     return Bench(eds=eds, changes=QUIET, **settings)
-
-
-def plain(data_type: int, **keys: str) -> str:
-    lines = {
-        "ParameterName": "Plain",
-        "ObjectType": "0x7",
-        "DataType": f"0x{data_type:04X}",
-        "AccessType": "rw",
-        **keys,
-    }
-    return "\n".join(f"{key}={value}" for key, value in lines.items())
-
-
-@pytest.mark.parametrize("index", sorted({e.index for e in shipped_eds().entries} - {0x1000, 0x1001, 0x1018}))
-def test_each_optional_object_can_be_dropped(index: int) -> None:
-    gone = {index}
-    if 0x1800 <= index < 0x1A00:
-        gone.add(index + 0x200)
-    if 0x1A00 <= index < 0x1C00:
-        gone.add(index - 0x200)
-    if index >= 0x2000:  # and the PDOs that carry it
-        gone |= {0x1800, 0x1801, 0x1802, 0x1803, 0x1A00, 0x1A01, 0x1A02, 0x1A03}
-    eds = replace(shipped_eds(), entries=tuple(e for e in shipped_eds().entries if e.index not in gone))
-    check_eds(eds, EscSettings())
-    bench = Bench(eds=eds)
-    bench.start()
-    for other in gone:
-        assert bench.read(other) == NO_OBJECT
-    bench.uart(uart(INFO, Layout.V4))
-    bench.uart(uart(LIVE._replace(operating_errors=1), Layout.V4))
-    bench.put(0x80, "")
-    bench.put(0x705, "05")
-    bench.wait(2000)
-    for entry in eds.entries:
-        bench.read(entry.index, entry.sub)
-    bench.put(0, "81 01")
-    assert 0x701 in {frame.can_id for frame in bench.take()}
 
 
 def test_an_eds_without_an_object_is_what_1021h_gives() -> None:
@@ -350,7 +289,7 @@ def test_an_eds_without_an_object_is_what_1021h_gives() -> None:
 
 
 def test_changed_defaults_names_limits_and_access_are_followed() -> None:
-    source = with_key(text(), "2100sub1", "DefaultValue", "0x04")
+    source = with_key(SHIPPED, "2100sub1", "DefaultValue", "0x04")
     source = with_key(source, "2100sub1", "HighLimit", "0x08")
     source = with_key(source, "2100sub4", "AccessType", "ro")
     source = with_key(source, "2100sub4", "DefaultValue", "0x1F4")
@@ -371,7 +310,7 @@ def test_changed_defaults_names_limits_and_access_are_followed() -> None:
 
 
 def test_a_changed_pdo_mapping_is_followed() -> None:
-    source = with_key(text(), "1A00sub0", "DefaultValue", "0x2")
+    source = with_key(SHIPPED, "1A00sub0", "DefaultValue", "0x2")
     source = with_key(source, "1A00sub1", "DefaultValue", "0x20010120")
     source = with_key(source, "1A00sub2", "DefaultValue", "0x20000C08")
     source = with_key(source, "1800sub1", "DefaultValue", "$NODEID+0x40000200")
@@ -384,7 +323,7 @@ def test_a_changed_pdo_mapping_is_followed() -> None:
 
 def test_a_default_mapping_that_cannot_be_is_refused_by_name() -> None:
     for mapping in ("0x30000108", "0x20000108", "0x21000108"):
-        source = with_key(text(), "1A00sub1", "DefaultValue", mapping)
+        source = with_key(SHIPPED, "1A00sub1", "DefaultValue", mapping)
         with pytest.raises(UserError, match="1A00"):
             check_eds(load(source.encode("ascii"), "other.eds"), EscSettings())
 
@@ -401,7 +340,7 @@ PLAIN = [
 
 @pytest.mark.parametrize(("data_type", "value", "data", "other"), PLAIN)
 def test_an_object_bound_to_nothing_is_plain_storage(data_type: int, value: str, data: bytes, other: bytes) -> None:
-    source = with_object(text(), 0x3000, plain(data_type, DefaultValue=value, PDOMapping="0"))
+    source = with_object(SHIPPED, 0x3000, variable(data_type, DefaultValue=value, PDOMapping="0"))
     bench = bench_of(source)
     assert bench.read(0x3000) == data
     assert bench.write(0x3000, 0, other) is None
@@ -419,7 +358,7 @@ def test_an_object_bound_to_nothing_is_plain_storage(data_type: int, value: str,
 
 def test_a_domain_is_plain_storage() -> None:
     lines = "\n".join(("ParameterName=Plain", "ObjectType=0x2", "DataType=0x000F", "AccessType=rw"))
-    bench = bench_of(with_object(text(), 0x3000, lines))
+    bench = bench_of(with_object(SHIPPED, 0x3000, lines))
     assert bench.read(0x3000) == b""
     data = bytes(range(256)) * 4
     assert bench.write(0x3000, 0, data) is None
@@ -428,7 +367,7 @@ def test_a_domain_is_plain_storage() -> None:
 
 
 def test_limits_of_plain_objects_hold() -> None:
-    bench = bench_of(with_object(text(), 0x3000, plain(0x04, LowLimit="-5", HighLimit="5", DefaultValue="0")))
+    bench = bench_of(with_object(SHIPPED, 0x3000, variable(0x04, LowLimit="-5", HighLimit="5", DefaultValue="0")))
     assert [bench.write(0x3000, 0, value) for value in (-6, -5, 0, 5, 6)] == [TOO_LOW, None, None, None, TOO_HIGH]
 
 
@@ -449,7 +388,7 @@ def test_limits_of_plain_objects_hold() -> None:
     ],
 )
 def test_an_object_of_a_type_that_cannot_hold_what_it_shows_is_refused_by_name(section: str, data_type: int) -> None:
-    source = text()
+    source = SHIPPED
     if section == "2000sub1" or section == "2000sub2":
         source = with_key(source, "1A00sub0", "DefaultValue", "0x0")
     if section == "2020sub1":
@@ -463,7 +402,7 @@ def test_an_object_of_a_type_that_cannot_hold_what_it_shows_is_refused_by_name(s
 
 @pytest.mark.parametrize("section", ["1003sub1", "1001", "1002", "603F", "2101sub1"])
 def test_objects_of_services_that_an_eds_makes_mappable_can_be_sent(section: str) -> None:
-    bench = bench_of(with_key(text(), section, "PDOMapping", "1"))
+    bench = bench_of(with_key(SHIPPED, section, "PDOMapping", "1"))
     index, sub = int(section[:4], 16), int(section[7:] or "0", 16)
     size = struct.calcsize(FORMATS[entries()[index, sub].data_type])
     assert bench.write(0x1A04, 1, index << 16 | sub << 8 | 8 * size) is None

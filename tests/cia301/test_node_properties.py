@@ -5,9 +5,10 @@ Equal input gives equal output.
 
 from typing import Any
 
-from dialogue import MS, NO_HEARTBEAT, Bench, default, info, live, shipped_eds
+from dialogue import NO_HEARTBEAT, Bench, default, info, live, shipped_eds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from script import MS
 
 from kontronik_can_gw.cia301.dictionary import Variable
 from kontronik_can_gw.frames import CanFrame
@@ -137,7 +138,7 @@ MAPPABLE = [
     if e.mappable and (size := Variable(e).size) is not None
 ]
 pdo_writes = st.one_of(
-    st.tuples(st.just(1), st.sampled_from([0x40000181, 0xC0000181, 0x40000333, 0x40000281]), st.just(4)),
+    st.tuples(st.just(1), st.sampled_from([0x40000181, 0x181, 0xC0000181, 0x40000333, 0x40000281]), st.just(4)),
     st.tuples(st.just(2), st.sampled_from([0, 1, 2, 240, 254, 255]), st.just(1)),
     st.tuples(st.just(3), st.sampled_from([0, 100, 5000]), st.just(2)),
     st.tuples(st.just(5), st.sampled_from([0, 7, 100]), st.just(2)),
@@ -175,7 +176,7 @@ def test_a_pdo_is_what_its_objects_say_whatever_was_configured(story: list[Any])
         assert bits <= 64
         for frame in bench.take():
             if frame.can_id in (0x181, 0x333) and step[0] != "wait":
-                assert cob_id == 0x40000000 | frame.can_id
+                assert cob_id & ~0x40000000 == frame.can_id
                 assert 8 * len(frame.data) == bits
 
 

@@ -306,7 +306,7 @@ def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(ste
         now = bench.now + gap
         expected = model.wait(now)
         if raw[7] % 4:
-            bench.wait_until(now)
+            bench.pass_time(now)
             assert [code_of(answer) for answer in bench.answers] == expected
             expected = []
         bench.now = now
@@ -339,13 +339,13 @@ def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(ste
 def test_random_traffic_leaves_a_pacing_server_in_order_too(steps: list[Step], segment_ns: int) -> None:
     bench, model = Bench(segment_ns), Model()
     for how, raw, gap in steps:
-        bench.wait_until(bench.now + gap)
+        bench.pass_time(bench.now + gap)
         data = model.fitting(raw) if how < 14 else raw
         assert len(bench.request(data)) <= 5  # a time-out and a burst
         model.wait(bench.now)
         model.hear(data, bench.now)
     bench.server.confirm(None, bench.now)
-    bench.wait_until(bench.now + 200_000 * MS)
+    bench.pass_time(bench.now + 200_000 * MS)
     assert not bench.server.busy
     assert bench.server.next_deadline() is None
 
@@ -372,22 +372,6 @@ class Client:
         if answer[0] == 0x80:
             raise Refused(Abort(int.from_bytes(answer[4:], "little")).name)
         return answer
-
-    def download(self, data: bytes, cuts: Sequence[int], tell_size: bool) -> None:
-        size = len(data).to_bytes(4, "little") if tell_size else bytes(4)
-        assert self.ask(bytes((0x20 | tell_size,)) + self.multiplexer + size) == b"\x60" + self.multiplexer + bytes(4)
-        toggle, at, turn = 0, 0, 0
-        while True:
-            count = cuts[turn % len(cuts)] if cuts else 7
-            turn += 1
-            part = data[at : at + count]
-            at += count
-            last = at >= len(data)
-            answer = self.ask(bytes((toggle << 4 | (7 - len(part)) << 1 | last,)) + part)
-            assert answer == bytes((0x20 | toggle << 4,)) + bytes(7)
-            toggle ^= 1
-            if last:
-                return
 
     def upload(self) -> bytes:
         answer = self.ask(b"\x40" + self.multiplexer)
@@ -490,17 +474,6 @@ def losing(seed: int, percent: int) -> Callable[[], bool]:
     return lambda: chance.randrange(100) < percent
 
 
-@settings(max_examples=100, deadline=None)
-@given(DATA, st.lists(st.integers(1, 7), max_size=5), st.booleans())
-def test_segmented_transfers_carry_any_data_both_ways(data: bytes, cuts: list[int], tell_size: bool) -> None:
-    bench = Bench()
-    client = Client(bench)
-    client.download(data, cuts, tell_size)
-    assert bench.objects.written == [(0x2003, 0, data)]
-    assert client.upload() == data
-    assert not bench.server.busy
-
-
 @settings(max_examples=150, deadline=None)
 @given(DATA, st.booleans(), st.booleans(), st.integers(0, 2**32), st.sampled_from([0, 1, 10, 50]))
 def test_block_downloads_carry_any_data_though_segments_get_lost(
@@ -575,7 +548,7 @@ def test_paced_segments_keep_their_distance_and_carry_the_data(
             due = bench.server.next_deadline()
             assert due is not None
             bench.answers = []
-            bench.wait_until(due)
+            bench.pass_time(due)
             bursts[due] = bursts.get(due, 0) + len(bench.answers)
             frames += bench.answers
         assert [frame[0] & 0x7F for frame in frames] == list(range(1, len(frames) + 1))
@@ -609,7 +582,7 @@ class Wire(canopen.Network):
         answers = list(self.bench.request(bytes(data)))
         while (deadline := self.bench.server.next_deadline()) is not None and deadline < self.bench.now + 1000 * MS:
             self.bench.answers = []
-            self.bench.wait_until(deadline)
+            self.bench.pass_time(deadline)
             answers += self.bench.answers
         for answer in answers:
             self.notify(0x581, bytearray(answer), 0.0)

@@ -4,7 +4,8 @@ import random
 from collections.abc import Sequence
 
 import pytest
-from dialogue import MS, Bench, default, info, live
+from dialogue import Bench, default, info, live
+from script import MS
 
 from kontronik_can_gw import gateway as gateway_module
 from kontronik_can_gw.cia301 import node as node_module

@@ -13,6 +13,7 @@ import canopen
 import pytest
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.cia301.bindings import bindings
 from kontronik_can_gw.cia301.eds import load, without
 from kontronik_can_gw.cia301.storage import Stored, encode
 from kontronik_can_gw.cli import main
@@ -22,6 +23,7 @@ from kontronik_can_gw.telemetry import EscSettings
 
 EDS = shipped("eds/kontronik_esc.eds")
 Key = tuple[int, int]
+TELEMETRY = bindings(EscSettings())
 
 
 def command(*words: object) -> tuple[int, str, str]:
@@ -113,19 +115,22 @@ def test_the_dcf_of_the_defaults_has_the_default_of_every_object_that_is_configu
         assert not isinstance(value, float)
         if value is not None:
             defaults[entry.index, entry.sub] = value + node_id if entry.relative and isinstance(value, int) else value
-    passed_over = {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, 0x2010, 0x2102, 0x603F}
-    expected = {key: value for key, value in defaults.items() if key[0] not in passed_over}
-    assert {key: found.get(key) for key in expected} == expected
-    assert set(found) - set(expected) == {(0x100A, 0), *((0x2101, sub) for sub in (1, 2, 3, 4))}
+    left_out = {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, 0x1020, 0x1021, 0x2010, 0x2102, 0x603F}
+    expected = {key: value for key, value in defaults.items() if key[0] not in left_out and key not in TELEMETRY}
+    own = {(0x100A, 0), *((0x2101, sub) for sub in (1, 3, 4))}
+    assert set(found) == set(expected)
+    assert {key: found[key] for key in expected if key not in own} == {
+        k: v for k, v in expected.items() if k not in own
+    }
     assert found[0x100A, 0] == __version__.encode()
     assert [found[0x2101, sub] for sub in (1, 2, 3, 4)] == [node_id, node_id, 500_000, 500_000]
     assert found[0x1800, 1] == 0x40000180 + node_id
 
 
-def test_a_dcf_without_a_configuration_says_no_serial_number() -> None:
+def test_a_dcf_without_a_configuration_names_no_serial_number_to_look_for() -> None:
     text = command("--node-id", 3)[1]
     assert "LSS_SerialNumber" not in text
-    assert "[1018sub4]\r\n" in text
+    assert values(imported(text))[0x1018, 4] == 0
     assert imported(text).node_id == 3
     assert imported(text).bitrate == 500_000
 
@@ -144,7 +149,21 @@ def test_a_dcf_is_the_eds_with_values_added() -> None:
     lines = command("--node-id", 1)[1].split("\r\n")
     begin = lines.index("[DeviceComissioning]")
     del lines[begin : lines.index("", begin) + 1]
+    assert lines[1:3] == ["FileName=kontronik_esc_1.dcf", "LastEDS=kontronik_esc.eds"]
+    lines[1:3] = ["FileName=kontronik_esc.eds"]
     assert [line for line in lines if not line.startswith("ParameterValue=")] == EDS.read_text("ascii").split("\n")
+
+
+@pytest.mark.parametrize(
+    ("output", "named"), [("left.dcf", "left.dcf"), ("mötor.dcf", "mine_1.dcf"), ("a;b.dcf", "mine_1.dcf")]
+)
+def test_a_dcf_names_itself_and_the_eds_it_was_made_from(tmp_path: Path, output: str, named: str) -> None:
+    lines = EDS.read_bytes().replace(b"FileName=kontronik_esc.eds\r\n", b"filename = old.eds\r\nLastEDS=older.eds\r\n")
+    (tmp_path / "mine.eds").write_bytes(lines)
+    file = configuration(tmp_path, 'enabled = true\neds = "mine.eds"')
+    assert command("-c", file, "--node-id", 1, "-o", tmp_path / output)[0] == 0
+    head = (tmp_path / output).read_text("ascii").partition("[DeviceInfo]")[0]
+    assert re.findall("(?im)^(filename|lasteds) ?= ?(.*)", head) == [("FileName", named), ("LastEDS", "mine.eds")]
 
 
 # --- the DCF of a configured node -----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The shipped DBC is read alike by cantools, canmatrix, opendbc and asammdf, without an error or a warning."""
+"""The shipped DBCs are read alike by cantools, canmatrix, opendbc and asammdf, without an error or a warning."""
 
 import logging
 import random
@@ -10,10 +10,13 @@ from dbc_rules import EVENT_HZ, Database, Message, Signal, parse
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 FRAMES_PER_MESSAGE = 100
+BOTH = pytest.mark.parametrize(
+    "file", [SHIPPED, SHIPPED.with_name("kontronik_canopen.dbc")], ids=lambda path: path.stem
+)
 
 
-def layout() -> Database:
-    return parse(SHIPPED.read_bytes())
+def layout(file: Path = SHIPPED) -> Database:
+    return parse(file.read_bytes())
 
 
 def raw_value(signal: Signal, data: bytes) -> int:
@@ -52,7 +55,8 @@ def valid(message: Message, choice: random.Random) -> dict[str, int]:
 def random_frames(message: Message) -> list[bytes]:
     """Any bytes whatever, and the two extremes; the same on each run."""
     choice = random.Random(message.id)
-    return [bytes(8), b"\xff" * 8, *(choice.randbytes(8) for _ in range(FRAMES_PER_MESSAGE))]
+    size = message.dlc
+    return [bytes(size), b"\xff" * size, *(choice.randbytes(size) for _ in range(FRAMES_PER_MESSAGE))]
 
 
 # --- cantools -------------------------------------------------------------------------------------------------------
@@ -65,12 +69,13 @@ def cantools_database() -> Any:
     return cantools.database.load_file(SHIPPED, database_format="dbc", strict=True)
 
 
+@BOTH
 @pytest.mark.filterwarnings("error")
-def test_cantools_loads_the_file_strictly_and_silently(caplog: pytest.LogCaptureFixture) -> None:
+def test_cantools_loads_the_file_strictly_and_silently(file: Path, caplog: pytest.LogCaptureFixture) -> None:
     import cantools
 
     with caplog.at_level(logging.INFO):
-        cantools.database.load_file(SHIPPED, database_format="dbc", encoding="ascii", strict=True)
+        cantools.database.load_file(file, database_format="dbc", encoding="ascii", strict=True)
     assert caplog.records == []
 
 
@@ -139,15 +144,19 @@ def test_a_file_written_again_by_cantools_means_the_same(cantools_database: Any)
 # --- canmatrix ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def canmatrix_matrix(caplog: pytest.LogCaptureFixture) -> Any:
+def matrix_of(file: Path, caplog: pytest.LogCaptureFixture) -> Any:
     import canmatrix.formats  # type: ignore[import-untyped]
 
     with caplog.at_level(logging.WARNING):
-        matrix = canmatrix.formats.loadp_flat(str(SHIPPED))
+        matrix = canmatrix.formats.loadp_flat(str(file))
     assert [record.getMessage() for record in caplog.records] == []
     assert matrix.load_errors == []
     return matrix
+
+
+@pytest.fixture
+def canmatrix_matrix(caplog: pytest.LogCaptureFixture) -> Any:
+    return matrix_of(SHIPPED, caplog)
 
 
 def test_canmatrix_sees_what_the_lines_say(canmatrix_matrix: Any) -> None:
@@ -190,12 +199,13 @@ def test_a_file_written_again_by_canmatrix_means_the_same(canmatrix_matrix: Any,
 # --- opendbc --------------------------------------------------------------------------------------------------------
 
 
-def test_opendbc_reads_every_signal_from_the_path_of_the_file() -> None:
+@BOTH
+def test_opendbc_reads_every_signal_from_the_path_of_the_file(file: Path) -> None:
     """It takes a path where one exists, else the name of a packaged file. What it does not understand it skips."""
     from opendbc.can.dbc import DBC  # type: ignore[import-untyped]
 
-    db = layout()
-    seen = DBC(str(SHIPPED))
+    db = layout(file)
+    seen = DBC(str(file))
     assert {address: message.name for address, message in seen.msgs.items()} == {m.id: m.name for m in db.messages}
     for message in db.messages:
         signals = seen.msgs[message.id].sigs
@@ -206,13 +216,14 @@ def test_opendbc_reads_every_signal_from_the_path_of_the_file() -> None:
             assert (its.factor, its.offset, its.type) == (float(signal.factor), 0.0, 0)
 
 
-def test_opendbc_reads_every_value_text() -> None:
+@BOTH
+def test_opendbc_reads_every_value_text(file: Path) -> None:
     """It splits texts at blanks and shouts: `Bus Off` would raise, `Ok` and `OK` would meet."""
     from opendbc.can import CANDefine  # type: ignore[import-untyped]
 
-    db = layout()
+    db = layout(file)
     names = {message.id: message.name for message in db.messages}
-    defined = CANDefine(str(SHIPPED)).dv
+    defined = CANDefine(str(file)).dv
     for (message_id, name), table in db.tables.items():
         assert defined[names[message_id]][name] == {number: text.upper() for number, text in table.items()}
 
@@ -242,16 +253,19 @@ def test_opendbc_packs_and_parses_valid_frames() -> None:
 # --- the same bits for all ------------------------------------------------------------------------------------------
 
 
-def test_all_readers_find_the_same_raw_values_in_any_bytes(cantools_database: Any, canmatrix_matrix: Any) -> None:
+@BOTH
+def test_all_readers_find_the_same_raw_values_in_any_bytes(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+    import cantools
     from opendbc.can.dbc import DBC
     from opendbc.can.parser import get_raw_value  # type: ignore[import-untyped]
 
-    opendbc = DBC(str(SHIPPED))
-    for message in layout().messages:
-        matrix_frame = canmatrix_matrix.frame_by_name(message.name)
+    opendbc, matrix = DBC(str(file)), matrix_of(file, caplog)
+    database: Any = cantools.database.load_file(file)
+    for message in layout(file).messages:
+        matrix_frame = matrix.frame_by_name(message.name)
         for data in random_frames(message):
             expected = {signal.name: raw_value(signal, data) for signal in message.signals}
-            assert cantools_database.decode_message(message.id, data, decode_choices=False, scaling=False) == expected
+            assert database.decode_message(message.id, data, decode_choices=False, scaling=False) == expected
             assert {name: seen.raw_value for name, seen in matrix_frame.decode(data).items()} == expected
             for name, its in opendbc.msgs[message.id].sigs.items():
                 raw = get_raw_value(data, its)

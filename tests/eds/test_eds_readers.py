@@ -40,7 +40,7 @@ def dcf_text(shipped: Eds, node_id: int) -> str:
             assert isinstance(default, int)
             default += node_id
         values[entry.index, entry.sub] = default
-    return reader.dcf(shipped, node_id, 250_000, values, "left")
+    return reader.dcf(shipped, node_id, 250_000, values, "left", "left.dcf")
 
 
 # --- dcf-tools ------------------------------------------------------------------------------------------------------

@@ -74,7 +74,7 @@ def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused_by_name(tmp_path: Path
 def test_an_eds_that_gives_two_nodes_one_cob_id_is_refused(tmp_path: Path) -> None:
     eds = shipped("eds/kontronik_esc.eds").read_bytes()
     said = refused(tmp_path, eds.replace(b"DefaultValue=$NODEID+0x80\r", b"DefaultValue=0xA0\r"))
-    assert "COB-ID 0A0h is that of emergencies of CANopen node 1 and of emergencies of CANopen node 2" in said
+    assert "COB-ID 0A0h is that of 1014h:00 of node 1 and of 1014h:00 of node 2" in said
 
 
 def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cantools.database
 
+from kontronik_can_gw.cia301.bindings import bindings
 from kontronik_can_gw.cia301.eds import ARRAY, RECORD, Eds, load
 from kontronik_can_gw.cia301.emergency import GatewayError, code_of_bit
 from kontronik_can_gw.config import (
@@ -132,6 +133,7 @@ def emergencies() -> str:
 
 def objects() -> str:
     eds = load(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
+    live = bindings(EscSettings())
     lines = ["| object | name | type | access | default | limits | PDO |", "|---|---|---|---|---|---|---|"]
     for entry in eds.entries:
         index, sub = entry.index, entry.sub
@@ -145,6 +147,8 @@ def objects() -> str:
         name = entry.name if several else f"**{entry.name}**"
         limits = "" if entry.low is entry.high is None else f"{_number(entry.low)} … {_number(entry.high)}"
         default = f"$NODEID + {_number(entry.default)}" if entry.relative else _number(entry.default)
+        if (entry.index, entry.sub) in live:  # a formal 0
+            default = ""
         mappable = "yes" if entry.mappable else ""
         lines.append(
             f"| {where} | {name} | {_TYPES[entry.data_type]} | {entry.access} | {default} | {limits} | {mappable} |"

@@ -9,7 +9,6 @@ import stat
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -172,14 +171,12 @@ def test_a_slow_disk_holds_up_nobody_and_the_queue_is_bounded(
     tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = SlowDisk(monkeypatch)
-    begun = time.monotonic()
     assert store.save("esc0", OLD)
     assert disk.reached.wait(PATIENCE)  # the worker hangs in the first saving
     accepted = [store.save(f"esc{number % 3}", numbered(number)) for number in range(1, CAPACITY + 10)]
     assert accepted == [True] * CAPACITY + [False] * 9
     assert store.results() == []
     assert select.select([store.fileno()], [], [], 0)[0] == []
-    assert time.monotonic() - begun < PATIENCE / 2
     disk.go.set()
     results = wait_for(store, CAPACITY + 1)
     assert results == [("esc0", None)] + [(f"esc{number % 3}", None) for number in range(1, CAPACITY + 1)]
@@ -516,13 +513,14 @@ def test_after_kill_9_at_any_instant_the_file_is_one_that_was_asked_for_and_none
     tmp_path: Path,
 ) -> None:
     rng = random.Random(3)
-    folder, confirmed, left_over = tmp_path / "params", 0, 0
+    folder, confirmed = tmp_path / "params", 0
     command = [sys.executable, "-S", "-c", HELPERS + SAVE_FOR_EVER, str(ROOT), str(folder)]
     for _ in range(40):
         child = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0)
         assert child.stdout is not None
-        said = child.stdout.read(1)  # it has begun
-        time.sleep(rng.uniform(0, 0.02))
+        said = b"".join(child.stdout.readline() for _ in range(rng.randrange(1, 12)))  # so far it goes on by itself
+        for _ in range(rng.randrange(20_000)):
+            pass  # some instant of the next saving
         child.kill()
         said += child.stdout.read()
         assert child.wait() == -9
@@ -534,7 +532,6 @@ def test_after_kill_9_at_any_instant_the_file_is_one_that_was_asked_for_and_none
                 asked = int(number)
             else:
                 done = int(number)
-        left_over += (folder / "esc1.params.tmp").exists()
         store = ParameterStore(folder)
         stored, problem = store.load("esc1")
         assert store.close(0)
@@ -545,7 +542,6 @@ def test_after_kill_9_at_any_instant_the_file_is_one_that_was_asked_for_and_none
             assert encode(stored) == numbered(confirmed, confirmed % 7 * 1000)
         assert {path.name for path in folder.glob("*")} <= {"esc1.params"}
     assert confirmed >= 1
-    print(f"{confirmed} savings, {left_over} of 40 kills within a writing")
 
 
 # --- loss of power

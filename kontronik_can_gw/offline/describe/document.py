@@ -241,7 +241,7 @@ def _object(item: ObjectFacts) -> Table:
 
 
 def _entry(e: EntryFacts) -> tuple[str, ...]:
-    default = "" if e.default is None else _hex(e.default)
+    default = "" if e.default is None or e.source is not None else _hex(e.default)  # a live value has none of its own
     if e.plus_node_id:
         default = f"$NODEID + {default}"
     limits = "" if e.low is e.high is None else f"{_number(e.low)} … {_number(e.high)}"

@@ -17,7 +17,7 @@ from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen_dbc import pascal_case
 from kontronik_can_gw.cia301 import bindings as at
 from kontronik_can_gw.cia301.bindings import bindings
-from kontronik_can_gw.cia301.dictionary import codec
+from kontronik_can_gw.cia301.dictionary import Dictionary, codec
 from kontronik_can_gw.cia301.eds import ARRAY, DOMAIN, RECORD, VAR, Eds, Entry
 from kontronik_can_gw.cia301.emergency import GatewayError, code_of_bit, register_of
 from kontronik_can_gw.cia301.node import Node
@@ -544,9 +544,7 @@ def _node(node: Node, esc: EscSettings) -> NodeFacts:
 
 def _emergencies(eds: Eds) -> Iterator[EmergencyFacts]:
     """Those of the ESC's bits that the EDS enables, those of the gateway, and the end of all."""
-    mask = next(
-        (e.default for e in eds.entries if (e.index, e.sub) == _MASK and isinstance(e.default, int)), 0xFFFFFFFF
-    )
+    mask = Dictionary(eds).number(*_MASK)
     bits = {int(bit): bit for bit in OperatingError}
     for bit in range(32):
         if not mask >> bit & 1:

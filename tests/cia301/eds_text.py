@@ -1,0 +1,38 @@
+"""The shipped EDS as text, and with other keys or further objects, as an EDS editor leaves it."""
+
+import re
+
+from kontronik_can_gw.config import shipped
+
+SHIPPED = shipped("eds/kontronik_esc.eds").read_bytes().decode("ascii")
+
+
+def with_key(source: str, section: str, key: str, value: str) -> str:
+    """The text with another value of a key, or with the key."""
+    start = source.index(f"[{section}]")
+    end = source.find("\r\n[", start)
+    part = source[start : end if end >= 0 else None]
+    changed = re.sub(rf"(?m)^{key}=.*?\r$", lambda _: f"{key}={value}\r", part)
+    if changed == part and f"{key}={value}\r" not in part:
+        changed = part.rstrip() + f"\r\n{key}={value}\r\n"
+    return source.replace(part, changed)
+
+
+def variable(data_type: int, access: str = "rw", name: str = "Test object", **keys: object) -> str:
+    """The content of a section of a VAR."""
+    values = {
+        "ParameterName": name,
+        "ObjectType": "0x7",
+        "DataType": f"0x{data_type:04X}",
+        "AccessType": access,
+        **keys,
+    }
+    return "".join(f"{key}={value}\r\n" for key, value in values.items())
+
+
+def with_object(source: str, index: int, content: str) -> str:
+    """The text with one more manufacturer object, of which ``content`` is the section's."""
+    count = int(re.search(r"\[ManufacturerObjects\]\r\nSupportedObjects=(\d+)", source)[1])  # type: ignore[index]
+    source = with_key(source, "ManufacturerObjects", "SupportedObjects", str(count + 1))
+    source = with_key(source, "ManufacturerObjects", str(count + 1), f"0x{index:04X}")
+    return f"{source.rstrip()}\r\n\r\n[{index:04X}]\r\n{content}\r\n"

@@ -1,0 +1,220 @@
+"""An EDS of a user: what it drops behaves as the shipped default, and what cannot be is refused by name."""
+
+from functools import cache
+
+import pytest
+from dialogue import Bench, changed, info, live, shipped_eds
+from eds_text import SHIPPED, with_key
+
+from kontronik_can_gw.cia301.check import check_eds
+from kontronik_can_gw.cia301.dictionary import _IF_ABSENT, key
+from kontronik_can_gw.cia301.eds import load, without
+from kontronik_can_gw.config import shipped
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.telemetry import EscSettings
+
+DATA = shipped("eds/kontronik_esc.eds").read_bytes()
+PDOS = frozenset(range(0x1800, 0x1C00))
+OPTIONAL = sorted({entry.index for entry in shipped_eds().entries} - PDOS - {0x1000, 0x1001, 0x1018})
+EVERY_SYNC = {(0x1800, 2): {"default": 1}}
+LSS_INQUIRY = ("5A", "5B", "5C", "5D", "5E")
+
+
+def pdos_with(index: int) -> frozenset[int]:
+    """The objects of PDOs that map something of an object: they go with it."""
+    return frozenset(
+        entry.index + offset
+        for entry in shipped_eds().entries
+        if entry.index >> 9 == 0x1A00 >> 9
+        and entry.sub
+        and isinstance(entry.default, int)
+        and entry.default >> 16 == index
+        for offset in (0, -0x200)
+    )
+
+
+def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
+    """What a node says, with its times, to a session in which every service has something to do. No SDO: that shows what is there."""
+    eds = changed(load(without(DATA, dropped), "my.eds"), EVERY_SYNC)
+    check_eds(eds, EscSettings())
+    bench = Bench(eds=eds, boot=False, self_start=self_start)
+    bench.can_state("ERROR_ACTIVE")
+    bench.put(0, "01 00")
+    for number in range(60):
+        bench.wait(10)
+        bench.uart(live(battery_voltage=2000 + number, operating_errors=(0, 1 << 17, 1 | 1 << 17, 0)[number // 15]))
+        if number == 5:
+            bench.uart(info(cell_count=6))
+        if number % 7 == 0:
+            bench.put(0x080, b"" if number != 21 else b"\x01")
+        if number % 9 == 0:
+            bench.put(0x702, "05")
+    bench.wait(1500)  # heartbeats; telemetry is lost
+    bench.uart(live()[:-1] + b"\xff")
+    bench.uart(live())
+    for name in ("BUS_OFF", "ERROR_ACTIVE"):
+        bench.can_state(name)
+        bench.wait(300)
+    bench.put(0x7E5, "04 01 00 00 00 00 00 00")
+    for service in LSS_INQUIRY:
+        bench.put(0x7E5, service + 7 * " 00")
+    bench.put(0, "82 00")
+    bench.wait(2000)
+    for index in dropped:
+        assert bench.read(index) == bench.write(index, 0, 0, size=1) == 0x06020000
+    for entry in eds.entries:
+        bench.read(entry.index, entry.sub)
+    return [f"{time} {frame.can_id:03X} {frame.data.hex()}" for time, frame in bench.heard]
+
+
+@cache
+def whole(dropped: frozenset[int] = frozenset()) -> list[str]:
+    return behaviour(dropped)
+
+
+def test_the_session_hears_every_service() -> None:
+    heard = {line.split()[1] for line in whole()}
+    assert heard == {"701", "081", "181", "281", "381", "481", "7E4"}
+    codes = {line.split()[2][:4] for line in whole() if line.split()[1] == "081"}
+    assert codes == {"0000", "2032", "4081", "4082", "1075"}
+
+
+@pytest.mark.parametrize("index", OPTIONAL, ids=lambda index: f"{index:04X}h")
+def test_a_dropped_object_leaves_the_behaviour_of_the_shipped_default(index: int) -> None:
+    pdos = pdos_with(index)
+    assert behaviour(pdos | {index}) == whole(pdos)
+
+
+def test_all_dropped_at_once_leave_it_too() -> None:
+    pdos = frozenset(index for index in shipped_eds().object_names if index in PDOS)
+    assert behaviour(frozenset(OPTIONAL) | pdos) == whole(pdos)
+    assert behaviour(frozenset(OPTIONAL) | pdos, self_start=True) == behaviour(pdos, self_start=True)
+
+
+def test_the_behaviour_without_an_object_is_that_of_the_shipped_file() -> None:
+    shipped_numbers = {key(entry.index, entry.sub): entry.default for entry in shipped_eds().entries}
+    assert {number: shipped_numbers[number] for number in _IF_ABSENT} == _IF_ABSENT
+    services = {entry.index for entry in shipped_eds().entries if entry.index < 0x2000 and entry.index not in PDOS}
+    for number, default in shipped_numbers.items():
+        if number & 0xFF and number >> 8 in services - {0x1010, 0x1011, 0x1200} and isinstance(default, int):
+            assert _IF_ABSENT.get(number, 0) == default, f"{number:06X}"
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_only_the_objects_of_a_pdo_take_it_away(number: int) -> None:
+    left = [line for line in whole() if line.split()[1] != f"{number + 1}81"]
+    assert behaviour(frozenset({0x1800 + number, 0x1A00 + number})) == left
+
+
+# --- what is refused at start
+
+
+def problems(data: bytes, node_ids: tuple[int, ...] = (1,)) -> list[str]:
+    with pytest.raises(UserError) as caught:
+        check_eds(load(data, "my.eds"), EscSettings(), node_ids)
+    return list(caught.value.problems)
+
+
+def replaced(*pairs: tuple[str, str]) -> bytes:
+    data = DATA
+    for old, new in pairs:
+        assert data.count(old.encode()) == 1, old
+        data = data.replace(old.encode(), new.encode())
+    return data
+
+
+ADVICE = "Change one DefaultValue (or add $NODEID)."
+
+
+@pytest.mark.parametrize(
+    ("pairs", "node_ids", "expected"),
+    [
+        (
+            [("$NODEID+0x40000280", "$NODEID+0x40000180")],
+            (1, 2),
+            ["COB-ID 181h is that of 1800h:01 of node 1 and of 1801h:01 of node 1."],
+        ),
+        (
+            [("$NODEID+0x40000280", "$NODEID+0x180")],
+            (),
+            ["COB-ID 181h is that of 1800h:01 of node 1 and of 1801h:01 of node 1."],
+        ),
+        (
+            [("$NODEID+0x40000380", "0x40000381")],
+            (1, 2),
+            ["COB-ID 381h is that of 1802h:01 of node 1 and of 1802h:01 of node 2."],
+        ),
+        (
+            [("$NODEID+0x80\r", "0x482\r")],
+            (2,),
+            ["COB-ID 482h is that of 1014h:00 of node 2 and of 1803h:01 of node 2."],
+        ),
+        ([("$NODEID+0x40000180", "0x40000080")], (1,), ["COB-ID 080h is that of 1005h:00 and of 1800h:01 of node 1."]),
+        (
+            [("$NODEID+0x40000280", "$NODEID+0x40000380"), ("$NODEID+0x40000180", "$NODEID+0x40000480")],
+            (1,),
+            [
+                "COB-ID 381h is that of 1801h:01 of node 1 and of 1802h:01 of node 1.",
+                "COB-ID 481h is that of 1800h:01 of node 1 and of 1803h:01 of node 1.",
+            ],
+        ),
+    ],
+)
+def test_two_defaults_with_one_cob_id_are_refused_with_both_objects(
+    pairs: list[tuple[str, str]], node_ids: tuple[int, ...], expected: list[str]
+) -> None:
+    assert problems(replaced(*pairs), node_ids) == [f"my.eds: {line} {ADVICE}" for line in expected]
+
+
+def test_a_cob_id_of_emergencies_that_are_not_in_the_eds_is_taken() -> None:
+    data = without(replaced(("$NODEID+0x40000180", "$NODEID+0x40000080")), {0x1014})
+    assert problems(data) == [f"my.eds: COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1. {ADVICE}"]
+
+
+def test_a_default_pdo_that_maps_nothing_is_refused() -> None:
+    data = changed(shipped_eds(), {(0x1A01, 0): {"default": 0}})
+    with pytest.raises(UserError) as caught:
+        check_eds(data, EscSettings())
+    said = "TPDO 2: 1A01h maps nothing, so 1801h:01 cannot be valid. Map objects, or set bit 31 of its DefaultValue."
+    assert list(caught.value.problems) == [f"kontronik_esc.eds: {said}"]
+
+
+def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
+    check_eds(shipped_eds(), EscSettings(), range(1, 128))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "said"),
+    [
+        ("1200sub1", "DefaultValue", "$NODEID+0x640", "1200h:01 COB-ID client to server: must be $NODEID+0x600"),
+        ("1001", "AccessType", "rw", "1001h:00 Error register: is shown by the node, so it must be read only"),
+        ("1001", "AccessType", "wo", "must be read only"),
+        ("100A", "AccessType", "rw", "must be read only"),
+        ("1018sub1", "AccessType", "rw", "must be read only"),
+        ("2010sub6", "AccessType", "rw", "must be read only"),
+        ("2101sub1", "AccessType", "rw", "must be read only"),
+        ("1005", "DefaultValue", "0x40000080", "1005h:00 COB-ID SYNC message: DefaultValue 0x40000080"),
+        ("1014", "DefaultValue", "0x601", "1014h:00 COB-ID EMCY"),
+        ("1019", "DefaultValue", "1", "1019h:00"),
+        ("1F80", "DefaultValue", "0x1", "1F80h:00"),
+    ],
+)
+def test_defaults_that_a_download_would_be_refused_are_refused_at_start(
+    section: str, key: str, value: str, said: str
+) -> None:
+    assert said in "\n".join(problems(with_key(SHIPPED, section, key, value).encode()))
+
+
+def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:
+    changed = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
+    check_eds(load(changed.encode(), "my.eds"), EscSettings(), [1])
+    assert "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3" in problems(changed.encode(), (3,))[0]
+
+
+def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:
+    changed = with_key(with_key(SHIPPED, "2100sub4", "DataType", "0x0005"), "2100sub4", "HighLimit", "0xFF")
+    changed = with_key(changed, "2100sub4", "DefaultValue", "0xFA")
+    eds = load(changed.encode(), "my.eds")
+    check_eds(eds, EscSettings())
+    with pytest.raises(UserError, match="2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says"):
+        check_eds(eds, [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
