@@ -114,10 +114,11 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
         kept = read_stored(config, store)
         escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
     database, layout, dbc = None, Layout("", "", ()), b""
+    ignored: list[str] = []
     if config.dbc.enabled:
         file = str(config.dbc_path)
         dbc = read_dbc(config.dbc_path)
-        found = parse_database(dbc, file)
+        found = parse_database(dbc, file, ignored)
         database, layout = prepare(found, file, escs, config.dbc_settings, config.can.fd, taken)
     bitrate, data_bitrate = config.can.bitrate, config.can.data_bitrate
     warnings = [check_load(layout, bitrate, data_bitrate, bits)]
@@ -129,7 +130,8 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
             bits = canopen.nodes(escs).bits_per_second()
         warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
     damaged = () if kept is None else tuple(kept.damaged)
-    return Loaded(config, escs, database, layout, canopen, damaged, store, tuple(w for w in warnings if w), dbc)
+    said = tuple(warning for warning in (*ignored, *warnings) if warning)
+    return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc)
 
 
 def with_store(loaded: Loaded, store: ParameterStore | None) -> Loaded:

@@ -106,7 +106,10 @@ def _database(args: argparse.Namespace) -> "Database":
         return database
     escs = _escs(args)
     file = args.source or shipped("dbc/kontronik_esc.dbc")
-    database = load_database(file)
+    ignored: list[str] = []
+    database = load_database(file, ignored)
+    for line in ignored:
+        say(f"warning: {line}")
     node = choose_node(database, args.node, str(file))
     database, bind = expand(database, node, escs, str(file), None, args.base_id, args.id_step)
     prepare(

@@ -216,9 +216,9 @@ def normalize(name: str) -> str:
     return "".join(c for c in name.casefold() if c.isalnum())
 
 
-def load_database(path: Path) -> "Database":
-    """Read a DBC file. UserError with one line for a file that cannot be read or is no DBC."""
-    return parse_database(read_dbc(path), str(path))
+def load_database(path: Path, warnings: list[str] | None = None) -> "Database":
+    """Read a DBC file, as ``parse_database``. UserError with one line for a file that cannot be read or is no DBC."""
+    return parse_database(read_dbc(path), str(path), warnings)
 
 
 def read_dbc(path: Path) -> bytes:
@@ -230,8 +230,11 @@ def read_dbc(path: Path) -> bytes:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def parse_database(raw: bytes, path: str) -> "Database":
-    """Read the bytes of a DBC file. UserError with one line that names ``path`` for what is no DBC."""
+def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> "Database":
+    """Read the bytes of a DBC file. UserError with one line that names ``path`` for what is no DBC.
+
+    Entries for what the file does not have are ignored, with a line for ``warnings``.
+    """
     check_size(len(raw), path)
     if b"\0" in raw:
         raise UserError(f"{path}: is a binary file, not a DBC")
@@ -245,7 +248,9 @@ def parse_database(raw: bytes, path: str) -> "Database":
     with without_asammdf():
         import cantools.database
 
-    text = _spelled_out(text, path)
+    text, ignored = _spelled_out(text, path)
+    if warnings is not None:
+        warnings += ignored
     try:
         database = cantools.database.load_string(text, database_format="dbc", strict=False, sort_signals=None)
     except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
@@ -259,13 +264,16 @@ def parse_database(raw: bytes, path: str) -> "Database":
 
 
 _STRING = re.compile(r'"(?:\\"|[^"])*"')
+_PAIRS = r'(?:[^\s";]+\s+"\0\d+\0"\s*)*'
+"""Values and their texts, masked. Never simply up to a semicolon: NS_ lists keywords without one."""
 _MASKED = re.compile(r'"\0(\d+)\0"')
 
 
-def _spelled_out(text: str, path: str) -> str:
+def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
     """What other tools write and cantools does not read: a VAL_ that names a VAL_TABLE_, enumeration attributes by text.
 
-    Strings are masked while lines are looked at, so that no comment and no value text is touched.
+    Entries for signals, tables and attributes that the file does not have are taken out, each kind with a warning; cantools refuses the
+    whole file for them. Strings are masked meanwhile, so that no comment and no value text is touched, and lines keep their numbers.
     """
     strings: list[str] = []
 
@@ -277,10 +285,45 @@ def _spelled_out(text: str, path: str) -> str:
         return _MASKED.sub(lambda found: strings[int(found[1])], masked)
 
     text = _STRING.sub(mask, text)
-    tables = dict(re.findall(r"^[ \t]*VAL_TABLE_\s+(\w+)\s+([^;]*)", text, re.MULTILINE))
+    ignored: dict[str, list[str]] = {}
+
+    def without(entry: re.Match[str], reason: str, what: str) -> str:
+        ignored.setdefault(reason, []).append(shown(what))
+        return "\n" * entry[0].count("\n")
+
+    tables = dict(re.findall(rf"^[ \t]*VAL_TABLE_\s+(\w+)\s+({_PAIRS});", text, re.MULTILINE))
+    signals: set[tuple[str, str]] = set()
+    message = ""
+    for found in re.finditer(r"^[ \t]*(?:BO_\s+0*(\d+)\s+\w+\s*:|SG_\s+(\w+))", text, re.MULTILINE):
+        message = found[1] or message
+        signals.add((message, found[2]))
+
+    def of_signal(found: re.Match[str]) -> str:
+        keyword, number, name, body = found["keyword"], found["message"], found["signal"], found["body"]
+        what = f"{keyword} {number or ''} {name}".replace("  ", " ")
+        if number is not None and (number.lstrip("0") or "0", name) not in signals:
+            return without(found, "for signals that are not in the file", what)
+        if keyword != "VAL_" or not re.fullmatch(r"[A-Za-z_]\w*", body.strip()):
+            return found[0]
+        if (table := tables.get(body.strip())) is None:
+            return without(found, "naming a VAL_TABLE_ that is not in the file", f"{what} {body.strip()}")
+        return f"{found['head']}{table};"
+
     text = re.sub(
-        r"^([ \t]*VAL_\s+\d+\s+\w+\s+)([A-Za-z_]\w*)(\s*;)",
-        lambda found: f"{found[1]}{tables.get(found[2], found[2])}{found[3]}",
+        r"^(?P<head>[ \t]*(?P<keyword>VAL_|SIG_VALTYPE_)\s+(?:(?P<message>\d+)\s+)?(?P<signal>[A-Za-z_]\w*+)\s*+)"
+        rf"(?P<body>{_PAIRS}|[A-Za-z_]\w*\s*|:?\s*\d+\s*);",
+        of_signal,
+        text,
+        flags=re.MULTILINE,
+    )
+    defined = set(map(shown, re.findall(r"^[ \t]*BA_DEF_\s+(?:\w+\s+)?(\"\0\d+\0\")", text, re.MULTILINE)))
+    text = re.sub(
+        r"^[ \t]*(BA_|BA_DEF_DEF_)\s+(\"\0\d+\0\")[^;\n]*;",
+        lambda found: (
+            found[0]
+            if shown(found[2]) in defined
+            else without(found, "of attributes that no BA_DEF_ defines", f"{found[1]} {found[2]}")
+        ),
         text,
         flags=re.MULTILINE,
     )
@@ -299,7 +342,14 @@ def _spelled_out(text: str, path: str) -> str:
         return f"{found[1]}{found[2]}{found[3]}{numbers.get(name, {}).get(value, found[4])}{found[5]}"
 
     text = re.sub(r"^([ \t]*BA_\s+)(\"\0\d+\0\")(\s[^\";]*)(\"\0\d+\0\")(\s*;)", number, text, flags=re.MULTILINE)
-    return shown(text)
+    return shown(text), [f"{path}: ignored, {reason}: {_listed(found)}" for reason, found in ignored.items()]
+
+
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    """Each name once, and how many more there are."""
+    names = list(dict.fromkeys(names))
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def choose_node(database: "Database", wanted: str | None, file: str) -> str:
