@@ -17,6 +17,7 @@ from posixpath import normpath
 from typing import Any, TypeVar, cast
 
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.dbc_output import units
 from kontronik_can_gw.dbc_output.layout import DbcSettings, normalize
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.states import Device
@@ -44,9 +45,9 @@ _FORMS = {
 
 
 def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
-    """A configuration key. ``limits``: low, high, choices, pattern.
+    """A configuration key. ``limits``: low, high, choices, pattern, values.
 
-    ``kind``: string, integer, number, boolean, ratio, bindings, ids, loopback, broker, topic, level.
+    ``kind``: string, integer, number, boolean, ratio, bindings, ids, meanings, loopback, broker, topic, level.
     """
     metadata = {"doc": doc, "kind": kind} | limits
     if isinstance(default, dict):
@@ -106,6 +107,9 @@ class DbcConfig:
         {},
     )
     e2e_data_ids: Mapping[str, int] = _key("message name = AUTOSAR E2E data id", "ids", {}, low=0, high=0xFFFF)
+    units: Mapping[str, str] = _key(
+        "unit text of the DBC = the unit that it means", "meanings", {}, values=units.names()
+    )
 
 
 @dataclass(frozen=True)
@@ -326,7 +330,9 @@ class Config:
     @property
     def dbc_settings(self) -> DbcSettings:
         dbc = self.dbc
-        return DbcSettings(dict(dbc.bind), dbc.node, dbc.base_id, dbc.id_step, dict(dbc.e2e_data_ids))
+        return DbcSettings(
+            dict(dbc.bind), dbc.node, dbc.base_id, dbc.id_step, dict(dbc.e2e_data_ids), units=dict(dbc.units)
+        )
 
     @property
     def dbc_path(self) -> Path:
@@ -493,7 +499,7 @@ def _value(value: Any, f: Field[Any]) -> Any:
             return _number(value, limits)
         case "ratio":
             return _ratio(value)
-        case "bindings" | "ids":
+        case "bindings" | "ids" | "meanings":
             if not isinstance(value, dict):
                 raise ValueError(f"{value!r} is not a table")
             flat = _flat(value) if limits["kind"] == "bindings" else value
@@ -534,6 +540,11 @@ def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _entry(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
+    if limits["kind"] == "meanings":
+        if value not in limits["values"]:
+            near = _nearest(str(value), limits["values"])
+            raise ValueError(f"{name}: {value!r} is none of those known here.{near}")
+        return value
     if limits["kind"] == "ids":
         try:
             return _integer(value, limits)
@@ -704,6 +715,8 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
             scalar = {"type": ["string", "number", "boolean"]}
             names = {"not": {"enum": sorted(_OWN_OPTIONS)}}
             entry |= {"type": "object", "propertyNames": names, "additionalProperties": scalar}
+        case "meanings":
+            entry |= {"type": "object", "additionalProperties": {"enum": list(limits["values"])}}
         case "ids":
             number = {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
             entry |= {"type": "object", "additionalProperties": number}

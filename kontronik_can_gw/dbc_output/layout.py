@@ -193,6 +193,8 @@ class DbcSettings:
     id_step: int | None = None
     data_ids: Mapping[str, int] = field(default_factory=dict)
     """Message name to E2E data id; otherwise the CAN id's low 16 bits."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Unit text of the DBC to the one that it means."""
 
 
 @dataclass(frozen=True)
@@ -467,6 +469,10 @@ def compile_layout(
         near = difflib.get_close_matches(key, known, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         compiler.problems.append(f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{hint}")
+    for text in sorted(set(settings.units) - compiler.units):
+        near = difflib.get_close_matches(text, compiler.units, n=1, cutoff=0.3)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        compiler.problems.append(f"dbc.units.{text}: no signal of {node} has this unit in {file}.{hint}")
     for name in sorted(set(settings.data_ids) - {m.name for m in ours}):
         compiler.problems.append(f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}.")
     if compiler.problems:
@@ -485,6 +491,8 @@ class _Compiler:
         self.binder = Binder(escs, settings.bind)
         self.problems: list[str] = []
         self.warnings: list[str] = []
+        self.units: set[str] = set()
+        """Unit texts that were met."""
 
     def check_ids(self, ours: Sequence["Message"], taken: Mapping[int, str]) -> None:
         mine = {id(message) for message in ours}
@@ -628,6 +636,13 @@ class _Compiler:
                 used[page] |= mask
             placed.append((signal.name, mask, pages))
 
+    def _unit(self, signal: "Signal") -> str:
+        """A signal's unit, as ``dbc.units`` has it; empty where it says nothing."""
+        text = (signal.unit or "").strip()
+        self.units.add(text)
+        text = self.settings.units.get(text, text)
+        return "" if units.says_nothing(text) else text
+
     def _signal(self, message: "Message", signal: "Signal", page: int | None) -> SignalPlan | None:
         where = f"{self.file}: {message.name}.{signal.name}"
         length, signed, is_float = signal.length, signal.is_signed, signal.is_float
@@ -675,7 +690,7 @@ class _Compiler:
             error = not_available
         base: dict[str, Any] = {
             "name": signal.name,
-            "unit": signal.unit or "",
+            "unit": self._unit(signal),
             "length": length,
             "signed": signed,
             "is_float": is_float,
@@ -739,7 +754,7 @@ class _Compiler:
             names = " or ".join(f"{e.name}.{source.name}" for e in self.binder.escs[:2])
             self.problems.append(f"{where}: does not say of which ESC. Prefix it or bind it: {names}.")
             return None
-        return self._bound_signal(where, signal, source, esc, base, codes, (factor, offset))
+        return self._bound_signal(where, signal, source, esc, base, codes)
 
     def _bound_signal(
         self,
@@ -749,9 +764,8 @@ class _Compiler:
         esc: int | None,
         base: dict[str, Any],
         codes: Mapping[str, int],
-        linear: tuple[Fraction, Fraction],
     ) -> SignalPlan | None:
-        factor, offset = linear
+        factor, offset, unit = base["factor"], base["offset"], base["unit"]
         numbers: dict[int, int] | None = None
         notes: list[str] = []
         if source.names:
@@ -765,15 +779,15 @@ class _Compiler:
                     notes.append(f"sent as Error, not in the value table: {', '.join(missing)}")
             else:
                 notes.append("the value table has no name of it: sent as the ESC's number")
-        converted = units.conversion(source.unit, signal.unit or "")
+        converted = units.conversion(source.unit, unit)
         if converted is None:
-            can = ", ".join(units.texts_like(source.unit)[:8]) or "no unit"
+            can = ", ".join(units.texts_like(source.unit))
             self.problems.append(
                 f"{where}: {source.name} is in {source.unit or 'no unit'} and cannot be converted to "
-                f"{signal.unit!r}. Possible: {can}."
+                f"{unit!r}. Possible: {can}; dbc.units says what other texts mean."
             )
             return None
-        if source.unit and not signal.unit:
+        if source.unit and not unit:
             self.warnings.append(f"{where}: has no unit; {source.unit} is taken.")
         scale, shift = converted
         slope = scale / source.per_unit / factor
@@ -782,11 +796,12 @@ class _Compiler:
         if numbers is None and not signal.is_float:
             step = abs(1 / slope)
             if step > 1 and source.whole:
-                notes.append(f"resolution {_number(abs(factor))} {signal.unit or source.unit}".rstrip())
+                notes.append(f"resolution {_number(abs(factor))} {unit or source.unit}".rstrip())
             if not source.rolls:
                 ends = [end * slope + intercept for end in (source.low, source.high) if end is not None]
                 if ends and (min(ends) < low - 2 or max(ends) > high + 2):  # more than NotAvailable and Error cost
-                    text = f"{_number(low * factor + offset)} to {_number(high * factor + offset)} {signal.unit or ''}".rstrip()
+                    first, last = sorted(end * factor + offset for end in (low, high))
+                    text = f"{_number(first)} to {_number(last)} {unit or source.unit}".rstrip()
                     notes.append(f"range {text}, beyond it Error")
         if source.rolls:
             if slope != 1 or intercept != 0 or low != 0 or high < 1 or signal.is_float:

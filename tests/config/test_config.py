@@ -23,7 +23,7 @@ from kontronik_can_gw.telemetry import MS
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
 TABLES: dict[str, tuple[str, ...]] = {
     "can": ("interface", "channel", "bitrate", "fd", "data_bitrate", "options"),
-    "dbc": ("enabled", "file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids"),
+    "dbc": ("enabled", "file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids", "units"),
     "canopen": (
         *("enabled", "node_id", "eds", "vendor_id", "serial", "self_start", "read_only", "cia402_mirrors", "store"),
     ),
@@ -47,7 +47,7 @@ DEFAULTS: dict[str, dict[str, object]] = {
         "base_id": None,
         "id_step": None,
     }
-    | {"bind": {}, "e2e_data_ids": {}},
+    | {"bind": {}, "e2e_data_ids": {}, "units": {}},
     "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
     "run": {"wait_for_devices": False, "realtime_priority": None},
@@ -386,6 +386,12 @@ def test_a_data_id_is_a_whole_number_of_16_bits_beside_a_message_name() -> None:
     assert "is not a table" in refused("dbc", "e2e_data_ids", 3)
 
 
+def test_a_meaning_is_one_of_those_that_are_known() -> None:
+    assert taken("dbc", "units", {"Unit_X": "degC", "x": "-"}) == {"Unit_X": "degC", "x": "-"}
+    assert "Unit_X: 'degr' is none of those known here. Did you mean deg" in refused("dbc", "units", {"Unit_X": "degr"})
+    assert "Unit_X: 1 is none" in refused("dbc", "units", {"Unit_X": 1})
+
+
 # --- mistakes
 
 
@@ -584,6 +590,7 @@ def test_what_the_example_shows_as_default_is_the_default() -> None:
     shown = {(table, key): value for table in TABLES if table != "esc" for key, value in made[table].items()}
     shown |= {("esc", key): value for key, value in made["esc"][0].items()}
     examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
+    examples |= {("dbc", "units")}
     examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options"), ("esc", "node_id"), ("esc", "device")}
     examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store"), ("record", "directory")}
     examples |= {("statistics", "file"), ("statistics", "prometheus"), ("mqtt", "discovery"), ("mqtt", "gateway")}
@@ -701,6 +708,7 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
         max_size=3,
     ),
     ("dbc", "e2e_data_ids"): st.dictionaries(_TEXT, st.integers(0, 0xFFFF), max_size=3),
+    ("dbc", "units"): st.dictionaries(_TEXT, st.sampled_from(["V", "degC", "1/min", "-"]), max_size=3),
     ("statistics", "prometheus"): st.builds(
         lambda host, port: f"{host}:{port}",
         st.sampled_from(["127.0.0.1", "localhost", "[::1]", "127.255.3.200"]),
