@@ -138,7 +138,9 @@ def _dbc_settings(found: Mapping[str, Any]) -> DbcSettings:
     """Checked as the configuration's are."""
     keys = {"bind": found["bind"], "e2e_data_ids": found["data_ids"]}
     keys |= {key: found[key] for key in ("node", "base_id", "id_step") if found[key] is not None}
-    keys |= {key: found[key] for key in ("units",) if found.get(key)}  # not in captures of 0.5.0
+    later = ("units", "messages", "unbound", "flags_on_loss")  # not in captures of 0.5.0
+    keys |= {key: found[key] for key in later if found.get(key) not in (None, {}, [])}
+    keys |= {"send_type": found["send_types"]} if found.get("send_types") else {}
     return parse({"dbc": keys, "esc": [{"port": "-"}]}, "the capture").dbc_settings
 
 

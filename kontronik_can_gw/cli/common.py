@@ -24,6 +24,7 @@ from kontronik_can_gw.cli.node_setup import (
 )
 from kontronik_can_gw.config import Config, MqttConfig, load
 from kontronik_can_gw.dbc_output.layout import Layout, parse_database, read_dbc
+from kontronik_can_gw.dbc_output.loss import unreported
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
@@ -130,7 +131,8 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
             bits = canopen.nodes(escs).bits_per_second()
         warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
     damaged = () if kept is None else tuple(kept.damaged)
-    said = tuple(warning for warning in (*ignored, *warnings) if warning)
+    mute = unreported(layout, config.dbc.on_loss == "silent")
+    said = tuple(warning for warning in (*ignored, *mute, *warnings) if warning)
     return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc)
 
 

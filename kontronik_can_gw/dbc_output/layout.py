@@ -11,13 +11,15 @@ import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum, Flag
+from enum import Enum
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from kontronik_can_gw.dbc_output import units
+from kontronik_can_gw.dbc_output import counters, send_types, units
 from kontronik_can_gw.dbc_output.bounds import MAX_BYTES, check_bounds, check_size
+from kontronik_can_gw.dbc_output.names import normalize as normalize
+from kontronik_can_gw.dbc_output.send_types import SendType as SendType
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.sources import Group, Source, sources
@@ -28,53 +30,20 @@ if TYPE_CHECKING:
 
 _NOT_AVAILABLE_TEXTS = frozenset({"notavailable", "sna", "na", "signalnotavailable"})
 _ERROR_TEXTS = frozenset({"error", "err", "invalid"})
-_ALIVE_ENDINGS = (
-    "alive",
-    "alivecounter",
-    "alivecount",
-    "livecounter",
-    "messagecounter",
-    "rollingcounter",
-    "sequencecounter",
-)
 _LARGEST_FLOAT = int(struct.unpack("<f", b"\xff\xff\x7f\x7f")[0])
-_CRC_ENDINGS = ("crc", "crc8", "checksum")
 _MAX_REASON = 300
 """Characters: cantools may quote the whole file."""
 _MAX_PAGES = 1024
 """Multiplexer values of a message of ours."""
+_MANY = 5
+_SUSPECT = {
+    None: "",
+    counters.Kind.COUNTER: ' If it counts the frames: bind = "alive".',
+    counters.Kind.CHECKSUM: ' If it is the CRC of AUTOSAR E2E profile 1: bind = "crc".',
+}
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 EXPECTED_LIVE_HZ = 100
 """What a UART is expected to bring, for the computed bus load only; the gateway sends as frames come."""
-
-
-class SendType(Flag):
-    """When a message is sent. Several may hold."""
-
-    CYCLIC = 1
-    EVENT = 2
-    """With each UART frame (or change of the link) that brings one of its signals."""
-    ON_CHANGE = 4
-
-
-_SEND_TYPES = {
-    "cyclic": SendType.CYCLIC,
-    "cyclicx": SendType.CYCLIC,
-    "periodic": SendType.CYCLIC,
-    "fixedperiodic": SendType.CYCLIC,
-    "event": SendType.EVENT,
-    "spontaneous": SendType.EVENT,
-    "spontan": SendType.EVENT,
-    "spontanwithdelay": SendType.EVENT,
-    "onwrite": SendType.EVENT,
-    "onchange": SendType.ON_CHANGE,
-    "cyclicandevent": SendType.CYCLIC | SendType.EVENT,
-    "cyclicandspontan": SendType.CYCLIC | SendType.EVENT,
-    "cyclicandspontanwithdelay": SendType.CYCLIC | SendType.EVENT,
-    "cyclicandspontaneous": SendType.CYCLIC | SendType.EVENT,
-    "cyclicandonchange": SendType.CYCLIC | SendType.ON_CHANGE,
-}
-_NO_SEND_TYPE = frozenset({"", "none", "nomsgsendtype", "notused", "nosendtype"})
 
 
 class Role(Enum):
@@ -129,6 +98,8 @@ class SignalPlan:
     """Value table, raw value to text, without the codes for not available and error."""
     notes: tuple[str, ...] = ()
     """What resolution or range is lost, for people."""
+    unbound: bool = False
+    """A constant because it is bound to nothing."""
 
 
 def classic_bits(length: int, extended: bool = False) -> int:
@@ -195,6 +166,14 @@ class DbcSettings:
     """Message name to E2E data id; otherwise the CAN id's low 16 bits."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Unit text of the DBC to the one that it means."""
+    send_types: Mapping[str, str] = field(default_factory=dict)
+    """GenMsgSendType to the one of ``send_types.NAMES`` that it means."""
+    messages: tuple[str, ...] = ()
+    """Patterns of the names of our messages, which ``prepare`` goes by; none: all."""
+    unbound: str = "error"
+    """What becomes of a signal without a source: "error", or its "start_value" for ever."""
+    flags_on_loss: int | None = None
+    """What a flag without a code is without telemetry; None: its own start value, else 0."""
 
 
 @dataclass(frozen=True)
@@ -211,11 +190,6 @@ class Layout:
         return sum(
             message.rate_hz * (message.bits[0] / bitrate + message.bits[1] / data_bitrate) for message in self.messages
         )
-
-
-def normalize(name: str) -> str:
-    """A name as it is compared: letters and digits only, lower case."""
-    return "".join(c for c in name.casefold() if c.isalnum())
 
 
 def load_database(path: Path, warnings: list[str] | None = None) -> "Database":
@@ -469,14 +443,30 @@ def compile_layout(
         near = difflib.get_close_matches(key, known, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         compiler.problems.append(f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{hint}")
-    for text in sorted(set(settings.units) - compiler.units):
-        near = difflib.get_close_matches(text, compiler.units, n=1, cutoff=0.3)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
-        compiler.problems.append(f"dbc.units.{text}: no signal of {node} has this unit in {file}.{hint}")
+    for table, given, met, what in (
+        ("units", settings.units, compiler.units, "signal of {} has this unit"),
+        ("send_type", settings.send_types, compiler.send_types, "message of {} has this GenMsgSendType"),
+    ):
+        for text in sorted(set(given) - met):
+            near = difflib.get_close_matches(text, met, n=1, cutoff=0.3)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            compiler.problems.append(f"dbc.{table}.{text}: no {what.format(node)} in {file}.{hint}")
     for name in sorted(set(settings.data_ids) - {m.name for m in ours}):
         compiler.problems.append(f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}.")
+    if compiler.unbound > _MANY:
+        compiler.problems.append(
+            f"{file}: {compiler.unbound} signals of {node} are bound to nothing. dbc.messages chooses messages, as "
+            f'["{ours[0].name}", "Esc*"]; dbc.unbound = "start_value" sends what is not bound as a constant.'
+        )
     if compiler.problems:
         raise UserError(*compiler.problems)
+    once = [plan.name for plan in plans if not plan.cycle_ns and not plan.paces]
+    if once:
+        compiler.warnings.append(
+            f"{file}: sent once at the start, without a cycle and a value that changes: {_listed(once)}"
+        )
+    if names := compiler.while_active:
+        compiler.warnings.append(f"{file}: sent all the time, not only while something is active: {_listed(names)}")
     return Layout(file, node, tuple(plans), tuple(compiler.warnings))
 
 
@@ -493,6 +483,10 @@ class _Compiler:
         self.warnings: list[str] = []
         self.units: set[str] = set()
         """Unit texts that were met."""
+        self.send_types: set[str] = set()
+        self.while_active: list[str] = []
+        """Messages that others send only while something is active."""
+        self.unbound = 0
 
     def check_ids(self, ours: Sequence["Message"], taken: Mapping[int, str]) -> None:
         mine = {id(message) for message in ours}
@@ -531,7 +525,9 @@ class _Compiler:
                 f"{where}: CAN FD has no frames of {message.length} bytes, but {', '.join(map(str, FD_LENGTHS[9:]))}."
             )
         if message.is_container or message.length == 0 or not message.signals:
-            self.problems.append(f"{where}: has no signal that could be sent. Remove it or give it signals.")
+            self.problems.append(
+                f"{where}: has no signal that could be sent. Give it signals, or leave it out (dbc.messages)."
+            )
             return None
         if message.length > FD_LENGTHS[-1]:
             return None
@@ -557,17 +553,14 @@ class _Compiler:
         for paged in signals:
             if paged.page is not None and paged.role in (Role.ALIVE, Role.CRC):
                 self.problems.append(
-                    f"{where}.{paged.name}: is a multiplexed {paged.role.value}; it has to be in every frame. Take the m{paged.page} away."
+                    f"{where}.{paged.name}: is a multiplexed {paged.role.value}; it has to be in every frame. "
+                    f"Take the m{paged.page} away, or bind it to a constant."
                 )
         crcs = [s for s in signals if s.role is Role.CRC]
         if len(crcs) > 1:
             self.problems.append(f"{where}: has several CRC signals: {', '.join(s.name for s in crcs)}. Keep one.")
-        if crcs:
-            alive = [s for s in signals if s.role is Role.ALIVE]
-            if len(alive) != 1 or alive[0].high < 14:
-                self.problems.append(
-                    f"{where}: {crcs[0].name}: E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
-                )
+        elif crcs:
+            self._check_e2e(message, where, crcs[0], [s for s in signals if s.role is Role.ALIVE])
         if len(self.problems) > before:
             return None
         return MessagePlan(
@@ -586,6 +579,28 @@ class _Compiler:
             data_id=self.settings.data_ids.get(message.name, message.frame_id & 0xFFFF),
         )
 
+    def _check_e2e(self, message: "Message", where: str, crc: SignalPlan, alive: Sequence[SignalPlan]) -> None:
+        """A checksum is sent only as AUTOSAR E2E profile 1, and only where that is said or its names are those of always."""
+        asked = message.name in self.settings.data_ids or self.binder.bound(message.name, crc.name) is not None
+        fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
+        one = len(alive) == 1 and alive[0].high >= 14
+        key = f"dbc.e2e_data_ids.{message.name} = 0x{message.frame_id & 0xFFFF:X}"
+        if not asked and not (fits and one and counters.is_e2e(crc.name, alive[0].name)):
+            self.problems.append(
+                f"{where}.{crc.name}: the DBC does not say how this checksum is made. AUTOSAR E2E profile 1 (8 bits on a byte border, "
+                f"beside exactly one alive counter, 0 to 14) is chosen by {key}. Otherwise bind it to a constant, if receivers take "
+                "one, or leave the message out (dbc.messages)."
+            )
+            return
+        if not fits:
+            self.problems.append(f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte border.")
+        if not one:
+            self.problems.append(
+                f"{where}: {crc.name}: E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
+            )
+        if not asked:
+            self.warnings.append(f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. If that is right, say so: {key}")
+
     def _timing(self, message: "Message", where: str) -> tuple[SendType, int, int]:
         def number(name: str) -> int:
             value = attribute(message, name, self.database)
@@ -601,17 +616,24 @@ class _Compiler:
 
         cycle, delay = number("GenMsgCycleTime"), number("GenMsgDelayTime")
         text = str(attribute(message, "GenMsgSendType", self.database) or "")
-        key = normalize(text)
-        if key in _NO_SEND_TYPE:
-            return (SendType.CYCLIC if cycle else SendType.EVENT), cycle, delay
-        if key not in _SEND_TYPES:
+        self.send_types.add(text)
+        name, while_active = send_types.meaning(text, self.settings.send_types)
+        if name is None:
             self.problems.append(
-                f"{where}: GenMsgSendType {text!r} is not known. Known: Cyclic, Event, OnChange, CyclicAndEvent, CyclicAndOnChange."
+                f"{where}: GenMsgSendType {text!r} is not known. Say what it means: dbc.send_type.{text!r} = "
+                f"{', '.join(send_types.NAMES)}."
             )
             return SendType.EVENT, cycle, delay
-        send_type = _SEND_TYPES[key]
+        if while_active:
+            cycle = cycle or number("GenMsgCycleTimeFast") or number("GenMsgCycleTimeActive")
+            self.while_active.append(message.name)
+        if name == send_types.NONE:
+            return (SendType.CYCLIC if cycle else SendType.EVENT), cycle, delay
+        send_type = send_types.NAMES[name]
         if SendType.CYCLIC in send_type and not cycle:
-            self.problems.append(f"{where}: is sent {text} but its GenMsgCycleTime is 0. Set one in ms.")
+            self.problems.append(
+                f'{where}: is sent {text} but its GenMsgCycleTime is 0. Set one in ms, or dbc.send_type.{text!r} = "Event".'
+            )
         return send_type, cycle, delay
 
     def _check_overlap(self, message: "Message", where: str) -> None:
@@ -676,16 +698,8 @@ class _Compiler:
         if not_available is None:
             start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
             # a default start value is nobody's statement that 0 means "not available"; a flag has nothing better
-            usable = (
-                (start_is_set or length == 1)
-                and isinstance(start, (int, float))
-                and math.isfinite(start)
-                and start == int(start)
-            )
-            if usable and low <= start <= high:
-                not_available = int(start)
-            else:
-                not_available = low if signed else high
+            usable = (start_is_set or length == 1) and _is_raw(start, low, high)
+            not_available = int(start) if usable else low if signed else high
         if error is None:
             error = not_available
         base: dict[str, Any] = {
@@ -730,23 +744,25 @@ class _Compiler:
             return SignalPlan(role=Role.CONSTANT, constant=constant, **base)
         name = signal.name if bound is None else bound
         found = self.binder.by_name(name)
-        key = normalize(name)
-        if found is None and key.endswith(_ALIVE_ENDINGS):
+        kind = counters.kind(name) if found is None else None
+        if kind is counters.Kind.COUNTER:
             if is_float or base["low"] > 0 or base["high"] < 2:
                 self.problems.append(
-                    f"{where}: an alive counter needs a whole number of 2 bits or more that begins at 0."
+                    f"{where}: an alive counter needs a whole number of 2 bits or more that begins at 0. Or bind it to a constant."
                 )
                 return None
             return SignalPlan(role=Role.ALIVE, **base)
-        if found is None and key.endswith(_CRC_ENDINGS):
-            if length != 8 or len(base["pieces"]) != 1 or base["pieces"][0].at % 8:
-                self.problems.append(f"{where}: an E2E profile 1 CRC needs 8 bits on a byte border.")
-                return None
+        if kind is counters.Kind.CHECKSUM:
             return SignalPlan(role=Role.CRC, **base)
+        if found is None and bound is None and self.settings.unbound == "start_value":
+            constant = self._start_value(where, signal, base, codes)
+            return None if constant is None else SignalPlan(role=Role.CONSTANT, constant=constant, unbound=True, **base)
         if found is None:
+            self.unbound += bound is None
             via = f" (bound by dbc.bind to {bound!r})" if bound is not None else ""
             self.problems.append(
-                f"{where}: no such source{via}.{self.binder.suggestions(name)} Bind it under [dbc.bind] or rename it."
+                f"{where}: no such source{via}.{self.binder.suggestions(name)}{_SUSPECT[counters.suspect(name)]} "
+                "Bind it under [dbc.bind] or rename it."
             )
             return None
         source, esc = found
@@ -755,6 +771,41 @@ class _Compiler:
             self.problems.append(f"{where}: does not say of which ESC. Prefix it or bind it: {names}.")
             return None
         return self._bound_signal(where, signal, source, esc, base, codes)
+
+    def _start_value(
+        self, where: str, signal: "Signal", base: Mapping[str, Any], codes: Mapping[str, int]
+    ) -> int | None:
+        """The raw bits of a signal that is bound to nothing: its own start value, else NotAvailable, else the default or 0."""
+        is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
+        if not is_set and _NOT_AVAILABLE_TEXTS & set(codes):
+            return int(base["not_available"])
+        start = attribute(signal, "GenSigStartValue", self.database) or 0
+        length, signed = signal.length, signal.is_signed
+        if signal.is_float and isinstance(start, (int, float)):
+            raw = _constant(start, Fraction(1), Fraction(0), length, signed, is_float=True)
+        elif _is_raw(start, *((-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1))):
+            raw = int(start)
+        else:
+            raw = None
+        if raw is None:
+            self.problems.append(
+                f"{where}: its GenSigStartValue {start} is none of its raw values. Bind it to a constant."
+            )
+        return raw
+
+    def _flag_on_loss(self, signal: "Signal", codes: Mapping[str, int]) -> int | None:
+        """What a flag without a code is without telemetry, 0 or 1; None: as its own start value has it."""
+        if _NOT_AVAILABLE_TEXTS & set(codes):
+            return None
+        if (
+            self.settings.flags_on_loss is None
+            and signal.dbc is not None
+            and "GenSigStartValue" in signal.dbc.attributes
+        ):
+            start = attribute(signal, "GenSigStartValue", self.database)
+            if _is_raw(start, *((-1, 0) if signal.is_signed else (0, 1))):
+                return None
+        return self.settings.flags_on_loss or 0
 
     def _bound_signal(
         self,
@@ -803,6 +854,15 @@ class _Compiler:
                     first, last = sorted(end * factor + offset for end in (low, high))
                     text = f"{_number(first)} to {_number(last)} {unit or source.unit}".rstrip()
                     notes.append(f"range {text}, beyond it Error")
+        if source.bit is not None and signal.length == 1:
+            raws = [math.floor(value * slope + intercept + Fraction(1, 2)) for value in (0, 1)]
+            if [raw if low <= raw <= high else base["error"] for raw in raws] != raws:
+                sign = " Make it unsigned." if signal.is_signed else ""
+                self.problems.append(f"{where}: cannot hold both values of a flag, 0 and 1.{sign}")
+                return None
+            if (on_loss := self._flag_on_loss(signal, codes)) is not None:
+                ends = {"low": min(raws), "high": max(raws)}  # a text "Error" at one of them is no code
+                base |= ends | {"not_available": raws[on_loss], "error": raws[on_loss]}
         if source.rolls:
             if slope != 1 or intercept != 0 or low != 0 or high < 1 or signal.is_float:
                 self.problems.append(
@@ -822,6 +882,11 @@ class _Compiler:
             notes=tuple(notes),
             **base,
         )
+
+
+def _is_raw(value: Any, low: int, high: int) -> bool:
+    """True for a number that is a raw value."""
+    return isinstance(value, (int, float)) and math.isfinite(value) and value == int(value) and low <= value <= high
 
 
 def _value_texts(signal: "Signal") -> dict[int, str]:

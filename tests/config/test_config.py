@@ -23,7 +23,8 @@ from kontronik_can_gw.telemetry import MS
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
 TABLES: dict[str, tuple[str, ...]] = {
     "can": ("interface", "channel", "bitrate", "fd", "data_bitrate", "options"),
-    "dbc": ("enabled", "file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids", "units"),
+    "dbc": ("enabled", "file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids", "units")
+    + ("send_type", "messages", "unbound", "flags_on_loss"),
     "canopen": (
         *("enabled", "node_id", "eds", "vendor_id", "serial", "self_start", "read_only", "cia402_mirrors", "store"),
     ),
@@ -47,7 +48,15 @@ DEFAULTS: dict[str, dict[str, object]] = {
         "base_id": None,
         "id_step": None,
     }
-    | {"bind": {}, "e2e_data_ids": {}, "units": {}},
+    | {
+        "bind": {},
+        "e2e_data_ids": {},
+        "units": {},
+        "send_type": {},
+        "messages": (),
+        "unbound": "error",
+        "flags_on_loss": None,
+    },
     "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
     "run": {"wait_for_devices": False, "realtime_priority": None},
@@ -64,6 +73,7 @@ RANGES = {
     ("can", "data_bitrate"): (10_000, 8_000_000),
     ("dbc", "base_id"): (0, 0x1FFFFFFF),
     ("dbc", "id_step"): (1, 0x1FFFFFFF),
+    ("dbc", "flags_on_loss"): (0, 1),
     ("run", "realtime_priority"): (1, 99),
     ("canopen", "vendor_id"): (0, 0xFFFFFFFF),
     ("canopen", "serial"): (0, 0xFFFFFFFF),
@@ -390,6 +400,14 @@ def test_a_meaning_is_one_of_those_that_are_known() -> None:
     assert taken("dbc", "units", {"Unit_X": "degC", "x": "-"}) == {"Unit_X": "degC", "x": "-"}
     assert "Unit_X: 'degr' is none of those known here. Did you mean deg" in refused("dbc", "units", {"Unit_X": "degr"})
     assert "Unit_X: 1 is none" in refused("dbc", "units", {"Unit_X": 1})
+    assert taken("dbc", "send_type", {"No": "Event"}) == {"No": "Event"}
+    assert "No: 'event' is none" in refused("dbc", "send_type", {"No": "event"})
+
+
+def test_messages_are_a_list_of_names() -> None:
+    assert taken("dbc", "messages", ["Motor_*", "X"]) == ("Motor_*", "X")
+    for value in ("Motor_*", [1], [""], {"a": 1}, [["x"]]):
+        assert "is not a list of names" in refused("dbc", "messages", value)
 
 
 # --- mistakes
@@ -590,7 +608,7 @@ def test_what_the_example_shows_as_default_is_the_default() -> None:
     shown = {(table, key): value for table in TABLES if table != "esc" for key, value in made[table].items()}
     shown |= {("esc", key): value for key, value in made["esc"][0].items()}
     examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
-    examples |= {("dbc", "units")}
+    examples |= {("dbc", key) for key in ("units", "send_type", "messages", "flags_on_loss")}
     examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options"), ("esc", "node_id"), ("esc", "device")}
     examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store"), ("record", "directory")}
     examples |= {("statistics", "file"), ("statistics", "prometheus"), ("mqtt", "discovery"), ("mqtt", "gateway")}
@@ -708,6 +726,9 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
         max_size=3,
     ),
     ("dbc", "e2e_data_ids"): st.dictionaries(_TEXT, st.integers(0, 0xFFFF), max_size=3),
+    ("dbc", "unbound"): st.sampled_from(["error", "start_value"]),
+    ("dbc", "messages"): st.lists(st.from_regex(r"\A[A-Za-z_*?]{1,8}\Z"), max_size=3),
+    ("dbc", "send_type"): st.dictionaries(_TEXT, st.sampled_from(["Cyclic", "OnChange"]), max_size=3),
     ("dbc", "units"): st.dictionaries(_TEXT, st.sampled_from(["V", "degC", "1/min", "-"]), max_size=3),
     ("statistics", "prometheus"): st.builds(
         lambda host, port: f"{host}:{port}",
