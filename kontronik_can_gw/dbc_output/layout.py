@@ -861,8 +861,8 @@ class _Compiler:
                 self.problems.append(f"{where}: cannot hold both values of a flag, 0 and 1.{sign}")
                 return None
             if (on_loss := self._flag_on_loss(signal, codes)) is not None:
-                ends = {"low": min(raws), "high": max(raws)}  # a text "Error" at one of them is no code
-                base |= ends | {"not_available": raws[on_loss], "error": raws[on_loss]}
+                base |= {"not_available": raws[on_loss], "error": raws[on_loss]}
+                base |= {"low": min(raws), "high": max(raws)}  # a text "Error" at one of them is no code
         if source.rolls:
             if slope != 1 or intercept != 0 or low != 0 or high < 1 or signal.is_float:
                 self.problems.append(

@@ -23,8 +23,10 @@ from kontronik_can_gw.telemetry import MS
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
 TABLES: dict[str, tuple[str, ...]] = {
     "can": ("interface", "channel", "bitrate", "fd", "data_bitrate", "options"),
-    "dbc": ("enabled", "file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids", "units")
-    + ("send_type", "messages", "unbound", "flags_on_loss"),
+    "dbc": (
+        *("enabled", "file", "node", "on_loss", "base_id", "id_step", "bind", "e2e_data_ids"),
+        *("units", "send_type", "messages", "unbound", "flags_on_loss"),
+    ),
     "canopen": (
         *("enabled", "node_id", "eds", "vendor_id", "serial", "self_start", "read_only", "cia402_mirrors", "store"),
     ),
