@@ -412,23 +412,37 @@ def shipped(name: str) -> Path:
 
 def load(path: Path) -> Config:
     """Read and check a configuration file. UserError with every mistake, each with file, key and remedy."""
+    config, problems = examine(path)
+    if config is None or problems:
+        raise UserError(*problems)
+    return config
+
+
+def examine(path: Path) -> tuple[Config | None, list[str]]:
+    """A configuration file and its mistakes; None where they leave nothing to look further at. UserError where it cannot be read."""
     try:
         text = path.read_bytes().decode("utf-8-sig")  # Windows' editors put a mark in front
     except OSError as error:
-        raise UserError(
-            f"{path}: cannot be read: {error.strerror}. `kontronik-can-gw init` writes an example."
-        ) from None
+        advice = " `kontronik-can-gw init` writes an example." if isinstance(error, FileNotFoundError) else ""
+        raise UserError(f"{path}: cannot be read: {error.strerror}.{advice}") from None
     except UnicodeDecodeError:
         raise UserError(f"{path}: is not a text file in UTF-8, so no TOML configuration") from None
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # beside TOMLDecodeError: numbers of 5000 digits, 1000 brackets
         raise UserError(f"{path}: is not valid TOML: {error}") from None
-    return parse(tables, str(path))
+    return _parsed(tables, str(path))
 
 
 def parse(tables: Mapping[str, Any], file: str) -> Config:
     """A configuration from TOML tables. UserError with every mistake."""
+    config, problems = _parsed(tables, file)
+    if config is None or problems:
+        raise UserError(*problems)
+    return config
+
+
+def _parsed(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[str]]:
     problems: list[str] = []
     for name in tables:
         if name not in _TABLES:
@@ -451,14 +465,13 @@ def parse(tables: Mapping[str, Any], file: str) -> Config:
         named = {"name": f"esc{number}"} | entry
         if (esc := _table(named, EscConfig, f"esc[{number}]", file, problems)) is not None:
             escs[number] = esc
+    is_whole = not problems
     _check_escs(escs, file, problems)
-    if problems:
-        raise UserError(*problems)
+    if not is_whole:
+        return None, problems
     config = Config(**cast(Any, made), esc=tuple(escs.values()), file=file)
     _check_outputs(config, problems)
-    if problems:
-        raise UserError(*problems)
-    return config
+    return config, problems
 
 
 def schema() -> dict[str, Any]:

@@ -149,7 +149,9 @@ def _count(text: str) -> int:
 
 def _name(text: str) -> str:
     if not re.fullmatch("[A-Za-z][A-Za-z0-9_]{0,11}", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a name of 1 to 12 letters, digits and underscores")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a name of 1 to 12 letters, digits and underscores that begins with a letter"
+        )
     return text
 
 

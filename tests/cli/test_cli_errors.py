@@ -307,7 +307,7 @@ def test_socketcan_that_is_not_there_is_told_with_the_command_that_makes_it(tmp_
     file = configuration(tmp_path, terminal.path, can='channel = "nocan7"')
     said = one_line(program("run", "-c", file), 1)
     assert "CAN interface nocan7: " in said
-    no_socketcan = "this kernel has no SocketCAN. Try: sudo modprobe can_raw vcan" in said
+    no_socketcan = "this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan" in said
     assert no_socketcan or ("there is none" in said and "ip link set nocan7 up type can bitrate 500000" in said)
 
 

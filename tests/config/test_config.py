@@ -552,9 +552,8 @@ def test_a_missing_file_and_a_directory_are_told_with_the_command_that_writes_an
         with pytest.raises(UserError) as caught:
             load(path)
         assert caught.value.exit_code == 2
-        assert list(caught.value.problems) == [
-            f"{path}: cannot be read: {reason}. `kontronik-can-gw init` writes an example."
-        ]
+        advice = "" if path == tmp_path else " `kontronik-can-gw init` writes an example."
+        assert list(caught.value.problems) == [f"{path}: cannot be read: {reason}.{advice}"]
 
 
 def test_the_dbc_file_is_relative_to_the_configuration(tmp_path: Path) -> None:

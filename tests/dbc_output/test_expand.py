@@ -470,10 +470,23 @@ def test_a_step_that_makes_ids_clash_is_refused() -> None:
 
 
 def test_ids_that_leave_their_range_are_refused() -> None:
-    assert "EscM0: id 7FFh moved to 800h is outside 0..7FFh" in refused(simple(0x7FF))
+    assert "1 of 2 messages lie outside 0..7FFh, up to 800h" in refused(simple(0x7FF))
     assert "outside 0..1FFFFFFFh" in refused(simple(0x1FFFFFFF, extended=True))
     assert "outside 0..7FFh" in refused(simple(0x100), base_id=0x7FF, id_step=1)
     assert "outside 0..7FFh" in refused(simple(0x100, 0x200), [EscSettings("one")], base_id=0x700)
+    assert "2 of 3 messages" in refused(simple(0x100, 0x200, 0x700), [EscSettings("one")], base_id=0x700)
+    assert "at most 1FFh" in refused(simple(0x100, 0x200, 0x700), [EscSettings("one")], base_id=0x700)
+
+
+def test_ids_that_canopen_leaves_free_are_not_moved_among_its_own_unless_somebody_says_where_to() -> None:
+    escs = [EscSettings(f"esc{number}") for number in range(1, 10)]
+    with pytest.raises(UserError, match=r"52 of 101 ids leave 680h..6DFh.*--base-id"):
+        multiplied(SHIPPED.read_text(), escs, "KontronikGateway")
+    assert multiplied(SHIPPED.read_text(), escs[:8], "KontronikGateway")
+    assert multiplied(SHIPPED.read_text(), escs, "KontronikGateway", base_id=0x680)
+    assert multiplied(simple(0x6DF), escs, "Gateway", base_id=0x6DF)
+    assert "1 of 2 ids" in refused(simple(0x6DF))
+    assert multiplied(simple(0x700), escs, "Gateway")  # it was there before
     assert ids_of(multiplied(simple(0x1FFFFFFE, extended=True), PAIR, "Gateway")[0]) == [0x1FFFFFFE, 0x1FFFFFFF]
 
 
