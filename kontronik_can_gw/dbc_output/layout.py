@@ -558,7 +558,9 @@ class _Compiler:
                 )
         crcs = [s for s in signals if s.role is Role.CRC]
         if len(crcs) > 1:
-            self.problems.append(f"{where}: has several CRC signals: {', '.join(s.name for s in crcs)}. Keep one.")
+            self.problems.append(
+                f"{where}: has several CRC signals: {', '.join(s.name for s in crcs)}. Bind all but one to constants."
+            )
         elif crcs:
             self._check_e2e(message, where, crcs[0], [s for s in signals if s.role is Role.ALIVE])
         if len(self.problems) > before:
@@ -621,7 +623,7 @@ class _Compiler:
         if name is None:
             self.problems.append(
                 f"{where}: GenMsgSendType {text!r} is not known. Say what it means: dbc.send_type.{text!r} = "
-                f"{', '.join(send_types.NAMES)}."
+                f"one of {', '.join(send_types.NAMES)}."
             )
             return SendType.EVENT, cycle, delay
         if while_active:
