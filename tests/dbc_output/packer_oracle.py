@@ -169,9 +169,7 @@ def _bit(word: str, number: int) -> Reader:
     return read
 
 
-def _calculated(
-    reckon: Callable[[EscTelemetry, LiveData], "Fraction | None"],
-) -> Reader:
+def _calculated(reckon: Callable[[EscTelemetry, LiveData], "Fraction | None"]) -> Reader:
     def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
         return None if esc.live is None else reckon(esc, esc.live)
 
