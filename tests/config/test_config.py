@@ -43,20 +43,11 @@ DEFAULTS: dict[str, dict[str, object]] = {
     "can": {"interface": "socketcan", "channel": "can0", "bitrate": 500_000, "fd": False, "data_bitrate": 2_000_000}
     | {"options": {}},
     "dbc": {
-        "enabled": True,
-        "file": "shipped",
-        "node": None,
-        "on_loss": "not_available",
-        "base_id": None,
+        "enabled": True, "file": "shipped", "node": None, "on_loss": "not_available", "base_id": None,
         "id_step": None,
     }
     | {
-        "bind": {},
-        "e2e_data_ids": {},
-        "units": {},
-        "send_type": {},
-        "messages": (),
-        "unbound": "error",
+        "bind": {}, "e2e_data_ids": {}, "units": {}, "send_type": {}, "messages": (), "unbound": "error",
         "flags_on_loss": None,
     },
     "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
@@ -69,7 +60,7 @@ DEFAULTS: dict[str, dict[str, object]] = {
     | {"tls": False, "gateway": None, "topic": "kontronik", "rate": 1.0, "retain": False, "discovery": None},
     "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250}
     | {"node_id": None, "device": None},
-}
+}  # fmt: skip
 RANGES = {
     ("can", "bitrate"): (10_000, 1_000_000),
     ("can", "data_bitrate"): (10_000, 8_000_000),
@@ -322,19 +313,11 @@ def test_a_name_that_is_no_identifier_is_refused(name: str) -> None:
 @pytest.mark.parametrize(
     ("given_gear", "gear"),
     [
-        (1, Fraction(1)),
-        (9.8, Fraction(98, 10)),
-        ("9.8", Fraction(98, 10)),
-        ("98/10", Fraction(98, 10)),
-        ("9.8/10", Fraction(98, 100)),
-        ("1/3", Fraction(1, 3)),
-        ("007", Fraction(7)),
-        (0.001, Fraction(1, 1000)),
-        ("1/1000", Fraction(1, 1000)),
-        (1000, Fraction(1000)),
-        (1e3, Fraction(1000)),
+        (1, Fraction(1)), (9.8, Fraction(98, 10)), ("9.8", Fraction(98, 10)), ("98/10", Fraction(98, 10)),
+        ("9.8/10", Fraction(98, 100)), ("1/3", Fraction(1, 3)), ("007", Fraction(7)), (0.001, Fraction(1, 1000)),
+        ("1/1000", Fraction(1, 1000)), (1000, Fraction(1000)), (1e3, Fraction(1000)),
     ],
-)
+)  # fmt: skip
 def test_a_gear_is_a_number_or_a_fraction_and_exact(given_gear: object, gear: Fraction) -> None:
     assert taken("esc", "gear", given_gear) == gear
 
@@ -522,13 +505,10 @@ def test_a_binary_file_that_happens_to_be_utf_8_is_no_toml(tmp_path: Path, conte
 @pytest.mark.parametrize(
     ("content", "line"),
     [
-        (b"[can]\nbitrate = \n", 2),
-        (b"[can]\n\n[can]\n", 3),
-        (b"[can]\nfd = yes\n", 2),
-        (b'[can]\nchannel = "can0\n', 2),
-        (b"channel: can0\n", 1),
+        (b"[can]\nbitrate = \n", 2), (b"[can]\n\n[can]\n", 3), (b"[can]\nfd = yes\n", 2),
+        (b'[can]\nchannel = "can0\n', 2), (b"channel: can0\n", 1),
     ],
-)
+)  # fmt: skip
 def test_broken_toml_is_told_with_its_line(tmp_path: Path, content: bytes, line: int) -> None:
     said = at_load(tmp_path / "a.toml", content)
     assert len(said) == 1
@@ -776,17 +756,10 @@ def only_the_parser_can_tell(made: dict[str, Any]) -> bool:
         parse(made, "a.toml")
     except UserError as error:
         signs = (
-            "is also that of",
-            "nothing would be sent",
-            "its node-ID would be",
-            "makes signal names ambiguous",
-            "is outside 0.001..1000",
-            "1 to 12 letters",
-            "is not a broker",
-            "is not the beginning of topics",
-            "is not a name of 1 to 64",
-            "which would be overwritten",
-        )
+            "is also that of", "nothing would be sent", "its node-ID would be", "makes signal names ambiguous",
+            "is outside 0.001..1000", "1 to 12 letters", "is not a broker", "is not the beginning of topics",
+            "is not a name of 1 to 64", "which would be overwritten",
+        )  # fmt: skip
         return all(any(sign in problem for sign in signs) for problem in error.problems)
     return False
 

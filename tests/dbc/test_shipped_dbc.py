@@ -285,52 +285,19 @@ def test_a_field_of_the_sheet_fits_its_signal_step_by_step(
 
 
 OPERATING_ERRORS = [
-    "Undervoltage",
-    "Overvoltage",
-    "OvercurrentIntegralError",
-    "OvercurrentIntegralWarning",
-    "PowerStageOvertempWarning",
-    "PowerStageOvertempError",
-    "BecUndervoltage",
-    "BecOvervoltage",
-    "BecOvercurrent",
-    "BecOvertemperature",
-    "SwitchedOffByRunningDown",
-    "CapacityLimitReached",
-    "OperatingErrorFound",
-    "OperatingWarningFound",
-    "SelftestError",
-    "EepromError",
-    "WatchdogErrorTripped",
-    "ProgrammingAllowed",
-    "LimitBatteryVoltageMinimum",
-    "LimitCurrentMaximum",
-    "LimitPowerStageTemperature",
-    "LimitBecTemperature",
-    "LimitBecCurrent",
-    "LimitDischargedCapacity",
-]
+    "Undervoltage", "Overvoltage", "OvercurrentIntegralError", "OvercurrentIntegralWarning",
+    "PowerStageOvertempWarning", "PowerStageOvertempError", "BecUndervoltage", "BecOvervoltage", "BecOvercurrent",
+    "BecOvertemperature", "SwitchedOffByRunningDown", "CapacityLimitReached", "OperatingErrorFound",
+    "OperatingWarningFound", "SelftestError", "EepromError", "WatchdogErrorTripped", "ProgrammingAllowed",
+    "LimitBatteryVoltageMinimum", "LimitCurrentMaximum", "LimitPowerStageTemperature", "LimitBecTemperature",
+    "LimitBecCurrent", "LimitDischargedCapacity",
+]  # fmt: skip
 SELFTEST_ERRORS = [
-    "TestPhaseLowSide",
-    "TestPhaseHighSide",
-    "TestShortToGround",
-    "TestBackEmfOffset",
-    "TestCurrentZeroPoint",
-    "TestUndervoltage",
-    "TestOvervoltage",
-    "TestBecUndervoltage",
-    "TestBecOvervoltage",
-    "TestReversePolarityFuse",
-    "TestOvervoltageFuse",
-    "TestPowerStageOvertemp",
-    "TestBecOvertemperature",
-    "TestMotorPhaseMissing",
-    "TestEepromEmpty",
-    "TestEepromStickPositions",
-    "TestEepromChecksum",
-    "TestEepromSize",
-    "TestEepromVersion",
-]
+    "TestPhaseLowSide", "TestPhaseHighSide", "TestShortToGround", "TestBackEmfOffset", "TestCurrentZeroPoint",
+    "TestUndervoltage", "TestOvervoltage", "TestBecUndervoltage", "TestBecOvervoltage", "TestReversePolarityFuse",
+    "TestOvervoltageFuse", "TestPowerStageOvertemp", "TestBecOvertemperature", "TestMotorPhaseMissing",
+    "TestEepromEmpty", "TestEepromStickPositions", "TestEepromChecksum", "TestEepromSize", "TestEepromVersion",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -345,13 +312,11 @@ def test_every_message_has_the_timing_that_its_readers_expect() -> None:
     db = parse(DATA)
     timing = {
         message.name: (
-            message.id,
-            db.send_type(message),
-            db.number("GenMsgCycleTime", message),
+            message.id, db.send_type(message), db.number("GenMsgCycleTime", message),
             db.number("GenMsgDelayTime", message),
         )
         for message in db.messages
-    }
+    }  # fmt: skip
     assert timing == {
         "EscStatus": (0x680, "CyclicAndOnChange", 100, 10),
         "EscSpeed": (0x688, "Event", 0, 5),

@@ -64,32 +64,14 @@ STATES = dict(
     zip(
         (1, 2, 3, 7, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26),
         [
-            "WaitForSignal",
-            "WaitForMotorOff",
-            "WaitForMotorOn",
-            "Selftest",
-            "Error_Selftest",
-            "CutOffDuringOperation",
-            "AcousticSignal",
-            "MotorOff",
-            "StandBy",
-            "Brake",
-            "BrakeTargetBackward",
-            "BrakeTargetForward",
-            "Programming",
-            "Sync_Forward",
-            "Sync_Backward",
-            "Sync_StandBy",
-            "Forward",
-            "Backward",
-            "SpoolUpFromStill",
-            "SpoolUpFromTurn",
-            "SpoolUpQuick",
-            "RPMControl",
+            "WaitForSignal", "WaitForMotorOff", "WaitForMotorOn", "Selftest", "Error_Selftest",
+            "CutOffDuringOperation", "AcousticSignal", "MotorOff", "StandBy", "Brake", "BrakeTargetBackward",
+            "BrakeTargetForward", "Programming", "Sync_Forward", "Sync_Backward", "Sync_StandBy", "Forward",
+            "Backward", "SpoolUpFromStill", "SpoolUpFromTurn", "SpoolUpQuick", "RPMControl",
         ],
         strict=True,
     )
-)
+)  # fmt: skip
 DEVICES = {1: "KOSMIK", 2: "KOLIBRI", 3: "JIVEPro", 4: "KONTROL-X", 5: "UHV"}
 LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
 LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
@@ -97,52 +79,20 @@ GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay")))
 CAN_STATES = dict(enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down")))
 
 ERROR_BITS = [
-    "undervoltage",
-    "overvoltage",
-    "overcurrent_integral_error",
-    "overcurrent_integral_warning",
-    "power_stage_overtemp_warning",
-    "power_stage_overtemp_error",
-    "bec_undervoltage",
-    "bec_overvoltage",
-    "bec_overcurrent",
-    "bec_overtemperature",
-    "switched_off_by_running_down",
-    "capacity_limit_reached",
-    "operating_error_found",
-    "operating_warning_found",
-    "selftest_error",
-    "eeprom_error",
-    "watchdog_error_tripped",
-    "programming_allowed",
-    "limit_battery_voltage_minimum",
-    "limit_current_maximum",
-    "limit_power_stage_temperature",
-    "limit_bec_temperature",
-    "limit_bec_current",
-    "limit_discharged_capacity",
-]
+    "undervoltage", "overvoltage", "overcurrent_integral_error", "overcurrent_integral_warning",
+    "power_stage_overtemp_warning", "power_stage_overtemp_error", "bec_undervoltage", "bec_overvoltage",
+    "bec_overcurrent", "bec_overtemperature", "switched_off_by_running_down", "capacity_limit_reached",
+    "operating_error_found", "operating_warning_found", "selftest_error", "eeprom_error", "watchdog_error_tripped",
+    "programming_allowed", "limit_battery_voltage_minimum", "limit_current_maximum", "limit_power_stage_temperature",
+    "limit_bec_temperature", "limit_bec_current", "limit_discharged_capacity",
+]  # fmt: skip
 TEST_BITS = [
-    "test_phase_low_side",
-    "test_phase_high_side",
-    "test_short_to_ground",
-    "test_back_emf_offset",
-    "test_current_zero_point",
-    "test_undervoltage",
-    "test_overvoltage",
-    "test_bec_undervoltage",
-    "test_bec_overvoltage",
-    "test_reverse_polarity_fuse",
-    "test_overvoltage_fuse",
-    "test_power_stage_overtemp",
-    "test_bec_overtemperature",
-    "test_motor_phase_missing",
-    "test_eeprom_empty",
-    "test_eeprom_stick_positions",
-    "test_eeprom_checksum",
-    "test_eeprom_size",
-    "test_eeprom_version",
-]
+    "test_phase_low_side", "test_phase_high_side", "test_short_to_ground", "test_back_emf_offset",
+    "test_current_zero_point", "test_undervoltage", "test_overvoltage", "test_bec_undervoltage",
+    "test_bec_overvoltage", "test_reverse_polarity_fuse", "test_overvoltage_fuse", "test_power_stage_overtemp",
+    "test_bec_overtemperature", "test_motor_phase_missing", "test_eeprom_empty", "test_eeprom_stick_positions",
+    "test_eeprom_checksum", "test_eeprom_size", "test_eeprom_version",
+]  # fmt: skip
 
 JIVEPRO = 3
 
@@ -507,24 +457,8 @@ def bindings(messages: Iterable[Msg]) -> dict[str, str | float]:
 # --- random layouts -----------------------------------------------------------------------------------------------------
 
 FACTORS = [
-    "1",
-    "1",
-    "1",
-    "0.1",
-    "0.01",
-    "0.001",
-    "0.5",
-    "2",
-    "5",
-    "-1",
-    "-0.1",
-    "0.25",
-    "0.0625",
-    "100",
-    "3",
-    "0.3",
-    "-7",
-]
+    "1", "1", "1", "0.1", "0.01", "0.001", "0.5", "2", "5", "-1", "-0.1", "0.25", "0.0625", "100", "3", "0.3", "-7",
+]  # fmt: skip
 OFFSETS = ["0", "0", "0", "0", "-40", "100", "0.5", "-273.15", "1000", "-0.05", "32768"]
 
 

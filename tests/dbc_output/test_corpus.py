@@ -32,11 +32,9 @@ ESC = EscSettings("esc1", 7)
 LIVE = LiveData(electrical_speed=21_000, battery_voltage=1234, battery_current=56, consumed_charge=78, pwm_input=1500, throttle=42,
                 power_stage_temperature=33)  # fmt: skip
 VALUES = {
-    "motor_speed": 3000,
-    "battery_voltage": Fraction("12.34"),
-    "battery_current": Fraction("5.6"),
+    "motor_speed": 3000, "battery_voltage": Fraction("12.34"), "battery_current": Fraction("5.6"),
     "consumed_charge": 78,
-}
+}  # fmt: skip
 VALUES |= {"pwm_input": 1500, "throttle": 42, "power_stage_temperature": 33}
 
 
@@ -159,8 +157,5 @@ def test_a_diesel_of_vw_can_be_worked_with_by_the_keys_of_the_configuration() ->
     data = compile_pack(layout.messages[0])(gateway.escs, gateway.status, 50 * MS, 9, 0).to_bytes(8, "little")
     read = database.get_message_by_name("Motor_12").decode_simple(data, decode_choices=False)
     assert (read["MO_Drehzahl_01"], read["Motor_12_BZ"], read["MO_Mom_neg_verfuegbar"], read["Motor_12_CRC"]) == (
-        3000,
-        9,
-        1,
-        0,
-    )
+        3000, 9, 1, 0,
+    )  # fmt: skip

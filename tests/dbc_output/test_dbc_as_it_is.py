@@ -312,19 +312,10 @@ def role(name: str, length: int = 8, **settings: Any) -> Role:
 @pytest.mark.parametrize(
     "name",
     [
-        "MsgCntr",
-        "AliveCnt",
-        "COUNTER",
-        "Counter",
-        "CTR",
-        "Motor_11_BZ",
-        "SQC",
-        "Gear_SQC",
-        "XMsgCnt",
-        "LWI_Botschaftszaehler",
-        "AliveCtr",
+        "MsgCntr", "AliveCnt", "COUNTER", "Counter", "CTR", "Motor_11_BZ", "SQC", "Gear_SQC", "XMsgCnt",
+        "LWI_Botschaftszaehler", "AliveCtr",
     ],
-)
+)  # fmt: skip
 def test_a_counter_of_frames_is_known_by_its_name(name: str) -> None:
     assert role(name) is Role.ALIVE
     assert role(name, bind={"Beside": 0, name: 1}) is Role.CONSTANT

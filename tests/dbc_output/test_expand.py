@@ -337,13 +337,8 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
         assert copy.frame_id == original.frame_id
         assert facts_of_message(copy, "") == facts_of_message(original, "")
     assert [m.name for m in after.messages] == [
-        "LeftPower",
-        "RightPower",
-        "LeftFlow",
-        "RightFlow",
-        "GatewayHealth",
-        "Foreign",
-    ]
+        "LeftPower", "RightPower", "LeftFlow", "RightFlow", "GatewayHealth", "Foreign",
+    ]  # fmt: skip
     assert relations(after) == {
         (256, "LeftConsumedCharge", "Logger", "Timeout", 250),
         (257, "RightConsumedCharge", "Logger", "Timeout", 250),
@@ -573,52 +568,27 @@ def test_the_command_takes_names_base_step_and_another_file(tmp_path: Path, caps
     source = tmp_path / "mine.dbc"
     source.write_text(RICH)
     line = [
-        "dbc",
-        "--from",
-        str(source),
-        "--node",
-        "Gw",
-        "--name",
-        "left",
-        "--name",
-        "right",
-        "--base-id",
-        "0x20",
-        "--id-step",
-        "4",
-    ]
+        "dbc", "--from", str(source), "--node", "Gw", "--name", "left", "--name", "right", "--base-id", "0x20",
+        "--id-step", "4",
+    ]  # fmt: skip
     assert main(line) == 0
     after = read(capsys.readouterr().out)
     assert [(m.name, m.frame_id) for m in after.messages][:5] == [
-        ("LeftPower", 0x320),
-        ("RightPower", 0x324),
-        ("LeftFlow", 0x20),
-        ("RightFlow", 0x24),
+        ("LeftPower", 0x320), ("RightPower", 0x324), ("LeftFlow", 0x20), ("RightFlow", 0x24),
         ("GatewayHealth", 0x120),
-    ]
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--esc", "0"],
-        ["--esc", "two"],
-        ["--esc", "2", "--name", "left"],
-        ["--name", "left", "--name", "LEFT"],
-        ["--name", "left_1", "--name", "left1"],
-        ["--name", "1st"],
-        ["--base-id", "0x20000000"],
-        ["--base-id", "0x7f0"],
-        ["--base-id", "here"],
-        ["--esc", "2", "--id-step", "8"],
-        ["--esc", "9"],
-        ["--node", "Nobody"],
-        ["--from", "none.dbc"],
-        ["-c", "none.toml"],
-        ["-c", "none.toml", "--esc", "2"],
+        ["--esc", "0"], ["--esc", "two"], ["--esc", "2", "--name", "left"], ["--name", "left", "--name", "LEFT"],
+        ["--name", "left_1", "--name", "left1"], ["--name", "1st"], ["--base-id", "0x20000000"],
+        ["--base-id", "0x7f0"], ["--base-id", "here"], ["--esc", "2", "--id-step", "8"], ["--esc", "9"],
+        ["--node", "Nobody"], ["--from", "none.dbc"], ["-c", "none.toml"], ["-c", "none.toml", "--esc", "2"],
         ["--esc", "2", "--name", "abcdefghijkl", "--name", "b"],
     ],
-)
+)  # fmt: skip
 def test_the_command_refuses_what_cannot_be(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     try:
         code = main(["dbc", *arguments])

@@ -343,10 +343,8 @@ def test_a_start_value_that_is_no_number_does_no_harm(tmp_path: Path) -> None:
 @pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
 def test_keys_that_bind_nothing_are_named_with_the_nearest_signal(tmp_path: Path, names: tuple[str, ...]) -> None:
     bind: dict[str, str | float] = {
-        "Power.BatteryVoltge": "battery_voltage",
-        "Nope.Signal": 1,
-        "BatteryVolt": "battery_voltage",
-    }
+        "Power.BatteryVoltge": "battery_voltage", "Nope.Signal": 1, "BatteryVolt": "battery_voltage",
+    }  # fmt: skip
     lines = mistakes(tmp_path, one(VOLTAGE), DbcSettings(bind), names)
     assert len(lines) == 3, lines
     for key in bind:
@@ -489,25 +487,9 @@ def test_a_dbc_in_an_old_windows_encoding_is_read(tmp_path: Path) -> None:
 # --- 200 broken versions of the shipped file ----------------------------------------------------------------------------
 
 WORDS = (
-    "-1",
-    "0",
-    "1e400",
-    "64",
-    "65535",
-    "M",
-    "m0",
-    "|",
-    "@0-",
-    '"',
-    ";",
-    "BO_",
-    "SG_",
-    "VAL_",
-    "nan",
-    "",
-    "\\",
+    "-1", "0", "1e400", "64", "65535", "M", "m0", "|", "@0-", '"', ";", "BO_", "SG_", "VAL_", "nan", "", "\\",
     "9" * 30,
-)
+)  # fmt: skip
 
 
 def broken(rng: random.Random, text: str) -> str:
