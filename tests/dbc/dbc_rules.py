@@ -608,30 +608,3 @@ def findings(data: bytes) -> list[str]:
     """Every violation of every rule, as `rule: what`."""
     db = parse(data)
     return [f"{name}: {finding}" for name, rule in RULES.items() for finding in rule(db)]
-
-
-def further_esc(data: bytes, number: int) -> bytes:
-    """The same messages for ESC `number` (1..8): ids raised by number - 1, names of messages and signals prefixed.
-
-    The messages of the gateway are left out for all but ESC 1.
-    """
-    db = parse(data)
-    names = {message.name for message in db.messages} | {signal.name for signal in db.signals}
-    gateway = {str(message.id) for message in db.messages if not message.is_of_an_esc}
-    ids = {str(message.id): str(message.id + number - 1) for message in db.messages if message.is_of_an_esc}
-    kept, in_gateway_message = [], False
-    for line in db.lines:
-        words = line.split()
-        if words and words[0] == "BO_":
-            in_gateway_message = words[1] in gateway
-        elif words and words[0] != "SG_":
-            in_gateway_message = bool(gateway & set(words[1:4])) and words[0] != "BU_:"
-        if number > 1 and in_gateway_message:
-            continue
-        head, quote, tail = line.partition(' "') if line.startswith(("CM_", " SG_", "VAL_")) else (line, "", "")
-        head = re.sub(rf"\b({'|'.join(ids)})\b", lambda match: ids[match[0]], head)
-        head = re.sub(
-            r"\b[A-Z][A-Za-z0-9]*\b", lambda match: f"Esc{number}{match[0]}" if match[0] in names else match[0], head
-        )
-        kept.append(head + quote + tail)
-    return "\n".join(kept).encode()
