@@ -36,25 +36,12 @@ DEFAULTS: dict[str, dict[str, object]] = {
     | {"node_id": None, "device": None},
 }  # fmt: skip
 TABLES = {table: [*keys, *(["port"] if table == "esc" else [])] for table, keys in DEFAULTS.items()}
-RANGES = {
-    ("can", "bitrate"): (10_000, 1_000_000),
-    ("can", "data_bitrate"): (10_000, 8_000_000),
-    ("dbc", "base_id"): (0, 0x1FFFFFFF),
-    ("dbc", "id_step"): (1, 0x1FFFFFFF),
-    ("dbc", "flags_on_loss"): (0, 1),
-    ("run", "realtime_priority"): (1, 99),
-    ("canopen", "vendor_id"): (0, 0xFFFFFFFF),
-    ("canopen", "serial"): (0, 0xFFFFFFFF),
-    ("canopen", "node_id"): (1, 127),
-    ("record", "part_mb"): (1, 4000),
-    ("record", "part_minutes"): (1, 10_000),
-    ("record", "keep_mb"): (0, 10_000_000),
-    ("record", "min_free_mb"): (0, 10_000_000),
-    ("esc", "node_id"): (1, 127),
-    ("esc", "pole_pairs"): (1, 100),
-    ("esc", "cell_count"): (0, 255),
-    ("esc", "telemetry_timeout_ms"): (20, 60_000),
-}
+_WHOLE = """
+can bitrate 10000 1000000, can data_bitrate 10000 8000000, dbc base_id 0 536870911, dbc id_step 1 536870911, dbc flags_on_loss 0 1,
+run realtime_priority 1 99, canopen vendor_id 0 4294967295, canopen serial 0 4294967295, canopen node_id 1 127, record part_mb 1 4000,
+record part_minutes 1 10000, record keep_mb 0 10000000, record min_free_mb 0 10000000, esc node_id 1 127, esc pole_pairs 1 100,
+esc cell_count 0 255, esc telemetry_timeout_ms 20 60000"""
+RANGES = {(table, key): (int(low), int(high)) for table, key, low, high in map(str.split, _WHOLE.split(","))}
 STRINGS = [("can", "interface"), ("can", "channel"), ("dbc", "file"), ("dbc", "node"), ("esc", "port")]
 STRINGS += [("canopen", "eds"), ("canopen", "store"), ("statistics", "file"), ("record", "directory")]
 STRINGS += [("mqtt", key) for key in ("ca_file", "cert_file", "key_file", "username", "password_file")]
@@ -191,16 +178,10 @@ def test_a_value_that_a_key_cannot_have_is_refused_with_the_reason(
 
 
 def test_some_values_mean_others() -> None:
-    gears: list[tuple[object, str]] = [
-        (1, "1"),
-        (9.8, "98/10"),
-        ("9.8", "98/10"),
-        ("98/10", "98/10"),
-        ("9.8/10", "98/100"),
-    ]
-    gears += [("1/3", "1/3"), ("007", "7"), (0.001, "1/1000"), ("1/1000", "1/1000"), (1000, "1000"), (1e3, "1000")]
-    for text, gear in gears:
-        assert taken("esc", "gear", text) == Fraction(gear)
+    for text in ("9.8", "98/10", "9.8/10", "1/3", "007", "1/1000"):
+        assert taken("esc", "gear", text) == Fraction(text.partition("/")[0]) / Fraction(text.partition("/")[2] or 1)
+    for number in (1, 9.8, 0.001, 1000, 1e3):
+        assert taken("esc", "gear", number) == Fraction(str(number))
     assert taken("dbc", "messages", ["Motor_*", "X"]) == ("Motor_*", "X")
     assert parse(tables("esc", "telemetry_timeout_ms", 20), "a.toml").escs[0].timeout_ns == 20 * MS
     addresses = {"127.0.0.1:9123": ("127.0.0.1", 9123), "127.255.0.9:1": ("127.255.0.9", 1)}

@@ -33,20 +33,13 @@ def load(
     return prepare(load_database(file), "my_car.dbc", escs, settings or DbcSettings(), fd, taken)[1]
 
 
-def mistakes(
-    folder: Path,
-    text: str,
-    settings: DbcSettings | None = None,
-    names: Sequence[str] = ("esc1",),
-    fd: bool = False,
-    taken: Mapping[int, str] | None = None,
-) -> list[str]:
+def mistakes(*arguments: Any, **more: Any) -> list[str]:
+    """What ``load`` refuses these with."""
     with pytest.raises(UserError) as caught:
-        load(folder, text, settings, names, fd, taken)
+        load(*arguments, **more)
     assert caught.value.exit_code == 2
     lines = list(caught.value.problems)
-    assert lines
-    assert all(line and "\n" not in line and len(line) < 500 for line in lines)
+    assert lines and all(line and "\n" not in line and len(line) < 500 for line in lines)
     return lines
 
 
