@@ -310,22 +310,22 @@ def test_one_message_can_hold_values_of_several_escs_and_of_the_gateway() -> Non
 # --- alive counter and E2E profile 1 ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "Alive", "AliveCounter", "alive_counter", "StatusAlive", "PowerRollingCounter", "MessageCounter",
-        "SequenceCounter",
-    ],
-)  # fmt: skip
-def test_an_alive_counter_is_known_by_its_name(name: str) -> None:
-    layout = layout_of([Msg("M", 1, 8, [Sig(name, 0, 4)])])
-    assert layout.messages[0].signals[0].role is Role.ALIVE
+ALIVES = [
+    "Alive",
+    "AliveCounter",
+    "alive_counter",
+    "StatusAlive",
+    "PowerRollingCounter",
+    "MessageCounter",
+    "SequenceCounter",
+]
 
 
-@pytest.mark.parametrize("name", ["Crc", "CRC8", "Power_Crc", "Checksum"])
-def test_a_crc_is_known_by_its_name(name: str) -> None:
-    layout = layout_of([Msg("M", 1, 8, [Sig(name, 0, 8), Sig("Alive", 8, 4)])])
-    assert layout.messages[0].signals[0].role is Role.CRC
+@pytest.mark.parametrize("alive", ALIVES)
+@pytest.mark.parametrize("crc", ["Crc", "CRC8", "Power_Crc", "Checksum"])
+def test_an_alive_counter_and_a_crc_are_known_by_their_names(alive: str, crc: str) -> None:
+    layout = layout_of([Msg("M", 1, 8, [Sig(crc, 0, 8), Sig(alive, 8, 4)])])
+    assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
 
 
 def test_alive_counter_and_crc_can_be_bound_by_name_too() -> None:

@@ -270,7 +270,7 @@ def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_the
     assert 'BA_ "SystemSignalLongSymbol"' not in text
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(20))
 def test_random_layouts_are_written_without_a_loss(seed: int) -> None:
     maker = LayoutMaker(random.Random(seed), PAIR)
     text = dbc_text([maker.message() for _ in range(5)])
@@ -280,7 +280,7 @@ def test_random_layouts_are_written_without_a_loss(seed: int) -> None:
     assert [facts_of_message(m, "") for m in after.messages] == [facts_of_message(m, "") for m in before.messages]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.text(st.sampled_from('aB1 \n";:,_()[]|é.'), max_size=40).filter(lambda text: not text.endswith("\\")))
 def test_any_comment_and_any_text_come_through(words: str) -> None:
     escaped = words.replace('"', '\\"')
@@ -354,6 +354,7 @@ def test_ids_that_leave_their_range_are_refused() -> None:
     assert "outside 0..7FFh" in refused(simple(0x100, 0x200), [EscSettings("one")], base_id=0x700)
     assert "2 of 3 messages" in refused(simple(0x100, 0x200, 0x700), [EscSettings("one")], base_id=0x700)
     assert "at most 1FFh" in refused(simple(0x100, 0x200, 0x700), [EscSettings("one")], base_id=0x700)
+    assert ids_of(multiplied(simple(0x1FFFFFFE, extended=True), PAIR, "Gateway")[0]) == [0x1FFFFFFE, 0x1FFFFFFF]
 
 
 def test_ids_that_canopen_leaves_free_are_not_moved_among_its_own_unless_somebody_says_where_to() -> None:
@@ -365,7 +366,6 @@ def test_ids_that_canopen_leaves_free_are_not_moved_among_its_own_unless_somebod
     assert multiplied(simple(0x6DF), escs, "Gateway", base_id=0x6DF)
     assert "1 of 2 ids" in refused(simple(0x6DF))
     assert multiplied(simple(0x700), escs, "Gateway")  # it was there before
-    assert ids_of(multiplied(simple(0x1FFFFFFE, extended=True), PAIR, "Gateway")[0]) == [0x1FFFFFFE, 0x1FFFFFFF]
 
 
 def test_names_of_more_than_32_characters_are_refused() -> None:
@@ -417,7 +417,7 @@ def test_plans_from_a_rich_file_are_those_of_the_gateway() -> None:
         assert [plain_plan(plan) for plan in again.messages] == [plain_plan(plan) for plan in layout.messages]
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(20))
 def test_plans_from_random_files_written_again_are_the_same(seed: int) -> None:
     maker = LayoutMaker(random.Random(seed), PAIR)
     messages = [maker.message() for _ in range(5)]
@@ -478,14 +478,7 @@ def test_the_command_refuses_what_cannot_be(arguments: list[str], capsys: pytest
     except SystemExit as end:
         code = end.code  # type: ignore[assignment]  # argparse gives numbers
     caught = capsys.readouterr()
-    if arguments == [
-        "--esc",
-        "9",
-    ]:  # the shipped ids leave room for eight; a greater step makes room for more, or none does
-        assert code in (0, 2)
-    else:
-        assert code == 2
-        assert not caught.out
+    assert code == 2 and not caught.out
     assert "Traceback" not in caught.err
 
 
