@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["dbc_text", "esc_prefix", "expand", "needs_expansion"]
 _NAME_LIMIT = 32
-_FREE = (0x680, 0x6DF)
-"""11-bit ids that CiA 301 uses for nothing."""
+_SDO_END, _RESTRICTED = 0x67F, 0x6E0
+"""Between them CiA 301 uses no 11-bit id: SDO requests end, restricted ids begin."""
 
 
 def esc_prefix(name: str) -> str:
@@ -111,7 +111,7 @@ def _id_problems(moves: Sequence[tuple[int, int, bool]], count: int, base_id: in
             problems.append(
                 f"{why}, {len(outside)} of {len(moves)} messages lie outside 0..{limit:X}h, up to {max(outside):X}h.{remedy}"
             )
-    low, high = _FREE
+    low, high = _SDO_END + 1, _RESTRICTED - 1
     left = [made for old, made, extended in moves if not extended and low <= old <= high and not low <= made <= high]
     if left and base_id is None and not problems:
         problems.append(
