@@ -120,6 +120,7 @@ TAKEN: dict[tuple[str, str], list[object]] = {
     ("dbc", "send_type"): [{"No": "Event"}],
 }
 NAN, INF = math.nan, math.inf
+ODD: list[Any] = [True, [], INF, -INF, NAN, "", " "]
 REFUSED: list[tuple[str, str, str, list[Any]]] = [
     *((*place, "is not a whole number", [7.0, "7", True, [7], {}, NAN]) for place in RANGES),
     *((*place, f"is outside {low}..{high}", [low - 1, high + 1, -(10**30), 10**30]) for place, (low, high) in RANGES.items()),
@@ -147,8 +148,8 @@ REFUSED: list[tuple[str, str, str, list[Any]]] = [
     ("esc", "gear", "is neither a number nor 'numerator/denominator'", [
         *("", "x", "1/0", "0/0", "1/", "/2", "1/2/3", "98 / 10", " 9.8", "+1", "-1", ".5", "9.", "1_0", "1e1"),
         *("1e999999999", "٣", "9,8", "9:8", True, NAN, INF, -INF, [1], {}, "1" * 5000)]),
-    ("dbc", "bind", "neither the name of a source nor a number", [{"A": v} for v in (True, [], INF, -INF, NAN, "", " ")]),
-    ("dbc", "bind", "A.B: ", [{"A": {"B": v}} for v in (True, [], INF, -INF, NAN, "", " ", {"C": 1})]),
+    ("dbc", "bind", "neither the name of a source nor a number", [{"A": v} for v in ODD]),
+    ("dbc", "bind", "A.B: ", [{"A": {"B": v}} for v in (*ODD, {"C": 1})]),
     ("dbc", "bind", "is not a table", ["A"]),
     ("dbc", "e2e_data_ids", "EscSpeed: 65536 is outside 0..65535", [{"EscSpeed": 0x10000}]),
     ("dbc", "e2e_data_ids", "EscSpeed: -1 is outside", [{"EscSpeed": -1}]),
@@ -267,8 +268,8 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     (tables() | {"can": 3}, "can: is a table, written [can]"),
     (tables() | {"dbc": []}, "dbc: is a table, written [dbc]"),
     (escs({}, {"polepairs": 7}), "esc[2].polepairs: unknown key. Did you mean pole_pairs?"),
-    *(({"esc": v}, "esc: is written [[esc]], once for each ESC") for v in ({}, {"port": "x"}, 3, "x", [1])),
-    *((v, NEEDED) for v in ({}, {"esc": []}, {"can": {}})),
+    *(({"esc": v}, "esc: is written [[esc]], once for each ESC") for v in [{}, {"port": "x"}, 3, "x", [1]]),
+    ({}, NEEDED), ({"esc": []}, NEEDED), ({"can": {}}, NEEDED),
     ({"esc": [{}]}, "esc[1].port: is required: serial port, best by /dev/serial/by-id/..."),
     *((named(*names), "esc[2].name: ") for names in (("left", "left"), ("left", "LEFT"), ("left_1", "left1"))),
     (escs({"name": "esc2"}, {}), "esc[2].name: 'esc2' is also that of esc[1]"),

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import opendbc  # type: ignore[import-untyped]
 import pytest
@@ -31,11 +32,9 @@ SAMPLE = ["tesla_can", "rivian_primary_actuator", "mazda_2017", "gm_global_a_pow
 ESC = EscSettings("esc1", 7)
 LIVE = LiveData(electrical_speed=21_000, battery_voltage=1234, battery_current=56, consumed_charge=78, pwm_input=1500, throttle=42,
                 power_stage_temperature=33)  # fmt: skip
-VALUES = {
-    "motor_speed": 3000, "battery_voltage": Fraction("12.34"), "battery_current": Fraction("5.6"),
-    "consumed_charge": 78,
-}  # fmt: skip
-VALUES |= {"pwm_input": 1500, "throttle": 42, "power_stage_temperature": 33}
+VALUES = {name: Fraction(value) for name, value in (
+    ("motor_speed", 3000), ("battery_voltage", "12.34"), ("battery_current", "5.6"), ("consumed_charge", 78), ("pwm_input", 1500),
+    ("throttle", 42), ("power_stage_temperature", 33))}  # fmt: skip
 
 
 def by_unit(messages: list[Message]) -> Iterator[tuple[str, str, Signal]]:
@@ -105,15 +104,13 @@ def check_frames(database: Database, layout: Layout, bound: dict[str, str]) -> N
     gateway = Gateway([ESC], layout, 0)
     gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), 50 * MS)
     for plan in layout.messages:
-        told = database.get_message_by_name(
-            plan.name
-        )  # cantools' codec wants sorted signals, which our loading does not give it
-        message = Message(
-            told.frame_id, told.name, told.length, told.signals, is_extended_frame=plan.extended, strict=False
-        )
+        # cantools' codec wants sorted signals, which our loading does not give it
+        of = database.get_message_by_name(plan.name)
+        message = Message(of.frame_id, of.name, of.length, of.signals, is_extended_frame=plan.extended, strict=False)
         for page in plan.pages:
             bits = compile_pack(plan)(gateway.escs, gateway.status, 50 * MS, 0, page or 0)
-            read = message.decode_simple(bits.to_bytes(plan.length, "little"), decode_choices=False, scaling=False)
+            data = bits.to_bytes(plan.length, "little")
+            read: dict[str, Any] = dict(message.decode_simple(data, decode_choices=False, scaling=False))
             for signal in (signal for signal in message.signals if signal.name in read):
                 raw, source = read[signal.name], bound.get(f"{plan.name}.{signal.name}")
                 (planned,) = (p for p in plan.signals if p.name == signal.name and p.page in (None, page))

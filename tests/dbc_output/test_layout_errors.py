@@ -59,7 +59,7 @@ def only(lines: list[str], *words: str) -> None:
 PAGE, ALIVE, CRC = Sig("Page", 0, 8, mux="M"), Sig("AliveCounter", 24, 4), Sig("Crc8", 0, 8)
 
 
-def volts(start: int = 0, length: int = 16, little: bool = True, **more: Any) -> Sig:
+def volts(start: Any = 0, length: Any = 16, little: Any = True, **more: Any) -> Sig:
     return Sig("BatteryVoltage", start, length, little, **{"unit": "V"} | more)
 
 
