@@ -1,12 +1,15 @@
 """A user's DBC as other tools write it: entries for nothing, units, send types, counters, checksums, flags, unbound signals."""
 
+import json
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
 import pytest
 
+from kontronik_can_gw.capture_setup import CaptureSetup
 from kontronik_can_gw.cli import check
+from kontronik_can_gw.config import parse
 from kontronik_can_gw.dbc_output import counters
 from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, Role, parse_database
 from kontronik_can_gw.dbc_output.loss import unreported
@@ -436,3 +439,23 @@ def test_of_two_escs_each_flag_needs_a_signal_of_its_own_esc() -> None:
     layout = compiled(f'{text} SG_ LeftLinkState : 8|8@1+ (1,0) [0|0] "" Other\n', names=("left", "right"))
     (line,) = unreported(layout, silent=False)
     assert "RightUndervoltage" in line and "LeftUndervoltage" not in line
+
+
+def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
+    keys = {
+        "units": {"x": "V"},
+        "send_type": {"y": "Event"},
+        "messages": ["Motor_*"],
+        "unbound": "start_value",
+        "flags_on_loss": 1,
+    }
+    config = parse(
+        {"dbc": {"bind": {"A.B": 1}, "e2e_data_ids": {"M": 7}, "base_id": 5} | keys, "esc": [{"port": "-"}]}, "a.toml"
+    )
+    setup = CaptureSetup(tuple(config.escs), ("-",), ("my.dbc", b""), config.dbc_settings, False, False, None)
+    header = json.loads(json.dumps(setup.header()))
+    assert CaptureSetup.of(header).dbc_settings == config.dbc_settings
+    for later in ("units", "send_types", "messages", "unbound", "flags_on_loss"):
+        del header["dbc"][later]
+    old = CaptureSetup.of(header).dbc_settings
+    assert old == DbcSettings(bind={"A.B": 1}, data_ids={"M": 7}, base_id=5)

@@ -599,7 +599,7 @@ def test_in_a_long_random_run_every_frame_is_the_telemetry_of_that_instant(seed:
     now = 0
     gateway.start(now)
     judge.look(now)
-    until = 40 * SECOND
+    until = 25 * SECOND
     talking = [True, True]
     while now < until:
         step = rng.choice((10 * MS, 10 * MS, 10 * MS, 3 * MS, 37 * MS, 100 * MS)) + rng.randrange(MS)
@@ -636,7 +636,7 @@ def test_in_a_long_random_run_every_frame_is_the_telemetry_of_that_instant(seed:
                     if old is not None:
                         judge.last_live[esc] = old
             judge.look(now)
-    assert judge.count > 5_000
+    assert judge.count > 3_000
 
 
 @settings(max_examples=60, deadline=None)
