@@ -194,7 +194,7 @@ def test_opendbc_reads_every_value_text(file: Path) -> None:
 
 
 def test_opendbc_packs_and_parses_valid_frames() -> None:
-    from opendbc.can import CANPacker, CANParser  # type: ignore[import-untyped]
+    from opendbc.can import CANPacker, CANParser
 
     db = layout()
     packer = CANPacker(str(SHIPPED))
