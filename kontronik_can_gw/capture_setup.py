@@ -7,7 +7,7 @@ JSON keys of the header (beside those that run and recorder add: created_ns, run
     configuration        the effective TOML text; file: where it stood
     escs                 settings of each ESC (gear as "31/4"), as they held
     ports                their serial ports
-    dbc                  file, text (one character a byte), node, bind, base_id, id_step, data_ids, fd, silent_on_loss; null without it
+    dbc                  file, text (one character a byte), fd, silent_on_loss and the fields of DbcSettings; null without it
     canopen              eds (file, text), nodes, stored, escs (settings as configured); null without it
 """
 
@@ -138,6 +138,9 @@ def _dbc_settings(found: Mapping[str, Any]) -> DbcSettings:
     """Checked as the configuration's are."""
     keys = {"bind": found["bind"], "e2e_data_ids": found["data_ids"]}
     keys |= {key: found[key] for key in ("node", "base_id", "id_step") if found[key] is not None}
+    later = ("units", "messages", "unbound", "flags_on_loss")  # not in captures of 0.5.0
+    keys |= {key: found[key] for key in later if found.get(key) not in (None, {}, [])}
+    keys |= {"send_type": found["send_types"]} if found.get("send_types") else {}
     return parse({"dbc": keys, "esc": [{"port": "-"}]}, "the capture").dbc_settings
 
 

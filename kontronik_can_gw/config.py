@@ -17,6 +17,7 @@ from posixpath import normpath
 from typing import Any, TypeVar, cast
 
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.dbc_output import send_types, units
 from kontronik_can_gw.dbc_output.layout import DbcSettings, normalize
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.states import Device
@@ -44,9 +45,9 @@ _FORMS = {
 
 
 def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
-    """A configuration key. ``limits``: low, high, choices, pattern.
+    """A configuration key. ``limits``: low, high, choices, pattern, values.
 
-    ``kind``: string, integer, number, boolean, ratio, bindings, ids, loopback, broker, topic, level.
+    ``kind``: string, integer, number, boolean, ratio, bindings, ids, meanings, names, loopback, broker, topic, level.
     """
     metadata = {"doc": doc, "kind": kind} | limits
     if isinstance(default, dict):
@@ -88,11 +89,29 @@ class DbcConfig:
         "DBC file, relative to this configuration; 'shipped' is the one of this package", "string", SHIPPED
     )
     node: str | None = _key("transmitter node in the DBC whose messages are sent", "string", None)
+    messages: Sequence[str] = _key(
+        "names of the messages to send, '*' for any characters, as [\"Motor_*\"] (default: all of the node)",
+        "names",
+        (),
+    )
+    unbound: str = _key(
+        "signals bound to nothing: 'error' refuses them, 'start_value' sends their GenSigStartValue (else NotAvailable, else 0) for ever",
+        "string",
+        "error",
+        choices=("error", "start_value"),
+    )
     on_loss: str = _key(
         "without telemetry: 'not_available' sends values marked as such, 'silent' stops messages with an ESC's values",
         "string",
         "not_available",
         choices=("not_available", "silent"),
+    )
+    flags_on_loss: int | None = _key(
+        "what flags without NotAvailable in their value table hold without telemetry (default: their own GenSigStartValue, else 0)",
+        "integer",
+        None,
+        low=0,
+        high=1,
     )
     base_id: int | None = _key(
         "move the messages so that the lowest id is this", "integer", None, low=0, high=0x1FFFFFFF
@@ -106,6 +125,12 @@ class DbcConfig:
         {},
     )
     e2e_data_ids: Mapping[str, int] = _key("message name = AUTOSAR E2E data id", "ids", {}, low=0, high=0xFFFF)
+    units: Mapping[str, str] = _key(
+        "unit text of the DBC = the unit that it means", "meanings", {}, values=units.names()
+    )
+    send_type: Mapping[str, str] = _key(
+        "GenMsgSendType of the DBC = what it means", "meanings", {}, values=tuple(send_types.NAMES)
+    )
 
 
 @dataclass(frozen=True)
@@ -326,7 +351,18 @@ class Config:
     @property
     def dbc_settings(self) -> DbcSettings:
         dbc = self.dbc
-        return DbcSettings(dict(dbc.bind), dbc.node, dbc.base_id, dbc.id_step, dict(dbc.e2e_data_ids))
+        return DbcSettings(
+            bind=dict(dbc.bind),
+            node=dbc.node,
+            base_id=dbc.base_id,
+            id_step=dbc.id_step,
+            data_ids=dict(dbc.e2e_data_ids),
+            units=dict(dbc.units),
+            send_types=dict(dbc.send_type),
+            messages=tuple(dbc.messages),
+            unbound=dbc.unbound,
+            flags_on_loss=dbc.flags_on_loss,
+        )
 
     @property
     def dbc_path(self) -> Path:
@@ -376,23 +412,37 @@ def shipped(name: str) -> Path:
 
 def load(path: Path) -> Config:
     """Read and check a configuration file. UserError with every mistake, each with file, key and remedy."""
+    config, problems = examine(path)
+    if config is None or problems:
+        raise UserError(*problems)
+    return config
+
+
+def examine(path: Path) -> tuple[Config | None, list[str]]:
+    """A configuration file and its mistakes; None where they leave nothing to look further at. UserError where it cannot be read."""
     try:
         text = path.read_bytes().decode("utf-8-sig")  # Windows' editors put a mark in front
     except OSError as error:
-        raise UserError(
-            f"{path}: cannot be read: {error.strerror}. `kontronik-can-gw init` writes an example."
-        ) from None
+        advice = " `kontronik-can-gw init` writes an example." if isinstance(error, FileNotFoundError) else ""
+        raise UserError(f"{path}: cannot be read: {error.strerror}.{advice}") from None
     except UnicodeDecodeError:
         raise UserError(f"{path}: is not a text file in UTF-8, so no TOML configuration") from None
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # beside TOMLDecodeError: numbers of 5000 digits, 1000 brackets
         raise UserError(f"{path}: is not valid TOML: {error}") from None
-    return parse(tables, str(path))
+    return _parsed(tables, str(path))
 
 
 def parse(tables: Mapping[str, Any], file: str) -> Config:
     """A configuration from TOML tables. UserError with every mistake."""
+    config, problems = _parsed(tables, file)
+    if config is None or problems:
+        raise UserError(*problems)
+    return config
+
+
+def _parsed(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[str]]:
     problems: list[str] = []
     for name in tables:
         if name not in _TABLES:
@@ -415,14 +465,13 @@ def parse(tables: Mapping[str, Any], file: str) -> Config:
         named = {"name": f"esc{number}"} | entry
         if (esc := _table(named, EscConfig, f"esc[{number}]", file, problems)) is not None:
             escs[number] = esc
+    is_whole = not problems
     _check_escs(escs, file, problems)
-    if problems:
-        raise UserError(*problems)
+    if not is_whole:
+        return None, problems
     config = Config(**cast(Any, made), esc=tuple(escs.values()), file=file)
     _check_outputs(config, problems)
-    if problems:
-        raise UserError(*problems)
-    return config
+    return config, problems
 
 
 def schema() -> dict[str, Any]:
@@ -493,11 +542,15 @@ def _value(value: Any, f: Field[Any]) -> Any:
             return _number(value, limits)
         case "ratio":
             return _ratio(value)
-        case "bindings" | "ids":
+        case "bindings" | "ids" | "meanings":
             if not isinstance(value, dict):
                 raise ValueError(f"{value!r} is not a table")
             flat = _flat(value) if limits["kind"] == "bindings" else value
             return {name: _entry(name, entry, limits) for name, entry in flat.items()}
+        case "names":
+            if not isinstance(value, list) or not all(isinstance(entry, str) and entry.strip() for entry in value):
+                raise ValueError(f'{value!r} is not a list of names, as ["Motor_*"]')
+            return tuple(value)
         case "options":
             if not isinstance(value, dict) or not all(isinstance(entry, (str, int, float)) for entry in value.values()):
                 raise ValueError(f"{value!r} is not a table of texts, numbers and booleans")
@@ -534,6 +587,11 @@ def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _entry(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
+    if limits["kind"] == "meanings":
+        if value not in limits["values"]:
+            near = _nearest(str(value), limits["values"])
+            raise ValueError(f"{name}: {value!r} is none of those known here.{near}")
+        return value
     if limits["kind"] == "ids":
         try:
             return _integer(value, limits)
@@ -704,6 +762,10 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
             scalar = {"type": ["string", "number", "boolean"]}
             names = {"not": {"enum": sorted(_OWN_OPTIONS)}}
             entry |= {"type": "object", "propertyNames": names, "additionalProperties": scalar}
+        case "names":
+            entry |= {"type": "array", "items": {"type": "string", "pattern": _NOT_BLANK}}
+        case "meanings":
+            entry |= {"type": "object", "additionalProperties": {"enum": list(limits["values"])}}
         case "ids":
             number = {"type": "integer", "minimum": limits["low"], "maximum": limits["high"]}
             entry |= {"type": "object", "additionalProperties": number}
@@ -721,7 +783,7 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
         entry["enum"] = list(limits["choices"])
     if "pattern" in limits:
         entry["pattern"] = f"^{limits['pattern']}$"
-    if f.default not in (MISSING, None, ""):
+    if f.default not in (MISSING, None, "", ()):
         entry["default"] = float(f.default) if isinstance(f.default, Fraction) else f.default
     return entry
 
@@ -744,6 +806,8 @@ def _toml(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, Fraction):
         return repr(float(value)) if Fraction(repr(float(value))) == value else f'"{value}"'
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)

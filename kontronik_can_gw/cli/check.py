@@ -1,6 +1,7 @@
 """``check``: what a configuration means and will send, without opening anything."""
 
 import argparse
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from kontronik_can_gw.cli.common import Loaded, load_all, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config import as_toml
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
+from kontronik_can_gw.dbc_output.loss import is_mute, reporter
 from kontronik_can_gw.telemetry import MS
 
 
@@ -33,9 +35,8 @@ def main(args: argparse.Namespace) -> int:
     if config.dbc.enabled:
         show(f"# messages of {layout.node} by {layout.file}")
         names = [esc.name for esc in config.escs]
-        for line in table(layout, names):
+        for line in (*table(layout, names), "", *unbound(layout)):
             show(line)
-        show()
     if loaded.canopen is not None:
         nodes = loaded.canopen.nodes(loaded.escs)
         show(f"# CANopen nodes by {loaded.canopen.eds.name}")
@@ -91,9 +92,35 @@ def table(layout: Layout, esc_names: list[str]) -> list[str]:
     for message in layout.messages:
         first = (message.name, can_id(message), timing(message))
         for signal in message.signals:
-            rows.append((*first, signal.name, _source(signal, esc_names), "; ".join(signal.notes)))
+            rows.append((*first, signal.name, _source(signal, esc_names), _lost(message, signal)))
             first = ("", "", "")
     return columns([head, *rows])
+
+
+def unbound(layout: Layout) -> list[str]:
+    """What is constant because it is bound to nothing, a line for each message."""
+    lines = []
+    for message in layout.messages:
+        if found := [signal for signal in message.signals if signal.unbound]:
+            held = ", ".join(f"{signal.name} = {shown(signal, signal.constant)}" for signal in found)
+            lines.append(f"#   {message.name}: {held}")
+    return ["# bound to nothing, so they hold these values for ever:", *lines, ""] if lines else []
+
+
+def shown(signal: SignalPlan, raw: int) -> str:
+    """The physical value of raw bits, or their text."""
+    if signal.is_float:
+        (value,) = struct.unpack("<f" if signal.length == 32 else "<d", raw.to_bytes(signal.length // 8, "little"))
+        return f"{value * float(signal.factor) + float(signal.offset):g} {signal.unit}".rstrip()
+    return signal.texts.get(raw) or f"{float(raw * signal.factor + signal.offset):.10g} {signal.unit}".rstrip()
+
+
+def _lost(message: MessagePlan, signal: SignalPlan) -> str:
+    """What a reader of the signal loses."""
+    notes = list(signal.notes)
+    if is_mute(signal) and (found := reporter(message, signal)) is not None:
+        notes.append(f"{found.name} reports the loss")
+    return "; ".join(notes)
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cia301.nodes import CanopenSetup
 from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
 from kontronik_can_gw.cli.node_setup import (
@@ -22,8 +23,9 @@ from kontronik_can_gw.cli.node_setup import (
     read_stored,
     with_stored,
 )
-from kontronik_can_gw.config import Config, MqttConfig, load
-from kontronik_can_gw.dbc_output.layout import Layout, parse_database, read_dbc
+from kontronik_can_gw.config import Config, EscConfig, MqttConfig, examine
+from kontronik_can_gw.dbc_output.layout import Layout, normalize, parse_database, read_dbc
+from kontronik_can_gw.dbc_output.loss import unreported
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
@@ -35,6 +37,29 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
 
 log = logging.getLogger("kontronik_can_gw")
+
+
+@contextmanager
+def collecting(problems: list[str]) -> Iterator[None]:
+    """Mistakes of people are added to ``problems``; what failed outside goes on as it is."""
+    try:
+        yield
+    except RunError:
+        raise
+    except UserError as error:
+        problems += error.problems
+
+
+def told_apart(config: Config) -> Config:
+    """Without the ESCs whose name, port or node-ID is that of another one or none at all, so that the rest can be looked at."""
+    kept: list[EscConfig] = []
+    seen: set[object] = set()
+    for esc, node_id in zip(config.esc, config.node_ids, strict=True):
+        own = {normalize(esc.name), ("port", esc.port), *({node_id} - {UNCONFIGURED})}
+        if not own & seen and (node_id <= 127 or node_id == UNCONFIGURED):
+            kept.append(replace(esc, node_id=node_id))
+            seen |= own
+    return replace(config, esc=tuple(kept))
 
 
 @dataclass(frozen=True)
@@ -60,8 +85,15 @@ def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) 
 
     ``store`` makes the store of what masters stored, for the one who runs; None: it is only looked at.
     """
-    config = load(path)
-    check_interface(config.can)
+    config, problems = examine(path)
+    if config is None:
+        raise UserError(*problems)
+    with collecting(problems):
+        check_interface(config.can)
+    if problems:
+        with collecting(problems):
+            assemble(told_apart(config))
+        raise UserError(*problems)
     loaded = assemble(config, store(parameter_folder(config)) if store and config.canopen.enabled else None)
     for warning in (*loaded.layout.warnings, *loaded.warnings):
         say(f"warning: {warning}")
@@ -103,22 +135,30 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
 
     Configuration, DBC and EDS may be refused here. What masters stored may not: it gives way, with a warning, where it does not fit them.
     """
-    check_devices(config)
+    problems: list[str] = []
+    with collecting(problems):
+        check_devices(config)
     escs, plain, kept = config.escs, None, None
     taken: dict[int, str] = {}
     bits = 0.0
     if config.canopen.enabled:
-        plain = plain_setup(config)
-        nodes = plain.nodes(plain.esc_settings(config.escs))
-        taken, bits = nodes.cob_ids(), nodes.bits_per_second()
-        kept = read_stored(config, store)
-        escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
+        with collecting(problems):
+            plain = plain_setup(config)
+            nodes = plain.nodes(plain.esc_settings(config.escs))
+            taken, bits = nodes.cob_ids(), nodes.bits_per_second()
+        if plain is not None and not problems:
+            kept = read_stored(config, store)
+            escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
     database, layout, dbc = None, Layout("", "", ()), b""
+    ignored: list[str] = []
     if config.dbc.enabled:
         file = str(config.dbc_path)
-        dbc = read_dbc(config.dbc_path)
-        found = parse_database(dbc, file)
-        database, layout = prepare(found, file, escs, config.dbc_settings, config.can.fd, taken)
+        with collecting(problems):
+            dbc = read_dbc(config.dbc_path)
+            found = parse_database(dbc, file, ignored)
+            database, layout = prepare(found, file, escs, config.dbc_settings, config.can.fd, taken)
+    if problems:
+        raise UserError(*problems)
     bitrate, data_bitrate = config.can.bitrate, config.can.data_bitrate
     warnings = [check_load(layout, bitrate, data_bitrate, bits)]
     canopen = None
@@ -129,7 +169,9 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
             bits = canopen.nodes(escs).bits_per_second()
         warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
     damaged = () if kept is None else tuple(kept.damaged)
-    return Loaded(config, escs, database, layout, canopen, damaged, store, tuple(w for w in warnings if w), dbc)
+    mute = unreported(layout, config.dbc.on_loss == "silent")
+    said = tuple(warning for warning in (*ignored, *mute, *warnings) if warning)
+    return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc)
 
 
 def with_store(loaded: Loaded, store: ParameterStore | None) -> Loaded:

@@ -209,6 +209,8 @@ def _format(args: argparse.Namespace) -> str:
         return str(args.to)
     if args.output == "-":
         raise UserError(f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}; bin through a pipe")
+    if Path(args.output).is_dir():
+        raise UserError(f"{args.output}: is a directory. Give a file.")
     suffix = Path(args.output).suffix.lower()
     if suffix not in SUFFIXES:
         raise UserError(

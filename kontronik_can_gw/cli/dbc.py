@@ -106,7 +106,10 @@ def _database(args: argparse.Namespace) -> "Database":
         return database
     escs = _escs(args)
     file = args.source or shipped("dbc/kontronik_esc.dbc")
-    database = load_database(file)
+    ignored: list[str] = []
+    database = load_database(file, ignored)
+    for line in ignored:
+        say(f"warning: {line}")
     node = choose_node(database, args.node, str(file))
     database, bind = expand(database, node, escs, str(file), None, args.base_id, args.id_step)
     prepare(
@@ -146,7 +149,9 @@ def _count(text: str) -> int:
 
 def _name(text: str) -> str:
     if not re.fullmatch("[A-Za-z][A-Za-z0-9_]{0,11}", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a name of 1 to 12 letters, digits and underscores")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a name of 1 to 12 letters, digits and underscores that begins with a letter"
+        )
     return text
 
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["dbc_text", "esc_prefix", "expand", "needs_expansion"]
 _NAME_LIMIT = 32
+_SDO_END, _RESTRICTED = 0x67F, 0x6E0
+"""Between them CiA 301 uses no 11-bit id: SDO requests end, restricted ids begin."""
 
 
 def esc_prefix(name: str) -> str:
@@ -58,7 +60,7 @@ def expand(
     step = _step([(m.frame_id + shift, m.is_extended_frame) for m in per_esc], taken, len(escs), id_step, file)
     messages: list[Message] = []
     moved: dict[int, list[tuple[int, dict[str, str]]]] = {}
-    problems: list[str] = []
+    moves: list[tuple[int, int, bool]] = []
     out_bind = dict(bind)  # what is left of it belongs to no signal, which the compiler reports
     for message in database.messages:
         copies = enumerate(escs) if message in per_esc else [(0, None)]
@@ -66,11 +68,7 @@ def expand(
             made = _copy(message)
             if message in ours:
                 made.frame_id = message.frame_id + shift + index * step
-                limit = 0x1FFFFFFF if message.is_extended_frame else 0x7FF
-                if not 0 <= made.frame_id <= limit:
-                    problems.append(
-                        f"{file}: {message.name}: id {message.frame_id:X}h moved to {made.frame_id:X}h is outside 0..{limit:X}h."
-                    )
+                moves.append((message.frame_id, made.frame_id, message.is_extended_frame))
             if esc is not None:
                 _rename(made, esc_prefix(esc.name))
             for old, new in zip(message.signals, made.signals, strict=True):
@@ -85,6 +83,7 @@ def expand(
             messages.append(made)
             names = {old.name: new.name for old, new in zip(message.signals, made.signals, strict=True)}
             moved.setdefault(frame_id(message), []).append((frame_id(made), names))
+    problems = [f"{file}: {problem}" for problem in _id_problems(moves, len(escs), base_id)]
     _check_lengths(messages, per_esc, escs, problems, file)
     if problems:
         raise UserError(*problems)
@@ -98,6 +97,28 @@ def expand(
         sort_signals=None,
     )
     return result, out_bind
+
+
+def _id_problems(moves: Sequence[tuple[int, int, bool]], count: int, base_id: int | None) -> list[str]:
+    """A line for ids that no frame can have, one for 11-bit ids that leave the free range. ``moves``: from, to, 29 bits."""
+    problems = []
+    why = f"for {count} ESCs" if base_id is None else f"with {base_id:X}h as the lowest id"
+    for extended, limit in ((False, 0x7FF), (True, 0x1FFFFFFF)):
+        ids = [made for _, made, is_extended in moves if is_extended is extended]
+        if outside := [made for made in ids if not 0 <= made <= limit]:
+            most = max(made for _, made, _ in moves) - min(made for _, made, _ in moves)
+            remedy = f" The lowest id can be at most {limit - most:X}h." if limit > most else ""
+            problems.append(
+                f"{why}, {len(outside)} of {len(moves)} messages lie outside 0..{limit:X}h, up to {max(outside):X}h.{remedy}"
+            )
+    low, high = _SDO_END + 1, _RESTRICTED - 1
+    left = [made for old, made, extended in moves if not extended and low <= old <= high and not low <= made <= high]
+    if left and base_id is None and not problems:
+        problems.append(
+            f"{why}, {len(left)} of {len(moves)} ids leave {low:X}h..{high:X}h, up to {max(left):X}h, where CANopen has its own. "
+            "Take fewer ESCs, a DBC with 29-bit ids, or an explicit lowest id (dbc.base_id, --base-id)."
+        )
+    return problems
 
 
 def _check_lengths(

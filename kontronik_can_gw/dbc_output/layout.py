@@ -11,13 +11,15 @@ import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum, Flag
+from enum import Enum
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from kontronik_can_gw.dbc_output import units
+from kontronik_can_gw.dbc_output import counters, send_types, units
 from kontronik_can_gw.dbc_output.bounds import MAX_BYTES, check_bounds, check_size
+from kontronik_can_gw.dbc_output.names import normalize as normalize
+from kontronik_can_gw.dbc_output.send_types import SendType as SendType
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.sources import Group, Source, sources
@@ -28,53 +30,20 @@ if TYPE_CHECKING:
 
 _NOT_AVAILABLE_TEXTS = frozenset({"notavailable", "sna", "na", "signalnotavailable"})
 _ERROR_TEXTS = frozenset({"error", "err", "invalid"})
-_ALIVE_ENDINGS = (
-    "alive",
-    "alivecounter",
-    "alivecount",
-    "livecounter",
-    "messagecounter",
-    "rollingcounter",
-    "sequencecounter",
-)
 _LARGEST_FLOAT = int(struct.unpack("<f", b"\xff\xff\x7f\x7f")[0])
-_CRC_ENDINGS = ("crc", "crc8", "checksum")
 _MAX_REASON = 300
 """Characters: cantools may quote the whole file."""
 _MAX_PAGES = 1024
 """Multiplexer values of a message of ours."""
+_MANY = 5
+_SUSPECT = {
+    None: "",
+    counters.Kind.COUNTER: ' If it counts the frames: bind = "alive".',
+    counters.Kind.CHECKSUM: ' If it is the CRC of AUTOSAR E2E profile 1: bind = "crc".',
+}
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 EXPECTED_LIVE_HZ = 100
 """What a UART is expected to bring, for the computed bus load only; the gateway sends as frames come."""
-
-
-class SendType(Flag):
-    """When a message is sent. Several may hold."""
-
-    CYCLIC = 1
-    EVENT = 2
-    """With each UART frame (or change of the link) that brings one of its signals."""
-    ON_CHANGE = 4
-
-
-_SEND_TYPES = {
-    "cyclic": SendType.CYCLIC,
-    "cyclicx": SendType.CYCLIC,
-    "periodic": SendType.CYCLIC,
-    "fixedperiodic": SendType.CYCLIC,
-    "event": SendType.EVENT,
-    "spontaneous": SendType.EVENT,
-    "spontan": SendType.EVENT,
-    "spontanwithdelay": SendType.EVENT,
-    "onwrite": SendType.EVENT,
-    "onchange": SendType.ON_CHANGE,
-    "cyclicandevent": SendType.CYCLIC | SendType.EVENT,
-    "cyclicandspontan": SendType.CYCLIC | SendType.EVENT,
-    "cyclicandspontanwithdelay": SendType.CYCLIC | SendType.EVENT,
-    "cyclicandspontaneous": SendType.CYCLIC | SendType.EVENT,
-    "cyclicandonchange": SendType.CYCLIC | SendType.ON_CHANGE,
-}
-_NO_SEND_TYPE = frozenset({"", "none", "nomsgsendtype", "notused", "nosendtype"})
 
 
 class Role(Enum):
@@ -129,6 +98,8 @@ class SignalPlan:
     """Value table, raw value to text, without the codes for not available and error."""
     notes: tuple[str, ...] = ()
     """What resolution or range is lost, for people."""
+    unbound: bool = False
+    """A constant because it is bound to nothing."""
 
 
 def classic_bits(length: int, extended: bool = False) -> int:
@@ -193,6 +164,16 @@ class DbcSettings:
     id_step: int | None = None
     data_ids: Mapping[str, int] = field(default_factory=dict)
     """Message name to E2E data id; otherwise the CAN id's low 16 bits."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Unit text of the DBC to the one that it means."""
+    send_types: Mapping[str, str] = field(default_factory=dict)
+    """GenMsgSendType to the one of ``send_types.NAMES`` that it means."""
+    messages: tuple[str, ...] = ()
+    """Patterns of the names of our messages, which ``prepare`` goes by; none: all."""
+    unbound: str = "error"
+    """What becomes of a signal without a source: "error", or its "start_value" for ever."""
+    flags_on_loss: int | None = None
+    """What a flag without a code is without telemetry; None: its own start value, else 0."""
 
 
 @dataclass(frozen=True)
@@ -211,14 +192,9 @@ class Layout:
         )
 
 
-def normalize(name: str) -> str:
-    """A name as it is compared: letters and digits only, lower case."""
-    return "".join(c for c in name.casefold() if c.isalnum())
-
-
-def load_database(path: Path) -> "Database":
-    """Read a DBC file. UserError with one line for a file that cannot be read or is no DBC."""
-    return parse_database(read_dbc(path), str(path))
+def load_database(path: Path, warnings: list[str] | None = None) -> "Database":
+    """Read a DBC file, as ``parse_database``. UserError with one line for a file that cannot be read or is no DBC."""
+    return parse_database(read_dbc(path), str(path), warnings)
 
 
 def read_dbc(path: Path) -> bytes:
@@ -230,8 +206,11 @@ def read_dbc(path: Path) -> bytes:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def parse_database(raw: bytes, path: str) -> "Database":
-    """Read the bytes of a DBC file. UserError with one line that names ``path`` for what is no DBC."""
+def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> "Database":
+    """Read the bytes of a DBC file. UserError with one line that names ``path`` for what is no DBC.
+
+    Entries for what the file does not have are ignored, with a line for ``warnings``.
+    """
     check_size(len(raw), path)
     if b"\0" in raw:
         raise UserError(f"{path}: is a binary file, not a DBC")
@@ -245,7 +224,9 @@ def parse_database(raw: bytes, path: str) -> "Database":
     with without_asammdf():
         import cantools.database
 
-    text = _spelled_out(text, path)
+    text, ignored = _spelled_out(text, path)
+    if warnings is not None:
+        warnings += ignored
     try:
         database = cantools.database.load_string(text, database_format="dbc", strict=False, sort_signals=None)
     except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
@@ -259,13 +240,16 @@ def parse_database(raw: bytes, path: str) -> "Database":
 
 
 _STRING = re.compile(r'"(?:\\"|[^"])*"')
+_PAIRS = r'(?:[^\s";]+\s+"\0\d+\0"\s*)*'
+"""Values and their texts, masked. Never simply up to a semicolon: NS_ lists keywords without one."""
 _MASKED = re.compile(r'"\0(\d+)\0"')
 
 
-def _spelled_out(text: str, path: str) -> str:
+def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
     """What other tools write and cantools does not read: a VAL_ that names a VAL_TABLE_, enumeration attributes by text.
 
-    Strings are masked while lines are looked at, so that no comment and no value text is touched.
+    Entries for signals, tables and attributes that the file does not have are taken out, each kind with a warning; cantools refuses the
+    whole file for them. Strings are masked meanwhile, so that no comment and no value text is touched, and lines keep their numbers.
     """
     strings: list[str] = []
 
@@ -277,10 +261,45 @@ def _spelled_out(text: str, path: str) -> str:
         return _MASKED.sub(lambda found: strings[int(found[1])], masked)
 
     text = _STRING.sub(mask, text)
-    tables = dict(re.findall(r"^[ \t]*VAL_TABLE_\s+(\w+)\s+([^;]*)", text, re.MULTILINE))
+    ignored: dict[str, list[str]] = {}
+
+    def without(entry: re.Match[str], reason: str, what: str) -> str:
+        ignored.setdefault(reason, []).append(shown(what))
+        return "\n" * entry[0].count("\n")
+
+    tables = dict(re.findall(rf"^[ \t]*VAL_TABLE_\s+(\w+)\s+({_PAIRS});", text, re.MULTILINE))
+    signals: set[tuple[str, str]] = set()
+    message = ""
+    for found in re.finditer(r"^[ \t]*(?:BO_\s+0*(\d+)\s+\w+\s*:|SG_\s+(\w+))", text, re.MULTILINE):
+        message = found[1] or message
+        signals.add((message, found[2]))
+
+    def of_signal(found: re.Match[str]) -> str:
+        keyword, number, name, body = found["keyword"], found["message"], found["signal"], found["body"]
+        what = f"{keyword} {number or ''} {name}".replace("  ", " ")
+        if number is not None and (number.lstrip("0") or "0", name) not in signals:
+            return without(found, "for signals that are not in the file", what)
+        if keyword != "VAL_" or not re.fullmatch(r"[A-Za-z_]\w*", body.strip()):
+            return found[0]
+        if (table := tables.get(body.strip())) is None:
+            return without(found, "naming a VAL_TABLE_ that is not in the file", f"{what} {body.strip()}")
+        return f"{found['head']}{table};"
+
     text = re.sub(
-        r"^([ \t]*VAL_\s+\d+\s+\w+\s+)([A-Za-z_]\w*)(\s*;)",
-        lambda found: f"{found[1]}{tables.get(found[2], found[2])}{found[3]}",
+        r"^(?P<head>[ \t]*(?P<keyword>VAL_|SIG_VALTYPE_)\s+(?:(?P<message>\d+)\s+)?(?P<signal>[A-Za-z_]\w*+)\s*+)"
+        rf"(?P<body>{_PAIRS}|[A-Za-z_]\w*\s*|:?\s*\d+\s*);",
+        of_signal,
+        text,
+        flags=re.MULTILINE,
+    )
+    defined = set(map(shown, re.findall(r"^[ \t]*BA_DEF_\s+(?:\w+\s+)?(\"\0\d+\0\")", text, re.MULTILINE)))
+    text = re.sub(
+        r"^[ \t]*(BA_|BA_DEF_DEF_)\s+(\"\0\d+\0\")[^;\n]*;",
+        lambda found: (
+            found[0]
+            if shown(found[2]) in defined
+            else without(found, "of attributes that no BA_DEF_ defines", f"{found[1]} {found[2]}")
+        ),
         text,
         flags=re.MULTILINE,
     )
@@ -299,7 +318,14 @@ def _spelled_out(text: str, path: str) -> str:
         return f"{found[1]}{found[2]}{found[3]}{numbers.get(name, {}).get(value, found[4])}{found[5]}"
 
     text = re.sub(r"^([ \t]*BA_\s+)(\"\0\d+\0\")(\s[^\";]*)(\"\0\d+\0\")(\s*;)", number, text, flags=re.MULTILINE)
-    return shown(text)
+    return shown(text), [f"{path}: ignored, {reason}: {_listed(found)}" for reason, found in ignored.items()]
+
+
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    """Each name once, and how many more there are."""
+    names = list(dict.fromkeys(names))
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def choose_node(database: "Database", wanted: str | None, file: str) -> str:
@@ -417,10 +443,30 @@ def compile_layout(
         near = difflib.get_close_matches(key, known, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         compiler.problems.append(f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{hint}")
+    for table, given, met, what in (
+        ("units", settings.units, compiler.units, "signal of {} has this unit"),
+        ("send_type", settings.send_types, compiler.send_types, "message of {} has this GenMsgSendType"),
+    ):
+        for text in sorted(set(given) - met):
+            near = difflib.get_close_matches(text, met, n=1, cutoff=0.3)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            compiler.problems.append(f"dbc.{table}.{text}: no {what.format(node)} in {file}.{hint}")
     for name in sorted(set(settings.data_ids) - {m.name for m in ours}):
         compiler.problems.append(f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}.")
+    if compiler.unbound > _MANY:
+        compiler.problems.append(
+            f"{file}: {compiler.unbound} signals of {node} are bound to nothing. dbc.messages chooses messages, as "
+            f'["{ours[0].name}", "Esc*"]; dbc.unbound = "start_value" sends what is not bound as a constant.'
+        )
     if compiler.problems:
         raise UserError(*compiler.problems)
+    once = [plan.name for plan in plans if not plan.cycle_ns and not plan.paces]
+    if once:
+        compiler.warnings.append(
+            f"{file}: sent once at the start, without a cycle and a value that changes: {_listed(once)}"
+        )
+    if names := compiler.while_active:
+        compiler.warnings.append(f"{file}: sent all the time, not only while something is active: {_listed(names)}")
     return Layout(file, node, tuple(plans), tuple(compiler.warnings))
 
 
@@ -435,6 +481,12 @@ class _Compiler:
         self.binder = Binder(escs, settings.bind)
         self.problems: list[str] = []
         self.warnings: list[str] = []
+        self.units: set[str] = set()
+        """Unit texts that were met."""
+        self.send_types: set[str] = set()
+        self.while_active: list[str] = []
+        """Messages that others send only while something is active."""
+        self.unbound = 0
 
     def check_ids(self, ours: Sequence["Message"], taken: Mapping[int, str]) -> None:
         mine = {id(message) for message in ours}
@@ -473,7 +525,9 @@ class _Compiler:
                 f"{where}: CAN FD has no frames of {message.length} bytes, but {', '.join(map(str, FD_LENGTHS[9:]))}."
             )
         if message.is_container or message.length == 0 or not message.signals:
-            self.problems.append(f"{where}: has no signal that could be sent. Remove it or give it signals.")
+            self.problems.append(
+                f"{where}: has no signal that could be sent. Give it signals, or leave it out (dbc.messages)."
+            )
             return None
         if message.length > FD_LENGTHS[-1]:
             return None
@@ -499,17 +553,16 @@ class _Compiler:
         for paged in signals:
             if paged.page is not None and paged.role in (Role.ALIVE, Role.CRC):
                 self.problems.append(
-                    f"{where}.{paged.name}: is a multiplexed {paged.role.value}; it has to be in every frame. Take the m{paged.page} away."
+                    f"{where}.{paged.name}: is a multiplexed {paged.role.value}; it has to be in every frame. "
+                    f"Take the m{paged.page} away, or bind it to a constant."
                 )
         crcs = [s for s in signals if s.role is Role.CRC]
         if len(crcs) > 1:
-            self.problems.append(f"{where}: has several CRC signals: {', '.join(s.name for s in crcs)}. Keep one.")
-        if crcs:
-            alive = [s for s in signals if s.role is Role.ALIVE]
-            if len(alive) != 1 or alive[0].high < 14:
-                self.problems.append(
-                    f"{where}: {crcs[0].name}: E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
-                )
+            self.problems.append(
+                f"{where}: has several CRC signals: {', '.join(s.name for s in crcs)}. Bind all but one to constants."
+            )
+        elif crcs:
+            self._check_e2e(message, where, crcs[0], [s for s in signals if s.role is Role.ALIVE])
         if len(self.problems) > before:
             return None
         return MessagePlan(
@@ -528,6 +581,28 @@ class _Compiler:
             data_id=self.settings.data_ids.get(message.name, message.frame_id & 0xFFFF),
         )
 
+    def _check_e2e(self, message: "Message", where: str, crc: SignalPlan, alive: Sequence[SignalPlan]) -> None:
+        """A checksum is sent only as AUTOSAR E2E profile 1, and only where that is said or its names are those of always."""
+        asked = message.name in self.settings.data_ids or self.binder.bound(message.name, crc.name) is not None
+        fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
+        one = len(alive) == 1 and alive[0].high >= 14
+        key = f"dbc.e2e_data_ids.{message.name} = 0x{message.frame_id & 0xFFFF:X}"
+        if not asked and not (fits and one and counters.is_e2e(crc.name, alive[0].name)):
+            self.problems.append(
+                f"{where}.{crc.name}: the DBC does not say how this checksum is made. AUTOSAR E2E profile 1 (8 bits on a byte border, "
+                f"beside exactly one alive counter, 0 to 14) is chosen by {key}. Otherwise bind it to a constant, if receivers take "
+                "one, or leave the message out (dbc.messages)."
+            )
+            return
+        if not fits:
+            self.problems.append(f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte border.")
+        if not one:
+            self.problems.append(
+                f"{where}: {crc.name}: E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
+            )
+        if not asked:
+            self.warnings.append(f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. If that is right, say so: {key}")
+
     def _timing(self, message: "Message", where: str) -> tuple[SendType, int, int]:
         def number(name: str) -> int:
             value = attribute(message, name, self.database)
@@ -543,17 +618,24 @@ class _Compiler:
 
         cycle, delay = number("GenMsgCycleTime"), number("GenMsgDelayTime")
         text = str(attribute(message, "GenMsgSendType", self.database) or "")
-        key = normalize(text)
-        if key in _NO_SEND_TYPE:
-            return (SendType.CYCLIC if cycle else SendType.EVENT), cycle, delay
-        if key not in _SEND_TYPES:
+        self.send_types.add(text)
+        name, while_active = send_types.meaning(text, self.settings.send_types)
+        if name is None:
             self.problems.append(
-                f"{where}: GenMsgSendType {text!r} is not known. Known: Cyclic, Event, OnChange, CyclicAndEvent, CyclicAndOnChange."
+                f"{where}: GenMsgSendType {text!r} is not known. Say what it means: dbc.send_type.{text!r} = "
+                f"one of {', '.join(send_types.NAMES)}."
             )
             return SendType.EVENT, cycle, delay
-        send_type = _SEND_TYPES[key]
+        if while_active:
+            cycle = cycle or number("GenMsgCycleTimeFast") or number("GenMsgCycleTimeActive")
+            self.while_active.append(message.name)
+        if name == send_types.NONE:
+            return (SendType.CYCLIC if cycle else SendType.EVENT), cycle, delay
+        send_type = send_types.NAMES[name]
         if SendType.CYCLIC in send_type and not cycle:
-            self.problems.append(f"{where}: is sent {text} but its GenMsgCycleTime is 0. Set one in ms.")
+            self.problems.append(
+                f'{where}: is sent {text} but its GenMsgCycleTime is 0. Set one in ms, or dbc.send_type.{text!r} = "Event".'
+            )
         return send_type, cycle, delay
 
     def _check_overlap(self, message: "Message", where: str) -> None:
@@ -577,6 +659,13 @@ class _Compiler:
             for page in pages:
                 used[page] |= mask
             placed.append((signal.name, mask, pages))
+
+    def _unit(self, signal: "Signal") -> str:
+        """A signal's unit, as ``dbc.units`` has it; empty where it says nothing."""
+        text = (signal.unit or "").strip()
+        self.units.add(text)
+        text = self.settings.units.get(text, text)
+        return "" if units.says_nothing(text) else text
 
     def _signal(self, message: "Message", signal: "Signal", page: int | None) -> SignalPlan | None:
         where = f"{self.file}: {message.name}.{signal.name}"
@@ -611,21 +700,13 @@ class _Compiler:
         if not_available is None:
             start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
             # a default start value is nobody's statement that 0 means "not available"; a flag has nothing better
-            usable = (
-                (start_is_set or length == 1)
-                and isinstance(start, (int, float))
-                and math.isfinite(start)
-                and start == int(start)
-            )
-            if usable and low <= start <= high:
-                not_available = int(start)
-            else:
-                not_available = low if signed else high
+            usable = (start_is_set or length == 1) and _is_raw(start, low, high)
+            not_available = int(start) if usable else low if signed else high
         if error is None:
             error = not_available
         base: dict[str, Any] = {
             "name": signal.name,
-            "unit": signal.unit or "",
+            "unit": self._unit(signal),
             "length": length,
             "signed": signed,
             "is_float": is_float,
@@ -665,23 +746,25 @@ class _Compiler:
             return SignalPlan(role=Role.CONSTANT, constant=constant, **base)
         name = signal.name if bound is None else bound
         found = self.binder.by_name(name)
-        key = normalize(name)
-        if found is None and key.endswith(_ALIVE_ENDINGS):
+        kind = counters.kind(name) if found is None else None
+        if kind is counters.Kind.COUNTER:
             if is_float or base["low"] > 0 or base["high"] < 2:
                 self.problems.append(
-                    f"{where}: an alive counter needs a whole number of 2 bits or more that begins at 0."
+                    f"{where}: an alive counter needs a whole number of 2 bits or more that begins at 0. Or bind it to a constant."
                 )
                 return None
             return SignalPlan(role=Role.ALIVE, **base)
-        if found is None and key.endswith(_CRC_ENDINGS):
-            if length != 8 or len(base["pieces"]) != 1 or base["pieces"][0].at % 8:
-                self.problems.append(f"{where}: an E2E profile 1 CRC needs 8 bits on a byte border.")
-                return None
+        if kind is counters.Kind.CHECKSUM:
             return SignalPlan(role=Role.CRC, **base)
+        if found is None and bound is None and self.settings.unbound == "start_value":
+            constant = self._start_value(where, signal, base, codes)
+            return None if constant is None else SignalPlan(role=Role.CONSTANT, constant=constant, unbound=True, **base)
         if found is None:
+            self.unbound += bound is None
             via = f" (bound by dbc.bind to {bound!r})" if bound is not None else ""
             self.problems.append(
-                f"{where}: no such source{via}.{self.binder.suggestions(name)} Bind it under [dbc.bind] or rename it."
+                f"{where}: no such source{via}.{self.binder.suggestions(name)}{_SUSPECT[counters.suspect(name)]} "
+                "Bind it under [dbc.bind] or rename it."
             )
             return None
         source, esc = found
@@ -689,7 +772,42 @@ class _Compiler:
             names = " or ".join(f"{e.name}.{source.name}" for e in self.binder.escs[:2])
             self.problems.append(f"{where}: does not say of which ESC. Prefix it or bind it: {names}.")
             return None
-        return self._bound_signal(where, signal, source, esc, base, codes, (factor, offset))
+        return self._bound_signal(where, signal, source, esc, base, codes)
+
+    def _start_value(
+        self, where: str, signal: "Signal", base: Mapping[str, Any], codes: Mapping[str, int]
+    ) -> int | None:
+        """The raw bits of a signal that is bound to nothing: its own start value, else NotAvailable, else the default or 0."""
+        is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
+        if not is_set and _NOT_AVAILABLE_TEXTS & set(codes):
+            return int(base["not_available"])
+        start = attribute(signal, "GenSigStartValue", self.database) or 0
+        length, signed = signal.length, signal.is_signed
+        if signal.is_float and isinstance(start, (int, float)):
+            raw = _constant(start, Fraction(1), Fraction(0), length, signed, is_float=True)
+        elif _is_raw(start, *((-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1))):
+            raw = int(start)
+        else:
+            raw = None
+        if raw is None:
+            self.problems.append(
+                f"{where}: its GenSigStartValue {start} is none of its raw values. Bind it to a constant."
+            )
+        return raw
+
+    def _flag_on_loss(self, signal: "Signal", codes: Mapping[str, int]) -> int | None:
+        """What a flag without a code is without telemetry, 0 or 1; None: as its own start value has it."""
+        if _NOT_AVAILABLE_TEXTS & set(codes):
+            return None
+        if (
+            self.settings.flags_on_loss is None
+            and signal.dbc is not None
+            and "GenSigStartValue" in signal.dbc.attributes
+        ):
+            start = attribute(signal, "GenSigStartValue", self.database)
+            if _is_raw(start, *((-1, 0) if signal.is_signed else (0, 1))):
+                return None
+        return self.settings.flags_on_loss or 0
 
     def _bound_signal(
         self,
@@ -699,9 +817,8 @@ class _Compiler:
         esc: int | None,
         base: dict[str, Any],
         codes: Mapping[str, int],
-        linear: tuple[Fraction, Fraction],
     ) -> SignalPlan | None:
-        factor, offset = linear
+        factor, offset, unit = base["factor"], base["offset"], base["unit"]
         numbers: dict[int, int] | None = None
         notes: list[str] = []
         if source.names:
@@ -715,15 +832,15 @@ class _Compiler:
                     notes.append(f"sent as Error, not in the value table: {', '.join(missing)}")
             else:
                 notes.append("the value table has no name of it: sent as the ESC's number")
-        converted = units.conversion(source.unit, signal.unit or "")
+        converted = units.conversion(source.unit, unit)
         if converted is None:
-            can = ", ".join(units.texts_like(source.unit)[:8]) or "no unit"
+            can = ", ".join(units.texts_like(source.unit))
             self.problems.append(
                 f"{where}: {source.name} is in {source.unit or 'no unit'} and cannot be converted to "
-                f"{signal.unit!r}. Possible: {can}."
+                f"{unit!r}. Possible: {can}; dbc.units says what other texts mean."
             )
             return None
-        if source.unit and not signal.unit:
+        if source.unit and not unit:
             self.warnings.append(f"{where}: has no unit; {source.unit} is taken.")
         scale, shift = converted
         slope = scale / source.per_unit / factor
@@ -732,12 +849,22 @@ class _Compiler:
         if numbers is None and not signal.is_float:
             step = abs(1 / slope)
             if step > 1 and source.whole:
-                notes.append(f"resolution {_number(abs(factor))} {signal.unit or source.unit}".rstrip())
+                notes.append(f"resolution {_number(abs(factor))} {unit or source.unit}".rstrip())
             if not source.rolls:
                 ends = [end * slope + intercept for end in (source.low, source.high) if end is not None]
                 if ends and (min(ends) < low - 2 or max(ends) > high + 2):  # more than NotAvailable and Error cost
-                    text = f"{_number(low * factor + offset)} to {_number(high * factor + offset)} {signal.unit or ''}".rstrip()
+                    first, last = sorted(end * factor + offset for end in (low, high))
+                    text = f"{_number(first)} to {_number(last)} {unit or source.unit}".rstrip()
                     notes.append(f"range {text}, beyond it Error")
+        if source.bit is not None and signal.length == 1:
+            raws = [math.floor(value * slope + intercept + Fraction(1, 2)) for value in (0, 1)]
+            if [raw if low <= raw <= high else base["error"] for raw in raws] != raws:
+                sign = " Make it unsigned." if signal.is_signed else ""
+                self.problems.append(f"{where}: cannot hold both values of a flag, 0 and 1.{sign}")
+                return None
+            if (on_loss := self._flag_on_loss(signal, codes)) is not None:
+                base |= {"not_available": raws[on_loss], "error": raws[on_loss]}
+                base |= {"low": min(raws), "high": max(raws)}  # a text "Error" at one of them is no code
         if source.rolls:
             if slope != 1 or intercept != 0 or low != 0 or high < 1 or signal.is_float:
                 self.problems.append(
@@ -757,6 +884,11 @@ class _Compiler:
             notes=tuple(notes),
             **base,
         )
+
+
+def _is_raw(value: Any, low: int, high: int) -> bool:
+    """True for a number that is a raw value."""
+    return isinstance(value, (int, float)) and math.isfinite(value) and value == int(value) and low <= value <= high
 
 
 def _value_texts(signal: "Signal") -> dict[int, str]:

@@ -1,5 +1,7 @@
 """From a DBC file and ESCs to what will be sent: the database (expanded to the ESCs where it describes one) and its layout."""
 
+import difflib
+import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -25,10 +27,39 @@ def prepare(
 ) -> tuple["Database", Layout]:
     """The exact database of what a gateway with these ESCs sends, and the compiled layout. UserError with every mistake."""
     node = choose_node(database, settings.node, file)
+    if settings.messages:
+        database = _with_chosen(database, node, settings.messages, file)
     if needs_expansion(database, node, escs, settings.bind) or settings.base_id is not None:
         database, bind = expand(database, node, escs, file, dict(settings.bind), settings.base_id, settings.id_step)
         settings = replace(settings, bind=bind)
     return database, compile_layout(database, file, escs, settings, taken_ids, fd_allowed)
+
+
+def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file: str) -> "Database":
+    """The database without those messages of a node that no pattern names. UserError for patterns that name none."""
+    import cantools.database.can
+
+    ours = {message.name for message in database.messages if node in message.senders}
+    problems = []
+    for pattern in patterns:
+        if not fnmatch.filter(ours, pattern):
+            others = [m for m in database.messages if m.name not in ours and fnmatch.fnmatchcase(m.name, pattern)]
+            sender = f" {others[0].name} is sent by {', '.join(others[0].senders) or 'nobody'}." if others else ""
+            near = difflib.get_close_matches(pattern, ours, n=1)
+            hint = f" Did you mean {near[0]}?" if near and not others else ""
+            problems.append(f"dbc.messages: {pattern!r} is no message of {node} in {file}.{sender}{hint}")
+    if problems:
+        raise UserError(*problems)
+    chosen = {name for pattern in patterns for name in fnmatch.filter(ours, pattern)}
+    return cantools.database.can.Database(
+        messages=[message for message in database.messages if message.name in chosen or message.name not in ours],
+        nodes=database.nodes,
+        buses=database.buses,
+        version=database.version,
+        dbc_specifics=database.dbc,
+        strict=False,
+        sort_signals=None,
+    )
 
 
 def check_load(layout: Layout, bitrate: int, data_bitrate: int = 2_000_000, further_bits: float = 0) -> str | None:

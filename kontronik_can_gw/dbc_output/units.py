@@ -1,6 +1,9 @@
-"""Unit texts as they are met in DBC files, and exact conversion between those of one quantity."""
+"""Unit texts as they are met in DBC files, and exact conversion between those of one quantity. The units stand in ``units.tsv``."""
 
+from collections.abc import Mapping
 from fractions import Fraction
+from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 
@@ -12,67 +15,75 @@ class Unit(NamedTuple):
     shift: Fraction = Fraction(0)
 
 
-def _units(quantity: str, **scales: str) -> dict[str, Unit]:
-    return {name: Unit(quantity, Fraction(scale)) for name, scale in scales.items()}
-
-
-_KELVIN_SHIFT = Fraction("-273.15")
-_UNITS: dict[str, Unit] = (
-    _units("voltage", V="1", mV="1/1000", kV="1000")
-    | _units("current", A="1", mA="1/1000", kA="1000")
-    | _units("power", W="1", mW="1/1000", kW="1000", hp="745.69987158227022", PS="735.49875")
-    | _units("energy", Wh="1", mWh="1/1000", kWh="1000", J="1/3600", kJ="1000/3600")
-    | _units("charge", mAh="1", Ah="1000", As="1000/3600")
-    | _units("time", s="1", sec="1", ms="1/1000", us="1/1000000", usec="1/1000000", min="60", h="3600")
-    | _units("frequency", Hz="1", kHz="1000")
-    | _units("rotation", rpm="1", rps="60")
-    | {
-        text: Unit("rotation", Fraction(1))
-        for text in (
-            "1/min",
-            "/min",
-            "min-1",
-            "min^-1",
-            "r/min",
-            "rev/min",
-            "U/min",
-            "Upm",
-            "erpm",
-            "eRPM",
-            "RPM",
-            "Rpm",
-        )
-    }
-    | {text: Unit("rotation", Fraction(60)) for text in ("1/s", "rev/s", "r/s", "U/s", "s-1")}
-    | {text: Unit("share", Fraction(1)) for text in ("%", "percent", "Percent", "pct")}
-    | {text: Unit("temperature", Fraction(1)) for text in ("degC", "deg C", "°C", "C", "Cel", "celsius", "Celsius")}
-    | {text: Unit("temperature", Fraction(1), _KELVIN_SHIFT) for text in ("K", "degK", "Kelvin")}
-    | {
-        text: Unit("temperature", Fraction(5, 9), Fraction(-160, 9))
-        for text in ("degF", "deg F", "°F", "F", "Fahrenheit")
-    }
+Spellings = Mapping[str, Mapping[str, Unit]]
+"""Key of a spelling -> by quantity the unit that it means."""
+_NONE = "none"
+_MOJIBAKE = (("Â", ""), ("Î¼", "µ"))
+"""UTF-8 read as Windows-1252, as it stands in files that went through both."""
+_LETTERS = str.maketrans(
+    {"µ": "u", "μ": "u", "°": "deg", "º": "deg", "˚": "deg", "⁻": "-", "¹": "1", "·": "*"} | dict.fromkeys("()[]_. ")
 )
-_UNITS |= {"µs": _UNITS["us"], "μs": _UNITS["us"], "Volt": _UNITS["V"], "Ampere": _UNITS["A"], "Watt": _UNITS["W"]}
-_COUNT = ("", "1", "-", "count", "counts", "cnt", "#", "bit", "bool", "cells", "B", "byte", "bytes", "frames")
-_UNITS |= {text: Unit("number", Fraction(1)) for text in _COUNT}
+
+
+def _key(text: str) -> str:
+    """A spelling as it is compared where case matters."""
+    for wrong, right in _MOJIBAKE:
+        text = text.replace(wrong, right)
+    text = text.strip()
+    return (text[5:] if text[:5].casefold() == "unit_" else text).translate(_LETTERS)
+
+
+@cache
+def _tables() -> tuple[Spellings, Spellings, tuple[tuple[str, str], ...]]:
+    """Spellings whose case matters, those in any case, and of each row quantity and the spelling to show."""
+    exact: dict[str, dict[str, Unit]] = {}
+    loose: dict[str, dict[str, Unit]] = {}
+    shown = []
+    for line in (Path(__file__).parent / "units.tsv").read_text(encoding="utf-8").splitlines():
+        if line.startswith("#"):
+            continue
+        quantity, scale, shift, cased, uncased = line.split("\t")
+        unit = Unit(quantity, Fraction(scale), Fraction(shift))
+        for text in filter(None, cased.split("|")):
+            exact.setdefault(_key(text) or text, {})[quantity] = unit
+        for text in filter(None, uncased.split("|")):
+            loose.setdefault((_key(text) or text).casefold(), {})[quantity] = unit
+        shown.append((quantity, (cased or uncased).split("|")[0]))
+    return exact, loose, tuple(shown)
+
+
+def meanings(text: str) -> Mapping[str, Unit]:
+    """By quantity what a unit text can mean; empty for an unknown one."""
+    exact, loose, _ = _tables()
+    key = _key(text) or text.strip()
+    return exact.get(key) or loose.get(key.casefold(), {})
+
+
+def says_nothing(text: str) -> bool:
+    """True for no text, and for one that says that there is no unit."""
+    return not text.strip() or _NONE in meanings(text)
 
 
 def conversion(source: str, target: str) -> tuple[Fraction, Fraction] | None:
     """(m, b) with ``value in target = value in source * m + b``; None where the two are not of one quantity.
 
-    An empty target means the source's own unit.
+    A target that says nothing means the source's own unit.
     """
-    if target in (source, ""):
+    if target == source or says_nothing(target):
         return Fraction(1), Fraction(0)
-    a, b = _UNITS.get(source), _UNITS.get(target.strip())
-    if a is None or b is None or a.quantity != b.quantity:
-        return None
-    return a.scale / b.scale, (a.shift - b.shift) / b.scale
+    of_source = meanings(source or "count")
+    for quantity, b in meanings(target).items():
+        if (a := of_source.get(quantity)) is not None:
+            return a.scale / b.scale, (a.shift - b.shift) / b.scale
+    return None
 
 
 def texts_like(source: str) -> list[str]:
-    """The unit texts that a source's unit can be converted to, for messages to people."""
-    unit = _UNITS.get(source)
-    return [
-        text for text, other in _UNITS.items() if unit and other.quantity == unit.quantity and text and text.isascii()
-    ]
+    """A spelling of each unit that a source's unit can be converted to, for messages to people."""
+    known = meanings(source or "count")
+    return [text for quantity, text in _tables()[2] if quantity in known]
+
+
+def names() -> tuple[str, ...]:
+    """The spelling to show of every unit."""
+    return tuple(dict.fromkeys(text for _, text in _tables()[2]))

@@ -132,10 +132,9 @@ class LogConversion:
         last, frames = first_of(self._cut(frames, origin_ns))
         if last is None:
             return None
-        comment = "\n".join(f"{key}: {value}" for key, value in recording.provenance.items())
         begins = last.time_ns - origin_ns
         channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
-        writer = CanLogWriter(out.open(), self.format, wall_ns, begins, channel, out.name, comment)
+        writer = CanLogWriter(out.open(), self.format, wall_ns, begins, channel, out.name, recording.provenance)
         count = 0
         try:
             for last in frames:

@@ -463,6 +463,16 @@ _TOTALS: dict[str, tuple[str, str | None]] = {"Wh": ("Wh", "energy"), "mAh": ("m
 """What only grows, until the ESC or the gateway starts anew."""
 _DIAGNOSTIC = {Group.LINK, Group.INFO, Group.GATEWAY}
 _OF_USE = {"energy_used", "motor_run_time", "link_state"}
+_SHORT = {
+    "bec": "BEC",
+    "pwm": "PWM",
+    "crc": "CRC",
+    "can": "CAN",
+    "id": "ID",
+    "esc": "ESC",
+    "escs": "ESCs",
+    "eeprom": "EEPROM",
+}
 _LEFT_OUT = {
     "operating_state_raw",
     "device_raw",
@@ -500,6 +510,11 @@ _ERROR_ENTITIES: dict[str, dict[str, Any]] = {
 }
 
 
+def _in_words(source: str) -> str:
+    words = [_SHORT.get(word, word) for word in source.split("_")]
+    return " ".join([words[0][0].upper() + words[0][1:], *words[1:]])
+
+
 def entity(source: str, column: Column) -> dict[str, Any] | None:
     """What Home Assistant is told of one value; None where another one says the same."""
     if source in _LEFT_OUT:
@@ -507,7 +522,7 @@ def entity(source: str, column: Column) -> dict[str, Any] | None:
     about = _SOURCES[source]
     made: dict[str, Any] = {
         "platform": "sensor",
-        "name": source[0].upper() + source[1:].replace("_", " "),
+        "name": _in_words(source),
         "value_template": f"{{{{ value_json.{source} }}}}",
     }
     if about.group in _DIAGNOSTIC and source not in _OF_USE:

@@ -440,7 +440,7 @@ def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
             f"CAN interface {name}: there is none. With an adapter plugged in: {make}. For a virtual one: {virtual}."
         )
     if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
-        return RunError(f"CAN interface {name}: this kernel has no SocketCAN. Try: sudo modprobe can_raw vcan.")
+        return RunError(f"CAN interface {name}: this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan.")
     if number == errno.ENETDOWN:
         return RunError(f"CAN interface {name}: is down. Start it: {make}.")
     return RunError(f"CAN interface {name}: cannot be opened: {text}")

@@ -52,6 +52,8 @@ _BASE_UNITS: Mapping[str, tuple[str, float, float]] = {
     "1/min": ("revolutions_per_second", 1, 60),
     "": ("", 1, 1),
 }
+_RENAMED = {"cell_count": "cells"}
+"""Names that no gauge may have: promtool keeps _count for summaries."""
 _COUNTED = ("energy_used", "motor_run_time")
 """Values that only grow while the process runs."""
 
@@ -87,7 +89,7 @@ def _families(document: Document) -> Iterator[Family]:
 
     names = {"interface": can["interface"], "channel": can["channel"]}
     yield "can_info", "gauge", "The CAN interface.", [(names, 1)]
-    yield "can_bitrate_bits_per_second", "gauge", "Bit rate of the CAN bus.", [({}, can["bitrate"])]
+    yield "can_bitrate", "gauge", "Bit rate of the CAN bus in bit/s.", [({}, can["bitrate"])]
     yield (
         "can_state",
         "gauge",
@@ -98,7 +100,7 @@ def _families(document: Document) -> Iterator[Family]:
     yield "can_stalled", "gauge", "1 while the bus takes no frame.", [({}, int(can["stalled"]))]
     for number, way in enumerate(("transmit", "receive")):
         count = None if can["error_counters"] is None else can["error_counters"][number]
-        yield f"can_{way}_error_counter", "gauge", f"The CAN controller's {way} error counter.", [({}, count)]
+        yield f"can_{way}_errors", "gauge", f"The CAN controller's {way} error counter.", [({}, count)]
     for name, value in can["counters"].items():
         text = f"CAN: {name.removesuffix('_count').replace('_', ' ')} since start."
         yield f"can_{name.removesuffix('_count')}_total", "counter", text, [({}, value)]
@@ -148,7 +150,7 @@ def _values(document: Document) -> Iterator[Family]:
     for name, unit in document["units"].items():
         base, multiplier, divisor = _BASE_UNITS[unit]
         kind = "counter" if name in _COUNTED else "gauge"
-        full = "_".join(filter(None, (name, base, "total" if kind == "counter" else "")))
+        full = "_".join(filter(None, (_RENAMED.get(name, name), base, "total" if kind == "counter" else "")))
         text = f"The ESC's {name.replace('_', ' ')}{' in ' + base.replace('_', ' ') if base else ''}."
         values = [(_of(e), e["values"][name]) for e in escs]
         yield full, kind, text, [(of, v if v is None or not base else v * multiplier / divisor) for of, v in values]

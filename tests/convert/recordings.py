@@ -23,8 +23,8 @@ def convert(*words: object) -> int:
 
 
 @cache
-def capture_bytes(escs: int = 2, seed: int = 3, seconds: float = 6) -> bytes:
-    """A capture file in which everything happens."""
+def capture_bytes(escs: int = 2, seed: int = 3, seconds: float = 6, devices: tuple[str, ...] = ()) -> bytes:
+    """A capture file in which everything happens. ``devices``: what is learnt of the ESCs at its end."""
     bench = Bench(*made(escs)).live(seed, seconds)
     header = bench.setup.header() | {
         "run": "r",
@@ -36,6 +36,9 @@ def capture_bytes(escs: int = 2, seed: int = 3, seconds: float = 6) -> bytes:
     parts = [block(b"H", 0, json_payload(header))]
     for number, at in enumerate(range(0, len(bench.entries), 300)):
         parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
+    if devices:
+        learnt = [{"device": name, "variant": 200, "firmware": "1.2", "layout": "V4"} for name in devices]
+        parts.append(block(b"I", len(parts), json_payload({"devices": learnt})))
     return b"".join([*parts, block(b"E", len(parts), b"")])
 
 

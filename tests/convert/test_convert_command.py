@@ -273,6 +273,7 @@ def test_what_is_wrong_is_told_in_one_line_with_the_remedy(
         (2, [dump, "-"], "give --to: csv, jsonl, candump, asc, trc"),
         (2, [dump, "-", "--to", "blf"], "blf cannot go to standard output."),
         (2, [dump, tmp_path, "--to", "csv"], "is a directory. Give a file."),
+        (2, [dump, tmp_path], "is a directory. Give a file."),
         (2, [dump, "/dev/null", "--to", "parquet"], "is no plain file, into which parquet cannot be written"),
         (1, [dump, tmp_path / "missing" / "out.csv"], "cannot be written: No such file or directory."),
         (1, [dump, tmp_path / "missing" / "out.mf4"], "cannot be written: No such file or directory."),

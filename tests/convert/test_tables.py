@@ -257,6 +257,16 @@ def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
     mdf.close()
 
 
+def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_path: Path) -> None:
+    source = tmp_path / "learnt.kcap"
+    source.write_bytes(capture_bytes(devices=("KOSMIK",)))
+    for arguments in ((), ("--to", "mf4-log")):
+        assert convert(source, tmp_path / "out.mf4", *arguments, "--force") == 0
+        with asammdf.MDF(tmp_path / "out.mf4") as mdf:
+            assert "e0: KOSMIK 200, firmware 1.2, V4 layout, at /dev/ttyUSB0" in mdf.header.comment
+            assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
+
+
 def test_asammdf_makes_a_data_frame_with_gaps(tmp_path: Path) -> None:
     source = write_candump(tmp_path / "bus.log", candump_lines(600))
     out = tmp_path / "out.mf4"

@@ -32,35 +32,18 @@ CODES = {"Error", "NotAvailable"}
 ENUMS: dict[str, dict[int, str]] = {
     # The telemetry sheet's states; 0, 4, 5, 6, 8 have no name and are sent as Error.
     "OperatingState": {
-        1: "WaitForSignal",
-        2: "WaitForMotorOff",
-        3: "WaitForMotorOn",
-        7: "Selftest",
-        9: "ErrorSelftest",
-        10: "CutOffDuringOperation",
-        11: "AcousticSignal",
-        12: "MotorOff",
-        13: "StandBy",
-        14: "Brake",
-        15: "BrakeTargetBackward",
-        16: "BrakeTargetForward",
-        17: "Programming",
-        18: "SyncForward",
-        19: "SyncBackward",
-        20: "SyncStandBy",
-        21: "Forward",
-        22: "Backward",
-        23: "SpoolUpFromStill",
-        24: "SpoolUpFromTurn",
-        25: "SpoolUpQuick",
-        26: "RpmControl",
+        1: "WaitForSignal", 2: "WaitForMotorOff", 3: "WaitForMotorOn", 7: "Selftest", 9: "ErrorSelftest",
+        10: "CutOffDuringOperation", 11: "AcousticSignal", 12: "MotorOff", 13: "StandBy", 14: "Brake",
+        15: "BrakeTargetBackward", 16: "BrakeTargetForward", 17: "Programming", 18: "SyncForward", 19: "SyncBackward",
+        20: "SyncStandBy", 21: "Forward", 22: "Backward", 23: "SpoolUpFromStill", 24: "SpoolUpFromTurn",
+        25: "SpoolUpQuick", 26: "RpmControl",
     },
     "Device": {1: "Kosmik", 2: "Kolibri", 3: "JivePro", 4: "KontrolX", 5: "Uhv"},
     "Layout": {0: "Unknown", 1: "V4", 2: "Legacy"},
     "LinkState": {0: "NeverSeen", 1: "Searching", 2: "Ok", 3: "Degraded", 4: "Lost", 5: "PortError"},
     "GatewayState": {0: "Starting", 1: "Running", 2: "Stopping", 3: "Replay"},
     "CanState": {0: "Unknown", 1: "ErrorActive", 2: "ErrorWarning", 3: "ErrorPassive", 4: "BusOff", 5: "Down"},
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -500,13 +483,9 @@ def everything_has_one_comment(db: Database) -> Iterator[str]:
 
 def attributes_are_declared(db: Database) -> Iterator[str]:
     expected = {
-        "LayoutVersion": ("", "STRING"),
-        "BusType": ("", "STRING"),
-        "GenMsgCycleTime": ("BO_", "INT"),
-        "GenMsgSendType": ("BO_", "ENUM"),
-        "GenMsgDelayTime": ("BO_", "INT"),
-        "GenSigStartValue": ("SG_", "FLOAT"),
-    }
+        "LayoutVersion": ("", "STRING"), "BusType": ("", "STRING"), "GenMsgCycleTime": ("BO_", "INT"),
+        "GenMsgSendType": ("BO_", "ENUM"), "GenMsgDelayTime": ("BO_", "INT"), "GenSigStartValue": ("SG_", "FLOAT"),
+    }  # fmt: skip
     for name, declared in expected.items():
         definition = db.definitions.get(name)
         if definition is None or (definition.object, definition.type) != declared:
@@ -613,66 +592,19 @@ Rule = Callable[[Database], Iterator[str]]
 RULES: dict[str, Rule] = {
     rule.__name__: rule
     for rule in (
-        text_is_ascii_with_line_feeds,
-        every_line_is_understood,
-        header_is_plain,
-        sections_are_in_order,
-        names_are_pascal_case,
-        names_are_unique,
-        percent_signals_say_so,
-        nodes_are_gateway_and_logger,
-        ids_are_in_the_free_range,
-        eight_escs_fit,
-        messages_have_eight_bytes,
-        signals_are_intel_on_byte_borders,
-        signals_do_not_overlap,
-        flags_are_plain_bits,
-        alive_counters_are_where_they_belong,
-        not_available_and_error_are_named,
-        limits_leave_out_the_codes,
-        value_tables_belong_to_signals,
-        enums_are_closed,
-        everything_has_one_comment,
-        attributes_are_declared,
-        attributes_belong_to_something,
-        enum_attributes_are_set_by_index,
-        bus_is_can_and_not_j1939,
-        version_is_in_attribute_and_comment,
-        messages_have_a_schedule,
-        start_values_are_raw_not_available,
-        one_esc_loads_the_bus_below_ten_percent,
+        text_is_ascii_with_line_feeds, every_line_is_understood, header_is_plain, sections_are_in_order,
+        names_are_pascal_case, names_are_unique, percent_signals_say_so, nodes_are_gateway_and_logger,
+        ids_are_in_the_free_range, eight_escs_fit, messages_have_eight_bytes, signals_are_intel_on_byte_borders,
+        signals_do_not_overlap, flags_are_plain_bits, alive_counters_are_where_they_belong,
+        not_available_and_error_are_named, limits_leave_out_the_codes, value_tables_belong_to_signals,
+        enums_are_closed, everything_has_one_comment, attributes_are_declared, attributes_belong_to_something,
+        enum_attributes_are_set_by_index, bus_is_can_and_not_j1939, version_is_in_attribute_and_comment,
+        messages_have_a_schedule, start_values_are_raw_not_available, one_esc_loads_the_bus_below_ten_percent,
     )
-}
+}  # fmt: skip
 
 
 def findings(data: bytes) -> list[str]:
     """Every violation of every rule, as `rule: what`."""
     db = parse(data)
     return [f"{name}: {finding}" for name, rule in RULES.items() for finding in rule(db)]
-
-
-def further_esc(data: bytes, number: int) -> bytes:
-    """The same messages for ESC `number` (1..8): ids raised by number - 1, names of messages and signals prefixed.
-
-    The messages of the gateway are left out for all but ESC 1.
-    """
-    db = parse(data)
-    names = {message.name for message in db.messages} | {signal.name for signal in db.signals}
-    gateway = {str(message.id) for message in db.messages if not message.is_of_an_esc}
-    ids = {str(message.id): str(message.id + number - 1) for message in db.messages if message.is_of_an_esc}
-    kept, in_gateway_message = [], False
-    for line in db.lines:
-        words = line.split()
-        if words and words[0] == "BO_":
-            in_gateway_message = words[1] in gateway
-        elif words and words[0] != "SG_":
-            in_gateway_message = bool(gateway & set(words[1:4])) and words[0] != "BU_:"
-        if number > 1 and in_gateway_message:
-            continue
-        head, quote, tail = line.partition(' "') if line.startswith(("CM_", " SG_", "VAL_")) else (line, "", "")
-        head = re.sub(rf"\b({'|'.join(ids)})\b", lambda match: ids[match[0]], head)
-        head = re.sub(
-            r"\b[A-Z][A-Za-z0-9]*\b", lambda match: f"Esc{number}{match[0]}" if match[0] in names else match[0], head
-        )
-        kept.append(head + quote + tail)
-    return "\n".join(kept).encode()

@@ -120,27 +120,6 @@ def test_cantools_starts_every_signal_not_available(cantools_database: Any) -> N
         assert seen.encode(initial, strict=False) == frame(message, not_available(message))
 
 
-def test_cantools_refuses_a_number_beyond_the_limits_but_not_one_that_hits_a_code(cantools_database: Any) -> None:
-    """cantools exempts the raw values of VAL_ from the limits, even for a number: whoever packs must look himself."""
-    import cantools
-
-    seen = cantools_database.get_message_by_name("EscSpeed")
-    values = {"ElectricalSpeed": 0, "BatteryVoltage": 655.33, "ThrottlePercent": 0, "Timing": 0, "SpeedAlive": 0}
-    assert seen.decode(seen.encode(values, strict=True))["BatteryVoltage"] == pytest.approx(655.33)
-    assert seen.decode(seen.encode(values | {"BatteryVoltage": 655.34}, strict=True))["BatteryVoltage"] == "Error"
-    for name, number in (("BatteryVoltage", 655.36), ("ThrottlePercent", -129), ("SpeedAlive", 15)):
-        with pytest.raises(cantools.database.EncodeError):
-            seen.encode(values | {name: number}, strict=True)
-
-
-def test_a_file_written_again_by_cantools_means_the_same(cantools_database: Any) -> None:
-    import cantools
-
-    again: Any = cantools.database.load_string(cantools_database.as_dbc_string(), "dbc", strict=True)
-    # Of the attributes it drops only a cycle time of 0, which is the default.
-    assert again.is_similar(cantools_database, include_format_specifics=False)
-
-
 # --- canmatrix ------------------------------------------------------------------------------------------------------
 
 
@@ -180,20 +159,6 @@ def test_canmatrix_sees_what_the_lines_say(canmatrix_matrix: Any) -> None:
             assert its.comment == comments[("SG_", *signal.key)]
             assert its.values == db.tables.get(signal.key, {})
             assert its.initial_value == not_available(message)[signal.name] * signal.factor
-
-
-def test_a_file_written_again_by_canmatrix_means_the_same(canmatrix_matrix: Any, cantools_database: Any) -> None:
-    import io
-
-    import canmatrix.formats
-    import cantools
-
-    written = io.BytesIO()
-    canmatrix.formats.dump(canmatrix_matrix, written, "dbc", dbcExportEncoding="ascii")
-    again: Any = cantools.database.load_string(written.getvalue().decode("ascii"), "dbc", strict=True)
-    for seen in again.messages:
-        data = frame(next(m for m in layout().messages if m.id == seen.frame_id), {s.name: 1 for s in seen.signals})
-        assert seen.decode(data) == cantools_database.decode_message(seen.frame_id, data)
 
 
 # --- opendbc --------------------------------------------------------------------------------------------------------
@@ -335,25 +300,4 @@ def test_asammdf_makes_a_table_of_numbers(tmp_path: Path) -> None:
     table = decoded.to_dataframe()
     assert {str(table[name].dtype) for name in ("BatteryVoltage", "BatteryCurrent", "Losses", "Uptime")} == {"float64"}
     assert list(table["BatteryVoltage"].isna()) == [True, False, False, False, False, False]
-    decoded.close()
-
-
-def test_asammdf_gives_texts_for_a_column_that_was_never_available(tmp_path: Path) -> None:
-    """Without one number in the whole recording there is no NaN: the column is the text of the code."""
-    messages = layout().messages
-    raw = [{message.name: not_available(message) for message in messages}] * 3
-    decoded = recorded(tmp_path / "raw.mf4", raw)
-    for name in ("BecCurrent", "BatteryCurrent", "OperatingState"):
-        assert list(decoded.get(name).samples) == [b"NotAvailable"] * 3
-    decoded.close()
-
-
-def test_asammdf_loses_all_names_by_one_state_without_a_name(tmp_path: Path) -> None:
-    """Why enums are closed, and why the gateway sends such a state as Error."""
-    messages = layout().messages
-    raw = [{message.name: not_available(message) for message in messages} for _ in range(3)]
-    for moment, state in zip(raw, (12, 13, 4), strict=True):
-        moment["EscStatus"]["OperatingState"] = state
-    decoded = recorded(tmp_path / "raw.mf4", raw)
-    assert b"MotorOff" not in list(decoded.get("OperatingState").samples)
     decoded.close()

@@ -9,14 +9,12 @@ from dbc_rules import (
     ESCS,
     FIRST_ID,
     LAST_ID,
-    LONGEST_NAME,
     RULES,
     Database,
     Message,
     Signal,
     bus_load,
     findings,
-    further_esc,
     parse,
     worst_frame_bits,
 )
@@ -43,34 +41,18 @@ MUTATIONS: list[tuple[str, str, str]] = [
     ("text_is_ascii_with_line_feeds", r'"degC"', '"\u00b0C"'),
     ("text_is_ascii_with_line_feeds", r'"us"', '"\u00b5s"'),
     ("text_is_ascii_with_line_feeds", r"\n", "\r\n"),
-    ("text_is_ascii_with_line_feeds", r"^ SG_", "\tSG_"),
-    ("text_is_ascii_with_line_feeds", r"Logger$", "Logger "),
-    ("text_is_ascii_with_line_feeds", r"\n\Z", ""),
     ("every_line_is_understood", r"^NS_ :$", "NS_ :\n\tNS_DESC_\n\tCM_"),
     ("every_line_is_understood", r"^CM_ ", 'VAL_TABLE_ States 1 "On" ;\nCM_ '),
     ("every_line_is_understood", r"^BA_DEF_DEF_", 'BA_DEF_REL_ BU_SG_REL_ "GenSigTimeoutTime" INT 0 1;\nBA_DEF_DEF_'),
-    ("every_line_is_understood", r"^CM_ ", "SIG_VALTYPE_ 1672 BatteryVoltage : 1;\nCM_ "),
-    ("every_line_is_understood", r"SG_ BatteryVoltage :", "SG_ BatteryVoltage m0 :"),
-    ("every_line_is_understood", r"SG_ OperatingState :", "SG_ OperatingState M :"),
-    ("every_line_is_understood", r"^VAL_ 1664 OperatingState .*", "VAL_ 1664 OperatingState States ;"),
-    ("every_line_is_understood", r'CM_ BO_ 1664 "', 'CM_ BO_ 1664 "Two\nlines. '),
-    ("every_line_is_understood", r'CM_ BO_ 1664 "', 'CM_ BO_ 1664 "A \\"quote\\". '),
     ("header_is_plain", r'^VERSION ""', 'VERSION "1.0.0"'),
     ("header_is_plain", r'^VERSION ""', '\nVERSION ""'),
     ("header_is_plain", r"^BS_:\n", ""),
-    ("header_is_plain", r"^NS_ :\n", ""),
     ("sections_are_in_order", r"^(BA_DEF_ .*\n)\n(BA_DEF_DEF_ .*\n)", r"\n\2\1"),
     ("sections_are_in_order", r"^(BS_:)\n\n(BU_:.*)$", r"\2\n\n\1"),
     ("sections_are_in_order", r"^BO_ 1672 ", 'CM_ "Too early.";\nBO_ 1672 '),
-    ("sections_are_in_order", r"^BA_ ", 'VAL_ 1664 Layout 1 "V4" ;\nBA_ '),
-    ("sections_are_in_order", r"^VAL_ (.*\n)+", ""),
     ("names_are_pascal_case", r"SG_ BatteryVoltage", "SG_ Battery_Voltage"),
     ("names_are_pascal_case", r"SG_ BatteryVoltage", "SG_ batteryVoltage"),
     ("names_are_pascal_case", r"SG_ Undervoltage", "SG_ Reserved1"),
-    ("names_are_pascal_case", r"SG_ Undervoltage", "SG_ ABitThatHasAVeryLongNameIndeed"),
-    ("names_are_pascal_case", r"EscStatus", "EscStatusWithANameOfThirtyThreeXY"),
-    ("names_are_pascal_case", r'"ErrorSelftest"', '"Error_Selftest"'),
-    ("names_are_pascal_case", r'"BusOff"', '"Bus off"'),
     ("names_are_unique", r"SG_ BecVoltage", "SG_ BatteryVoltage"),
     ("names_are_unique", r"SG_ BecVoltage", "SG_ BATTERYVoltage"),
     ("names_are_unique", r"EscSpeed", "EscStatus"),
@@ -85,14 +67,11 @@ MUTATIONS: list[tuple[str, str, str]] = [
     ("eight_escs_fit", r"^BO_ 1672 ", "BO_ 1671 "),
     ("eight_escs_fit", r"^BO_ 1744 ", "BO_ 1745 "),
     ("eight_escs_fit", r"^BO_ 1753 ", "BO_ 1752 "),
-    ("eight_escs_fit", r"^BO_ 1753 GatewayTraffic", "BO_ 1753 EscTraffic"),
     ("messages_have_eight_bytes", r": 8 Kon", ": 7 Kon"),
     ("messages_have_eight_bytes", r"^CM_ ", "BO_ 1754 GatewayEmpty: 8 KontronikGateway\n\nCM_ "),
     ("signals_are_intel_on_byte_borders", r"24\|16@1", "31|16@0"),
     ("signals_are_intel_on_byte_borders", r"SG_ BatteryVoltage : 24\|16", "SG_ BatteryVoltage : 25|15"),
     ("signals_are_intel_on_byte_borders", r"SG_ Variant : 0\|16", "SG_ Variant : 0|10"),
-    ("signals_are_intel_on_byte_borders", r"SG_ Layout : 60\|4", "SG_ Layout : 54|4"),
-    ("signals_are_intel_on_byte_borders", r"SG_ ElectricalSpeed : 0\|24@1\+", "SG_ ElectricalSpeed : 0|24@1-"),
     ("signals_do_not_overlap", r"SG_ Timing : 48\|8", "SG_ Timing : 40|8"),
     ("signals_do_not_overlap", r"SG_ Uptime : 32\|32", "SG_ Uptime : 40|32"),
     ("flags_are_plain_bits", r"(SG_ Undervoltage .*)\[0\|1\]", r"\1[0|0]"),
@@ -100,43 +79,27 @@ MUTATIONS: list[tuple[str, str, str]] = [
     ("alive_counters_are_where_they_belong", r"^ SG_ SpeedAlive .*\n", ""),
     ("alive_counters_are_where_they_belong", r"^ SG_ LinkAlive .*\n", ""),
     ("alive_counters_are_where_they_belong", r"(SG_ SpeedAlive .*)\[0\|14\]", r"\1[0|15]"),
-    ("alive_counters_are_where_they_belong", r"^VAL_ ", 'VAL_ 1672 SpeedAlive 15 "NotAvailable" ;\nVAL_ '),
     ("not_available_and_error_are_named", r"^VAL_ 1672 BatteryVoltage .*\n", ""),
     ("not_available_and_error_are_named", r'65534 "Error" ', ""),
     ("not_available_and_error_are_named", r'65535 "NotAvailable"', '65533 "NotAvailable"'),
-    ("not_available_and_error_are_named", r'-128 "NotAvailable" -127 "Error"', '127 "NotAvailable" 126 "Error"'),
-    ("not_available_and_error_are_named", r'254 "Error" 255 "NotAvailable"', '255 "Error" 254 "NotAvailable"'),
     ("limits_leave_out_the_codes", r"\|655\.33\]", "|655.35]"),
     ("limits_leave_out_the_codes", r"\[-126\|127\]", "[-128|127]"),
     ("limits_leave_out_the_codes", r"\[-126\|127\]", "[0|0]"),
-    ("limits_leave_out_the_codes", r"\[0\|26\]", "[1|26]"),
     ("value_tables_belong_to_signals", r"^VAL_ 1672 BatteryVoltage", "VAL_ 1680 BatteryVoltage"),
     ("value_tables_belong_to_signals", r"^(VAL_ 1672 BatteryVoltage .*)$", r"\1\n\1"),
     ("value_tables_belong_to_signals", r'"Lost"', '"Ok"'),
-    ("value_tables_belong_to_signals", r'4 "Lost"', '3 "Lost"'),
     ("enums_are_closed", r'25 "SpoolUpQuick" ', ""),
     ("enums_are_closed", r'"SyncForward"', '"Rudder"'),
     ("enums_are_closed", r"^(VAL_ 1664 OperatingState) ", r'\1 0 "Unknown" '),
-    ("enums_are_closed", r'(SG_ LinkState .*)""', r'\1"V"'),
-    ("enums_are_closed", r"SG_ CanState", "SG_ BusState"),
     ("everything_has_one_comment", r'^CM_ "(.*)\n', ""),
     ("everything_has_one_comment", r"^CM_ BU_ Logger .*\n", ""),
     ("everything_has_one_comment", r"^CM_ BO_ 1672 .*\n", ""),
-    ("everything_has_one_comment", r"^CM_ SG_ 1672 Timing .*\n", ""),
-    ("everything_has_one_comment", r"^(CM_ SG_ 1672 Timing .*\n)", r"\1\1"),
-    ("everything_has_one_comment", r"^CM_ SG_ 1672 Timing", "CM_ SG_ 1672 Tuning"),
-    ("everything_has_one_comment", r"Battery voltage at the ESC", "Battery voltage; at the ESC"),
-    ("everything_has_one_comment", r"Battery voltage at the ESC\.", ""),
     ("attributes_are_declared", r'^(BA_DEF_ SG_ "GenSigStartValue") FLOAT', r"\1 INT"),
     ("attributes_are_declared", r'^BA_DEF_ "LayoutVersion" .*\n', ""),
     ("attributes_are_declared", r'^BA_DEF_DEF_ "GenMsgDelayTime" .*\n', ""),
-    ("attributes_are_declared", r'^(BA_DEF_DEF_ "GenMsgSendType") .*', r'\1 "Sometimes";'),
-    ("attributes_are_declared", r"^BA_ ", 'BA_ "Colour" "red";\nBA_ '),
-    ("attributes_are_declared", r"^BA_DEF_ ", 'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_DEF_ '),
     ("attributes_belong_to_something", r'^(BA_ "GenMsgCycleTime" BO_) 1664', r"\1 1665"),
     ("attributes_belong_to_something", r'^(BA_ "GenSigStartValue" SG_) 1672 Timing', r"\1 1680 Timing"),
     ("attributes_belong_to_something", r'^(BA_ "GenMsgCycleTime" BO_ 1664 .*)$', r"\1\n\1"),
-    ("attributes_belong_to_something", r'^BA_ "BusType" ', 'BA_ "BusType" BU_ Logger '),
     ("enum_attributes_are_set_by_index", r'^(BA_ "GenMsgSendType" BO_ 1664) .*', r'\1 "CyclicAndOnChange";'),
     ("enum_attributes_are_set_by_index", r'^(BA_ "GenMsgSendType" BO_ 1664) .*', r"\1 6;"),
     ("enum_attributes_are_set_by_index", r'^(BA_ "LayoutVersion") .*', r"\1 1;"),
@@ -152,14 +115,9 @@ MUTATIONS: list[tuple[str, str, str]] = [
     ("messages_have_a_schedule", r'^BA_ "GenMsgCycleTime" BO_ 1664 .*\n', ""),
     ("messages_have_a_schedule", r'^BA_ "GenMsgSendType" BO_ 1664 .*\n', ""),
     ("messages_have_a_schedule", r'^BA_ "GenMsgDelayTime" BO_ 1664 .*\n', ""),
-    ("messages_have_a_schedule", r'^(BA_ "GenMsgSendType" BO_ 1664) .*', r"\1 5;"),
-    ("messages_have_a_schedule", r'^(BA_ "GenMsgCycleTime" BO_ 1672) .*', r"\1 10;"),
-    ("messages_have_a_schedule", r'^(BA_ "GenMsgCycleTime" BO_ 1664) .*', r"\1 0;"),
-    ("messages_have_a_schedule", r'^(BA_ "GenMsgDelayTime" BO_ 1664) .*', r"\1 100;"),
     ("start_values_are_raw_not_available", r'^BA_ "GenSigStartValue" SG_ 1672 BatteryVoltage .*\n', ""),
     ("start_values_are_raw_not_available", r'^(BA_ "GenSigStartValue" SG_ 1672 BatteryVoltage) .*', r"\1 655.35;"),
     ("start_values_are_raw_not_available", r'^(BA_ "GenSigStartValue" SG_ 1672 ThrottlePercent) .*', r"\1 128;"),
-    ("start_values_are_raw_not_available", r'^(BA_ "GenSigStartValue" SG_ 1664 Undervoltage) .*', r"\1 1;"),
     ("one_esc_loads_the_bus_below_ten_percent", r'^(BA_ "GenMsgDelayTime" BO_ 1664) .*', r"\1 5;"),
     ("one_esc_loads_the_bus_below_ten_percent", r'^(BA_ "GenMsgSendType" BO_ 1712) .*', r"\1 1;"),
     ("one_esc_loads_the_bus_below_ten_percent", r'^BA_DEF_ BO_ "GenMsgSendType" .*\n', ""),
@@ -215,122 +173,48 @@ def test_eight_escs_fit_on_a_bus_of_500_kbit() -> None:
     assert 0.5 < bus_load(parse(DATA), escs=ESCS) < 0.8
 
 
-def test_eight_escs_with_prefixed_names_load_into_one_strict_database() -> None:
-    import cantools
-
-    database = cantools.database.Database(strict=True)
-    for number in range(1, ESCS + 1):
-        database.add_dbc_string(further_esc(DATA, number).decode("ascii"))
-    one = parse(DATA)
-    escs = [message for message in one.messages if message.is_of_an_esc]
-    assert len(database.messages) == ESCS * len(escs) + len(one.messages) - len(escs)
-    assert len({message.frame_id for message in database.messages}) == len(database.messages)
-    assert {message.frame_id for message in database.messages} <= set(range(FIRST_ID, LAST_ID + 1))
-    names = [signal.name for message in database.messages for signal in message.signals]
-    assert len({name.lower() for name in names}) == len(names)
-    assert max(len(name) for name in names) <= LONGEST_NAME
-    assert "Esc8BatteryVoltage" in names
-    assert "Esc2Uptime" not in names
-
-
 # --- against the telemetry sheet ------------------------------------------------------------------------------------
 
-SHEET: list[tuple[str, str, str, int, int]] = [
-    # signal, unit, one step on the UART in this unit, least and greatest raw value that the sheet allows
-    ("ElectricalSpeed", "1/min", "1", 0, 1_000_000),
-    ("BatteryVoltage", "V", "0.01", 0, 10_000),
-    ("BatteryCurrent", "A", "0.1", -10_000, 10_000),
-    ("MotorCurrent", "A", "0.1", -10_000, 10_000),
-    ("PeakCurrent", "A", "0.1", -10_000, 10_000),
-    ("ConsumedCharge", "mAh", "1", 0, 65_533),
-    ("BecCurrent", "A", "0.001", 0, 65_533),
-    ("BecVoltage", "V", "0.001", 0, 65_533),
-    ("PwmInput", "us", "1", 0, 65_533),
-    ("ThrottlePercent", "%", "1", -100, 100),
-    ("OutputOpeningPercent", "%", "1", 0, 100),
-    ("PowerStageTemperature", "degC", "1", -126, 127),
-    ("BecTemperature", "degC", "1", -126, 127),
-    ("OperatingStateRaw", "", "1", 0, 253),
-    ("Timing", "us", "1", 0, 253),
-    ("DeviceRaw", "", "1", 0, 63),
-    ("Variant", "", "1", 0, 1023),
-    ("FirmwareMain", "", "1", 0, 253),
-    ("FirmwareSub", "", "1", 0, 253),
-    ("CellCount", "", "1", 0, 253),
-    ("MaxElectricalSpeed", "1/min", "1", 0, 1_000_000),
-    ("MinBatteryVoltage", "V", "0.01", 0, 10_000),
-    ("MaxBatteryVoltage", "V", "0.01", 0, 10_000),
-    ("MaxBatteryCurrent", "A", "0.1", -10_000, 10_000),
-    ("MaxMotorCurrent", "A", "0.1", -10_000, 10_000),
-    ("MaxPeakCurrent", "A", "0.1", -10_000, 10_000),
-    ("MaxBecCurrent", "A", "0.001", 0, 65_533),
-    ("MinBecVoltage", "V", "0.001", 0, 65_533),
-    ("MaxThrottlePercent", "%", "1", -100, 100),
-    ("MaxOutputOpeningPercent", "%", "1", 0, 100),
-    ("MinPowerStageTemperature", "degC", "1", -126, 127),
-    ("MaxPowerStageTemperature", "degC", "1", -126, 127),
-    ("MinBecTemperature", "degC", "1", -126, 127),
-    ("MaxBecTemperature", "degC", "1", -126, 127),
-]
+SHEET = """
+ElectricalSpeed 1/min 1 0 1000000, BatteryVoltage V 0.01 0 10000, BatteryCurrent A 0.1 -10000 10000,
+MotorCurrent A 0.1 -10000 10000, PeakCurrent A 0.1 -10000 10000, ConsumedCharge mAh 1 0 65533,
+BecCurrent A 0.001 0 65533, BecVoltage V 0.001 0 65533, PwmInput us 1 0 65533, ThrottlePercent % 1 -100 100,
+OutputOpeningPercent % 1 0 100, PowerStageTemperature degC 1 -126 127, BecTemperature degC 1 -126 127,
+OperatingStateRaw - 1 0 253, Timing us 1 0 253, DeviceRaw - 1 0 63, Variant - 1 0 1023, FirmwareMain - 1 0 253,
+FirmwareSub - 1 0 253, CellCount - 1 0 253, MaxElectricalSpeed 1/min 1 0 1000000,
+MinBatteryVoltage V 0.01 0 10000, MaxBatteryVoltage V 0.01 0 10000, MaxBatteryCurrent A 0.1 -10000 10000,
+MaxMotorCurrent A 0.1 -10000 10000, MaxPeakCurrent A 0.1 -10000 10000, MaxBecCurrent A 0.001 0 65533,
+MinBecVoltage V 0.001 0 65533, MaxThrottlePercent % 1 -100 100, MaxOutputOpeningPercent % 1 0 100,
+MinPowerStageTemperature degC 1 -126 127, MaxPowerStageTemperature degC 1 -126 127,
+MinBecTemperature degC 1 -126 127, MaxBecTemperature degC 1 -126 127
+"""
+"""signal, unit, one step on the UART in this unit, least and greatest raw value that the sheet allows"""
 
 
-@pytest.mark.parametrize(("name", "unit", "step", "least", "greatest"), SHEET)
-def test_a_field_of_the_sheet_fits_its_signal_step_by_step(
-    name: str, unit: str, step: str, least: int, greatest: int
-) -> None:
+@pytest.mark.parametrize("row", SHEET.split(","))
+def test_a_field_of_the_sheet_fits_its_signal_step_by_step(row: str) -> None:
+    name, unit, step, *ends = row.split()
+    least, greatest = map(int, ends)
     found = signal(name)
-    assert (found.unit, found.factor, found.offset) == (unit, Decimal(step), Decimal(0))
+    assert (found.unit, found.factor, found.offset) == (unit.strip("-"), Decimal(step), Decimal(0))
     assert found.minimum <= least * found.factor
     assert greatest * found.factor <= found.maximum
 
 
 OPERATING_ERRORS = [
-    "Undervoltage",
-    "Overvoltage",
-    "OvercurrentIntegralError",
-    "OvercurrentIntegralWarning",
-    "PowerStageOvertempWarning",
-    "PowerStageOvertempError",
-    "BecUndervoltage",
-    "BecOvervoltage",
-    "BecOvercurrent",
-    "BecOvertemperature",
-    "SwitchedOffByRunningDown",
-    "CapacityLimitReached",
-    "OperatingErrorFound",
-    "OperatingWarningFound",
-    "SelftestError",
-    "EepromError",
-    "WatchdogErrorTripped",
-    "ProgrammingAllowed",
-    "LimitBatteryVoltageMinimum",
-    "LimitCurrentMaximum",
-    "LimitPowerStageTemperature",
-    "LimitBecTemperature",
-    "LimitBecCurrent",
-    "LimitDischargedCapacity",
-]
+    "Undervoltage", "Overvoltage", "OvercurrentIntegralError", "OvercurrentIntegralWarning",
+    "PowerStageOvertempWarning", "PowerStageOvertempError", "BecUndervoltage", "BecOvervoltage", "BecOvercurrent",
+    "BecOvertemperature", "SwitchedOffByRunningDown", "CapacityLimitReached", "OperatingErrorFound",
+    "OperatingWarningFound", "SelftestError", "EepromError", "WatchdogErrorTripped", "ProgrammingAllowed",
+    "LimitBatteryVoltageMinimum", "LimitCurrentMaximum", "LimitPowerStageTemperature", "LimitBecTemperature",
+    "LimitBecCurrent", "LimitDischargedCapacity",
+]  # fmt: skip
 SELFTEST_ERRORS = [
-    "TestPhaseLowSide",
-    "TestPhaseHighSide",
-    "TestShortToGround",
-    "TestBackEmfOffset",
-    "TestCurrentZeroPoint",
-    "TestUndervoltage",
-    "TestOvervoltage",
-    "TestBecUndervoltage",
-    "TestBecOvervoltage",
-    "TestReversePolarityFuse",
-    "TestOvervoltageFuse",
-    "TestPowerStageOvertemp",
-    "TestBecOvertemperature",
-    "TestMotorPhaseMissing",
-    "TestEepromEmpty",
-    "TestEepromStickPositions",
-    "TestEepromChecksum",
-    "TestEepromSize",
-    "TestEepromVersion",
-]
+    "TestPhaseLowSide", "TestPhaseHighSide", "TestShortToGround", "TestBackEmfOffset", "TestCurrentZeroPoint",
+    "TestUndervoltage", "TestOvervoltage", "TestBecUndervoltage", "TestBecOvervoltage", "TestReversePolarityFuse",
+    "TestOvervoltageFuse", "TestPowerStageOvertemp", "TestBecOvertemperature", "TestMotorPhaseMissing",
+    "TestEepromEmpty", "TestEepromStickPositions", "TestEepromChecksum", "TestEepromSize", "TestEepromVersion",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -345,13 +229,11 @@ def test_every_message_has_the_timing_that_its_readers_expect() -> None:
     db = parse(DATA)
     timing = {
         message.name: (
-            message.id,
-            db.send_type(message),
-            db.number("GenMsgCycleTime", message),
+            message.id, db.send_type(message), db.number("GenMsgCycleTime", message),
             db.number("GenMsgDelayTime", message),
         )
         for message in db.messages
-    }
+    }  # fmt: skip
     assert timing == {
         "EscStatus": (0x680, "CyclicAndOnChange", 100, 10),
         "EscSpeed": (0x688, "Event", 0, 5),

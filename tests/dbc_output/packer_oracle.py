@@ -64,32 +64,14 @@ STATES = dict(
     zip(
         (1, 2, 3, 7, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26),
         [
-            "WaitForSignal",
-            "WaitForMotorOff",
-            "WaitForMotorOn",
-            "Selftest",
-            "Error_Selftest",
-            "CutOffDuringOperation",
-            "AcousticSignal",
-            "MotorOff",
-            "StandBy",
-            "Brake",
-            "BrakeTargetBackward",
-            "BrakeTargetForward",
-            "Programming",
-            "Sync_Forward",
-            "Sync_Backward",
-            "Sync_StandBy",
-            "Forward",
-            "Backward",
-            "SpoolUpFromStill",
-            "SpoolUpFromTurn",
-            "SpoolUpQuick",
-            "RPMControl",
+            "WaitForSignal", "WaitForMotorOff", "WaitForMotorOn", "Selftest", "Error_Selftest",
+            "CutOffDuringOperation", "AcousticSignal", "MotorOff", "StandBy", "Brake", "BrakeTargetBackward",
+            "BrakeTargetForward", "Programming", "Sync_Forward", "Sync_Backward", "Sync_StandBy", "Forward",
+            "Backward", "SpoolUpFromStill", "SpoolUpFromTurn", "SpoolUpQuick", "RPMControl",
         ],
         strict=True,
     )
-)
+)  # fmt: skip
 DEVICES = {1: "KOSMIK", 2: "KOLIBRI", 3: "JIVEPro", 4: "KONTROL-X", 5: "UHV"}
 LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
 LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
@@ -97,52 +79,20 @@ GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay")))
 CAN_STATES = dict(enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down")))
 
 ERROR_BITS = [
-    "undervoltage",
-    "overvoltage",
-    "overcurrent_integral_error",
-    "overcurrent_integral_warning",
-    "power_stage_overtemp_warning",
-    "power_stage_overtemp_error",
-    "bec_undervoltage",
-    "bec_overvoltage",
-    "bec_overcurrent",
-    "bec_overtemperature",
-    "switched_off_by_running_down",
-    "capacity_limit_reached",
-    "operating_error_found",
-    "operating_warning_found",
-    "selftest_error",
-    "eeprom_error",
-    "watchdog_error_tripped",
-    "programming_allowed",
-    "limit_battery_voltage_minimum",
-    "limit_current_maximum",
-    "limit_power_stage_temperature",
-    "limit_bec_temperature",
-    "limit_bec_current",
-    "limit_discharged_capacity",
-]
+    "undervoltage", "overvoltage", "overcurrent_integral_error", "overcurrent_integral_warning",
+    "power_stage_overtemp_warning", "power_stage_overtemp_error", "bec_undervoltage", "bec_overvoltage",
+    "bec_overcurrent", "bec_overtemperature", "switched_off_by_running_down", "capacity_limit_reached",
+    "operating_error_found", "operating_warning_found", "selftest_error", "eeprom_error", "watchdog_error_tripped",
+    "programming_allowed", "limit_battery_voltage_minimum", "limit_current_maximum", "limit_power_stage_temperature",
+    "limit_bec_temperature", "limit_bec_current", "limit_discharged_capacity",
+]  # fmt: skip
 TEST_BITS = [
-    "test_phase_low_side",
-    "test_phase_high_side",
-    "test_short_to_ground",
-    "test_back_emf_offset",
-    "test_current_zero_point",
-    "test_undervoltage",
-    "test_overvoltage",
-    "test_bec_undervoltage",
-    "test_bec_overvoltage",
-    "test_reverse_polarity_fuse",
-    "test_overvoltage_fuse",
-    "test_power_stage_overtemp",
-    "test_bec_overtemperature",
-    "test_motor_phase_missing",
-    "test_eeprom_empty",
-    "test_eeprom_stick_positions",
-    "test_eeprom_checksum",
-    "test_eeprom_size",
-    "test_eeprom_version",
-]
+    "test_phase_low_side", "test_phase_high_side", "test_short_to_ground", "test_back_emf_offset",
+    "test_current_zero_point", "test_undervoltage", "test_overvoltage", "test_bec_undervoltage",
+    "test_bec_overvoltage", "test_reverse_polarity_fuse", "test_overvoltage_fuse", "test_power_stage_overtemp",
+    "test_bec_overtemperature", "test_motor_phase_missing", "test_eeprom_empty", "test_eeprom_stick_positions",
+    "test_eeprom_checksum", "test_eeprom_size", "test_eeprom_version",
+]  # fmt: skip
 
 JIVEPRO = 3
 
@@ -169,9 +119,7 @@ def _bit(word: str, number: int) -> Reader:
     return read
 
 
-def _calculated(
-    reckon: Callable[[EscTelemetry, LiveData], "Fraction | None"],
-) -> Reader:
+def _calculated(reckon: Callable[[EscTelemetry, LiveData], "Fraction | None"]) -> Reader:
     def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
         return None if esc.live is None else reckon(esc, esc.live)
 
@@ -214,81 +162,65 @@ def _age(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> Fraction | Non
     return None if esc.live_ns is None else Fraction(max(0, now - esc.live_ns) // 1_000_000)
 
 
+def _plain(rows: str, reader: Callable[[str, str], Reader]) -> dict[str, Known]:
+    """Rows of fields: name, unit (- for none), and one step in that unit where it is not 1."""
+    split = [row.split() for row in rows.split(",")]
+    return {name: Known(unit.strip("-"), reader(name, *step or ["1"])) for name, unit, *step in split}
+
+
+def _counters(
+    names: str, read: Callable[[Any], Any], of: Callable[[Callable[..., Any]], Reader], gateway: bool = False
+) -> dict[str, Known]:
+    def reader(path: str) -> Reader:
+        return of(lambda owner, *_: getattr(read(owner), path))
+
+    pairs = [pair.split("=") for pair in names.split()]
+    return {pair[0]: Known("", reader(pair[-1]), rolls=True, gateway=gateway) for pair in pairs}
+
+
 KNOWN: dict[str, Known] = {
-    "electrical_speed": Known("1/min", _live("electrical_speed")),
-    "battery_voltage": Known("V", _live("battery_voltage", "0.01")),
-    "battery_current": Known("A", _live("battery_current", "0.1")),
-    "motor_current": Known("A", _live("motor_current", "0.1")),
-    "peak_current": Known("A", _live("peak_current", "0.1")),
-    "consumed_charge": Known("mAh", _live("consumed_charge")),
+    **_plain(
+        "electrical_speed 1/min, battery_voltage V 0.01, battery_current A 0.1, motor_current A 0.1, peak_current A 0.1,"
+        "consumed_charge mAh, bec_voltage V 0.001, pwm_input us, throttle %, output_opening %, power_stage_temperature degC,"
+        "bec_temperature degC, operating_errors -, timing us", _live),
     "bec_current": Known("A", _calculated(_bec_current)),
-    "bec_voltage": Known("V", _live("bec_voltage", "0.001")),
-    "pwm_input": Known("us", _live("pwm_input")),
-    "throttle": Known("%", _live("throttle")),
-    "output_opening": Known("%", _live("output_opening")),
-    "power_stage_temperature": Known("degC", _live("power_stage_temperature")),
-    "bec_temperature": Known("degC", _live("bec_temperature")),
-    "operating_errors": Known("", _live("operating_errors")),
     "operating_state": Known("", _live("operating_state"), STATES),
     "operating_state_raw": Known("", _live("operating_state")),
-    "timing": Known("us", _live("timing")),
     **{name: Known("", _bit("operating_errors", number)) for number, name in enumerate(ERROR_BITS)},
-    "selftest_errors": Known("", _info("selftest_errors")),
     **{name: Known("", _bit("selftest_errors", number)) for number, name in enumerate(TEST_BITS)},
-    "cell_count": Known("", _info("cell_count")),
-    "max_electrical_speed": Known("1/min", _info("max_electrical_speed")),
-    "min_battery_voltage": Known("V", _info("min_battery_voltage", "0.01")),
-    "max_battery_voltage": Known("V", _info("max_battery_voltage", "0.01")),
-    "max_battery_current": Known("A", _info("max_battery_current", "0.1")),
-    "max_motor_current": Known("A", _info("max_motor_current", "0.1")),
-    "max_peak_current": Known("A", _info("max_peak_current", "0.1")),
+    **_plain(
+        "selftest_errors -, cell_count -, max_electrical_speed 1/min, min_battery_voltage V 0.01, max_battery_voltage V 0.01,"
+        "max_battery_current A 0.1, max_motor_current A 0.1, max_peak_current A 0.1, min_bec_voltage V 0.001, max_throttle %,"
+        "max_output_opening %, min_power_stage_temperature degC, max_power_stage_temperature degC, min_bec_temperature degC,"
+        "max_bec_temperature degC", _info),
     "max_bec_current": Known("A", _of_esc(_max_bec_current)),
-    "min_bec_voltage": Known("V", _info("min_bec_voltage", "0.001")),
-    "max_throttle": Known("%", _info("max_throttle")),
-    "max_output_opening": Known("%", _info("max_output_opening")),
-    "min_power_stage_temperature": Known("degC", _info("min_power_stage_temperature")),
-    "max_power_stage_temperature": Known("degC", _info("max_power_stage_temperature")),
-    "min_bec_temperature": Known("degC", _info("min_bec_temperature")),
-    "max_bec_temperature": Known("degC", _info("max_bec_temperature")),
     "device": Known("", _device_word(lambda word: word >> 10), DEVICES),
     "device_raw": Known("", _device_word(lambda word: word >> 10)),
     "variant": Known("", _device_word(lambda word: word & 1023)),
     "firmware_main": Known("", _device_word(lambda word: word >> 8, "firmware_word")),
     "firmware_sub": Known("", _device_word(lambda word: word & 255, "firmware_word")),
     "motor_speed": Known("1/min", _calculated(lambda e, v: Fraction(v.electrical_speed, e.settings.pole_pairs))),
-    "output_speed": Known(
-        "1/min", _calculated(lambda e, v: v.electrical_speed / (e.settings.pole_pairs * e.settings.gear))
-    ),
+    "output_speed": Known("1/min", _calculated(lambda e, v: v.electrical_speed / (e.settings.pole_pairs * e.settings.gear))),
     "battery_power": Known("W", _calculated(lambda _e, v: Fraction(v.battery_voltage * v.battery_current, 1000))),
     "mean_cell_voltage": Known(
-        "V", _calculated(lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None), exact=False
-    ),
+        "V", _calculated(lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None), exact=False),
     "energy_used": Known("Wh", _of_esc(lambda e: Fraction(e.energy, 3600 * 1000 * 10**9))),
     "motor_run_time": Known("s", _of_esc(lambda e: Fraction(e.run_time, 10**9))),
     "link_state": Known("", _of_esc(lambda e: int(e.link)), LINKS),
     "layout": Known("", _of_esc(lambda e: e.layout), LAYOUTS),
     "data_age": Known("ms", _age),
     "frame_rate": Known("Hz", _of_esc(lambda e: None if e.frame_rate is None else Fraction(e.frame_rate, 10))),
-    "losses": Known("", _of_esc(lambda e: e.losses), rolls=True),
-    "crc_errors": Known("", _of_esc(lambda e: e.counters.crc_errors), rolls=True),
-    "dropped_bytes": Known("", _of_esc(lambda e: e.counters.dropped_bytes), rolls=True),
-    "live_frames": Known("", _of_esc(lambda e: e.counters.live), rolls=True),
-    "info_frames": Known("", _of_esc(lambda e: e.counters.info), rolls=True),
-    "received_bytes": Known("", _of_esc(lambda e: e.counters.bytes), rolls=True),
-    "suspect_frames": Known("", _of_esc(lambda e: e.suspect_frames), rolls=True),
+    **_counters("losses suspect_frames", lambda esc: esc, _of_esc),
+    **_counters("crc_errors dropped_bytes live_frames=live info_frames=info received_bytes=bytes", lambda esc: esc.counters, _of_esc),
     "gateway_state": Known("", _of_gateway(lambda g, _: int(g.state)), GATEWAY_STATES, gateway=True),
     "can_state": Known("", _of_gateway(lambda g, _: int(g.can_state)), CAN_STATES, gateway=True),
     "esc_count": Known("", _of_gateway(lambda g, _: g.esc_count), gateway=True),
     "escs_ok": Known("", _of_gateway(lambda g, _: g.escs_ok), gateway=True),
     "uptime": Known("s", _of_gateway(lambda g, now: Fraction((now - g.started_ns) // 10**6, 1000)), gateway=True),
-    "sent_frames": Known("", _of_gateway(lambda g, _: g.sent_frames), rolls=True, gateway=True),
-    "replaced_frames": Known("", _of_gateway(lambda g, _: g.replaced_frames), rolls=True, gateway=True),
-    "send_failures": Known("", _of_gateway(lambda g, _: g.send_failures), rolls=True, gateway=True),
-    "received_frames": Known("", _of_gateway(lambda g, _: g.received_frames), rolls=True, gateway=True),
-    "bus_off_count": Known("", _of_gateway(lambda g, _: g.bus_off_count), rolls=True, gateway=True),
-    "dropped_frames": Known("", _of_gateway(lambda g, _: g.dropped_frames), rolls=True, gateway=True),
-    "id_conflicts": Known("", _of_gateway(lambda g, _: g.id_conflicts), rolls=True, gateway=True),
-}
+    **_counters(
+        "sent_frames replaced_frames send_failures received_frames bus_off_count dropped_frames id_conflicts",
+        lambda gateway: gateway, _of_gateway, True),
+}  # fmt: skip
 
 # unit -> other unit -> (text, factor, shift): value in other = value * factor + shift
 UNITS: dict[str, list[tuple[str, str, str]]] = {
@@ -509,24 +441,8 @@ def bindings(messages: Iterable[Msg]) -> dict[str, str | float]:
 # --- random layouts -----------------------------------------------------------------------------------------------------
 
 FACTORS = [
-    "1",
-    "1",
-    "1",
-    "0.1",
-    "0.01",
-    "0.001",
-    "0.5",
-    "2",
-    "5",
-    "-1",
-    "-0.1",
-    "0.25",
-    "0.0625",
-    "100",
-    "3",
-    "0.3",
-    "-7",
-]
+    "1", "1", "1", "0.1", "0.01", "0.001", "0.5", "2", "5", "-1", "-0.1", "0.25", "0.0625", "100", "3", "0.3", "-7",
+]  # fmt: skip
 OFFSETS = ["0", "0", "0", "0", "-40", "100", "0.5", "-273.15", "1000", "-0.05", "32768"]
 
 
@@ -734,17 +650,14 @@ def random_escs(rng: random.Random, settings: Sequence[EscSettings], now: int) -
 
 
 def random_gateway(rng: random.Random, now: int) -> GatewayStatus:
-    return GatewayStatus(
-        state=rng.choice(list(GatewayState)),
-        can_state=rng.choice(list(CanState)),
-        esc_count=rng.randint(0, 9),
-        escs_ok=rng.randint(0, 9),
-        started_ns=now - rng.randrange(10**14),
-        sent_frames=rng.randrange(10**10),
-        replaced_frames=rng.randrange(1000),
-        send_failures=rng.randrange(100000),
-        received_frames=rng.randrange(100000),
-        bus_off_count=rng.randrange(100000),
-        dropped_frames=rng.randrange(100000),
-        id_conflicts=rng.randrange(100000),
+    status = GatewayStatus(
+        rng.choice(list(GatewayState)), rng.choice(list(CanState)), rng.randint(0, 9), rng.randint(0, 9)
     )
+    status.started_ns, status.sent_frames, status.replaced_frames = (
+        now - rng.randrange(10**14),
+        rng.randrange(10**10),
+        rng.randrange(1000),
+    )
+    for name in ("send_failures", "received_frames", "bus_off_count", "dropped_frames", "id_conflicts"):
+        setattr(status, name, rng.randrange(100000))
+    return status

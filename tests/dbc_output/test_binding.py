@@ -80,17 +80,10 @@ def raw_of(signal: Sig, bind: str | float | None = None, live: LiveData = LIVE, 
 @pytest.mark.parametrize(
     "name",
     [
-        "BatteryVoltage",
-        "battery_voltage",
-        "BATTERY_VOLTAGE",
-        "batteryvoltage",
-        "Battery_Voltage_",
-        "_BatteryVoltage",
-        "Esc1BatteryVoltage",
-        "ESC1_battery_voltage",
-        "esc_1_BatteryVoltage",
+        "BatteryVoltage", "battery_voltage", "BATTERY_VOLTAGE", "batteryvoltage", "Battery_Voltage_",
+        "_BatteryVoltage", "Esc1BatteryVoltage", "ESC1_battery_voltage", "esc_1_BatteryVoltage",
     ],
-)
+)  # fmt: skip
 def test_a_name_is_found_whatever_its_case_underscores_and_prefix(name: str) -> None:
     assert raw_of(Sig(name, 0, 16, unit="V", factor="0.01")) == 4442
 
@@ -208,16 +201,10 @@ def test_a_value_halfway_between_two_steps_goes_to_the_upper_one(signal: Sig, ra
 @pytest.mark.parametrize(
     ("minimum", "maximum", "raw"),
     [
-        ("0", "44.42", 4442),
-        ("0", "44.424", 4442),
-        ("0", "44.419", 9),
-        ("44.42", "100", 4442),
-        ("44.416", "100", 4442),
-        ("44.421", "100", 9),
-        ("44.43", "100", 9),
-        ("0", "0", 4442),
+        ("0", "44.42", 4442), ("0", "44.424", 4442), ("0", "44.419", 9), ("44.42", "100", 4442),
+        ("44.416", "100", 4442), ("44.421", "100", 9), ("44.43", "100", 9), ("0", "0", 4442),
     ],
-)
+)  # fmt: skip
 def test_limits_that_lie_between_two_steps_leave_out_what_is_beyond_them(minimum: str, maximum: str, raw: int) -> None:
     texts = {9: "Error"}
     assert (
@@ -323,27 +310,22 @@ def test_one_message_can_hold_values_of_several_escs_and_of_the_gateway() -> Non
 # --- alive counter and E2E profile 1 ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "Alive",
-        "AliveCounter",
-        "alive_counter",
-        "StatusAlive",
-        "PowerRollingCounter",
-        "MessageCounter",
-        "SequenceCounter",
-    ],
-)
-def test_an_alive_counter_is_known_by_its_name(name: str) -> None:
-    layout = layout_of([Msg("M", 1, 8, [Sig(name, 0, 4)])])
-    assert layout.messages[0].signals[0].role is Role.ALIVE
+ALIVES = [
+    "Alive",
+    "AliveCounter",
+    "alive_counter",
+    "StatusAlive",
+    "PowerRollingCounter",
+    "MessageCounter",
+    "SequenceCounter",
+]
 
 
-@pytest.mark.parametrize("name", ["Crc", "CRC8", "Power_Crc", "Checksum"])
-def test_a_crc_is_known_by_its_name(name: str) -> None:
-    layout = layout_of([Msg("M", 1, 8, [Sig(name, 0, 8), Sig("Alive", 8, 4)])])
-    assert layout.messages[0].signals[0].role is Role.CRC
+@pytest.mark.parametrize("alive", ALIVES)
+@pytest.mark.parametrize("crc", ["Crc", "CRC8", "Power_Crc", "Checksum"])
+def test_an_alive_counter_and_a_crc_are_known_by_their_names(alive: str, crc: str) -> None:
+    layout = layout_of([Msg("M", 1, 8, [Sig(crc, 0, 8), Sig(alive, 8, 4)])])
+    assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
 
 
 def test_alive_counter_and_crc_can_be_bound_by_name_too() -> None:

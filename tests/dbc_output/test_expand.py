@@ -180,124 +180,7 @@ def facts_of_database(database: Database) -> dict[str, Any]:
     }
 
 
-RICH = r"""VERSION "4.2 \"beta\""
-
-NS_ :
-
-BS_:
-
-BU_: Gw Logger Other
-
-VAL_TABLE_ OnOff 1 "On" 0 "Off" ;
-
-BO_ 2147484672 EscPower: 16 Gw
- SG_ Page M : 0|4@1+ (1,0) [0|0] "" Logger
- SG_ BatteryVoltage m0 : 15|16@0+ (0.01,0) [0|655.33] "V" Logger,Other
- SG_ BatteryCurrent m1 : 8|32@1- (1,0) [-1000|1000] "A" Logger
- SG_ MotorSpeed m3 : 8|64@1- (0.0001,-5.5) [0|0] "rps" Vector__XXX
- SG_ OperatingState : 72|8@1+ (1,0) [0|26] "" Logger
- SG_ BecTemperature : 80|8@1- (0.5,-40) [0|0] "degC" Logger
-
-BO_ 256 Flow: 8 Gw
- SG_ ConsumedCharge : 7|16@0+ (0.001,0) [0|65.533] "Ah" Logger
- SG_ BecVoltage : 16|16@1+ (1E-05,0) [0|0] "kV" Logger
-
-BO_ 512 GatewayHealth: 4 Gw
- SG_ Uptime : 0|32@1+ (1,0) [0|0] "s" Logger
-
-BO_ 770 Foreign: 8 Other
- SG_ Anything : 0|12@1+ (1,0) [0|0] "furlong" Gw
-
-BO_TX_BU_ 770 : Other,Logger;
-
-EV_ Ambient: 1 [-40|85.5] "degC" 21.5 1 DUMMY_NODE_VECTOR0 Logger;
-EV_ Mode: 0 [0|3] "" 2 2 DUMMY_NODE_VECTOR1 Vector__XXX;
-
-CM_ "Made by hand.
-It has \"quotes\", a ; semicolon,
-
-
-two empty lines and BO_ 5 words.";
-CM_ BU_ Gw "The gateway
-on two lines";
-CM_ BO_ 2147484672 "Power \"of\" one ESC.
-
-
-
-After three empty lines.";
-CM_ SG_ 2147484672 BatteryVoltage "At the terminals.  ";
-CM_ SG_ 770 Anything "Not ours.";
-CM_ EV_ Ambient "Around the car";
-
-BA_DEF_ "NetText" STRING ;
-BA_DEF_ "NetNumber" INT -5 5;
-BA_DEF_ "NetFloat" FLOAT -1.5 2.5;
-BA_DEF_ BU_ "NodeHex" HEX 0 65535;
-BA_DEF_ BU_ "NodeKind" ENUM "Small","Large";
-BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
-BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;
-BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndOnChange","NoMsgSendType";
-BA_DEF_ BO_ "MsgFloat" FLOAT 0 1;
-BA_DEF_ BO_ "MsgText" STRING ;
-BA_DEF_ BO_ "MsgHex" HEX 0 255;
-BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG","r4","r5","r6","StandardCAN_FD","ExtendedCAN_FD";
-BA_DEF_ SG_ "GenSigStartValue" INT 0 65535;
-BA_DEF_ SG_ "SigEnum" ENUM "Low","Mid","High";
-BA_DEF_ SG_ "SigText" STRING ;
-BA_DEF_ EV_ "EnvNumber" INT 0 10;
-BA_DEF_REL_ BU_SG_REL_ "Timeout" INT 0 1000;
-BA_DEF_REL_ BU_BO_REL_ "Filter" INT 0 3;
-BA_DEF_DEF_ "NetText" "";
-BA_DEF_DEF_ "NetNumber" 0;
-BA_DEF_DEF_ "NetFloat" 0.5;
-BA_DEF_DEF_ "NodeHex" 0;
-BA_DEF_DEF_ "NodeKind" "Small";
-BA_DEF_DEF_ "GenMsgCycleTime" 0;
-BA_DEF_DEF_ "GenMsgDelayTime" 0;
-BA_DEF_DEF_ "GenMsgSendType" "NoMsgSendType";
-BA_DEF_DEF_ "MsgFloat" 0;
-BA_DEF_DEF_ "MsgText" "none";
-BA_DEF_DEF_ "MsgHex" 0;
-BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
-BA_DEF_DEF_ "GenSigStartValue" 0;
-BA_DEF_DEF_ "SigEnum" "Low";
-BA_DEF_DEF_ "SigText" "";
-BA_DEF_DEF_ "EnvNumber" 0;
-BA_DEF_DEF_REL_ "Timeout" 100;
-BA_DEF_DEF_REL_ "Filter" 0;
-BA_ "NetText" "a \"quoted\" text; BA_ \"x\"";
-BA_ "NetNumber" -3;
-BA_ "NetFloat" 1.25;
-BA_ "NodeHex" BU_ Gw 4660;
-BA_ "NodeKind" BU_ Logger 1;
-BA_ "GenMsgCycleTime" BO_ 256 0;
-BA_ "GenMsgSendType" BO_ 256 1;
-BA_ "GenMsgDelayTime" BO_ 256 7;
-BA_ "GenMsgCycleTime" BO_ 2147484672 20;
-BA_ "GenMsgSendType" BO_ 2147484672 3;
-BA_ "MsgFloat" BO_ 2147484672 0.125;
-BA_ "MsgText" BO_ 2147484672 "line";
-BA_ "MsgHex" BO_ 256 171;
-BA_ "VFrameFormat" BO_ 2147484672 8;
-BA_ "GenSigStartValue" SG_ 256 ConsumedCharge 65535;
-BA_ "GenSigStartValue" SG_ 256 BecVoltage 0;
-BA_ "SigEnum" SG_ 256 BecVoltage 2;
-BA_ "SigText" SG_ 2147484672 BatteryVoltage "V \"bat\"";
-BA_ "EnvNumber" EV_ Ambient 4;
-BA_REL_ "Timeout" BU_SG_REL_ Logger SG_ 256 ConsumedCharge 250;
-BA_REL_ "Filter" BU_BO_REL_ Logger 256 2;
-BA_REL_ "Filter" BU_BO_REL_ Gw 770 1;
-
-VAL_ 2147484672 OperatingState 1 "WaitForSignal" 12 "MotorOff" 21 "Forward" 254 "Error" 255 "NotAvailable" ;
-VAL_ 256 ConsumedCharge 65534 "Error" 65535 "NotAvailable" ;
-VAL_ 770 Anything 1 "a text with \"quotes\"" 0 "plain" ;
-
-SIG_GROUP_ 256 Charge 1 : ConsumedCharge BecVoltage;
-SIG_GROUP_ 2147484672 Slow 2 : OperatingState BecTemperature;
-
-SIG_VALTYPE_ 2147484672 BatteryCurrent : 1;
-SIG_VALTYPE_ 2147484672 MotorSpeed : 2;
-"""
+RICH = Path(__file__).with_name("rich.dbc").read_text()
 
 
 def relations(database: Database) -> set[tuple[Any, ...]]:
@@ -337,13 +220,8 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
         assert copy.frame_id == original.frame_id
         assert facts_of_message(copy, "") == facts_of_message(original, "")
     assert [m.name for m in after.messages] == [
-        "LeftPower",
-        "RightPower",
-        "LeftFlow",
-        "RightFlow",
-        "GatewayHealth",
-        "Foreign",
-    ]
+        "LeftPower", "RightPower", "LeftFlow", "RightFlow", "GatewayHealth", "Foreign",
+    ]  # fmt: skip
     assert relations(after) == {
         (256, "LeftConsumedCharge", "Logger", "Timeout", 250),
         (257, "RightConsumedCharge", "Logger", "Timeout", 250),
@@ -392,7 +270,7 @@ def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_the
     assert 'BA_ "SystemSignalLongSymbol"' not in text
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(20))
 def test_random_layouts_are_written_without_a_loss(seed: int) -> None:
     maker = LayoutMaker(random.Random(seed), PAIR)
     text = dbc_text([maker.message() for _ in range(5)])
@@ -402,7 +280,7 @@ def test_random_layouts_are_written_without_a_loss(seed: int) -> None:
     assert [facts_of_message(m, "") for m in after.messages] == [facts_of_message(m, "") for m in before.messages]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.text(st.sampled_from('aB1 \n";:,_()[]|é.'), max_size=40).filter(lambda text: not text.endswith("\\")))
 def test_any_comment_and_any_text_come_through(words: str) -> None:
     escaped = words.replace('"', '\\"')
@@ -470,11 +348,24 @@ def test_a_step_that_makes_ids_clash_is_refused() -> None:
 
 
 def test_ids_that_leave_their_range_are_refused() -> None:
-    assert "EscM0: id 7FFh moved to 800h is outside 0..7FFh" in refused(simple(0x7FF))
+    assert "1 of 2 messages lie outside 0..7FFh, up to 800h" in refused(simple(0x7FF))
     assert "outside 0..1FFFFFFFh" in refused(simple(0x1FFFFFFF, extended=True))
     assert "outside 0..7FFh" in refused(simple(0x100), base_id=0x7FF, id_step=1)
     assert "outside 0..7FFh" in refused(simple(0x100, 0x200), [EscSettings("one")], base_id=0x700)
+    assert "2 of 3 messages" in refused(simple(0x100, 0x200, 0x700), [EscSettings("one")], base_id=0x700)
+    assert "at most 1FFh" in refused(simple(0x100, 0x200, 0x700), [EscSettings("one")], base_id=0x700)
     assert ids_of(multiplied(simple(0x1FFFFFFE, extended=True), PAIR, "Gateway")[0]) == [0x1FFFFFFE, 0x1FFFFFFF]
+
+
+def test_ids_that_canopen_leaves_free_are_not_moved_among_its_own_unless_somebody_says_where_to() -> None:
+    escs = [EscSettings(f"esc{number}") for number in range(1, 10)]
+    with pytest.raises(UserError, match=r"52 of 101 ids leave 680h..6DFh.*--base-id"):
+        multiplied(SHIPPED.read_text(), escs, "KontronikGateway")
+    assert multiplied(SHIPPED.read_text(), escs[:8], "KontronikGateway")
+    assert multiplied(SHIPPED.read_text(), escs, "KontronikGateway", base_id=0x680)
+    assert multiplied(simple(0x6DF), escs, "Gateway", base_id=0x6DF)
+    assert "1 of 2 ids" in refused(simple(0x6DF))
+    assert multiplied(simple(0x700), escs, "Gateway")  # it was there before
 
 
 def test_names_of_more_than_32_characters_are_refused() -> None:
@@ -526,7 +417,7 @@ def test_plans_from_a_rich_file_are_those_of_the_gateway() -> None:
         assert [plain_plan(plan) for plan in again.messages] == [plain_plan(plan) for plan in layout.messages]
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(20))
 def test_plans_from_random_files_written_again_are_the_same(seed: int) -> None:
     maker = LayoutMaker(random.Random(seed), PAIR)
     messages = [maker.message() for _ in range(5)]
@@ -560,66 +451,34 @@ def test_the_command_takes_names_base_step_and_another_file(tmp_path: Path, caps
     source = tmp_path / "mine.dbc"
     source.write_text(RICH)
     line = [
-        "dbc",
-        "--from",
-        str(source),
-        "--node",
-        "Gw",
-        "--name",
-        "left",
-        "--name",
-        "right",
-        "--base-id",
-        "0x20",
-        "--id-step",
-        "4",
-    ]
+        "dbc", "--from", str(source), "--node", "Gw", "--name", "left", "--name", "right", "--base-id", "0x20",
+        "--id-step", "4",
+    ]  # fmt: skip
     assert main(line) == 0
     after = read(capsys.readouterr().out)
     assert [(m.name, m.frame_id) for m in after.messages][:5] == [
-        ("LeftPower", 0x320),
-        ("RightPower", 0x324),
-        ("LeftFlow", 0x20),
-        ("RightFlow", 0x24),
+        ("LeftPower", 0x320), ("RightPower", 0x324), ("LeftFlow", 0x20), ("RightFlow", 0x24),
         ("GatewayHealth", 0x120),
-    ]
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--esc", "0"],
-        ["--esc", "two"],
-        ["--esc", "2", "--name", "left"],
-        ["--name", "left", "--name", "LEFT"],
-        ["--name", "left_1", "--name", "left1"],
-        ["--name", "1st"],
-        ["--base-id", "0x20000000"],
-        ["--base-id", "0x7f0"],
-        ["--base-id", "here"],
-        ["--esc", "2", "--id-step", "8"],
-        ["--esc", "9"],
-        ["--node", "Nobody"],
-        ["--from", "none.dbc"],
-        ["-c", "none.toml"],
-        ["-c", "none.toml", "--esc", "2"],
+        ["--esc", "0"], ["--esc", "two"], ["--esc", "2", "--name", "left"], ["--name", "left", "--name", "LEFT"],
+        ["--name", "left_1", "--name", "left1"], ["--name", "1st"], ["--base-id", "0x20000000"],
+        ["--base-id", "0x7f0"], ["--base-id", "here"], ["--esc", "2", "--id-step", "8"], ["--esc", "9"],
+        ["--node", "Nobody"], ["--from", "none.dbc"], ["-c", "none.toml"], ["-c", "none.toml", "--esc", "2"],
         ["--esc", "2", "--name", "abcdefghijkl", "--name", "b"],
     ],
-)
+)  # fmt: skip
 def test_the_command_refuses_what_cannot_be(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     try:
         code = main(["dbc", *arguments])
     except SystemExit as end:
         code = end.code  # type: ignore[assignment]  # argparse gives numbers
     caught = capsys.readouterr()
-    if arguments == [
-        "--esc",
-        "9",
-    ]:  # the shipped ids leave room for eight; a greater step makes room for more, or none does
-        assert code in (0, 2)
-    else:
-        assert code == 2
-        assert not caught.out
+    assert code == 2 and not caught.out
     assert "Traceback" not in caught.err
 
 

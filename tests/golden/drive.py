@@ -69,7 +69,7 @@ class Drive:
 
     def __init__(self, tables: Mapping[str, Any], file: Path) -> None:
         loaded = assemble(parse(dict(tables), str(file)))
-        self.warnings = [*loaded.layout.warnings, *loaded.warnings]
+        self.warnings = [line.replace(f"{file.parent}/", "") for line in (*loaded.layout.warnings, *loaded.warnings)]
         silent = loaded.config.dbc.on_loss == "silent"
         self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.canopen)
         self._waiting = Mailboxes()

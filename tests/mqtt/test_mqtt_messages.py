@@ -384,6 +384,20 @@ def test_every_unit_of_ours_has_a_place() -> None:
         assert component is None or component.get("unit_of_measurement") in known
 
 
+def test_names_are_written_as_people_write_them() -> None:
+    columns = {column.source: column for column in SignalReader(layout_of("esc1").layout).columns}
+    shown = {
+        "bec_voltage": "BEC voltage",
+        "pwm_input": "PWM input",
+        "crc_errors": "CRC errors",
+        "min_bec_temperature": "Min BEC temperature",
+        "battery_voltage": "Battery voltage",
+    }
+    for source, name in shown.items():
+        component = entity(source, columns[source])
+        assert component is not None and component["name"] == name
+
+
 def test_what_an_entity_shows_is_in_the_state() -> None:
     bus = layout_of("esc1")
     published = run(Publisher(bus, TOPICS, 1, discovery="homeassistant"), flight(bus, 3), 3)

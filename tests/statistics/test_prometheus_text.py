@@ -25,7 +25,7 @@ UNITS: tuple[str, ...] = (
     "bytes",
     "hertz",
 )
-UNITS += ("revolutions_per_second", "bits_per_second")
+UNITS += ("revolutions_per_second",)
 
 
 def families(document: dict[str, Any]) -> dict[str, Metric]:
@@ -81,6 +81,9 @@ def test_names_have_the_prefix_counters_end_in_total_and_a_unit_stands_behind_th
         assert family.documentation
         for unit in UNITS:
             units[unit] += name.removesuffix("_total").endswith(f"_{unit}")
+        # promtool check metrics: base units, suffixes and types that belong to other kinds of metric
+        assert not re.search(r"_(bits|minutes|hours|days|kelvins|gauge|counter|histogram|summary)(_|$)", name), name
+        assert not name.endswith(("_count", "_sum", "_bucket")), name
         assert not re.search(r"_(v|a|w|wh|mah|ms|us|percent|rpm|millis|degrees|kbit)(_|$)", name), name
     assert all(units.values()), units
 
@@ -99,7 +102,7 @@ def test_values_are_in_base_units(document: dict[str, Any]) -> None:
         "throttle_ratio": values["throttle"] / 100,
         "pwm_input_seconds": values["pwm_input"] * 1e-6,
         "electrical_speed_revolutions_per_second": values["electrical_speed"] / 60,
-        "cell_count": values["cell_count"],
+        "cells": values["cell_count"],
         "operating_state_raw": values["operating_state_raw"],
         "esc_data_age_seconds": document["escs"][0]["data_age_ms"] / 1000,
         "esc_frame_rate_hertz": document["escs"][0]["frame_rate_hz"],
@@ -108,8 +111,8 @@ def test_values_are_in_base_units(document: dict[str, Any]) -> None:
     }
     for name, number in expected.items():
         assert value(document, f"kontronik_{name}", esc="esc1") == pytest.approx(number, rel=1e-12), name
-    assert value(document, "kontronik_can_bitrate_bits_per_second") == 500_000
-    assert value(document, "kontronik_can_transmit_error_counter") == 8
+    assert value(document, "kontronik_can_bitrate") == 500_000
+    assert value(document, "kontronik_can_transmit_errors") == 8
     assert value(document, "kontronik_uptime_seconds") == 6
     assert value(document, "kontronik_esc_port_line_errors_total", esc="esc2", kind="parity") == 2
     assert value(document, "kontronik_store_failed") == 1
@@ -117,7 +120,7 @@ def test_values_are_in_base_units(document: dict[str, Any]) -> None:
 
 def test_every_value_of_the_document_has_its_metric_for_each_esc(document: dict[str, Any]) -> None:
     found = families(document)
-    for name in document["units"]:
+    for name in ({"cell_count": "cells"}.get(name, name) for name in document["units"]):
         (family,) = [f for full, f in found.items() if re.match(rf"kontronik_{name}(_(?!error)|$)", full)]
         assert [sample.labels for sample in family.samples] == [{"esc": "esc1"}, {"esc": "esc2"}]
     for name in document["can"]["counters"]:

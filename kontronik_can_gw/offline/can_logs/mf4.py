@@ -5,7 +5,7 @@ import gc
 import heapq
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -144,11 +144,12 @@ class Mf4Reader:
 class Mf4Writer:
     """Writes CAN frames as python-can's MF4Writer does, in chunks. ``start_ns``: Unix time of time 0; None: 1970."""
 
-    def __init__(self, path: Path, start_ns: int | None, comment: str = "") -> None:
+    def __init__(self, path: Path, start_ns: int | None, provenance: Mapping[str, str] | None = None) -> None:
         module = asammdf_module()
         import numpy as np
 
         self._path = path
+        self._provenance = provenance or {}
         self._np = np
         parts = [("BusChannel", "<u1"), ("ID", "<u4"), ("IDE", "<u1"), ("DLC", "<u1"), ("DataLength", "<u1")]
         parts += [("DataBytes", "(64,)u1"), ("Dir", "<u1"), ("EDL", "<u1"), ("BRS", "<u1"), ("ESI", "<u1")]
@@ -159,8 +160,6 @@ class Mf4Writer:
         with quiet():
             self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
             set_start(self._mdf, start_ns or 0)
-            if comment:
-                self._mdf.header.comment = comment
             source = module.blocks.v4_blocks.SourceInformation(source_type=2, bus_type=2)  # a bus, CAN
             self._mdf.append(
                 module.Signal(
@@ -201,7 +200,7 @@ class Mf4Writer:
     def close(self) -> None:
         """Write the file."""
         self._flush()
-        save_mf4(self._mdf, self._path)
+        save_mf4(self._mdf, self._path, self._provenance)
 
     def discard(self) -> None:
         """Close asammdf's temporary file."""
@@ -233,10 +232,14 @@ def set_start(mdf: Any, start_ns: int) -> None:
     mdf.header.abs_time = start_ns
 
 
-def save_mf4(mdf: Any, path: Path) -> None:
-    """Save and close; the file says nothing of the time of its writing, so that it is the same each time."""
+def save_mf4(mdf: Any, path: Path, provenance: Mapping[str, str]) -> None:
+    """Save and close. ``provenance``: for the header, as it is known at the end.
+
+    The file says nothing of the time of its writing, so that it is the same each time."""
     with quiet():
         try:
+            if provenance:
+                mdf.header.comment = "\n".join(f"{key}: {value}" for key, value in provenance.items())
             start = mdf.header.abs_time
             beside = path.with_name(f"{path.name}.mf4")  # asammdf insists on its suffix
             Path(mdf.save(beside, overwrite=True, compression=2)).replace(path)

@@ -4,7 +4,7 @@ The same frames give the same bytes: no file tells when it was written.
 """
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -36,7 +36,7 @@ class CanLogWriter:
         first_ns: int = 0,
         channel: str = "can0",
         name: str = "",
-        comment: str = "",
+        provenance: Mapping[str, str] | None = None,
     ) -> None:
         self.left_out: dict[str, int] = {}
         """Frames that the format does not know, by what they are."""
@@ -50,7 +50,7 @@ class CanLogWriter:
 
             assert isinstance(file, Path)
             start_ns = None if wall_start_ns is None else _whole_us(wall_start_ns + first_ns)
-            mf4 = Mf4Writer(file, start_ns, comment)
+            mf4 = Mf4Writer(file, start_ns, provenance)
             shift = 0 if start_ns is None else start_ns - (wall_start_ns or 0)
             self.write = lambda time_ns, frame, received: mf4.write(time_ns - shift, frame, received)
             self._close, self._discard = mf4.close, mf4.discard

@@ -24,11 +24,11 @@ class Mf4Table:
     def __init__(self, path: Path, table: Table) -> None:
         module = asammdf_module()
         self._path = path
+        self._provenance = table.provenance
         self._texts = [[text for _, text in one.texts] for one in table.fields]
         with quiet():
             self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
             set_start(self._mdf, table.start_wall_ns or 0)
-            self._mdf.header.comment = "\n".join(f"{key}: {value}" for key, value in table.provenance.items())
             if table.by_frame:
                 messages = dict.fromkeys(one.message for one in table.fields[2:])
                 self._groups: dict[Value, _Group] = {
@@ -52,7 +52,7 @@ class Mf4Table:
         """Write the file."""
         for group in self._groups.values() if self._groups else [self._group]:
             group.flush()
-        save_mf4(self._mdf, self._path)
+        save_mf4(self._mdf, self._path, self._provenance)
 
     def discard(self) -> None:
         """Close asammdf's temporary file."""

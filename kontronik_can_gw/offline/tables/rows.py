@@ -116,7 +116,7 @@ class Rows:
         if first_row is None:
             return
         wall_ns = recording.wall_ns(origin_ns)
-        self.table = Table(fields, wall_ns is not None, by_frame, wall_ns, dict(recording.provenance))
+        self.table = Table(fields, wall_ns is not None, by_frame, wall_ns, recording.provenance)
 
     def __iter__(self) -> Iterator[Row | Block]:
         return self._rows

@@ -1,0 +1,59 @@
+"""Flags without a code for "not available": which signal of their message tells a reader that telemetry is lost."""
+
+import math
+import struct
+
+from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, SignalPlan
+from kontronik_can_gw.sources import Group
+
+_OF_LINK = frozenset({"link_state", "data_age"})
+
+
+def is_mute(signal: SignalPlan) -> bool:
+    """True for a flag that holds one of its two values without telemetry."""
+    source = signal.source
+    if source is None or source.bit is None or source.group not in (Group.LIVE, Group.INFO) or signal.is_float:
+        return False
+    return signal.not_available in {value * signal.slope + signal.intercept for value in (0, 1)}
+
+
+def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
+    """The signal of the same message, and sent with the flag, that reports the loss."""
+    for signal in message.signals:
+        source = signal.source
+        if source is None or signal.esc != flag.esc or signal.page not in (None, flag.page):
+            continue
+        assert flag.source is not None
+        if source.name in _OF_LINK and flag.source.group is Group.LIVE:
+            return signal
+        if source.group is flag.source.group and source.supplied is None and _has_code(signal):
+            return signal
+    return None
+
+
+def _has_code(signal: SignalPlan) -> bool:
+    """True where "not available" is none of the values."""
+    if signal.is_float:
+        code = "<f" if signal.length == 32 else "<d"
+        (value,) = struct.unpack(code, signal.not_available.to_bytes(signal.length // 8, "little"))
+        return math.isnan(value) or not signal.limits[0] <= value <= signal.limits[1]
+    if signal.numbers is not None:
+        return signal.not_available not in signal.numbers.values()
+    return not signal.low <= signal.not_available <= signal.high
+
+
+def unreported(layout: Layout, silent: bool) -> list[str]:
+    """A warning for each message that goes on without telemetry, and nobody can see it by its flags. ``silent``: ``dbc.on_loss``."""
+    found = []
+    for message in layout.messages:
+        stops = bool(message.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in message.paces
+        flags = [signal for signal in message.signals if is_mute(signal) and reporter(message, signal) is None]
+        if not flags or (silent and stops):
+            continue
+        names = ", ".join(flag.name for flag in flags[:3]) + (f" and {len(flags) - 3} more" if len(flags) > 3 else "")
+        remedy = ', or set dbc.on_loss = "silent"' if stops else ""
+        found.append(
+            f"{layout.file}: {message.name}: without telemetry {names} are sent as if they were known, and no signal of the message "
+            f"reports the loss. Add one bound to link_state, or with NotAvailable in its value table{remedy}."
+        )
+    return found

@@ -1,0 +1,69 @@
+"""When a message is sent: GenMsgSendType as Vector's and OEM templates spell it."""
+
+from collections.abc import Mapping
+from enum import Flag
+
+from kontronik_can_gw.dbc_output.names import normalize
+
+
+class SendType(Flag):
+    """When a message is sent. Several may hold."""
+
+    CYCLIC = 1
+    EVENT = 2
+    """With each UART frame (or change of the link) that brings one of its signals."""
+    ON_CHANGE = 4
+
+
+NAMES = {
+    "Cyclic": SendType.CYCLIC,
+    "Event": SendType.EVENT,
+    "OnChange": SendType.ON_CHANGE,
+    "CyclicAndEvent": SendType.CYCLIC | SendType.EVENT,
+    "CyclicAndOnChange": SendType.CYCLIC | SendType.ON_CHANGE,
+}
+"""Those that ``dbc.send_type`` gives."""
+NONE = ""
+"""By the cycle time alone: cyclic with one, else with each frame."""
+
+_SPELLINGS: dict[str, tuple[str, ...]] = {
+    "Cyclic": (
+        *("Cyclic", "CyclicX", "Periodic", "FixedPeriodic", "FixedCyclic", "Cycle", "Zyklisch", "Periodique", "P"),
+        *("CyclicWithRepeatOnDemand", "CyclicFast", "Time", "TimeTriggered"),
+    ),
+    "Event": (
+        *("Event", "OnEvent", "EventTriggered", "Evenement", "Ereignis", "E"),
+        *("Spontaneous", "Spontan", "SpontanX", "SpontaneousWithDelay", "SpontanWithDelay", "SpontanWD"),
+        *("SpontaneousWithRepetition", "SpontanWithRepetition", "SpontanWithRepitition"),
+        *("OnWrite", "OnWriteWithRepetition", "Triggered", "Direct", "Sporadic", "Acyclic", "Aperiodic"),
+    ),
+    "OnChange": ("OnChange", "OnChangeWithRepetition", "Change", "OnDelta"),
+    "CyclicAndEvent": (
+        *("CyclicAndEvent", "EventPeriodic", "PeriodicEvent", "PeriodicAndEvent", "EventAndPeriodic", "EventAndCyclic"),
+        *("CyclicAndSpontaneous", "CyclicAndSpontan", "CyclicAndSpontanX", "SpontaneousAndCyclic"),
+        *("CyclicAndSpontaneousWithDelay", "CyclicAndSpontanWithDelay", "CyclicAndSpontanWD"),
+        *("CyclicAndSpontaneousWD", "CyclicAndOnWrite", "CyclicEvent", "EventCyclic", "CE", "PE", "Mixed", "Mixte"),
+    ),
+    "CyclicAndOnChange": ("CyclicAndOnChange", "PeriodicAndOnChange", "CyclicOnChange", "CyclicAndChange"),
+    # only while a signal has a value that means activity: what is always sent holds that too
+    "IfActive": ("IfActive", "CyclicIfActive", "CyclicIfActiveX", "CyclicIfActiveFast", "EnabledPeriodic", "IfActiveWithRepetition"),
+    "IfActiveAndEvent": (
+        *("CyclicIfActiveAndSpontaneousWD", "CyclicIfActiveAndSpontanWD", "CyclicIfActiveAndSpontaneous"),
+        *("CyclicIfActiveAndSpontan", "IfActiveAndOnWrite"),
+    ),
+    "IfActiveAndOnChange": ("OnChangeAndIfActive", "OnChangeAndIfActiveWithRepetition", "IfActiveAndOnChange"),
+    NONE: (
+        *("", "None", "NoMsgSendType", "NoSendType", "NoSigSendType", "NotUsed", "NotDefined", "Undefined"),
+        *("vector_leerstring", "Unknown", "NA", "Reserved", "Default"),
+    ),
+}  # fmt: skip
+_WHILE_ACTIVE = {"IfActive": "Cyclic", "IfActiveAndEvent": "CyclicAndEvent", "IfActiveAndOnChange": "CyclicAndOnChange"}
+
+
+_BY_KEY = {normalize(text): name for name, texts in _SPELLINGS.items() for text in texts}
+
+
+def meaning(text: str, overrides: Mapping[str, str]) -> tuple[str | None, bool]:
+    """One of ``NAMES``, NONE, or None for a text that is not known; and True for one that is sent while something is active only."""
+    name = overrides.get(text) or _BY_KEY.get(normalize(text))
+    return (_WHILE_ACTIVE[name], True) if name in _WHILE_ACTIVE else (name, False)
