@@ -1,12 +1,7 @@
-"""What a bus sees of simulated ESCs: the frames of a real gateway core, with their times. And a screen as text."""
+"""What a bus sees of simulated ESCs: the frames of a real gateway core, with their times."""
 
-import io
-import re
 from collections.abc import Sequence
 from pathlib import Path
-
-from rich.console import Console
-from rich.text import Text
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.cli.status import Line
@@ -69,23 +64,23 @@ def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float =
     return path
 
 
+class Clock:
+    """Time that passes only by being slept; for what takes the module ``time``."""
+
+    def __init__(self, now: float = 100.0) -> None:
+        self.now = now
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def monotonic_ns(self) -> int:
+        return round(self.now * 1e9)
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds > 0, "a busy loop"
+        self.now += seconds
+
+
 def as_texts(lines: Sequence[Line]) -> list[str]:
     """The words alone."""
     return ["".join(piece.text for piece in line) for line in lines]
-
-
-def drawn(lines: Sequence[Line], size: tuple[int, int], *, colour: bool = True) -> str:
-    """What a terminal is sent for a screen."""
-    console = Console(
-        file=io.StringIO(), force_terminal=True, width=size[0], height=size[1], no_color=not colour,
-        color_system="truecolor", highlight=False, record=True,
-    )  # fmt: skip
-    for line in lines:
-        console.print(Text.assemble(*((p.text, p.style) for p in line), no_wrap=True, overflow="crop", end="\n"))
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
-
-
-def plain(text: str) -> str:
-    """Without control sequences."""
-    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)

@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from monitor_tools import flight, layout_of, plain, with_errors, write_log
+from monitor_tools import flight, layout_of, with_errors, write_log
 
 from kontronik_can_gw.protocol.states import OperatingError
-from kontronik_can_gw.simulator import EscOptions
 
-if shutil.which("tmux") is None:
-    pytest.skip("tmux is not installed: apt-get install tmux", allow_module_level=True)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("tmux") is None, reason="tmux is not installed: apt-get install tmux"),
+]
 
 
 class Terminal:
@@ -34,7 +35,7 @@ class Terminal:
 
     def _tmux(self, *words: str) -> str:
         done = subprocess.run(
-            ["tmux", "-u", "-S", self._socket, *words], capture_output=True, text=True, env=self._environment, timeout=20
+            ["tmux", "-u", "-S", self._socket, *words], capture_output=True, text=True, env=self._environment, timeout=60
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -54,7 +55,7 @@ class Terminal:
     def lines(self) -> list[str]:
         return [line.rstrip() for line in self._tmux("capture-pane", "-p").split("\n")[:-1]]
 
-    def until(self, wanted: Callable[[list[str]], object], what: str, seconds: float = 15) -> list[str]:
+    def until(self, wanted: Callable[[list[str]], object], what: str, seconds: float = 60) -> list[str]:
         end = time.monotonic() + seconds
         while not wanted(lines := self.lines()):
             assert time.monotonic() < end, f"{what}: not within {seconds} s:\n" + "\n".join(lines)
@@ -98,7 +99,6 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         escs = "".join(f'[[esc]]\nname = "{name}"\nport = "/dev/ttyX{name}"\npole_pairs = 7\n' for name in names)
         (folder / f"{count}.toml").write_text(f"[can]\nbitrate = 1000000\n{escs}")
-    write_log(folder / "short.log", flight(layout_of(["esc1"]), 2, [EscOptions()]))
     return folder
 
 
@@ -139,10 +139,6 @@ def test_values_move_and_keys_are_obeyed(terminal: Open, logs: Path) -> None:
     screen.until(lambda lines: lines[1].startswith("ESC"), "all")
     screen.press("Space")
     screen.until(lambda lines: "PAUSED" in lines[0], "a pause")
-    time.sleep(0.5)  # so that all of it is drawn
-    still = screen.lines()
-    time.sleep(0.5)
-    assert screen.lines() == still
     screen.press("r")
     screen.until(lambda lines: lines[-1].endswith("min/max of 0 s"), "a reset")
     screen.press("q")
@@ -166,24 +162,6 @@ def test_ctrl_c_ends_it_and_ctrl_z_is_borne(terminal: Open, logs: Path) -> None:
     screen.until(lambda lines: any("none sent" in line for line in lines), "the end")
 
 
-def test_the_end_of_a_file_stays_on_the_screen(terminal: Open, logs: Path) -> None:
-    screen = terminal()
-    screen.monitor(logs / "short.log")
-    lines = screen.until(lambda lines: "END OF FILE" in lines[0], "the end")
-    assert any(re.match(r"battery voltage +V +\d\d\.\d\d", line) for line in lines)
-    screen.press("q")
-    screen.until(lambda lines: "code 0" in lines, "the end")
-
-
-def test_without_colour_there_is_none(terminal: Open, logs: Path) -> None:
-    screen = terminal(NO_COLOR="1")
-    screen.monitor(logs / "1.log", "-c", logs / "1.toml")
-    screen.until(is_drawn, "a screen")
-    shown = screen.coloured()
-    assert "ERROR: battery voltage too low" in plain(shown)
-    assert not re.search(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7])m", shown)
-
-
 def test_without_utf8_bars_are_ascii(terminal: Open, logs: Path) -> None:
     screen = terminal(PYTHONIOENCODING="ascii")
     screen.monitor(logs / "1.log")
@@ -191,13 +169,3 @@ def test_without_utf8_bars_are_ascii(terminal: Open, logs: Path) -> None:
     assert "".join(lines).isascii()
     assert "?" not in "".join(lines)
     assert any(re.match(r"power stage +degC +\d+ +\d+ +\d+ +#+\.+$", line) for line in lines)
-
-
-def test_a_dumb_terminal_gets_lines(terminal: Open, logs: Path) -> None:
-    screen = terminal((150, 24), TERM="dumb")
-    screen.type("TERM=dumb\n")
-    screen.monitor(logs / "1.log", "--interval", "0.3")
-    lines = screen.until(lambda lines: sum("  esc1  link ok" in line for line in lines) >= 3, "lines")
-    assert not any("frames/s" in line for line in lines)
-    screen.press("C-c")
-    screen.until(lambda lines: "code 0" in lines, "the end")
