@@ -160,15 +160,6 @@ def test_chunks_do_not_matter(
     assert (one.times, one.columns) == (many.times, many.columns)
 
 
-@given(ROWS, STEPS)
-def test_nothing_changes_where_there_is_room(rows: list[tuple[Number, Number]], steps: list[int]) -> None:
-    times = times_of(rows, steps)
-    found, bucket = decimated(rows, times, 300, [])
-    assert bucket == 1
-    assert found.times == times
-    assert list(zip(*found.columns, strict=True)) == rows
-
-
 def test_the_values_of_a_bucket_keep_their_order() -> None:
     decimator = Decimator(1, 8)
     decimator.feed(range(64), [[*range(32), *range(32, 0, -1)]])
