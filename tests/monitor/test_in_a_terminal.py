@@ -16,7 +16,7 @@ from monitor_tools import flight, layout_of, with_errors, write_log
 from kontronik_can_gw.protocol.states import OperatingError
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.extended,
     pytest.mark.skipif(shutil.which("tmux") is None, reason="tmux is not installed: apt-get install tmux"),
 ]
 

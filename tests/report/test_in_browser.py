@@ -16,7 +16,7 @@ from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults
 from kontronik_can_gw.telemetry import SECOND as S
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(PROGRAM is None, reason=MISSING)]
+pytestmark = [pytest.mark.extended, pytest.mark.skipif(PROGRAM is None, reason=MISSING)]
 
 EVIL = "</script><script>window.hit = 1</script><img src=x onerror='window.hit = 2'>"
 FAULTS = Faults(
