@@ -6,7 +6,7 @@ import os
 
 import can
 import pytest
-from monitor_tools import Clock
+from flights import Clock
 
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError

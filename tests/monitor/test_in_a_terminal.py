@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from monitor_tools import flight, layout_of, with_errors, write_log
+from flights import flight, layout_of, with_errors, write_log
 
 from kontronik_can_gw.protocol.states import OperatingError
 

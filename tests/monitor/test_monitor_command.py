@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import pytest
 from capture_bench import START, Bench, made
 from command_line import Done, run, written
-from monitor_tools import Clock, Timed, flight, layout_of, with_errors, write_log
+from flights import Clock, Timed, flight, layout_of, with_errors, write_log
 
 from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.cli import monitor, monitor_screen

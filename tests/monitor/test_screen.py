@@ -4,9 +4,9 @@ import re
 from functools import cache
 
 import pytest
+from flights import STEP_NS, Timed, flight, layout_of, with_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from monitor_tools import STEP_NS, Timed, as_texts, flight, layout_of, with_errors
 
 from kontronik_can_gw.cli.monitor_screen import (
     ASCII,
@@ -18,6 +18,7 @@ from kontronik_can_gw.cli.monitor_screen import (
     plain_lines,
     screen,
 )
+from kontronik_can_gw.cli.status import Line
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.monitor import Monitor
 from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError
@@ -63,6 +64,11 @@ def texts(
 ) -> list[str]:
     lines = screen(monitor, where, size, choice or Choice(), glyphs)
     return [text.rstrip() for text in as_texts(lines)]
+
+
+def as_texts(lines: list[Line]) -> list[str]:
+    """The words alone."""
+    return ["".join(piece.text for piece in line) for line in lines]
 
 
 KINDS = ["good", "errors", "all", "warning", "lost", "silent", "replay", "none"]

@@ -1,10 +1,9 @@
-"""What a bus sees of simulated ESCs: the frames of a real gateway core, with their times."""
+"""What a bus sees of simulated ESCs: the frames of a real gateway core, with their times; and a clock that tests move."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.cli.status import Line
 from kontronik_can_gw.config import parse
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
@@ -14,6 +13,7 @@ from kontronik_can_gw.simulator import FLIGHT, SECOND_NS, ErrorWindow, EscOption
 from kontronik_can_gw.sources import GatewayState
 
 STEP_NS = 10_000_000
+START_S = 1_790_000_000
 FLYING = tuple(phase._replace(duration_s=phase.duration_s * 0.4, ramp_s=phase.ramp_s * 0.4) for phase in FLIGHT)
 Timed = list[tuple[int, CanFrame]]
 
@@ -54,7 +54,7 @@ def with_errors(*bits: OperatingError | SelfTestError) -> EscOptions:
     return EscOptions(profile=FLYING, faults=Faults(errors=tuple(ErrorWindow(bit, 0) for bit in bits)))
 
 
-def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float = 1_790_000_000.0) -> Path:
+def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float = START_S) -> Path:
     """A candump log."""
     lines = []
     for now, frame in frames:
@@ -79,8 +79,3 @@ class Clock:
     def sleep(self, seconds: float) -> None:
         assert seconds > 0, "a busy loop"
         self.now += seconds
-
-
-def as_texts(lines: Sequence[Line]) -> list[str]:
-    """The words alone."""
-    return ["".join(piece.text for piece in line) for line in lines]
