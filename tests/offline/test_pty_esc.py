@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -167,9 +166,7 @@ def test_the_run_ends_when_told_and_reports_what_a_gateway_sends(esc: PtyEsc) ->
 
     fd = os.open(esc.path, os.O_RDWR | os.O_NOCTTY)
     os.write(fd, b"+++")
-    begin = time.monotonic()
-    run([(SimulatedEsc(), esc)], seconds=30, stop=over.is_set, on_received=on_received)
+    run([(SimulatedEsc(), esc)], seconds=1e6, stop=over.is_set, on_received=on_received)
     os.close(fd)
-    assert time.monotonic() - begin < 10
     assert guilty == [0]
     assert esc.received == 3
