@@ -13,6 +13,8 @@ from hour_programme import Result, Step, run, steps_of, table
 from hour_recording import SECOND, record
 from hour_truth import Truth
 
+pytestmark = pytest.mark.extended
+
 NAMES = (
     *(f"convert to {form}" for form in (*hour_check.TABLES, *hour_check.LOGS)),
     *(f"convert {form} to csv" for form in hour_check.LOGS),
