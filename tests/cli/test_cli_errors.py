@@ -172,15 +172,15 @@ def test_a_port_that_its_group_may_not_use_either_is_not_told_to_join_the_group(
     assert "chmod g+rw" in said
 
 
+# --- CAN interface
+
+
 def test_one_missing_port_of_two_leaves_nothing_running(tmp_path: Path, terminal: PtyEsc) -> None:
     file = configuration(tmp_path, terminal.path)
     file.write_text(file.read_text() + f'[[esc]]\nport = "{tmp_path}/none"\n')
     said = refused(1, "run", "-c", file)
     assert f"esc2: {tmp_path}/none: no such serial port" in said
     assert terminal.check() == 0
-
-
-# --- CAN interface
 
 
 def test_socketcan_that_is_not_there_is_told_with_the_command_that_makes_it(tmp_path: Path, terminal: PtyEsc) -> None:
@@ -329,13 +329,6 @@ def test_check_of_two_escs_says_whose_value_each_signal_is(tmp_path: Path) -> No
     assert len(re.findall(r"^GatewayStatus ", done.out, re.MULTILINE)) == 1
 
 
-def test_names_with_which_a_value_would_be_taken_from_the_wrong_esc_are_refused(tmp_path: Path) -> None:
-    file = configuration(tmp_path)
-    file.write_text(file.read_text() + 'name = "a"\n[[esc]]\nport = "y"\nname = "a_max"\n')
-    assert "ambiguous" in refused(2, "check", "-c", file)
-    assert "ambiguous" in refused(2, "dbc", "--name", "a", "--name", "a_max")
-
-
 def test_schema_is_the_json_schema_of_the_configuration() -> None:
     done = run("schema")
     assert (done.code, done.err) == (0, "")
@@ -419,12 +412,6 @@ def test_options_that_a_configuration_says_already_are_refused_beside_it(tmp_pat
     assert "--esc and --base-id cannot be combined with --config" in said
 
 
-def test_ids_that_do_not_fit_are_told_for_each_message() -> None:
-    done = run("dbc", "--base-id", "0x7ff")
-    assert (done.code, done.out) == (2, "")
-    assert "EscSpeed: id 688h moved to 807h is outside 0..7FFh" in done.err
-
-
 def test_a_dbc_that_cannot_be_written_is_one_line_and_leaves_nothing_behind(tmp_path: Path) -> None:
     said = refused(1, "dbc", "-o", tmp_path / "none" / "out.dbc")
     assert f"{tmp_path}/none/out.dbc: cannot be written: No such file or directory" in said
@@ -467,16 +454,6 @@ def test_a_closed_standard_output_is_no_reason_for_a_traceback(tmp_path: Path) -
     done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert done.returncode == 0
-
-
-def test_a_reader_that_goes_away_is_not_told_about_it() -> None:
-    done = subprocess.run(
-        ["sh", "-c", f"{sys.executable} -m kontronik_can_gw dbc --esc 8 | head -c 10"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.stdout, done.stderr) == ('VERSION ""', "")
 
 
 def test_a_folder_without_a_name_is_refused(tmp_path: Path) -> None:

@@ -23,7 +23,6 @@ from cantools.database.can import Database
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import CanConfig, parse
-from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Mailboxes, Sent
@@ -243,21 +242,6 @@ def test_file_descriptors_do_not_grow_with_a_port_that_comes_and_goes(tmp_path: 
     assert max(counts[2:]) <= counts[2]
 
 
-def test_a_missing_port_is_waited_for_where_the_configuration_says_so(tmp_path: Path) -> None:
-    link = tmp_path / "esc"
-    with pytest.raises(RunError, match="no such serial port"), bench(str(link)):
-        pass
-    with bench(str(link), wait=True) as running:
-        running.until(lambda _, s: s.get("LinkState") == LinkState.PORT_ERROR, "port error")
-        with PtyEsc(link) as esc:
-            end = time.monotonic() + 60
-            while not running.gateway.escs[0].up:
-                assert time.monotonic() < end
-                esc.write(encode(LIVE, Layout.V4))
-                select.select([], [], [], 0.005)
-            running.speed(12_345)
-
-
 def test_the_last_word_on_the_bus_is_that_the_gateway_stops(esc: PtyEsc) -> None:
     with bench(esc.path) as running:
         esc.write(encode(LIVE, Layout.V4))
@@ -270,19 +254,6 @@ def test_the_last_word_on_the_bus_is_that_the_gateway_stops(esc: PtyEsc) -> None
             states.append((known.name, known.decode_simple(bytes(message.data))))
         name, signals = states[-1]
         assert (name, str(signals["GatewayState"])) == ("GatewayStatus", "Stopping")
-
-
-def test_stopping_a_loop_that_has_ended_writes_to_nobody(esc: PtyEsc) -> None:
-    with bench(esc.path) as running:
-        running.stop()
-        read, write = os.pipe2(os.O_NONBLOCK)  # likely the numbers that the loop's own pipe had
-        more = [os.pipe2(os.O_NONBLOCK) for _ in range(8)]
-        running.loop.stop()
-        for reader, writer in [(read, write), *more]:
-            with pytest.raises(BlockingIOError):
-                os.read(reader, 1)
-            os.close(reader)
-            os.close(writer)
 
 
 # --- as processes

@@ -69,21 +69,6 @@ def test_what_python_can_writes_is_read(tmp_path: Path, format_: str) -> None:
     assert max(abs(a[0] - b[0]) for a, b in zip(found, items, strict=True)) <= 1000
 
 
-@pytest.mark.parametrize("format_", FORMATS)
-def test_the_same_frames_give_the_same_bytes(tmp_path: Path, format_: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    import time
-
-    items = some_frames(50)
-    first, second = tmp_path / "a", tmp_path / "b"
-    now = time.time()
-    for folder, moment in ((first, now), (second, now + 12345)):
-        folder.mkdir()
-        monkeypatch.setattr(time, "time", lambda moment=moment: moment)
-        write_log(folder / f"log{SUFFIX[format_]}", format_, items)
-    one, other = ((folder / f"log{SUFFIX[format_]}").read_bytes() for folder in (first, second))
-    assert one == other
-
-
 ITEM = st.builds(
     lambda us, extended, can_id, fd, data, received: (
         us * 1000,
@@ -186,12 +171,6 @@ def test_what_candump_shows_on_the_screen_is_read(tmp_path: Path) -> None:
         (at + 3000, CanFrame(0x123, bytes.fromhex("00112233445566778899AABB"), fd=True), False),
         (at + 6000, CanFrame(0x123, b""), False),
     ]
-
-
-def test_bytes_of_an_esc_are_no_log_whatever_their_name(tmp_path: Path) -> None:
-    path = tmp_path / "esc.log"
-    path.write_bytes(b"KODL\x04" * 100)
-    assert log_format(path) is None
 
 
 def test_asc_with_decimal_base_and_relative_times_is_read(tmp_path: Path) -> None:

@@ -1,8 +1,5 @@
 """``kontronik-can-gw convert`` as people use it: what it makes, what it says, what it leaves behind when it cannot go on."""
 
-import contextlib
-import os
-import pty
 import resource
 import shutil
 import signal
@@ -12,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from command_line import refused, written
+from command_line import refused, run, written
 from log_files import SUFFIX, read_by_library, read_log
 from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_candump
 
@@ -117,52 +114,12 @@ def test_the_converters_of_can_utils_agree(tmp_path: Path, log: Path) -> None:
 # --- standard output and talk
 
 
-@pytest.mark.parametrize("form", ["csv", "trc"])
-def test_text_on_standard_output_is_that_of_a_file(dump: Path, tmp_path: Path, form: str) -> None:
-    done = subprocess.run([*PROGRAM, dump, "-", "--to", form, "-q"], capture_output=True, timeout=60, check=True)
-    assert done.stderr == b""
-    out = tmp_path / "out"
-    assert convert(dump, out, "--to", form) == 0
-    written = out.read_bytes()
-    if form == "trc":  # which has the file's name in its header
-        written = written.replace(b";   out\r\n", b";   \r\n")
-    assert done.stdout == written
-
-
-def test_a_reader_that_goes_away_ends_it_without_a_word(dump: Path) -> None:
-    command = " ".join(map(str, [*PROGRAM, dump, "-", "--to", "jsonl", "|", "head", "-n", "1"]))
-    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.count("\n") == 1
-    assert "Traceback" not in done.stderr
-
-
-def test_a_rate_for_bytes_without_times(dump: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_on_standard_output_is_that_of_a_file_and_talk_goes_to_standard_error(dump: Path, tmp_path: Path) -> None:
+    done = run("convert", dump, "-", "--to", "csv", "--live-rate", "50")
     assert convert(dump, tmp_path / "out.csv", "--live-rate", "50") == 0
-    times = [line.partition(",")[0] for line in (tmp_path / "out.csv").read_text().splitlines()[1:4]]
-    assert times == ["0.000000", "0.020000", "0.040000"]
-    assert "times are assumed: 50 live frames a second" in capsys.readouterr().err
-
-
-def _on_terminal(*words: object, data_too: bool = False) -> bytes:
-    """What a person sees on standard error (and output), a terminal."""
-    master, slave = pty.openpty()
-    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
-    process = subprocess.Popen(
-        [*PROGRAM, *map(str, words)], stderr=slave, stdout=slave if data_too else subprocess.DEVNULL, env=environment
-    )
-    os.close(slave)
-    seen = b""
-    with contextlib.suppress(OSError):  # EIO: the program has gone
-        while data := os.read(master, 65536):
-            seen += data
-    os.close(master)
-    assert process.wait(60) == 0
-    return seen
-
-
-def test_no_bar_where_the_data_goes_to_the_same_terminal(dump: Path) -> None:
-    assert "━" not in _on_terminal(dump, "-", "--to", "csv", data_too=True).decode()
-    assert "━" in _on_terminal(dump, "-", "--to", "csv").decode()
+    assert (done.code, done.data) == (0, (tmp_path / "out.csv").read_bytes())
+    assert [line.partition(",")[0] for line in done.out.splitlines()[1:4]] == ["0.000000", "0.020000", "0.040000"]
+    assert "times are assumed: 50 live frames a second" in done.err
 
 
 # --- damage

@@ -67,13 +67,6 @@ def test_a_pipe_gives_what_the_file_gives(tmp_path: Path, kind: str, way: str) -
     assert (tmp_path / "o.csv").read_bytes() == (tmp_path / "file.csv").read_bytes()
 
 
-def test_a_pipe_that_is_called_by_its_device_and_goes_on_standard_output(tmp_path: Path) -> None:
-    log = _recordings(tmp_path)["log"]
-    done = program("cat bus.log | gw convert /dev/stdin - --to candump -q", cwd=tmp_path)
-    assert done.stderr == b""
-    assert [line.removesuffix(" T") for line in done.stdout.decode().splitlines()] == log.read_text().splitlines()
-
-
 def test_replay_and_monitor_read_pipes_too(tmp_path: Path) -> None:
     log = _recordings(tmp_path)["log"]
     done = program("gw replay <(cat bus.log) --to log", cwd=tmp_path)
@@ -83,13 +76,6 @@ def test_replay_and_monitor_read_pipes_too(tmp_path: Path) -> None:
     plain = program("gw monitor --once bus.log", cwd=tmp_path)
     assert piped.returncode == plain.returncode == 0
     assert piped.stdout.replace(b'"standard input"', b'"bus.log"') == plain.stdout != b""
-
-
-def test_standard_input_is_read_from_where_it_stands(tmp_path: Path) -> None:
-    log = _recordings(tmp_path)["log"]
-    done = program("(read -r line; gw convert - o.log -q) < <(cat bus.log)", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert len((tmp_path / "o.log").read_text().splitlines()) == len(log.read_text().splitlines()) - 1
 
 
 def test_what_a_pipe_brings_is_named_by_the_pipe_and_nothing_is_left(tmp_path: Path) -> None:
@@ -169,29 +155,6 @@ def test_a_pipe_that_cannot_be_read(tmp_path: Path) -> None:
 # --- bytes through a pipe
 
 
-def test_bytes_of_an_esc_go_through_a_pipe(tmp_path: Path) -> None:
-    (tmp_path / "two.kcap").write_bytes(capture_bytes())
-    done = program("gw convert two.kcap - --to bin --esc e1 -q | cat", cwd=tmp_path)
-    with open_input(tmp_path / "two.kcap") as opened:
-        assert done.stdout == b"".join(opened.esc_bytes(1)) != b""
-    assert done.stderr == b""
-
-
-def test_bytes_do_not_go_to_a_terminal(tmp_path: Path) -> None:
-    import pty
-
-    path = tmp_path / "esc.bytes"
-    path.write_bytes(dump_bytes())
-    master, slave = pty.openpty()
-    done = subprocess.run(
-        [*PROGRAM, "convert", path, "-", "--to", "bin"], stdout=slave, stderr=subprocess.PIPE, timeout=60, check=False
-    )
-    os.close(slave)
-    os.close(master)
-    assert done.returncode == 2
-    assert done.stderr == b"kontronik-can-gw convert: bin cannot go to a terminal. Give a file, or a pipe behind it.\n"
-
-
 # --- more ESCs than the DBC has
 
 
@@ -229,18 +192,6 @@ def test_a_log_of_several_escs_by_the_dbc_of_one_is_told(
     assert "look like" not in capsys.readouterr().err
 
 
-def test_a_users_dbc_is_named_in_the_remedy(tmp_path: Path) -> None:
-    own = tmp_path / "own.dbc"
-    own.write_bytes(Path(shipped("dbc/kontronik_esc.dbc")).read_bytes())
-    with open_input(_log_of(tmp_path / "bus.log", 3), layout_of_dbc(own)) as opened:
-        list(opened.samples())
-        assert f"dbc --from {own} --esc 3 -o escs.dbc" in opened.notes[0]
-        assert opened.damage == []
-        list(opened.frames())
-        assert len(opened.notes) == 1
-        assert opened.damage == []
-
-
 def test_a_vehicles_frames_are_counted_once_and_quietly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = _log_of(tmp_path / "bus.log", 1, foreign=2000)
     capsys.readouterr()
@@ -254,15 +205,6 @@ def test_a_vehicles_frames_are_counted_once_and_quietly(tmp_path: Path, capsys: 
         assert (opened.others, opened.notes, opened.damage) == (2000, [], [])
     assert main(["monitor", "--once", str(log)]) == 0
     assert capsys.readouterr().err == ""
-
-
-def test_a_few_ids_beside_ours_are_no_second_esc(tmp_path: Path) -> None:
-    log = _log_of(tmp_path / "bus.log", 1)
-    more = "".join(f"(1700000001.{n:06d}) can0 {i:03X}#00\n" for n, i in enumerate((0x681, 0x699, 0x6A1) * 50))
-    log.write_text(log.read_text() + more)
-    with open_input(log) as opened:
-        list(opened.samples())
-        assert opened.notes == []
 
 
 # --- content before names

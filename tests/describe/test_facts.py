@@ -15,7 +15,7 @@ from described import DBC, EDS, NASTY_NAME, NASTY_UNIT, TWO_ESCS, configuration,
 from kontronik_can_gw.cia301.emergency import GatewayError
 from kontronik_can_gw.offline.describe.facts import DATA_TYPES
 from kontronik_can_gw.offline.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
-from kontronik_can_gw.protocol.states import Device, OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.protocol.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.sources import CanState, GatewayState, Group, sources
 from kontronik_can_gw.telemetry import EscSettings, LinkState
 
@@ -148,19 +148,6 @@ def test_emergencies_are_those_that_the_eds_enables(facts: Facts) -> None:
     assert {e["code"]: e["register"] for e in of_esc}[0x3220] == 0b101
 
 
-def test_errors_states_and_devices_are_all_told(facts: Facts) -> None:
-    for key, bits in (("operating_errors", OperatingError), ("selftest_errors", SelfTestError)):
-        told = [(row["bit"], row["name"], row["severity"], row["meaning"], row["remedy"]) for row in facts[key]]
-        assert told == [(int(b), b.text, b.severity.value, b.meaning, b.remedy) for b in bits]
-    assert [row["value"] for row in facts["operating_states"]] == [int(state) for state in OperatingState]
-    assert [row["name"] for row in facts["devices"]] == [device.text for device in Device]
-    jive = next(row for row in facts["devices"] if row["value"] == Device.JIVEPRO)
-    assert (jive["peak_current"], jive["not_supplied"]) == ("battery", ["bec_current"])
-    assert [row["name"] for row in facts["link_states"]][:3] == ["NeverSeen", "Searching", "Ok"]
-    assert [row["value"] for row in facts["can_states"]] == [int(state) for state in CanState]
-    assert [row["value"] for row in facts["gateway_states"]] == [int(state) for state in GatewayState]
-
-
 def test_each_source_is_told_with_a_meaning_and_where_it_is_shown(facts: Facts) -> None:
     known = sources(EscSettings())
     told = {row["name"]: row for row in facts["sources"]}
@@ -200,18 +187,6 @@ def test_of_two_escs_each_has_its_signals_and_cob_ids_and_the_objects_are_told_o
     assert two["canopen"]["objects"] == facts["canopen"]["objects"]
 
 
-def test_an_output_that_is_off_is_not_described(tmp_path: Path) -> None:
-    esc = '[[esc]]\nport = "/dev/ttyUSB0"\n'
-    only_dbc = by_configuration(tmp_path, esc)
-    assert only_dbc["canopen"] is None
-    assert len(only_dbc["dbc"]["messages"]) == 13
-    only_canopen = by_configuration(tmp_path, f'[dbc]\nenabled = false\n[canopen]\nenabled = true\nstore = "s"\n{esc}')
-    assert only_canopen["dbc"] is None
-    assert len(only_canopen["canopen"]["nodes"]) == 1
-    assert not any(row["signals"] for row in only_canopen["sources"])
-    assert any(row["objects"] for row in only_canopen["sources"])
-
-
 def test_a_node_that_waits_for_lss_has_no_cob_ids_of_its_own(tmp_path: Path) -> None:
     text = '[canopen]\nenabled = true\nnode_id = 255\nstore = "s"\n[[esc]]\nport = "/dev/ttyUSB0"\n'
     node = by_configuration(tmp_path, text)["canopen"]["nodes"][0]
@@ -231,36 +206,6 @@ def test_a_dbc_of_ones_own_is_described_with_the_messages_of_the_gateway_alone(t
     assert {item["index"]: item["name"] for item in found["canopen"]["objects"]}[0x2000] == NASTY_NAME
     meaning = {row["name"]: row["meaning"] for row in found["sources"]}
     assert meaning["battery_voltage"] == "Battery voltage at the ESC."
-
-
-def test_an_eds_of_ones_own_is_described(tmp_path: Path) -> None:
-    text = EDS.read_text().replace("DefaultValue=0x00FDFFFF", "DefaultValue=0x01000001")
-    (tmp_path / "own.eds").write_text(text)
-    found = by_configuration(
-        tmp_path,
-        '[canopen]\nenabled = true\nread_only = true\neds = "own.eds"\nstore = "s"\n[[esc]]\nport = "/dev/ttyUSB0"\n',
-    )["canopen"]
-    assert (found["file"], found["read_only"]) == ("own.eds", True)
-    assert [(e["code"], e["byte3"], e["name"]) for e in found["emergencies"] if e["byte3"] != 0xFF] == [
-        (0x3220, 0, "undervoltage"),
-        (0xFF18, 24, "bit24"),
-    ]
-
-
-def test_a_signal_without_limits_and_a_float_are_valid_json(tmp_path: Path) -> None:
-    file = tmp_path / "float.dbc"
-    file.write_text(
-        'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: Gate\n\nBO_ 291 Volt: 8 Gate\n'
-        ' SG_ BatteryVoltage : 0|32@1- (1,0) [0|0] "V" Gate\n SG_ BatteryCurrent : 39|16@0- (0.1,0) [0|0] "A" Gate\n\n'
-        'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_DEF_DEF_ "GenMsgCycleTime" 50;\n'
-        "SIG_VALTYPE_ 291 BatteryVoltage : 1;\n"
-    )
-    message = json.loads(described("--dbc", file, "--format", "json"))["dbc"]["messages"][0]
-    voltage, current = message["signals"]
-    assert (voltage["is_float"], voltage["minimum"]) in ((True, None), (True, 0))
-    assert (current["byte_order"], current["signed"], current["minimum"]) == ("big_endian", True, -3276.8)
-    assert current["not_available"] == -32768
-    assert "Not available is sent as -3276.8" in current["notes"]
 
 
 # --- mistakes

@@ -122,17 +122,6 @@ def test_it_comes_back_after_the_interface_was_removed(clock: Clock) -> None:
     assert listener.receive(1) == [FRAME]
 
 
-def test_one_that_is_down_and_up_again_keeps_its_socket(clock: Clock) -> None:
-    listener = BusListener(CanConfig(), frozenset({0x123}))
-    FakePort.fault = errno.ENETDOWN
-    listener.receive(0.6)
-    assert "is down. Start it: sudo ip link set can0 up" in listener.problem
-    FakePort.fault = 0
-    listener.receive(0.6)
-    assert listener.problem == ""
-    assert len(FakePort.opened) == 1
-
-
 def test_it_is_tried_at_most_each_half_second(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     listener = BusListener(CanConfig("pcan", "PCAN_USBBUS1"), frozenset({0x123}))
     looked: list[float] = []

@@ -160,12 +160,3 @@ def test_ctrl_c_ends_it_and_ctrl_z_is_borne(terminal: Open, logs: Path) -> None:
     screen.until(lambda lines: lines[-1].endswith("min/max of 0 s"), "a key")
     screen.press("C-c")
     screen.until(lambda lines: any("none sent" in line for line in lines), "the end")
-
-
-def test_without_utf8_bars_are_ascii(terminal: Open, logs: Path) -> None:
-    screen = terminal(PYTHONIOENCODING="ascii")
-    screen.monitor(logs / "1.log")
-    lines = screen.until(lambda lines: is_drawn(lines) and any("##" in line for line in lines), "a bar")
-    assert "".join(lines).isascii()
-    assert "?" not in "".join(lines)
-    assert any(re.match(r"power stage +degC +\d+ +\d+ +\d+ +#+\.+$", line) for line in lines)

@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse
-from kontronik_can_gw.dbc_output import units
 from kontronik_can_gw.dbc_output.layout import normalize
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.offline.monitor import CELL, QUANTITIES, TEMPERATURE, Monitor, Scale
+from kontronik_can_gw.offline.monitor import Monitor
 from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError, Severity
 from kontronik_can_gw.simulator import SECOND_NS, EscOptions, SimulatedEsc
 from kontronik_can_gw.sources import sources
@@ -191,23 +190,6 @@ def test_a_link_is_never_lost_beside_a_value() -> None:
     assert shown[-1] == "Ok"
 
 
-def test_a_link_that_is_said_to_be_lost_behind_the_values_is_lost() -> None:
-    """As where the values of a DBC have no code for not available, and stay."""
-    monitor = Monitor(ONE)
-    (esc,) = monitor.escs
-    lost = next(f for now, f in gapped() if f.can_id == LINK_ID and now > 4 * SECOND_NS)
-    frames = flight(ONE, 3)
-    for now, frame in frames:
-        monitor.take(frame, now)
-    assert esc.link == "Ok"
-    monitor.take(lost, frames[-1][0])
-    monitor.take(lost, frames[-1][0])
-    assert esc.number("battery_voltage") is not None
-    assert esc.link == "Lost"
-    document = monitor.document()["escs"][0]
-    assert document["link"] == "Lost"
-
-
 def test_errors_have_their_meaning_and_come_first() -> None:
     bits = (
         OperatingError.POWER_STAGE_OVERTEMP_WARNING,
@@ -224,19 +206,6 @@ def test_errors_have_their_meaning_and_come_first() -> None:
         ("power_stage_overtemp_warning", Severity.WARNING),
     ]
     assert esc.alarms[0].meaning == OperatingError.UNDERVOLTAGE.meaning
-
-
-@pytest.mark.parametrize(
-    ("bit", "alarms"),
-    [
-        (OperatingError.OPERATING_WARNING_FOUND, ["operating_warning_found"]),  # a summary that stands alone
-        (OperatingError.PROGRAMMING_ALLOWED, []),
-    ],
-)
-def test_a_single_bit_is_an_alarm_or_not(bit: OperatingError, alarms: list[str]) -> None:
-    (esc,) = watched(ONE, flight(ONE, 2, [with_errors(bit)])).escs
-    assert [active.name for active in esc.alarms] == alarms
-    assert bit.text in [active.name for active in esc.active]
 
 
 USERS_DBC = """VERSION ""
@@ -318,16 +287,6 @@ def test_all_cyclic_messages_make_it_complete() -> None:
     assert when <= 1.1 * SECOND_NS
 
 
-def test_the_frame_rate_is_that_of_the_last_two_seconds() -> None:
-    frames = flight(ONE, 6)
-    monitor = watched(ONE, frames)
-    recent = sum(now > 4 * SECOND_NS for now, _ in frames) / 2
-    assert monitor.frame_rate == pytest.approx(recent, rel=0.06)
-    for step in range(300):
-        monitor.advance(6 * SECOND_NS + step * STEP_NS)
-    assert monitor.frame_rate == 0
-
-
 def test_the_document_names_sources_and_has_null_for_what_is_not_available() -> None:
     monitor = watched(TWO, FLIGHT_OF_TWO)
     document = json.loads(json.dumps(monitor.document(), allow_nan=False))
@@ -341,22 +300,3 @@ def test_the_document_names_sources_and_has_null_for_what_is_not_available() -> 
     assert set(left["values"]) <= set(known)
     assert {"crc_errors", "dropped_bytes", "link_state"} <= set(left["values"])
     assert all(known[name].unit == unit for name, unit in document["units"].items())
-
-
-@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
-def test_a_warmer_part_is_never_in_a_better_zone(a: float, b: float) -> None:
-    low, high = sorted((a, b))
-    assert TEMPERATURE.zone(low).value <= TEMPERATURE.zone(high).value
-    assert CELL.zone(low).value >= CELL.zone(high).value
-    for scale in (TEMPERATURE, CELL, Scale(-5, 5)):
-        assert 0 <= scale.share(low) <= scale.share(high) <= 1
-
-
-def test_every_quantity_is_a_source_with_a_unit() -> None:
-    known = sources(EscSettings())
-    for quantity in QUANTITIES:
-        converted = units.conversion(known[quantity.source].unit, quantity.unit)
-        assert converted is not None
-        factor, offset = converted
-        assert factor == 1
-        assert offset == 0

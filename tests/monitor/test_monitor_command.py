@@ -17,12 +17,11 @@ from flights import Clock, Timed, flight, layout_of, with_errors, write_log
 
 from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.cli import monitor, monitor_screen
-from kontronik_can_gw.cli.monitor import Recording, can_config, is_c_locale, last_ns
+from kontronik_can_gw.cli.monitor import Recording, is_c_locale, last_ns
 from kontronik_can_gw.config import CanConfig, shipped
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.offline import monitor as model
 from kontronik_can_gw.offline.inputs import open_input
-from kontronik_can_gw.offline.layouts import layout_of_dbc
 from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.runtime import bus_listener
 from kontronik_can_gw.simulator import SECOND_NS, EscOptions, SimulatedEsc
@@ -148,11 +147,6 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(tmp_path: Path) -> 
     assert "nothing may be sent to an ESC" in done.err
 
 
-def test_without_a_configuration_fd_is_asked_for_only_where_the_dbc_has_it() -> None:
-    config = can_config(layout_of_dbc(DBC), None, None)
-    assert (config.interface, config.channel, config.fd) == ("socketcan", "can0", False)
-
-
 # --- from a file
 
 
@@ -259,25 +253,6 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
     assert len(taken) == len(flight(ONE, 12))
     assert all(-1e-6 <= when - 100 - (now - first) / SECOND_NS / speed <= 0.11 for when, now in taken)
     assert "END OF FILE" in recording.where().progress
-
-
-def test_a_recording_that_pauses_stands_still(log: Path, clock: Clock) -> None:
-    taken: list[CanFrame] = []
-    with open_input(log) as opened:
-        recording = Recording(opened, 1)
-        for _ in range(10):
-            recording.pump(lambda frame, _now: taken.append(frame), clock.now + 0.1)
-        count, now = len(taken), recording.now()
-        recording.paused = True
-        for _ in range(50):
-            recording.pump(lambda frame, _now: taken.append(frame), clock.now + 0.1)
-        assert (len(taken), recording.now()) == (count, now)
-        assert "PAUSED" in recording.where().progress
-        recording.paused = False
-        clock.now += 1000  # the machine slept
-        recording.pump(lambda frame, _now: taken.append(frame), clock.now + 0.1)
-        assert len(taken) > count
-        assert recording.now() - now < SECOND_NS, "it goes on where it was"
 
 
 # --- mistakes

@@ -122,18 +122,6 @@ def test_what_matters_is_never_cut(size: tuple[int, int], count: int) -> None:
     assert "ERROR: BEC current too high" in whole
 
 
-def test_a_few_lines_hold_eight_escs_in_pages() -> None:
-    monitor = seen(8)
-    choice = Choice()
-    shown = set()
-    for page in range(8):
-        choice.page = page
-        lines = texts(monitor, (80, 8), choice=choice)
-        assert re.search(r"page \d of \d, 8 ESCs", lines[-1])
-        shown |= {name for line in lines for name in re.findall(r"esc\d", line)}
-    assert shown == {esc.name for esc in monitor.escs}
-
-
 def test_a_value_that_is_not_available_is_a_dash() -> None:
     lines = texts(seen(1, "lost"), (80, 24))
     (voltage,) = [line for line in lines if line.startswith("battery voltage")]
@@ -157,12 +145,6 @@ def test_what_holds_stands_on_the_screen_and_nowhere_else(kind: str, count: int,
     assert said in "\n".join(texts(seen(count, kind), (80, 24)))
     if kind != "good":
         assert said not in "\n".join(texts(seen(count), (80, 24)))
-
-
-def test_a_bus_that_is_down_is_said_instead_of_its_silence() -> None:
-    lines = texts(seen(1, "silent"), (80, 24), LIVE._replace(problem="CAN interface can0: is down. Start it"))
-    assert lines[1].startswith("CAN interface can0: is down.")
-    assert not any("no frames" in line for line in lines)
 
 
 def test_plain_lines_have_a_line_for_each_esc_with_its_values_and_errors() -> None:

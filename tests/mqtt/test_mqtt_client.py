@@ -190,14 +190,6 @@ def test_a_broker_that_knows_only_mqtt_3_is_spoken_to_in_it(refusal: bytes) -> N
     assert [greeting[8] for greeting in got[:2]] == [5, 4]  # protocol level of MQTT 5 and 3.1.1
 
 
-def test_one_that_ends_each_connection_at_once_is_left_alone_for_a_while(said: pytest.LogCaptureFixture) -> None:
-    accepted = b"\x20\x03\x00\x00\x00"
-    listener, port, got = served(*[accepted] * 20)
-    with listener, connecting(to(port)) as client:
-        waits_until(client, "ends each connection at once: maybe another program uses the client id 'test'")
-        assert len(got) == 3
-
-
 def test_rubbish_instead_of_an_answer_ends_nothing() -> None:
     rng = random.Random(1)
     rubbish = [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x00" * 100, b"\x20\x7f\x00", bytes(range(256))]
@@ -207,15 +199,6 @@ def test_rubbish_instead_of_an_answer_ends_nothing() -> None:
         listener, port, got = served(answer, answer, pause_s=0)
         with listener, connecting(to(port)):
             wait_for(lambda got=got: len(got) == 2, answer)  # type: ignore[misc]  # it tries again
-
-
-def test_rubbish_on_a_connection_ends_that_connection_only() -> None:
-    rng = random.Random(2)
-    for _ in range(6):
-        listener, port, got = served(b"\x20\x03\x00\x00\x00" + rng.randbytes(50), b"", pause_s=0)
-        with listener, connecting(to(port)) as client:
-            client.offer("a", b"x", lasting=True)
-            wait_for(lambda got=got: len(got) == 2, "a second attempt")  # type: ignore[misc]
 
 
 def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,14 +300,3 @@ def test_a_certificate_that_does_not_fit_ends_in_a_problem_and_no_connection(
         wait_for(lambda: client.problem, "a problem")
         assert said in client.problem
         assert not client.connected
-
-
-def test_plain_text_to_a_port_of_tls_and_tls_to_a_plain_one_are_told_so(
-    encrypted: tuple[Mosquitto, Broker, Authority], broker: Mosquitto
-) -> None:
-    made, _, _ = encrypted
-    with connecting(to(made.port)) as client:
-        waits_until(client, "closed the connection instead of answering. Does it want TLS (--tls)?")
-    with connecting(replace(to(broker.port), tls=True)) as client:
-        wait_for(lambda: client.problem, "a problem")
-        assert "Is this the port for TLS?" in client.problem or "connection reset" in client.problem

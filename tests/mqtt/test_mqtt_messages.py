@@ -24,7 +24,7 @@ from kontronik_can_gw.offline.mqtt_messages import (
     is_ours,
 )
 from kontronik_can_gw.protocol.states import OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.simulator import SECOND_NS, Dropout, ErrorWindow, EscOptions, Faults, Phase
+from kontronik_can_gw.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, Phase
 
 TOPICS = Topics("fleet", "boat")
 MS = 1_000_000
@@ -109,15 +109,6 @@ def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str
         assert compared == len(signals - flags)
         assert found["electrical_speed"] > 0
         assert found["firmware"] == "4.17"
-
-
-def test_the_gateways_own_values_have_a_topic_of_their_own() -> None:
-    bus = layout_of(["esc1"])
-    frames = flight(bus, 3)
-    found = states(run(Publisher(bus, TOPICS, 1), frames, 3), None)[-1][1]
-    assert (found["gateway_state"], found["esc_count"], found["escs_ok"]) == ("Running", 1, 1)
-    assert found["available"] is True
-    assert not found.keys() & {"battery_voltage", "errors", "motor"}
 
 
 def test_without_any_frame_all_is_null_and_not_available() -> None:
@@ -291,28 +282,6 @@ def components(found: dict[str, dict[str, Any]]) -> Iterator[tuple[str, str, dic
             yield topic, key, component
 
 
-def test_each_esc_and_the_gateway_is_a_device() -> None:
-    found = discovered("left", "right")
-    assert set(found) == {
-        f"homeassistant/device/{name}/config"
-        for name in ("kontronik_boat", "kontronik_boat_left", "kontronik_boat_right")
-    }
-    left = found["homeassistant/device/kontronik_boat_left/config"]
-    assert left["device"] == {
-        "identifiers": ["kontronik_boat_left"],
-        "name": "boat left",
-        "manufacturer": "KONTRONIK",
-        "model": "KOSMIK",
-        "sw_version": "4.17",
-        "via_device": "kontronik_boat",
-    }
-    assert left["availability"] == [{"topic": "fleet/boat/online"}, {"topic": "fleet/boat/left/available"}]
-    assert left["availability_mode"] == "all"
-    assert left["state_topic"] == "fleet/boat/left/state"
-    assert left["origin"]["name"] == "kontronik-can-gw"
-    assert re.fullmatch(r"\w+/(?:[a-zA-Z0-9_-]+/)?[a-zA-Z0-9_-]+/config", "device/kontronik_boat_left/config")
-
-
 def test_every_entity_keeps_to_the_rules_of_home_assistant() -> None:
     found = discovered("left", "right")
     ids = [component["unique_id"] for _, _, component in components(found)]
@@ -372,13 +341,6 @@ def test_an_esc_that_does_not_tell_what_it_is_is_told_of_all_the_same() -> None:
     assert "sw_version" not in found["device"]
     assert IDENTITY_NS <= now <= IDENTITY_NS + 1.6 * SECOND_NS
     assert discoveries(run(publisher("esc1", discovery="ha"), [], 10)) == []
-
-
-def test_an_esc_that_goes_away_stays_what_it_is() -> None:
-    options = EscOptions(faults=Faults(dropout=Dropout(15 * SECOND_NS, 20 * SECOND_NS)))
-    frames = flight(layout_of(["esc1"]), 25, [options])
-    told = discoveries(run(publisher("esc1", discovery="ha"), frames, 25))
-    assert [found["device"].get("sw_version") for _, found in told] == ["4.17"]
 
 
 def test_only_the_discovery_of_this_gateway_is_ours() -> None:

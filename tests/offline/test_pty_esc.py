@@ -39,12 +39,6 @@ def test_every_byte_value_passes_unchanged_and_nothing_is_echoed(esc: PtyEsc) ->
     assert esc.received == 0
 
 
-def test_the_reader_may_come_and_go(esc: PtyEsc) -> None:
-    for _ in range(3):
-        esc.write(b"KODL\n\r\x03\x04")
-        assert read_exactly(esc.path, 8) == b"KODL\n\r\x03\x04"
-
-
 def test_a_transmitting_gateway_is_noticed(esc: PtyEsc) -> None:
     fd = os.open(esc.path, os.O_RDWR | os.O_NOCTTY)
     os.write(fd, b"ATSN?\r\n")
@@ -118,22 +112,6 @@ def test_a_real_file_is_never_overwritten(tmp_path: Path, kind: str) -> None:
     assert link.exists()
     assert not link.is_symlink()
     assert list(tmp_path.iterdir()) == [link]
-
-
-def test_a_link_in_a_missing_directory_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="no link can be made: No such file"):
-        PtyEsc(tmp_path / "missing" / "esc1")
-
-
-def test_a_relative_link_is_removed_though_the_directory_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    terminal = PtyEsc("esc1")
-    monkeypatch.chdir("/")
-    terminal.close()
-    terminal.close()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_several_escs_run_in_one_thread_and_every_frame_arrives() -> None:

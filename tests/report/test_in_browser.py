@@ -256,14 +256,3 @@ def test_every_error_is_told_at_its_mark_or_by_its_number(
         for mark in marks:  # no line runs through a text
             for box in boxes if mark["text"] else ():
                 assert box["row"] >= mark["text"]["row"] or not box["left"] < mark["x"] < box["right"]
-
-
-def test_on_a_phone_nothing_of_several_escs_is_cut(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["two"], 390, 844, phone=True)
-    assert browser.run("document.documentElement.scrollWidth") == 390
-    cut = browser.run(
-        "[...document.querySelectorAll('.groups, .groups *, .scroll, .legend td, .legend th')].filter((node) => { "
-        "const r = node.getBoundingClientRect(); return r.right > 390 || r.left < 0 || "
-        "(node.clientWidth && node.scrollWidth > node.clientWidth + 1); }).map((node) => node.outerHTML.slice(0, 200))"
-    )
-    assert cut == []

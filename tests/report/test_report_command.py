@@ -109,15 +109,6 @@ def test_no_line_is_drawn_over_a_dropout(recording: Path, points: int) -> None:
         assert len(gaps) == 60 * S // lost.interval_ns
 
 
-def test_all_devices_that_there_were_are_named_with_their_time(recording: Path) -> None:
-    _, html, _ = report(recording, "-o", "-")
-    found = re.search(r"<dt>e1</dt><dd>(.*?)</dd>", html)
-    assert found is not None
-    assert re.match(
-        r"Kosmik 120 firmware 4\.17; from 0:2[12]\.\d: Kolibri 120 firmware 4\.17, at /dev/ttyUSB1$", found[1]
-    ), found[1]
-
-
 @pytest.mark.parametrize(
     ("words", "code", "expected"),
     [

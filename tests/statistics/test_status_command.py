@@ -27,7 +27,6 @@ from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     PortFacts,
     ProgramFacts,
-    StoreFacts,
     program_facts,
     with_rates,
 )
@@ -89,11 +88,6 @@ def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 # --- the judgement
 
 
-def test_a_gateway_that_hears_all_is_healthy() -> None:
-    seen = judged(heard().document())
-    assert (seen.code, seen.sentence, seen.troubles) == (HEALTHY, "running", ())
-
-
 def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     bench = heard()
     bench.silent.add(1)
@@ -137,11 +131,6 @@ def test_a_bus_that_takes_nothing_is_a_fault(state: CanState, facts: CanFacts, c
     bench.gateway.set_can_state(state, bench.now)
     seen = judged(bench.document(can=facts))
     assert (seen.code, list(seen.troubles)) == (code, [said] if said else [])
-
-
-def test_parameters_that_cannot_be_stored_are_a_fault() -> None:
-    seen = judged(heard().document(store=StoreFacts(0, "disk full")))
-    assert (seen.code, seen.troubles) == (TROUBLE, ("parameters cannot be stored: disk full",))
 
 
 def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> None:
@@ -212,14 +201,6 @@ def test_a_missing_file_a_folder_a_pipe_and_another_version_are_told_in_one_line
         code, out, talk = shell("--file", tmp_path / name)
         assert (code, out, talk.count("\n")) == (NOT_RUNNING, "", 1)
         assert said in talk
-
-
-def test_the_configuration_says_where_the_file_is(tmp_path: Path) -> None:
-    configuration = tmp_path / "gateway.toml"
-    configuration.write_text('[statistics]\nfile = "s/status.json"\n[[esc]]\nport = "x"\n', encoding="utf-8")
-    written(tmp_path / "s" / "status.json", heard())
-    code, out, _ = shell("-c", configuration)
-    assert code == HEALTHY and out.startswith("kontronik-can-gw")
 
 
 def test_a_configuration_that_says_nothing_is_looked_for_among_the_services(tmp_path: Path, run_folder: Path) -> None:
@@ -301,38 +282,6 @@ def crowded() -> Document:
     return with_rates(later, before)
 
 
-def test_eight_escs_with_faults_fit_into_80_columns_and_24_lines() -> None:
-    seen = judged(crowded())
-    shown = words(seen, (80, 22)).split("\n")
-    assert len(shown) == 22
-    too_long = [line for line in shown if len(line) > 80]
-    assert too_long == []
-    assert sum(line.startswith("tailrotor_0") and " ok " in line for line in shown) == 7
-    assert any(re.match(r"tailrotor_06 +port error", line) for line in shown)
-    assert any("port not open: /dev/serial/by-id" in line for line in shown)
-    assert re.fullmatch(r"\.\.\. and \d+ lines more: --once shows them", shown[-1])
-
-
-def test_values_are_in_their_columns_and_a_dash_where_there_is_none() -> None:
-    bench = heard(2, 6)
-    bench.silent.add(1)
-    bench.run(1)
-    lines = words(judged(bench.document())).split("\n")
-    head = next(line.split() for line in lines if line.startswith("ESC"))
-    assert head == ["ESC", "link", "Hz", "age", "ms", "V", "A", "1/min", "°C", "CRC", "line", "lost"]
-    values = bench.document()["escs"][0]["values"]
-    ok = next(line.split() for line in lines if line.startswith("esc1"))
-    assert ok[1:3] == ["ok", "100"]
-    assert ok[4:8] == [
-        f"{values['battery_voltage']:.2f}",
-        f"{values['battery_current']:.1f}",
-        f"{values['motor_speed']:.0f}",
-        f"{values['power_stage_temperature']:.0f}",
-    ]
-    lost = next(line.split() for line in lines if line.startswith("esc2"))
-    assert lost[1] == "lost" and lost[4:8] == ["-", "-", "-", "-"] and lost[-1] == "1"
-
-
 def test_nothing_that_a_terminal_might_obey_comes_from_a_file(tmp_path: Path) -> None:
     evil = "\x1b[2J\x1b]0;x\x07\r\n\x9b[31m\u202e"
     document = heard().document(log_lines=[evil])
@@ -384,14 +333,6 @@ def test_no_document_makes_anything_but_lines(changes: list[tuple[tuple[Any, ...
 
 
 # --- the process
-
-
-def test_in_a_pipe_it_is_shown_once_without_colour(tmp_path: Path) -> None:
-    written(tmp_path / "status.json", heard())
-    code, out, talk = shell("--file", tmp_path / "status.json")
-    assert (code, talk) == (0, "")
-    assert "\x1b" not in out
-    assert "esc1" in out and "esc2" in out
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
