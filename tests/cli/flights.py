@@ -3,6 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from capture_bench import START, Bench
+
+from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse
 from kontronik_can_gw.frames import CanFrame
@@ -79,3 +82,12 @@ class Clock:
     def sleep(self, seconds: float) -> None:
         assert seconds > 0, "a busy loop"
         self.now += seconds
+
+
+def capture_file(bench: Bench, wall_ns: int = 1_700_000_000 * SECOND_NS) -> bytes:
+    """What was recorded, as the file of a capture."""
+    times = {"created_ns": START, "monotonic_ns": START, "wall_ns": wall_ns}
+    parts = [block(b"H", 0, json_payload(bench.setup.header() | {"run": "r", "part": 0} | times))]
+    for number, at in enumerate(range(0, len(bench.entries), 300)):
+        parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
+    return b"".join([*parts, block(b"E", len(parts), b"")])

@@ -294,17 +294,6 @@ def test_init_writes_the_example_once_and_replaces_it_only_when_forced(
     assert os.listdir(tmp_path) == ["gateway.toml"]
 
 
-def test_init_where_nothing_can_be_written_is_one_line(tmp_path: Path) -> None:
-    said = refused(1, "init", tmp_path / "none" / "a.toml")
-    assert f"{tmp_path}/none/a.toml: cannot be written: No such file or directory" in said
-    assert "Is a directory" in refused(1, "init", "--force", tmp_path)
-    closed = tmp_path / "closed"
-    closed.mkdir()
-    before = forbidden(str(closed), 0o755) if not os.geteuid() else []
-    closed.chmod(0o755 if not os.geteuid() else 0o555)
-    assert "Permission denied" in one_line(program("init", closed / "a.toml", before=before), 1)
-
-
 def test_check_shows_the_effective_configuration_the_messages_and_the_bus_load(tmp_path: Path) -> None:
     file = tmp_path / "gateway.toml"
     run("init", file)
@@ -317,16 +306,6 @@ def test_check_shows_the_effective_configuration_the_messages_and_the_bus_load(t
         assert line, message.name
         assert all(re.search(rf"\b{signal.name}\b", rest) for signal in message.signals)
     assert re.search(r"^# bus load \d+\.\d% of 500 kbit/s", rest, re.MULTILINE)
-
-
-def test_check_of_two_escs_says_whose_value_each_signal_is(tmp_path: Path) -> None:
-    file = configuration(tmp_path)
-    file.write_text(file.read_text() + 'name = "left"\n[[esc]]\nport = "y"\nname = "right"\n')
-    done = run("check", "-c", file)
-    assert (done.code, done.err) == (0, "")
-    for name in ("left", "right"):
-        assert re.search(rf"{name.title()}ElectricalSpeed +{name}\.electrical_speed 1/min", done.out)
-    assert len(re.findall(r"^GatewayStatus ", done.out, re.MULTILINE)) == 1
 
 
 def test_schema_is_the_json_schema_of_the_configuration() -> None:
@@ -385,31 +364,6 @@ def test_bad_wishes_for_a_dbc_are_one_line(words: list[str], expected: str) -> N
     assert "Traceback" not in done.err
     assert all(line.startswith("kontronik-can-gw dbc: ") for line in done.err.splitlines())
     assert expected in done.err
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--esc", "0"],
-        ["--esc", "129"],
-        ["--esc", "two"],
-        ["--name", "1a"],
-        ["--name", "a b"],
-        ["--base-id", "x"],
-        ["--base-id", "0x20000000"],
-        ["--id-step", "-1"],
-    ],
-)
-def test_arguments_of_the_wrong_kind_are_named_with_their_option(words: list[str]) -> None:
-    done = run("dbc", *words)
-    assert (done.code, done.out) == (2, "")
-    assert f"{words[0]}: " in done.err.splitlines()[-1]
-    assert "Traceback" not in done.err
-
-
-def test_options_that_a_configuration_says_already_are_refused_beside_it(tmp_path: Path) -> None:
-    said = refused(2, "dbc", "-c", configuration(tmp_path), "--esc", "2", "--base-id", "1")
-    assert "--esc and --base-id cannot be combined with --config" in said
 
 
 def test_a_dbc_that_cannot_be_written_is_one_line_and_leaves_nothing_behind(tmp_path: Path) -> None:

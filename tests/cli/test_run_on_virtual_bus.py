@@ -289,29 +289,6 @@ def test_a_signal_ends_the_gateway_well(tmp_path: Path, esc: PtyEsc, number: sig
         process.communicate()
 
 
-def test_eight_escs_need_no_threads_of_their_own(tmp_path: Path) -> None:
-    """There is the loop, the writer of the log, and the reader of a bus that is not SocketCAN."""
-    escs = [PtyEsc() for _ in range(8)]
-    process = gateway_process(tmp_path, [esc.path for esc in escs])
-    try:
-        for esc in escs:
-            esc.write(encode(LIVE, Layout.V4))
-        seen = 0
-        assert process.stderr is not None
-        while seen < 8:
-            line = process.stderr.readline()
-            assert line
-            seen += "telemetry ok" in line
-        assert len(os.listdir(f"/proc/{process.pid}/task")) == 3
-        assert [esc.check() for esc in escs] == [0] * 8
-    finally:
-        process.terminate()
-        process.communicate(timeout=60)
-        for esc in escs:
-            esc.close()
-    assert process.returncode == 0
-
-
 @pytest.mark.extended
 def test_the_demonstration_in_a_pipe_prints_plain_lines() -> None:
     command = [*PROGRAM, "demo", "--seconds", "3"]

@@ -1,6 +1,5 @@
 """CAN logs are written as python-can reads them and read as python-can writes them, frame by frame, to the microsecond."""
 
-import io
 from pathlib import Path
 
 import can
@@ -82,30 +81,6 @@ ITEM = st.builds(
     st.sampled_from((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64)).flatmap(lambda n: st.binary(min_size=n, max_size=n)),
     st.booleans(),
 )
-
-
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(ITEM, max_size=20))
-def test_candump_lines_are_those_of_python_can(items: list[Item]) -> None:
-    items.sort(key=lambda item: item[0])
-    ours, theirs = io.BytesIO(), io.StringIO()
-    writer = CanLogWriter(ours, "candump", 0, channel="can3")
-    library = can.CanutilsLogWriter(theirs, channel="can3")
-    for time_ns, frame, received in items:
-        writer.write(time_ns, frame, received)
-        library.on_message_received(
-            can.Message(
-                time_ns / 1e9,
-                frame.can_id,
-                frame.extended,
-                data=frame.data,
-                is_fd=frame.fd,
-                bitrate_switch=frame.fd,
-                is_rx=received,
-            )
-        )
-    writer.close()
-    assert ours.getvalue().decode() == theirs.getvalue()
 
 
 @pytest.mark.parametrize("format_", ["candump", "asc", "blf", "trc"])
@@ -245,18 +220,6 @@ def test_the_content_tells_the_format_before_the_suffix(tmp_path: Path) -> None:
         CanLog(tmp_path / "missing.log")
     with pytest.raises(RunError, match="cannot be opened: Is a directory"):
         CanLog(tmp_path)
-
-
-def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    path = tmp_path / "log.mf4"
-    write_log(path, "mf4", some_frames(5))
-    monkeypatch.setitem(sys.modules, "asammdf", None)
-    with pytest.raises(UserError, match=r"MF4 needs asammdf: pip install 'kontronik-can-gw\[mf4\]'"):
-        CanLog(path)
-    with pytest.raises(UserError, match="MF4 needs asammdf"):
-        write_log(tmp_path / "new.mf4", "mf4", some_frames(5))
 
 
 def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:

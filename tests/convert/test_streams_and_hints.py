@@ -16,11 +16,9 @@ from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_
 from kontronik_can_gw.capture import Block, Scanner, block, json_payload, read_json
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config import shipped
-from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.offline.can_logs import NAMES, CanLog
-from kontronik_can_gw.offline.inputs import CanLogInput, open_input
+from kontronik_can_gw.offline.inputs import open_input
 from kontronik_can_gw.offline.layouts import layout_of_dbc
-from kontronik_can_gw.offline.spool import spooled
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 
@@ -124,34 +122,6 @@ def test_a_stream_without_a_recording_is_one_line(tmp_path: Path, command: str, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_no_room_for_what_a_pipe_brings_is_one_line(tmp_path: Path) -> None:
-    log = _recordings(tmp_path)["log"]
-    done = program("ulimit -f 1; cat bus.log | gw convert - o.csv", cwd=tmp_path)
-    assert log.stat().st_size > 2048
-    assert done.returncode == 1, done.stderr
-    assert (
-        b"cannot be written: File too large. What a pipe brings is kept there; TMPDIR names another folder."
-        in done.stderr
-    )
-    assert done.stderr.count(b"\n") == 1
-
-
-def test_a_pipe_that_cannot_be_read(tmp_path: Path) -> None:
-    folder = os.open(tmp_path, os.O_RDONLY)
-    kept = os.dup(0)
-    try:
-        os.dup2(folder, 0)
-        with pytest.raises(UserError, match="is a terminal or another device"):
-            spooled(Path("-"))
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 0)
-        with pytest.raises(RunError, match="standard input: cannot be read: Bad file descriptor"):
-            spooled(Path("-"))
-    finally:
-        os.dup2(kept, 0)
-        os.close(kept)
-        os.close(folder)
-
-
 # --- bytes through a pipe
 
 
@@ -190,21 +160,6 @@ def test_a_log_of_several_escs_by_the_dbc_of_one_is_told(
     assert "look like" not in capsys.readouterr().err
     assert convert(log, tmp_path / "o.blf") == 0  # which holds all of them
     assert "look like" not in capsys.readouterr().err
-
-
-def test_a_vehicles_frames_are_counted_once_and_quietly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log = _log_of(tmp_path / "bus.log", 1, foreign=2000)
-    capsys.readouterr()
-    assert convert(log, tmp_path / "o.csv") == 0
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert ", 2000 other frames passed over, in " in said
-    with open_input(log) as opened:
-        assert isinstance(opened, CanLogInput)
-        list(opened.samples())
-        assert (opened.others, opened.notes, opened.damage) == (2000, [], [])
-    assert main(["monitor", "--once", str(log)]) == 0
-    assert capsys.readouterr().err == ""
 
 
 # --- content before names

@@ -10,7 +10,7 @@ import cantools.database
 import pytest
 from canopen.objectdictionary import ODVariable
 from command_line import refused, run
-from described import DBC, EDS, NASTY_NAME, NASTY_UNIT, TWO_ESCS, configuration, described, nasty
+from described import DBC, EDS, TWO_ESCS, configuration, described
 
 from kontronik_can_gw.cia301.emergency import GatewayError
 from kontronik_can_gw.offline.describe.facts import DATA_TYPES
@@ -192,20 +192,6 @@ def test_a_node_that_waits_for_lss_has_no_cob_ids_of_its_own(tmp_path: Path) -> 
     node = by_configuration(tmp_path, text)["canopen"]["nodes"][0]
     assert (node["node_id"], node["pdos"]) == (None, [])
     assert {cob["use"] for cob in node["cob_ids"]} == {"NMT", "LSS"}
-
-
-def test_a_dbc_of_ones_own_is_described_with_the_messages_of_the_gateway_alone(tmp_path: Path) -> None:
-    found = json.loads(described("-c", nasty(tmp_path), "--format", "json"))
-    (message,) = found["dbc"]["messages"]
-    assert (message["name"], message["id"], message["cycle_ms"]) == ("Volt", 291, 100)
-    voltage, state, mark = message["signals"]
-    assert voltage["comment"].endswith(" second line")
-    assert (state["not_available"], state["error"]) == (255, 254)
-    assert {"value": 13, "name": "<i>|Stand</i>"} in state["values"]
-    assert (mark["unit"], mark["role"], mark["source"], mark["not_available"]) == (NASTY_UNIT, "constant", None, None)
-    assert {item["index"]: item["name"] for item in found["canopen"]["objects"]}[0x2000] == NASTY_NAME
-    meaning = {row["name"]: row["meaning"] for row in found["sources"]}
-    assert meaning["battery_voltage"] == "Battery voltage at the ESC."
 
 
 # --- mistakes

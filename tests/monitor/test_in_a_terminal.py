@@ -1,7 +1,6 @@
 """The screen in a real terminal (tmux): drawn, redrawn after a resize, obeying keys, and leaving the terminal as it was."""
 
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -48,9 +47,6 @@ class Terminal:
 
     def resize(self, width: int, height: int) -> None:
         self._tmux("resize-window", "-x", str(width), "-y", str(height))
-
-    def coloured(self) -> str:
-        return self._tmux("capture-pane", "-e", "-p")
 
     def lines(self) -> list[str]:
         return [line.rstrip() for line in self._tmux("capture-pane", "-p").split("\n")[:-1]]
@@ -104,25 +100,6 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def is_drawn(lines: list[str]) -> bool:
     return "frames/s" in lines[0] and "quit" in lines[-1] and " - frames/s" not in lines[0]
-
-
-def test_one_esc_is_drawn_and_follows_the_size_of_the_terminal(terminal: Open, logs: Path) -> None:
-    screen = terminal()
-    screen.monitor(logs / "1.log", "-c", logs / "1.toml")
-    lines = screen.until(is_drawn, "a screen")
-    assert lines[0].startswith(" 1.log ")
-    assert any(re.match(r"battery voltage +V +\d\d\.\d\d +\d\d\.\d\d +\d\d\.\d\d$", line) for line in lines)
-    assert "ERROR: battery voltage too low" in lines
-    assert re.search(r"\x1b\[(?:\d+;)*31m(?:\x1b\[[\d;]*m)*ERROR: battery", screen.coloured())
-    for width, height in ((120, 40), (60, 20), (80, 24), (40, 10)):
-        screen.resize(width, height)
-
-        def follows(lines: list[str], width: int = width, height: int = height) -> bool:
-            voltage = sum(bool(re.match(r"battery voltage +V +\d\d\.\d\d", line)) for line in lines)
-            fits = len(lines) == height and len(lines[0]) == width
-            return is_drawn(lines) and fits and voltage == 1 and "ERROR: battery voltage too low" in lines
-
-        screen.until(follows, f"{width}x{height}")
 
 
 def test_values_move_and_keys_are_obeyed(terminal: Open, logs: Path) -> None:

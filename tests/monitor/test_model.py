@@ -62,24 +62,6 @@ def test_values_are_those_that_cantools_decodes() -> None:
     assert compared > 80
 
 
-def test_extremes_are_those_of_all_values_that_came() -> None:
-    monitor = watched(TWO, FLIGHT_OF_TWO)
-    by_signal: dict[str, list[float]] = {}
-    for _, frame in FLIGHT_OF_TWO:
-        for name, value in TWO.database.decode_message(frame.can_id, frame.data).items():  # type: ignore[union-attr]
-            if isinstance(value, (int, float)):
-                by_signal.setdefault(name, []).append(value)
-    for index, prefix in enumerate(("Left", "Right")):
-        for signal, source in (
-            ("BatteryVoltage", "battery_voltage"), ("BatteryCurrent", "battery_current"), ("MotorSpeed", "motor_speed"),
-            ("PowerStageTemperature", "power_stage_temperature"), ("ThrottlePercent", "throttle"),
-            ("BatteryPower", "battery_power"), ("MeanCellVoltage", "mean_cell_voltage"),
-        ):  # fmt: skip
-            values = by_signal[prefix + signal]
-            spread = monitor.escs[index].spreads[source]
-            assert (spread.low, spread.high) == pytest.approx((min(values), max(values)))
-
-
 @given(st.lists(st.one_of(st.none(), st.integers(0, 65533), st.integers(-200, 200)), min_size=1, max_size=30))
 @settings(max_examples=100, deadline=None)
 def test_extremes_and_availability_hold_for_any_values(values: list[int | None]) -> None:

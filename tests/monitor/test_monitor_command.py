@@ -4,20 +4,18 @@ import ast
 import inspect
 import itertools
 import json
-import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from capture_bench import START, Bench, made
+from capture_bench import Bench, made
 from command_line import Done, run, written
-from flights import Clock, Timed, flight, layout_of, with_errors, write_log
+from flights import Clock, Timed, capture_file, flight, layout_of, with_errors, write_log
 
-from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.cli import monitor, monitor_screen
-from kontronik_can_gw.cli.monitor import Recording, is_c_locale, last_ns
+from kontronik_can_gw.cli.monitor import Recording
 from kontronik_can_gw.config import CanConfig, shipped
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.offline import monitor as model
@@ -187,21 +185,9 @@ def test_a_log_without_our_frames_is_told_so(tmp_path: Path, clock: Clock) -> No
     assert "x.log holds no frame of kontronik_esc.dbc" in done.err
 
 
-def write_capture(path: Path, escs: int, seconds: float) -> Bench:
-    bench = Bench(*made(escs)).live(3, seconds, wild=False)
-    header = bench.setup.header() | {
-        "run": "r", "part": 0, "created_ns": START, "monotonic_ns": START, "wall_ns": 1_700_000_000 * SECOND_NS,
-    }  # fmt: skip
-    parts = [block(b"H", 0, json_payload(header))]
-    for number, at in enumerate(range(0, len(bench.entries), 300)):
-        parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
-    written(path, b"".join([*parts, block(b"E", len(parts), b"")]))
-    return bench
-
-
 def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) -> None:
-    file = tmp_path / "x.kcap"
-    bench = write_capture(file, 2, 8)
+    bench = Bench(*made(2)).live(3, 8, wild=False)
+    file = written(tmp_path / "x.kcap", capture_file(bench))
     found = document(run("monitor", file, "--once"))
     assert [esc["name"] for esc in found["escs"]] == ["e0", "e1"]
     assert found["time"].startswith("2023-11-14T")
@@ -211,26 +197,6 @@ def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) 
     done = run("monitor", file, "--dbc", DBC)
     assert (done.code, done.out) == (2, "")
     assert "x.kcap: is a capture, which holds its own DBC. Leave -c and --dbc out." in done.err
-
-
-def test_a_captures_share_is_that_of_its_time_where_it_is_known(tmp_path: Path, clock: Clock) -> None:
-    path = tmp_path / "a.kcap"
-    write_capture(path, 1, 20)
-    with open_input(path) as opened:
-        entries = [entry.time_ns for entry in opened.entries()]  # type: ignore[attr-defined]
-        assert last_ns(opened) == entries[-1]
-        recording = Recording(opened, 1)
-        first, lasts = recording.now(), (entries[-1] - recording.now()) / SECOND_NS
-        shares = 0
-        while not recording.ended:
-            recording.pump(lambda _frame, _now: None, clock.now + 0.1)
-            if found := re.fullmatch(r"0:\d\d  (\d+) %", recording.where().progress):
-                wanted = 100 * (recording.now() - first) / SECOND_NS / lasts
-                assert wanted - 1.01 <= int(found[1]) <= wanted
-                shares += 1
-        assert shares > 150
-        written(path, b"x" * path.stat().st_size)
-        assert last_ns(opened) is None
 
 
 def test_plain_bytes_of_a_uart_are_watched(tmp_path: Path) -> None:
@@ -278,18 +244,3 @@ def test_a_mistake_is_one_line_with_the_remedy(
     done = run("monitor", *words)
     assert (done.code, done.out) == (code, "")
     assert said in done.err.splitlines()[-1]
-
-
-@pytest.mark.parametrize(
-    ("environment", "expected"),
-    [
-        ({"LC_ALL": "POSIX", "LANG": "de_DE.UTF-8"}, True),
-        ({"LC_ALL": "C", "LC_CTYPE": "C.UTF-8"}, True),
-        ({"LC_ALL": "", "LC_CTYPE": "", "LANG": "C"}, True),
-        ({}, True),
-        ({"LC_CTYPE": "C.utf8", "LANG": "C"}, False),
-        ({"LC_CTYPE": "en_US"}, False),
-    ],
-)
-def test_the_locale_of_the_person_counts(environment: dict[str, str], expected: bool) -> None:
-    assert is_c_locale(environment) is expected

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.cli.monitor_screen import (
-    ASCII,
     UNICODE,
     Choice,
     Glyphs,
@@ -72,20 +71,6 @@ def as_texts(lines: list[Line]) -> list[str]:
 
 
 KINDS = ["good", "errors", "all", "warning", "lost", "silent", "replay", "none"]
-
-
-@pytest.mark.parametrize("kind", ["good", "all", "lost"])
-@pytest.mark.parametrize("count", [1, 8])
-@pytest.mark.parametrize("size", [*SIZES, (20, 5), (80, 10)], ids=str)
-@pytest.mark.parametrize("glyphs", [UNICODE, ASCII], ids=["utf8", "ascii"])
-def test_no_line_is_longer_than_the_width_and_no_line_too_many(
-    size: tuple[int, int], count: int, kind: str, glyphs: Glyphs
-) -> None:
-    lines = as_texts(screen(seen(count, kind), LIVE, size, Choice(), glyphs))
-    assert len(lines) == size[1]
-    assert max(map(len, lines)) <= size[0]
-    if glyphs is ASCII:
-        assert "".join(lines).isascii()
 
 
 @given(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mqtt_bench import PATIENCE, Mosquitto, Subscriber, free_port, kept, wait_for
+from mqtt_bench import PATIENCE, Mosquitto, Subscriber, free_port, wait_for
 
 from kontronik_can_gw.runtime import mqtt_client
 from kontronik_can_gw.runtime.mqtt_client import Broker, MqttClient, check
@@ -80,24 +80,6 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
         ("k/test/other", b"999"),
         (ONLINE, b"offline"),
     ]
-
-
-def test_after_a_restart_of_the_broker_all_that_is_lasting_is_there_again(tmp_path: Path) -> None:
-    made = Mosquitto(tmp_path)
-    try:
-        with connecting(to(made.port)) as client:
-            client.offer("k/test/a", b"1", lasting=True, retain=True)
-            client.offer("k/test/b", b"1", lasting=True, retain=True)
-            wait_for(lambda: len(kept(made.port, "k/#")) == 3, "messages")
-            made.stop()
-            waits_until(client, "connection")
-            client.offer("k/test/b", b"2", lasting=True, retain=True)
-            made.start()
-            wait_for(lambda: client.connected, "a connection")
-            expected = {ONLINE: b"online", "k/test/a": b"1", "k/test/b": b"2"}
-            wait_for(lambda: kept(made.port, "k/#") == expected, "messages")
-    finally:
-        made.stop()
 
 
 def test_a_broker_that_takes_nothing_makes_nothing_pile_up(tmp_path: Path, said: pytest.LogCaptureFixture) -> None:

@@ -25,8 +25,8 @@ from mqtt_bench import (
 )
 
 from kontronik_can_gw.config import shipped
-from kontronik_can_gw.protocol.states import OperatingError, OperatingState
-from kontronik_can_gw.simulator import ErrorWindow, EscOptions, Faults, Phase
+from kontronik_can_gw.protocol.states import OperatingState
+from kontronik_can_gw.simulator import EscOptions, Phase
 
 pytestmark = pytest.mark.extended
 
@@ -93,21 +93,6 @@ def test_what_is_on_the_bus_is_published_and_nothing_is_sent(adapter: Slcan, bro
     assert heard.of("kontronik/way/online")[-1].payload == b"offline"
     assert heard.of("kontronik/way/esc1/available")[0].payload == b"online"
     assert adapter.sent == []
-
-
-def test_a_fault_is_told_at_once_though_the_rate_is_slow(adapter: Slcan, broker: Mosquitto) -> None:
-    window = ErrorWindow(OperatingError.OVERVOLTAGE, 1500 * 1_000_000)
-    frames = flight(layout_of(["esc1"]), 10, [EscOptions(profile=QUIET.profile, faults=Faults(errors=(window,)))])
-    with (
-        live(adapter, broker, "fault", "--rate", 0.01) as program,
-        Subscriber(broker.port, "kontronik/fault/#") as heard,
-    ):
-        wait_for(lambda: adapter.is_open, lambda: program.log)
-        with Traffic(adapter, frames):
-            topic = "kontronik/fault/esc1/state"
-            wait_for(lambda: any(state.json["problem"] for state in heard.of(topic)), lambda: heard.heard)
-    told = next(state for state in heard.of(topic) if state.json["problem"])
-    assert next(error["name"] for error in told.json["errors"] if error["severity"] == "error") == "overvoltage"
 
 
 def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(adapter: Slcan, broker: Mosquitto) -> None:
@@ -246,18 +231,6 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
             program.wait_for_line("refuses us without a user name: not authorized. Check --username, --password-file.")
     finally:
         made.stop()
-
-
-def test_a_password_without_tls_to_another_machine_is_warned_of(tmp_path: Path, adapter: Slcan) -> None:
-    secret = tmp_path / "password"
-    secret.write_text("x")
-    secret.chmod(0o600)
-    bus = ("-c", adapter.configuration, "--username", "a", "--password-file", secret)
-    with Process(*bus, "--broker", "broker.invalid") as program:
-        program.wait_for_line("without TLS the password can be read by all on the way. Use --tls.")
-        program.wait_for_line("MQTT broker broker.invalid:1883: the host's name is not known")
-        assert "everybody" not in program.log
-        assert program.end() == 0
 
 
 # --- systemd

@@ -67,18 +67,6 @@ def test_the_recorded_frames_give_exactly_this_json() -> None:
     assert json_lines(decode(LIVE + INFO)) == LIVE_JSON + INFO_JSON
 
 
-def test_the_recorded_frames_in_the_v4_layout_give_the_same_values() -> None:
-    """Synthetic: the recorded values encoded in the other layout."""
-    (live, info) = (record.copy() for record in decode(LIVE + INFO))
-    live_raw = LiveData(0, 2442, 0, 0, 0, 0, 0, 8024, 1001, 0, 0, 29, 32, 0x20000, 12, 0)
-    info_raw = InfoData(0x0C78, 0x010E, 0, 6, 0, 2414, 0, 0, 0, 0, 0, 5599, 0, 0, 27, 30, 28, 33)
-    assert encode(live_raw, Layout.LEGACY) == LIVE
-    assert encode(info_raw, Layout.LEGACY) == INFO
-    live["layout"] = info["layout"] = "v4"
-    info["offset"] = 40
-    assert decode(encode(live_raw, Layout.V4) + encode(info_raw, Layout.V4)) == [live, info]
-
-
 def test_rubbish_only_moves_the_offsets() -> None:
     rubbish = b"\0KOD\xff" * 3
     records = decode(rubbish + LIVE + b"KODLKO" + INFO + rubbish)
@@ -156,18 +144,6 @@ def test_csv_holds_what_json_holds() -> None:
                 assert row[column] == value
             else:
                 assert row[column] == ("" if value is None else json.dumps(value))
-
-
-def test_several_names_are_joined_by_a_bar() -> None:
-    text = csv_lines(decode(encode(LiveData(operating_errors=0b11), Layout.V4)))
-    assert ",3,undervoltage|overvoltage," in text
-
-
-def test_each_column_stands_once_and_in_wire_order() -> None:
-    assert len(set(COLUMNS)) == len(COLUMNS)
-    assert COLUMNS[:5] == ("kind", "layout", "offset", "electrical_speed", "battery_voltage")
-    plain = [name for name in COLUMNS if name in LiveData._fields]
-    assert plain == list(LiveData._fields)
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=30))

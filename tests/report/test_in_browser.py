@@ -149,56 +149,6 @@ def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Pa
         assert all((text != "–") == is_known for text in shown), (share, shown)
 
 
-def test_a_drag_zooms_all_plots_and_a_double_click_resets(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"])
-    whole = ranges(browser)
-    (x0, y), (x1, _) = centre(browser, "power", 0.25), centre(browser, "power", 0.5)
-    browser.drag(x0, x1, y)
-    zoomed = ranges(browser)
-    assert all(r == zoomed[0] for r in zoomed)
-    assert zoomed[0] == [pytest.approx(15, abs=0.2), pytest.approx(30, abs=0.2)]
-    browser.click(x0 + 20, y, clicks=2)
-    assert ranges(browser) == whole
-    browser.run("flight.setRange(10, 10.1)")
-    browser.settle()
-    browser.drag(x0, x0 + 40, y)  # less than can be shown
-    low, high = ranges(browser)[0]
-    assert all(r == [low, high] for r in ranges(browser))
-    assert high - low == pytest.approx(0.05)
-
-
-def test_events_can_be_searched_sorted_filtered_and_gone_to(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"])
-
-    def texts(column: int = 5) -> list[str]:
-        found: list[str] = browser.run(
-            f"[...document.querySelectorAll('#events tbody td:nth-child({column})')].map((c) => c.textContent)"
-        )
-        return found
-
-    everything = texts()
-    assert {"power stage hot", "battery voltage too low", "No telemetry"} <= set(everything)
-    browser.run("document.querySelector('[data-sort=text]').click()")
-    assert texts() == sorted(everything, key=lambda text: [ord(c) for c in text])
-    browser.run("document.querySelector('[data-kind=state]').click()")
-    assert set(texts(4)) == {"Error", "Warning", "Link"}
-    browser.run(
-        "(() => { const s = document.getElementById('search'); s.value = 'voltage'; s.dispatchEvent(new Event('input')); })()"
-    )
-    assert texts() == ["battery voltage too low"]
-    assert "battery" in texts(6)[0]  # a remedy
-    browser.run("document.querySelector('#events tbody tr').scrollIntoView({behavior: 'instant', block: 'center'})")
-    box = browser.run(
-        "(() => { const r = document.querySelector('#events tbody .at').getBoundingClientRect(); return [r.x + 5, r.y + 5]; })()"
-    )
-    browser.click(*box)
-    low, high = ranges(browser)[3]
-    assert low == pytest.approx(17.5, abs=0.2)
-    assert high == pytest.approx(23, abs=0.2)
-    browser.run("document.querySelector('.tiles [data-at]').click()")
-    assert ranges(browser)[0] != [low, high]
-
-
 MARKS = """flight.plots.filter((p) => p.key !== "states").map((p) => ({
   key: p.key, told: p.below.hidden ? "" : p.below.textContent, shown: !p.below.hidden && p.below.offsetHeight > 0,
   left: p.u.bbox.left, right: p.u.bbox.left + p.u.bbox.width,

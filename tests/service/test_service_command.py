@@ -154,17 +154,6 @@ def test_what_was_changed_by_hand_is_refused_then_kept_aside(root: Path) -> None
     assert is_ours(unit.read_text())
 
 
-def test_uninstall_keeps_what_was_changed_by_hand_aside(root: Path) -> None:
-    install(root)
-    rules = root / "etc/udev/rules.d/70-kontronik-can-gw.rules"
-    rules.write_text(rules.read_text() + 'SUBSYSTEM=="tty", ENV{ID_SERIAL_SHORT}=="A1", SYMLINK+="esc_left"\n')
-    mine = rules.read_text()
-    done = run("service", "uninstall", "--root", root)
-    assert "70-kontronik-can-gw.rules: was changed by hand, kept as 70-kontronik-can-gw.rules.bak" in done.err
-    assert rules.with_name("70-kontronik-can-gw.rules.bak").read_text() == mine
-    assert not rules.exists()
-
-
 def test_a_link_that_leads_out_of_an_image_is_not_followed(root: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (root / "etc").symlink_to(tmp_path / "elsewhere")
@@ -253,20 +242,6 @@ def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path
     done = run("service", "install", "--dry-run", "--executable", program)
     said = the_line(done, 2)
     assert "the service has a /tmp of its own" in said or "is closed to others" in said
-
-
-def test_closed_folders_on_the_way_are_found(tmp_path: Path) -> None:
-    tmp_path.chmod(0o755)
-    (tmp_path / "a").mkdir(mode=0o755)
-    (tmp_path / "a/b").mkdir(mode=0o750)
-    (tmp_path / "a/b/x").write_text("x")
-    found = service_machine.closed_to_others(tmp_path / "a/b/x")
-    assert found is not None
-    (tmp_path / "a/b").chmod(0o711)
-    (tmp_path / "a/b/x").chmod(0o640)
-    below = [service_machine.closed_to_others(tmp_path / name) for name in ("a/b/x", "a/b")]
-    outside = service_machine.closed_to_others(tmp_path.parent)
-    assert below == ([tmp_path / "a/b/x", None] if outside is None else [outside, outside])
 
 
 # --- status, with stand-ins for systemctl and journalctl

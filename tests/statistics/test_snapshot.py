@@ -10,13 +10,12 @@ from statistics_bench import Bench, with_nodes
 
 from kontronik_can_gw.protocol.deframer import Counters
 from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
-from kontronik_can_gw.protocol.states import OperatingError, state_text
+from kontronik_can_gw.protocol.states import state_text
 from kontronik_can_gw.runtime.snapshot import (
     LOG_LINES,
     CanFacts,
     PortFacts,
     StoreFacts,
-    process_facts,
     program_facts,
     start_ticks,
     with_rates,
@@ -104,19 +103,6 @@ def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> No
     assert set(document["can"]["counters"]) == {f.name for f in fields(GatewayStatus)} - others
 
 
-def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_error() -> None:
-    bench = Bench(1)
-    bench.run(1)
-    esc = bench.gateway.escs[0]
-    assert esc.live is not None
-    word = 1 << OperatingError.UNDERVOLTAGE | 1 << OperatingError.POWER_STAGE_OVERTEMP_WARNING | 1 << 31
-    esc.live = esc.live._replace(operating_errors=word | 1 << OperatingError.PROGRAMMING_ALLOWED)
-    (shown,) = bench.document()["escs"]
-    assert shown["errors"] == ["undervoltage", "bit31"]
-    assert shown["warnings"] == ["power_stage_overtemp_warning"]
-    assert shown["statuses"] == ["programming_allowed"]
-
-
 def test_ports_interface_store_and_log_are_told_as_the_loop_gave_them() -> None:
     bench = Bench(2)
     bench.run(1)
@@ -163,19 +149,6 @@ def test_rates_are_per_second_between_two_documents() -> None:
     }
     assert with_rates(before, None)["rates"] is None
     assert with_rates(before, before)["rates"] is None
-
-
-def test_the_figures_of_the_process_are_those_of_proc(tmp_path: Path) -> None:
-    before = process_facts()
-    opened = [(tmp_path / f"{n}").open("w") for n in range(5)]
-    after = process_facts()
-    for file in opened:
-        file.close()
-    assert after.open_fds == before.open_fds + 5
-    assert after.threads == len(list(Path("/proc/self/task").iterdir()))
-    status = Path("/proc/self/status").read_text(encoding="ascii")
-    resident = next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmRSS"))
-    assert abs(after.rss_bytes - resident) < 0.2 * resident
 
 
 def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> None:

@@ -180,20 +180,6 @@ def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
     until(lambda: number_in(file) == 501)  # the newest, and none of those between
 
 
-def test_a_stuck_disk_does_not_hold_up_the_end_and_leaves_no_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    statistics = Statistics(file, None)
-    put(statistics, file, 1)
-    disk = StuckDisk(monkeypatch)
-    statistics.publish(numbered(2))
-    assert disk.stuck.wait(PATIENCE)
-    monkeypatch.setattr(statistics_module, "_CLOSE_S", 0.01)
-    statistics.close()
-    assert not disk.free.is_set()
-    disk.free.set()
-    until(lambda: os.listdir(file.parent) == [])
-    until(lambda: "statistics" not in [thread.name for thread in threading.enumerate()])
-
-
 def test_the_end_removes_the_file_ends_the_thread_and_closes_what_was_opened(file: Path) -> None:
     def descriptors() -> set[str]:
         return set(os.listdir("/proc/self/fd"))
