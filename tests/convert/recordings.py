@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cantools.database
 from capture_bench import Bench, made
-from flights import capture_file
+from simulated_bus import capture_file
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config import shipped

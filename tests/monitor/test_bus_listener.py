@@ -6,7 +6,7 @@ import os
 
 import can
 import pytest
-from flights import Clock
+from simulated_bus import Clock
 
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError

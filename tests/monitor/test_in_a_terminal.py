@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from flights import flight, layout_of, with_errors, write_log
+from simulated_bus import flight, layout_of, with_errors, write_log
 
 from kontronik_can_gw.protocol.states import OperatingError
 

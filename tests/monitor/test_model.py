@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from flights import STEP_NS, Timed, flight, layout_of, with_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from simulated_bus import STEP_NS, Timed, flight, layout_of, with_errors
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse

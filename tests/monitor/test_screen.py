@@ -4,9 +4,9 @@ import re
 from functools import cache
 
 import pytest
-from flights import STEP_NS, Timed, flight, layout_of, with_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from simulated_bus import STEP_NS, Timed, flight, layout_of, with_errors
 
 from kontronik_can_gw.cli.monitor_screen import (
     UNICODE,

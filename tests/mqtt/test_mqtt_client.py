@@ -197,7 +197,7 @@ def test_pauses_grow_and_are_not_all_alike(monkeypatch: pytest.MonkeyPatch) -> N
     """A fleet that lost its broker does not come back all at once."""
     client = MqttClient(to(free_port()), ONLINE)
     pauses = []
-    monkeypatch.setattr(mqtt_client.time, "monotonic_ns", lambda: 0)
+    monkeypatch.setattr("kontronik_can_gw.runtime.mqtt_client.time.monotonic_ns", lambda: 0)
     for _ in range(14):
         client._failed("x")
         assert client._retry.due is not None

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 from cantools.database.can import Database
-from flights import START_S, STEP_NS, Timed, flight, layout_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of
 
 from kontronik_can_gw.dbc_output.unpacker import SignalReader
 from kontronik_can_gw.offline.mqtt_messages import (

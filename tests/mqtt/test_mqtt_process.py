@@ -10,7 +10,6 @@ from pathlib import Path
 import cantools.database
 import pytest
 from command_line import run
-from flights import flight, layout_of, write_log
 from mqtt_bench import (
     PATIENCE,
     Mosquitto,
@@ -23,6 +22,7 @@ from mqtt_bench import (
     slcan,
     wait_for,
 )
+from simulated_bus import flight, layout_of, write_log
 
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.protocol.states import OperatingState

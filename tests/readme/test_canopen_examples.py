@@ -13,7 +13,6 @@ from unittest.mock import patch
 
 import can
 import pytest
-from canopen.sdo import SdoClient
 
 from kontronik_can_gw.cia301.storage import decode
 from kontronik_can_gw.cli.common import assemble
@@ -36,7 +35,7 @@ pytestmark = pytest.mark.extended
 @pytest.fixture(autouse=True, scope="module")
 def patient_master() -> Iterator[None]:
     """The master waits for an answer however loaded the machine is."""
-    with patch.object(SdoClient, "RESPONSE_TIMEOUT", 60.0):
+    with patch("canopen.sdo.client.SdoClient.RESPONSE_TIMEOUT", 60.0):
         yield
 
 

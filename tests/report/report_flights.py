@@ -6,7 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 
 from capture_bench import START, Bench, made
-from flights import capture_file
+from simulated_bus import capture_file
 
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.dbc_output.expand import expand

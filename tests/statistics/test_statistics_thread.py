@@ -152,7 +152,7 @@ def test_who_reads_while_it_is_written_always_reads_a_whole_document(file: Path,
     for number in range(2, 52):
         statistics.publish(numbered(number, size=number * 37 % 3000))
         count = min(read)
-        until(lambda count=count: min(read) > count or torn)  # type: ignore[misc]
+        until(lambda count=count: min(read) > count or torn != [])  # type: ignore[misc]
     until(lambda: number_in(file) == 51)
     ended.set()
     for thread in readers:

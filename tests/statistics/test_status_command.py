@@ -66,7 +66,7 @@ NOW = 10**15
 @pytest.fixture(autouse=True)
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command's time stands still."""
-    monkeypatch.setattr(status.time, "monotonic_ns", lambda: NOW)
+    monkeypatch.setattr("kontronik_can_gw.cli.status.time.monotonic_ns", lambda: NOW)
 
 
 def written(file: Path, bench: Bench, program: ProgramFacts | None = None, **changes: Any) -> Document:
