@@ -88,76 +88,64 @@ def test_nothing_is_left_out(minute: Minute) -> None:
 # --- the comparison finds what is wrong
 
 
-def _set(line: str, column: int, text: str) -> str:
-    cells = line.split(",")
-    cells[column] = text
-    return ",".join(cells)
+Cells = list[list[str]]
+"""Rows of a table, the first its head."""
 
 
-def _changed_value(lines: list[str]) -> None:
-    column = lines[0].split(",").index("BatteryVoltage [V]")
-    row = next(n for n in range(3000, len(lines)) if lines[n].split(",")[column])
-    lines[row] = _set(lines[row], column, f"{float(lines[row].split(',')[column]) + 0.01:.2f}")
+def _column(rows: Cells, name: str) -> int:
+    return rows[0].index(name)
 
 
-def _changed_text(lines: list[str]) -> None:
-    column = lines[0].split(",").index("OperatingState")
-    lines[3000] = _set(lines[3000], column, "StandBy")
+def _edit(rows: Cells, row: int, column: int, text: str) -> None:
+    rows[row][column] = text
 
 
-def _missing_row(lines: list[str]) -> None:
-    del lines[3000]
+def _changed_value(rows: Cells) -> None:
+    at = _column(rows, "BatteryVoltage [V]")
+    row = next(row for row in rows[3000:] if row[at])
+    row[at] = f"{float(row[at]) + 0.01:.2f}"
 
 
-def _shifted_time(lines: list[str]) -> None:
-    seconds = float(lines[3000].split(",")[0])
-    lines[3000] = _set(lines[3000], 0, f"{seconds + 0.000001:.6f}")
+def _old_value_in_a_gap(rows: Cells) -> None:
+    at = _column(rows, "BatteryVoltage [V]")
+    gap = next(n for n, row in enumerate(rows) if not row[at])
+    rows[gap][at] = rows[gap - 1][at]
 
 
-def _shifted_clock(lines: list[str]) -> None:
-    utc = lines[3000].split(",")[1]
-    lines[3000] = _set(lines[3000], 1, utc[:-4] + f"{(int(utc[-4:-1]) + 2) % 1000:03d}Z")
+def _bec_current_of_a_jivepro(rows: Cells) -> None:
+    row = next(row for row in rows if row[_column(rows, "Device")] == "JivePro")
+    row[_column(rows, "BecCurrent [A]")] = "0.0"
 
 
-def _old_value_in_a_gap(lines: list[str]) -> None:
-    column = lines[0].split(",").index("BatteryVoltage [V]")
-    gap = next(n for n in range(1, len(lines)) if not lines[n].split(",")[column])
-    lines[gap] = _set(lines[gap], column, lines[gap - 1].split(",")[column])
+def _missing_column(rows: Cells) -> None:
+    at = _column(rows, "MotorSpeed [1/min]")
+    for row in rows:
+        del row[at]
 
 
-def _bec_current_of_a_jivepro(lines: list[str]) -> None:
-    device, column = (lines[0].split(",").index(name) for name in ("Device", "BecCurrent [A]"))
-    row = next(n for n in range(1, len(lines)) if lines[n].split(",")[device] == "JivePro")
-    lines[row] = _set(lines[row], column, "0.0")
+TABLE_FAULTS: dict[str, Callable[[Cells], object]] = {
+    "value": _changed_value,
+    "value in a gap": _old_value_in_a_gap,
+    "row": lambda rows: rows.pop(3000),
+    "time": lambda rows: _edit(rows, 3000, 0, f"{float(rows[3000][0]) + 0.000005:.6f}"),
+    "clock": lambda rows: _edit(rows, 3000, 1, rows[2000][1]),
+    "text": lambda rows: _edit(rows, 3000, _column(rows, "OperatingState"), "StandBy"),
+    "value of a JIVEPro": _bec_current_of_a_jivepro,
+    "column": _missing_column,
+}
 
 
-def _missing_column(lines: list[str]) -> None:
-    column = lines[0].split(",").index("MotorSpeed [1/min]")
-    for number, line in enumerate(lines):
-        cells = line.split(",")
-        del cells[column]
-        lines[number] = ",".join(cells)
+def _mutilated(path: Path, fault: str, folder: Path) -> Path:
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    TABLE_FAULTS[fault](rows)
+    bad = folder / "bad.csv"
+    bad.write_text("".join(",".join(row) + "\n" for row in rows))
+    return bad
 
 
-TABLE_FAULTS = (
-    *(
-        _changed_value,
-        _changed_text,
-        _missing_row,
-        _shifted_time,
-        _shifted_clock,
-    ),
-    *(_old_value_in_a_gap, _bec_current_of_a_jivepro, _missing_column),
-)
-
-
-@pytest.mark.parametrize("fault", TABLE_FAULTS, ids=lambda fault: fault.__name__[1:])
-def test_a_mutilated_table_is_found_out(fault: Callable[[list[str]], None], minute: Minute, tmp_path: Path) -> None:
-    lines = (minute.folder / "hour.csv").read_text().splitlines()
-    fault(lines)
-    path = tmp_path / "bad.csv"
-    path.write_text("\n".join(lines) + "\n")
-    verdict = minute.table_of(path)
+@pytest.mark.parametrize("fault", TABLE_FAULTS)
+def test_a_mutilated_table_is_found_out(fault: str, minute: Minute, tmp_path: Path) -> None:
+    verdict = minute.table_of(_mutilated(minute.folder / "hour.csv", fault, tmp_path))
     assert not verdict.ok
     assert verdict.differences >= 1
     assert verdict.problems
@@ -249,18 +237,9 @@ def test_a_value_that_no_esc_meant_is_found_out(
 
 def test_a_mutilated_table_of_a_log_is_found_out(minute: Minute, tmp_path: Path) -> None:
     _, frames = check_log(minute.folder / "hour.log", minute.truth, minute.decoded)
-    lines = (minute.folder / "of_log.csv").read_text().splitlines()
-    path = tmp_path / "bad.csv"
-    for fault in (_changed_value, _missing_row, _shifted_time_of_a_log, _old_value_in_a_gap):
-        changed = list(lines)
-        fault(changed)
-        path.write_text("\n".join(changed) + "\n")
-        assert not check_table_of_log(path, minute.truth, frames, minute.decoded).ok, fault.__name__
-
-
-def _shifted_time_of_a_log(lines: list[str]) -> None:
-    seconds = float(lines[3000].split(",")[0])
-    lines[3000] = _set(lines[3000], 0, f"{seconds + 0.000005:.6f}")
+    for fault in list(TABLE_FAULTS)[:4]:
+        path = _mutilated(minute.folder / "of_log.csv", fault, tmp_path)
+        assert not check_table_of_log(path, minute.truth, frames, minute.decoded).ok, fault
 
 
 def test_mutilated_bytes_and_records_are_found_out(minute: Minute, tmp_path: Path) -> None:
