@@ -49,38 +49,6 @@ def terminal() -> Iterator[PtyEsc]:
 # --- usage
 
 
-def test_no_command_is_told_with_the_usage() -> None:
-    done = run()
-    assert (done.code, done.out) == (2, "")
-    assert done.err.splitlines()[-1].endswith("error: the following arguments are required: COMMAND")
-
-
-def test_an_unknown_command_is_told_with_those_there_are() -> None:
-    done = run("rum")
-    assert (done.code, done.out) == (2, "")
-    assert "invalid choice: 'rum'" in done.err
-    assert all(name in done.err for name in COMMANDS)
-
-
-@pytest.mark.parametrize("command", list(COMMANDS))
-def test_an_unknown_option_is_named(command: str) -> None:
-    needed = {
-        "run": ["-c", "x"],
-        "check": ["-c", "x"],
-        "doctor": ["-c", "x"],
-        "decode": ["-"],
-        "convert": ["x", "y.csv"],
-        "report": ["x"],
-        "replay": ["x", "--to", "log"],
-        "service": ["status"],
-        "completion": ["bash"],
-    }.get(command, [])
-    done = run(command, *needed, "--no-such-option")
-    assert (done.code, done.out) == (2, "")
-    assert "Traceback" not in done.err
-    assert "unrecognized arguments: --no-such-option" in done.err.splitlines()[-1]
-
-
 def test_the_help_lists_the_commands() -> None:
     done = program("--help")
     assert (done.returncode, done.stderr) == (0, "")
@@ -202,76 +170,6 @@ def test_an_interface_python_can_does_not_know_is_a_mistake_of_the_configuration
 # --- configuration and DBC
 
 
-@pytest.mark.parametrize("command", ["run", "check", "dbc"])
-def test_bad_configurations_are_one_line_each(tmp_path: Path, command: str) -> None:
-    file = tmp_path / "a.toml"
-    for content, expected in (
-        (b"", "at least one [[esc]]"),
-        (b"\x7fELF\xff\xfe\0", "is not a text file in UTF-8"),
-        (b"\0\0", "is not valid TOML"),
-        (b"[can]\nchannel = can0", "(at line 2, "),
-        (b"a = " + b"1" * 5000, "is not valid TOML"),
-    ):
-        file.write_bytes(content)
-        said = refused(2, command, "-c", file)
-        assert said.startswith(f"{file}: ")
-        assert expected in said
-    said = refused(2, command, "-c", tmp_path / "none.toml")
-    assert "none.toml: cannot be read: No such file or directory. `kontronik-can-gw init` writes an example." in said
-    assert "Is a directory" in refused(2, command, "-c", tmp_path)
-
-
-def test_all_mistakes_of_a_configuration_are_told_line_by_line(tmp_path: Path) -> None:
-    file = tmp_path / "a.toml"
-    file.write_text('[can]\nbitrte = 1\n[[esc]]\nprot = "x"\n')
-    done = run("run", "-c", file)
-    assert (done.code, done.out) == (2, "")
-    assert [line.split(": ")[2] for line in done.err.splitlines()] == ["can.bitrte", "esc[1].prot", "esc[1].port"]
-
-
-FOREIGN = 'VERSION ""\nBU_: Other Gw\nBO_ 100 Foreign: 8 {sender}\n SG_ Speed : 0|8@1+ (1,0) [0|255] "" Gw\n'
-DBCS: list[tuple[bytes | None, str, str]] = [
-    (None, "", "cannot be read: No such file or directory"),
-    (b"", "", "DBC"),
-    (b"\x7fELF\0\0", "", "is a binary file, not a DBC"),
-    (b"hello, world\n", "", "is not a DBC that can be read"),
-    (b'{"a": 1}', "", "is not a DBC that can be read"),
-    (FOREIGN.format(sender="Other").encode(), 'node = "Gw"', "no message is sent by node 'Gw'; nodes that send: Other"),
-    (FOREIGN.format(sender="Vector__XXX").encode(), "", ""),
-]
-
-
-@pytest.mark.parametrize(("content", "more", "expected"), DBCS)
-def test_a_file_that_is_no_dbc_of_ours_is_told_so(
-    tmp_path: Path, content: bytes | None, more: str, expected: str
-) -> None:
-    if content is not None:
-        (tmp_path / "my.dbc").write_bytes(content)
-    file = configuration(tmp_path, dbc=f'file = "my.dbc"\n{more}')
-    for command in ("run", "check"):
-        said = refused(2, command, "-c", file)
-        assert f"{tmp_path}/my.dbc: " in said
-        assert expected in said
-
-
-def test_more_than_the_bus_can_carry_is_refused_and_more_than_half_is_warned_of(tmp_path: Path) -> None:
-    file = configuration(tmp_path, can='interface = "virtual"\nbitrate = 20_000')
-    for command in ("run", "check", "dbc"):
-        said = refused(2, command, "-c", file)
-        assert re.search(r"need \d{3}% of 20 kbit/s", said)
-        assert "can.bitrate" in said
-    done = run("check", "-c", configuration(tmp_path, can='interface = "virtual"\nbitrate = 50_000'))
-    assert done.code == 0
-    assert re.fullmatch(r"kontronik-can-gw: warning: .* need \d\d% of 50 kbit/s; .*\n", done.err)
-
-
-@pytest.mark.parametrize("constant", ["inf", "nan", "1e400"])
-def test_an_infinite_constant_is_refused_as_any_other_wrong_value(tmp_path: Path, constant: str) -> None:
-    file = configuration(tmp_path, **{"dbc.bind": f'"EscShaft.MotorSpeed" = {constant}'})
-    said = refused(2, "check", "-c", file)
-    assert "EscShaft.MotorSpeed" in said
-
-
 # --- init, check, schema
 
 
@@ -318,23 +216,6 @@ def test_schema_is_the_json_schema_of_the_configuration() -> None:
 # --- dbc
 
 
-@pytest.mark.parametrize("count", [1, 2, 8])
-def test_the_dbc_of_several_escs_is_read_by_cantools_at_its_strictest(tmp_path: Path, count: int) -> None:
-    file = tmp_path / "out.dbc"
-    done = run("dbc", "--esc", count, "-o", file)
-    assert (done.code, done.out, done.err) == (0, "", f"kontronik-can-gw: {file} written\n")
-    database = cantools.database.load_file(file, strict=True)
-    assert isinstance(database, cantools.database.can.Database)
-    of_one = cantools.database.load_file(DBC, strict=True)
-    assert isinstance(of_one, cantools.database.can.Database)
-    assert len(database.messages) == 11 * count + 2
-    assert len(of_one.messages) == 13
-    assert len({message.frame_id for message in database.messages}) == len(database.messages)
-    assert all(0x680 <= message.frame_id <= 0x6DF for message in database.messages)
-    assert run("dbc", "--esc", count).out == file.read_text()
-    assert os.listdir(tmp_path) == ["out.dbc"]
-
-
 def test_the_dbc_of_a_configuration_is_what_its_gateway_sends(tmp_path: Path) -> None:
     file = configuration(tmp_path, dbc="base_id = 0x100\nid_step = 128")
     file.write_text(file.read_text() + 'name = "left"\n[[esc]]\nport = "y"\nname = "right"\n')
@@ -345,33 +226,6 @@ def test_the_dbc_of_a_configuration_is_what_its_gateway_sends(tmp_path: Path) ->
     checked = dict(re.findall(r"^(\w+) +([0-9A-F]{3})h ", run("check", "-c", file).out, re.MULTILINE))
     assert checked == {message.name: f"{message.frame_id:03X}" for message in database.messages}
     assert database.get_message_by_name("LeftStatus").frame_id == 0x100
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["--esc", "2", "--name", "a"], "--name is given 1 times for 2 ESCs"),
-        (["--name", "a", "--name", "A"], "--name: "),
-        (["--from", "/none.dbc"], "/none.dbc: cannot be read"),
-        (["--node", "Nobody"], "no message is sent by node 'Nobody'"),
-        (["--esc", "2", "--id-step", "8"], "Take another step"),
-        (["--esc", "128"], ""),
-    ],
-)
-def test_bad_wishes_for_a_dbc_are_one_line(words: list[str], expected: str) -> None:
-    done = run("dbc", *words)
-    assert (done.code, done.out) == (2, "")
-    assert "Traceback" not in done.err
-    assert all(line.startswith("kontronik-can-gw dbc: ") for line in done.err.splitlines())
-    assert expected in done.err
-
-
-def test_a_dbc_that_cannot_be_written_is_one_line_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    said = refused(1, "dbc", "-o", tmp_path / "none" / "out.dbc")
-    assert f"{tmp_path}/none/out.dbc: cannot be written: No such file or directory" in said
-    (tmp_path / "dir").mkdir()
-    assert "Is a directory" in refused(1, "dbc", "-o", tmp_path / "dir")
-    assert sorted(os.listdir(tmp_path)) == ["dir"]
 
 
 def test_a_dbc_goes_into_a_pipe_and_through_a_link_without_replacing_them(tmp_path: Path) -> None:
@@ -408,12 +262,3 @@ def test_a_closed_standard_output_is_no_reason_for_a_traceback(tmp_path: Path) -
     done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert done.returncode == 0
-
-
-def test_a_folder_without_a_name_is_refused(tmp_path: Path) -> None:
-    done = run("run", "-c", configuration(tmp_path), "--record", " ")
-    assert done.code == 2
-    assert "--record: is empty. Give a folder" in done.err
-    done = run("check", "-c", configuration(tmp_path, can='fd = true\ninterface = "virtual"', record='can_log = "trc"'))
-    assert done.code == 2
-    assert "record.can_log: a TRC log knows no CAN FD frames" in done.err

@@ -70,35 +70,6 @@ def test_statistics_are_written_as_json(tmp_path: Path) -> None:
     assert (counters["bytes"], counters["dropped_bytes"]) == (40, 2)
 
 
-def test_where_no_frame_is_found_a_line_says_why_and_the_exit_code_is_0(tmp_path: Path) -> None:
-    stats = tmp_path / "stats.json"
-    result = decode("-", "--stats", str(stats), data=b"\xaa" * 500)
-    assert result.returncode == 0
-    assert result.stdout == b""
-    assert "no frame found: bytes but never KOD: wrong parity" in result.stderr.decode()
-    assert json.loads(stats.read_text())["dropped_bytes"] == 500
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        ("missing", 1, "missing: cannot be opened: No such file or directory."),
-        (".", 1, ".: is a directory."),
-        ("flight.bin --stats missing/s.json", 1, "--stats missing/s.json: cannot be written: No such file"),
-        ("flight.bin --stats .", 1, "--stats .: cannot be written: Is a directory"),
-        ("flight.bin --stats flight.bin", 2, "is the input"),
-        ("", 2, "the following arguments are required: FILE"),
-    ],
-)
-def test_what_cannot_be_opened_or_is_wrong_is_one_line(
-    tmp_path: Path, words: str, code: int, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    file = written(tmp_path / "flight.bin", LIVE)
-    assert said in refused(code, "decode", *words.split())
-    assert file.read_bytes() == LIVE
-
-
 def test_an_unreadable_file_gives_one_clear_line_and_exit_code_1(tmp_path: Path) -> None:
     """Within this process, so that root can lay its rights down for the moment: root may read everything."""
     file = tmp_path / "secret"

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from command_line import refused, run, written
+from command_line import refused, run
 from log_files import SUFFIX, read_by_library
 from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_candump
 
@@ -144,45 +144,6 @@ def test_nothing_to_convert_leaves_nothing(tmp_path: Path, form: str, capsys: py
 
 
 # --- refusals
-
-
-@pytest.mark.parametrize(
-    ("code", "words", "said"),
-    [
-        (2, "esc.bytes esc.bytes", "its suffix tells no format. Give --to, or one of these suffixes: .csv "),
-        (2, "bus.log bus.log", "is IN. Give another OUT."),
-        (2, "bus.log bus.log --force", "is IN. Give another OUT."),
-        (2, "esc.bytes there.csv", "is there already. Give --force to write over it."),
-        (2, "esc.bytes -", "give --to: csv, jsonl, candump, asc, trc"),
-        (2, "esc.bytes - --to blf", "blf cannot go to standard output."),
-        (2, "esc.bytes . --to csv", "is a directory. Give a file."),
-        (2, "esc.bytes /dev/null --to parquet", "is no plain file, into which parquet cannot be written"),
-        (1, "esc.bytes missing/out.csv", "cannot be written: No such file or directory."),
-        (1, "esc.bytes missing/out.mf4", "cannot be written: No such file or directory."),
-        (1, "esc.bytes missing/out.parquet", "cannot be written: No such file or directory."),
-        (1, "esc.bytes esc.bytes/out.blf", "cannot be written: Not a directory."),
-        (1, "missing.log out.csv", "missing.log: there is no such file."),
-        (2, "esc.bytes out.csv --signals BateryVoltage", "no such signal. Did you mean BatteryVoltage?"),
-        (2, "esc.bytes out.csv --esc esc7", "--esc esc7: there is no such ESC. There are: esc1"),
-        (2, "esc.bytes o.log --signals X", "--signals is for tables"),
-        (2, "esc.bytes o.log --rate 1", "--rate is for tables"),
-        (2, "esc.bytes o.asc --esc esc1", "--esc is for tables and bin"),
-        (2, "esc.bytes out.csv --units-line", "--units-line is for jsonl, not for csv"),
-        (2, "esc.bytes o.bin --from 1", "not for bin, which has no times"),
-        (2, "bus.log o.bin", "is a log of CAN frames"),
-        (2, "esc.bytes out.csv --from 2 --until 1", "--until is before --from"),
-        (1, "esc.bytes out.csv --from 999", "nothing in it is between --from and --until"),
-        (2, "esc.bytes out.csv --dbc no.dbc", "no.dbc"),
-    ],
-)
-def test_what_is_wrong_is_told_in_one_line_with_the_remedy(
-    dump: Path, log: Path, tmp_path: Path, code: int, words: str, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    there = written(tmp_path / "there.csv", "mine")
-    monkeypatch.chdir(tmp_path)
-    assert said in refused(code, "convert", *words.split())
-    assert there.read_text() == "mine"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bus.log", "esc.bytes", "there.csv"]
 
 
 @pytest.mark.parametrize(

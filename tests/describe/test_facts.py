@@ -9,7 +9,7 @@ import canopen
 import cantools.database
 import pytest
 from canopen.objectdictionary import ODVariable
-from command_line import refused, run
+from command_line import run
 from described import DBC, EDS, TWO_ESCS, configuration, described
 
 from kontronik_can_gw.cia301.emergency import GatewayError
@@ -195,22 +195,6 @@ def test_a_node_that_waits_for_lss_has_no_cob_ids_of_its_own(tmp_path: Path) -> 
 
 
 # --- mistakes
-
-
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [
-        (2, ["--dbc", "none.dbc"]),
-        (2, ["--dbc", "no.dbc"]),
-        (2, ["-c", "none.toml"]),
-        (2, ["--format", "man", "--dbc", str(DBC)]),
-        (1, ["-o", "none/x.md"]),
-    ],
-)
-def test_mistakes_are_one_line(code: int, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "no.dbc").write_text("no DBC\n")
-    assert refused(code, "describe", *words)
 
 
 def test_the_same_files_give_the_same_text_without_a_path(tmp_path: Path) -> None:

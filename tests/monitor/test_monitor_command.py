@@ -230,14 +230,8 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (["--speed", "2"], 2, "--speed: is for a FILE"),
-        (["--timeout", "2"], 2, "--timeout: is for --once"),
-        (["x.log", "--channel", "can1"], 2, "--interface and --channel mean nothing"),
-        (["x.log"], 1, "x.log: there is no such file"),
         (["--interface", "sockcan"], 2, "Did you mean socketcan?"),
         (["--interface", "socketcan", "--channel", "nocan7"], 1, "CAN interface nocan7: "),
-        (["--once", "--timeout", "0"], 2, "not a number of seconds"),
-        (["x.log", "--speed", "fast"], 2, "not a factor"),
     ],
 )
 def test_a_mistake_is_one_line_with_the_remedy(

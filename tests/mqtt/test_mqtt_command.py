@@ -10,22 +10,13 @@ from command_line import refused, written
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        ([], 2, "no broker is given: --broker HOST, or broker in the table [mqtt] of the configuration"),
-        (["--broker", "mqtt://x"], 2, "--broker: 'mqtt://x' is not a broker, as broker.example"),
-        (["--broker", "127.0.0.1:1", "--rate", "21"], 2, "--rate: 21.0 is outside 0.01..20"),
         (["--broker", "127.0.0.1:1", "--ca-file", "x"], 2, "--tls"),
-        (
-            ["--broker", "127.0.0.1:1", "--username", "x", "--password-file", "none"], 1,
-            "none: the password cannot be read: No such file or directory",
-        ),
         (
             ["--broker", "127.0.0.1:1", "--username", "x", "--password-file", "empty"], 1,
             "has no password on its first line",
         ),
         (["--broker", "127.0.0.1:1", "--tls", "--ca-file", "empty"], 1, "is not a certificate in PEM form"),
-        (["--broker", "127.0.0.1:1", "--tls", "--ca-file", "none"], 1, "none: mqtt.ca_file cannot be read"),
         (["--broker", "127.0.0.1:1", "--interface", "socketcan", "--channel", "no0"], 1, "no0"),
-        (["--broker", "127.0.0.1:1", "none.log"], 1, "none.log: there is no such file"),
         (["--broker", "127.0.0.1:1", "--discovery", "empty"], 2, "is a file. Give FILE before the options."),
     ],
 )  # fmt: skip

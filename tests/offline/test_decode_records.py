@@ -1,7 +1,5 @@
 """Records from bytes: exact values, in wire order, alike however the stream is cut."""
 
-import csv
-import io
 import json
 
 import pytest
@@ -9,11 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.offline.decode import (
-    COLUMNS,
     Decoder,
     Record,
-    csv_header,
-    csv_lines,
     json_lines,
     physical_fields,
     summary,
@@ -126,24 +121,6 @@ def test_printed_floats_read_back_to_the_exact_step(raw: int, signed: int) -> No
     for name in ("battery_voltage", "battery_current", "bec_voltage"):
         assert rows(LiveData)[name].raw(record[name]) == getattr(data, name)
         assert len(repr(record[name]).partition(".")[2]) <= 3
-
-
-def test_csv_holds_what_json_holds() -> None:
-    records = decode(spoiled_stream())
-    assert {record["layout"] for record in records} == {"v4", "legacy"}
-    table = list(csv.DictReader(io.StringIO(csv_header() + csv_lines(records))))
-    lines = [json.loads(line) for line in json_lines(records).splitlines()]
-    assert len(table) == len(lines) == len(records)
-    for row, line in zip(table, lines, strict=True):
-        assert tuple(row) == COLUMNS
-        for column in COLUMNS:
-            value = line.get(column)
-            if isinstance(value, list):
-                assert row[column] == "|".join(value)
-            elif isinstance(value, str):
-                assert row[column] == value
-            else:
-                assert row[column] == ("" if value is None else json.dumps(value))
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=30))

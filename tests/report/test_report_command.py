@@ -107,24 +107,3 @@ def test_no_line_is_drawn_over_a_dropout(recording: Path, points: int) -> None:
     for esc, lost in enumerate(DROPOUTS):
         gaps = [e for e in found["events"] if e["esc"] == esc and e["text"] == "No telemetry"]
         assert len(gaps) == 60 * S // lost.interval_ns
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "expected"),
-    [
-        (["{dump}"], 2, "give -o FILE for the page, --png FOLDER for pictures, or both"),
-        (["{dump}", "-o", "{dump}"], 2, "is the input. Give another file."),
-        (["{dump}", "-o", ""], 2, "-o: is empty. Give a file, or - for standard output."),
-        (["{dump}", "-o", "{tmp}"], 2, "is a folder. Give a file."),
-        (["{dump}", "-o", "{tmp}/" + 300 * "x"], 2, "cannot be written: File name too long."),
-        (["{dump}", "-o", "{tmp}/no/x.html"], 1, "cannot be written: No such file or directory"),
-        (["{dump}", "-o", "-", "--from", "9", "--to", "3"], 2, "--to 3: must be greater than --from 9"),
-        (["{dump}", "-o", "-", "--from", "900"], 1, "no values in this part of it"),
-        (["{tmp}/none.kcap", "-o", "-"], 1, "there is no such file"),
-        (["{tmp}/text", "-o", "-"], 2, "is no capture, no CAN log"),
-        (["{dump}", "-o", "-", "--points", "99"], 2, "--points"),
-    ],
-)
-def test_mistakes_are_one_line(dump: Path, tmp_path: Path, words: list[str], code: int, expected: str) -> None:
-    (tmp_path / "text").write_text("hello " * 100)
-    assert expected in refused(code, "report", *(word.format(dump=dump, tmp=tmp_path) for word in words))
