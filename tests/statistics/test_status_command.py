@@ -357,17 +357,20 @@ def test_on_a_terminal_it_is_live_and_ends_by_a_signal_with_0_and_the_cursor_sho
             if select.select([master], [], [], 0.1)[0]:
                 text += os.read(master, 65536).decode("utf-8", "replace")
 
-    until("Ctrl-C ends.")
-    document["monotonic_ns"] -= 100 * SECOND
-    file.write_text(json.dumps(document), encoding="utf-8")
-    until("does not answer since")
-    file.unlink()
-    until("there is no such file")
-    process.send_signal(number)
-    with contextlib.suppress(OSError):  # the other end has closed
-        while data := os.read(master, 65536):
-            text += data.decode("utf-8", "replace")
-    assert process.wait(60) == 0
-    os.close(master)
+    try:
+        until("Ctrl-C ends.")
+        document["monotonic_ns"] -= 100 * SECOND
+        file.write_text(json.dumps(document), encoding="utf-8")
+        until("does not answer since")
+        file.unlink()
+        until("there is no such file")
+        process.send_signal(number)
+        with contextlib.suppress(OSError):  # the other end has closed
+            while data := os.read(master, 65536):
+                text += data.decode("utf-8", "replace")
+        assert process.wait(60) == 0
+    finally:
+        process.kill()
+        os.close(master)
     assert "Traceback" not in text
     assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
