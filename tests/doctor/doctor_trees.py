@@ -125,6 +125,9 @@ class Tree(System):
     def user(self) -> User:
         return self.me
 
+    def group_name(self, gid: int) -> str:
+        return {0: "root", DIALOUT: "dialout"}.get(gid, str(gid))
+
     def status(self, name: str) -> os.stat_result | None:
         return self.devices.get(self.real(name)) or super().status(name)
 
@@ -137,6 +140,12 @@ class Tree(System):
 
     def file_system(self, name: str) -> FileSystem | None:
         return self.full.get(name, _ROOM)
+
+    def may_open(self, name: str) -> bool:
+        return name not in self.closed
+
+    def may_fill(self, name: str) -> bool:
+        return name not in self.closed
 
 
 def only(findings: Sequence[Finding], check: str) -> Finding:
