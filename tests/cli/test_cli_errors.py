@@ -262,3 +262,13 @@ def test_a_closed_standard_output_is_no_reason_for_a_traceback(tmp_path: Path) -
     done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert done.returncode == 0
+
+
+def test_a_reader_that_goes_away_is_not_told_about_it() -> None:
+    done = subprocess.run(
+        ["sh", "-c", f"{sys.executable} -m kontronik_can_gw dbc --esc 8 | head -c 10"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == ('VERSION ""', "")

@@ -259,6 +259,19 @@ def test_the_last_word_on_the_bus_is_that_the_gateway_stops(esc: PtyEsc) -> None
 # --- as processes
 
 
+def test_stopping_a_loop_that_has_ended_writes_to_nobody(esc: PtyEsc) -> None:
+    with bench(esc.path) as running:
+        running.stop()
+        read, write = os.pipe2(os.O_NONBLOCK)  # likely the numbers that the loop's own pipe had
+        more = [os.pipe2(os.O_NONBLOCK) for _ in range(8)]
+        running.loop.stop()
+        for reader, writer in [(read, write), *more]:
+            with pytest.raises(BlockingIOError):
+                os.read(reader, 1)
+            os.close(reader)
+            os.close(writer)
+
+
 def gateway_process(tmp_path: Path, ports: list[str]) -> subprocess.Popen[str]:
     """``run`` on the virtual interface, when all its ports are open."""
     file = tmp_path / "gateway.toml"

@@ -1,5 +1,8 @@
 """``kontronik-can-gw convert`` as people use it: what it makes, what it says, what it leaves behind when it cannot go on."""
 
+import contextlib
+import os
+import pty
 import resource
 import signal
 import subprocess
@@ -107,6 +110,28 @@ def test_text_on_standard_output_is_that_of_a_file_and_talk_goes_to_standard_err
 
 
 # --- damage
+
+
+def _on_terminal(*words: object, data_too: bool = False) -> bytes:
+    """What a person sees on standard error (and output), a terminal."""
+    master, slave = pty.openpty()
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
+    process = subprocess.Popen(
+        [*PROGRAM, *map(str, words)], stderr=slave, stdout=slave if data_too else subprocess.DEVNULL, env=environment
+    )
+    os.close(slave)
+    seen = b""
+    with contextlib.suppress(OSError):  # EIO: the program has gone
+        while data := os.read(master, 65536):
+            seen += data
+    os.close(master)
+    assert process.wait(60) == 0
+    return seen
+
+
+def test_no_bar_where_the_data_goes_to_the_same_terminal(dump: Path) -> None:
+    assert "━" not in _on_terminal(dump, "-", "--to", "csv", data_too=True).decode()
+    assert "━" in _on_terminal(dump, "-", "--to", "csv").decode()
 
 
 def test_of_damaged_input_all_that_is_intact_is_converted_and_the_rest_told(

@@ -128,6 +128,18 @@ def test_a_stream_without_a_recording_is_one_line(tmp_path: Path, command: str, 
 # --- more ESCs than the DBC has
 
 
+def test_no_room_for_what_a_pipe_brings_is_one_line(tmp_path: Path) -> None:
+    log = _recordings(tmp_path)["log"]
+    done = program("ulimit -f 1; cat bus.log | gw convert - o.csv", cwd=tmp_path)
+    assert log.stat().st_size > 2048
+    assert done.returncode == 1, done.stderr
+    assert (
+        b"cannot be written: File too large. What a pipe brings is kept there; TMPDIR names another folder."
+        in done.stderr
+    )
+    assert done.stderr.count(b"\n") == 1
+
+
 def _log_of(path: Path, escs: int, frames: int = 900, foreign: int = 0) -> Path:
     """A log of so many ESCs by ``dbc --esc``, made by cantools' ids alone; and of foreign ids."""
     import cantools.database

@@ -194,9 +194,6 @@ def test_a_node_that_waits_for_lss_has_no_cob_ids_of_its_own(tmp_path: Path) -> 
     assert {cob["use"] for cob in node["cob_ids"]} == {"NMT", "LSS"}
 
 
-# --- mistakes
-
-
 def test_the_same_files_give_the_same_text_without_a_path(tmp_path: Path) -> None:
     file = tmp_path / "x.json"
     assert run("describe", "--format", "json", "-o", file).code == 0

@@ -223,7 +223,7 @@ class Process:
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
-        self._reader.join(2)
+        self._reader.join(PATIENCE)
         for stream in (self.process.stdout, self.process.stderr):
             if stream:
                 stream.close()
@@ -272,7 +272,7 @@ class Slcan:
 
     def close(self) -> None:
         self._stop.set()
-        self._thread.join(2)
+        self._thread.join(PATIENCE)
         os.close(self._master)
         os.close(self._slave)
 
@@ -309,4 +309,4 @@ class Traffic:
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        self._thread.join(5)
+        self._thread.join(PATIENCE)

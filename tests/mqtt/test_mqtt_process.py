@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cantools.database
 import pytest
-from command_line import run
+from command_line import refused, run
 from mqtt_bench import (
     PATIENCE,
     Mosquitto,
@@ -128,6 +128,15 @@ def test_a_bus_without_frames_is_told_while_the_publisher_stays_online(adapter: 
         assert heard.of("kontronik/quiet/online")[-1].payload == b"online"
 
 
+def test_a_recording_that_nobody_takes_fails(tmp_path: Path) -> None:
+    file = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 1))
+    code, said = talk(file, "--broker", f"127.0.0.1:{free_port()}", "--gateway", "nobody")
+    assert code == 1
+    last = said.splitlines()[-1]
+    assert last.startswith("kontronik-can-gw mqtt: the end of the recording was not published. MQTT broker 127.0.0.1:")
+    assert last.endswith(": connection refused. Does it run, and is the port right?")
+
+
 def test_several_escs_come_by_their_names_from_a_configuration(tmp_path: Path, broker: Mosquitto) -> None:
     toml = tmp_path / "gateway.toml"
     toml.write_text(
@@ -236,6 +245,15 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
 # --- systemd
 
 
+def test_the_same_gateway_twice_on_a_machine_is_refused(adapter: Slcan, broker: Mosquitto, tmp_path: Path) -> None:
+    file = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 1))
+    with live(adapter, broker, "twice") as program:
+        program.wait_for_line("connected as")
+        said = refused(1, "mqtt", file, "--broker", broker.address, "--gateway", "twice")
+        assert f"another process on this machine publishes as twice to MQTT broker {broker.address}" in said
+        assert program.process.poll() is None
+
+
 def test_the_service_manager_is_told_and_the_watchdog_fed(tmp_path: Path, adapter: Slcan, broker: Mosquitto) -> None:
     told: list[str] = []
     path = str(tmp_path / "notify")
@@ -250,3 +268,27 @@ def test_the_service_manager_is_told_and_the_watchdog_fed(tmp_path: Path, adapte
             while "STOPPING=1" not in told[-1]:
                 told.append(manager.recv(4096).decode())
     assert "READY=1" in told[0]
+
+
+def test_as_a_service_it_waits_for_the_interface(tmp_path: Path, broker: Mosquitto) -> None:
+    path = str(tmp_path / "notify")
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
+        Subscriber(broker.port, "kontronik/wait/#") as heard,
+    ):
+        manager.bind(path)
+        words = (
+            "--interface",
+            "slcan",
+            "--channel",
+            tmp_path / "none",
+            "--broker",
+            broker.address,
+            "--gateway",
+            "wait",
+        )
+        with Process(*words, environment={"NOTIFY_SOCKET": path}) as program:
+            heard.wait("kontronik/wait/online", b"online")
+            heard.wait("kontronik/wait/available", b"offline")
+            assert program.log.count(f"CAN slcan {tmp_path}/none") == 1
+            assert program.end() == 0

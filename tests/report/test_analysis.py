@@ -191,6 +191,14 @@ def test_losses_are_gaps_in_lines_and_events(bus: BusLayout, rows: list[Row], fl
         assert all(v is None for v in inside[5:-5])
 
 
+def test_a_device_that_changes_is_told(flight: Flight) -> None:
+    (event,) = [e for e in flight.events if e.kind == "device"]
+    assert event.text == "Device changed from Kosmik 120 firmware 4.17 to Kolibri 120 firmware 4.17"
+    assert 70 < (event.begin_ns - flight.origin_ns) / S < 72
+    assert (flight.facts[0].device, flight.facts[0].firmware, flight.facts[0].layout) == ("Kolibri", "4.17", "V4")
+    assert (flight.facts[1].device, flight.facts[1].layout) == ("JivePro", "Legacy")
+
+
 def test_the_band_holds_the_states_that_were_flown(flight: Flight) -> None:
     names = [int(s.state) for s in flight.segments[1]]
     profile = [int(phase.state) for phase in FLIGHT]

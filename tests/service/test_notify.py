@@ -72,6 +72,12 @@ def test_a_status_cannot_carry_a_message_of_its_own(manager: Manager) -> None:
     assert manager.told() == [["STATUS=bus-off STOPPING=1 MAINPID=1"]]
 
 
+def test_a_long_status_fits_what_systemd_reads(manager: Manager) -> None:
+    Notifier(manager.environment()).status("\N{GRINNING FACE}" * 5000)
+    [[line]] = manager.told()
+    assert 3000 < len(line.encode()) <= 4096
+
+
 def test_without_a_manager_nothing_happens() -> None:
     for address in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}, {"NOTIFY_SOCKET": "@"}):
         notifier = Notifier(address | {"WATCHDOG_USEC": "1000"})

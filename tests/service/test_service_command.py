@@ -154,6 +154,47 @@ def test_what_was_changed_by_hand_is_refused_then_kept_aside(root: Path) -> None
     assert is_ours(unit.read_text())
 
 
+def test_a_foreign_file_is_never_taken_for_ours(root: Path) -> None:
+    unit = root / UNITS / "kontronik-can-gw.service"
+    unit.parent.mkdir(parents=True)
+    unit.write_text("[Service]\nExecStart=/bin/true\n")
+    assert "--force replaces it" in the_line(install(root), 2)
+    assert added(root) == [f"{UNITS}/kontronik-can-gw.service"]
+
+
+def test_an_active_network_file_takes_the_place_of_its_example(root: Path) -> None:
+    install(root)
+    install(root, "--network", 500_000)
+    network = root / "etc/systemd/network"
+    active = ["50-kontronik-can-gw-can0.link", "50-kontronik-can-gw-can0.network"]
+    assert sorted(path.name for path in network.iterdir()) == active
+    install(root)
+    assert sorted(path.name for path in network.iterdir()) == active
+
+
+def test_the_group_of_serial_ports_comes_from_the_image(root: Path) -> None:
+    (root / "etc").mkdir()
+    (root / "etc/group").write_text("root:x:0:\nuucp:x:986:\n")
+    install(root)
+    assert "\nSupplementaryGroups=uucp\n" in (root / UNITS / "kontronik-can-gw.service").read_text()
+
+
+def test_a_program_in_a_home_folder_is_made_visible(root: Path) -> None:
+    run("service", "install", "--root", root, "--executable", "/home/pi/.venv/bin/kontronik-can-gw")
+    assert "\nProtectHome=read-only\n" in (root / UNITS / "kontronik-can-gw.service").read_text()
+
+
+def test_uninstall_keeps_what_was_changed_by_hand_aside(root: Path) -> None:
+    install(root)
+    rules = root / "etc/udev/rules.d/70-kontronik-can-gw.rules"
+    rules.write_text(rules.read_text() + 'SUBSYSTEM=="tty", ENV{ID_SERIAL_SHORT}=="A1", SYMLINK+="esc_left"\n')
+    mine = rules.read_text()
+    done = run("service", "uninstall", "--root", root)
+    assert "70-kontronik-can-gw.rules: was changed by hand, kept as 70-kontronik-can-gw.rules.bak" in done.err
+    assert rules.with_name("70-kontronik-can-gw.rules.bak").read_text() == mine
+    assert not rules.exists()
+
+
 def test_a_link_that_leads_out_of_an_image_is_not_followed(root: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (root / "etc").symlink_to(tmp_path / "elsewhere")
@@ -161,7 +202,7 @@ def test_a_link_that_leads_out_of_an_image_is_not_followed(root: Path, tmp_path:
     assert tree(tmp_path / "elsewhere") == []
 
 
-def test_a_folder_that_cannot_be_written_is_the_line(root: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_one_line(root: Path) -> None:
     (root / "etc").write_text("a file")
     assert "cannot be" in the_line(install(root), 1)
 
@@ -328,3 +369,16 @@ def test_status_of_a_service_that_cannot_start_says_why(tmp_path: Path, monkeypa
     assert lines[0].startswith("kontronik-can-gw.service: activating (auto-restart) since ")
     assert lines[0].endswith("; does not start with the machine")
     assert lines[1] == "  process        restarted 12 times, last ended by exit-code, status 2"
+
+
+def test_status_of_instances_names_each_and_fails_if_one_is_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left, right = "kontronik-can-gw@left.service", "kontronik-can-gw@right.service"
+    idle = RUNNING | {"ActiveState": "inactive", "UnitFileState": "disabled"}
+    units = {"kontronik-can-gw.service": idle, left: RUNNING, right: FAILED}
+    done = status(tmp_path, monkeypatch, units, [])
+    heads = [line.split(":")[0] for line in done.out.splitlines() if not line.startswith(" ")]
+    assert (done.code, heads) == (3, [left, right])
+    assert "configuration  /etc/kontronik-can-gw/left.toml" in done.out
+    assert status(tmp_path, monkeypatch, units, [], "--instance", "left").code == 0

@@ -10,7 +10,7 @@ from statistics_bench import Bench, with_nodes
 
 from kontronik_can_gw.protocol.deframer import Counters
 from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
-from kontronik_can_gw.protocol.states import state_text
+from kontronik_can_gw.protocol.states import OperatingError, state_text
 from kontronik_can_gw.runtime.snapshot import (
     LOG_LINES,
     CanFacts,
@@ -20,6 +20,7 @@ from kontronik_can_gw.runtime.snapshot import (
     start_ticks,
     with_rates,
 )
+from kontronik_can_gw.runtime.statistics import default_file
 from kontronik_can_gw.simulator import EscOptions, Faults
 from kontronik_can_gw.sources import CanState, GatewayStatus
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -103,6 +104,19 @@ def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> No
     assert set(document["can"]["counters"]) == {f.name for f in fields(GatewayStatus)} - others
 
 
+def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_error() -> None:
+    bench = Bench(1)
+    bench.run(1)
+    esc = bench.gateway.escs[0]
+    assert esc.live is not None
+    word = 1 << OperatingError.UNDERVOLTAGE | 1 << OperatingError.POWER_STAGE_OVERTEMP_WARNING | 1 << 31
+    esc.live = esc.live._replace(operating_errors=word | 1 << OperatingError.PROGRAMMING_ALLOWED)
+    (shown,) = bench.document()["escs"]
+    assert shown["errors"] == ["undervoltage", "bit31"]
+    assert shown["warnings"] == ["power_stage_overtemp_warning"]
+    assert shown["statuses"] == ["programming_allowed"]
+
+
 def test_ports_interface_store_and_log_are_told_as_the_loop_gave_them() -> None:
     bench = Bench(2)
     bench.run(1)
@@ -161,3 +175,10 @@ def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> Non
     assert start_ticks(child) == -1  # ended, and nobody has asked for its exit code
     os.waitpid(child, 0)
     assert start_ticks(child) == 0
+
+
+def test_the_default_file_is_in_the_services_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    assert default_file() is None
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/kontronik-can-gw:/run/other")
+    assert default_file() == Path("/run/kontronik-can-gw/status.json")

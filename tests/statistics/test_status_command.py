@@ -27,6 +27,7 @@ from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     PortFacts,
     ProgramFacts,
+    StoreFacts,
     program_facts,
     with_rates,
 )
@@ -133,6 +134,11 @@ def test_a_bus_that_takes_nothing_is_a_fault(state: CanState, facts: CanFacts, c
     assert (seen.code, list(seen.troubles)) == (code, [said] if said else [])
 
 
+def test_parameters_that_cannot_be_stored_are_a_fault() -> None:
+    seen = judged(heard().document(store=StoreFacts(0, "disk full")))
+    assert (seen.code, seen.troubles) == (TROUBLE, ("parameters cannot be stored: disk full",))
+
+
 def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> None:
     document = heard().document()
     assert judged(document, STALE_NS).code == HEALTHY
@@ -201,6 +207,14 @@ def test_a_missing_file_a_folder_a_pipe_and_another_version_are_told_in_one_line
         code, out, talk = shell("--file", tmp_path / name)
         assert (code, out, talk.count("\n")) == (NOT_RUNNING, "", 1)
         assert said in talk
+
+
+def test_the_configuration_says_where_the_file_is(tmp_path: Path) -> None:
+    configuration = tmp_path / "gateway.toml"
+    configuration.write_text('[statistics]\nfile = "s/status.json"\n[[esc]]\nport = "x"\n', encoding="utf-8")
+    written(tmp_path / "s" / "status.json", heard())
+    code, out, _ = shell("-c", configuration)
+    assert code == HEALTHY and out.startswith("kontronik-can-gw")
 
 
 def test_a_configuration_that_says_nothing_is_looked_for_among_the_services(tmp_path: Path, run_folder: Path) -> None:
