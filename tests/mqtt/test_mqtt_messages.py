@@ -175,6 +175,14 @@ def test_the_rate_is_held_whenever_it_is_asked(rate: float, steps: list[int]) ->
     assert told == list(expected.values())
 
 
+def test_due_tells_when_to_ask_again() -> None:
+    made = publisher("esc1", rate=0.5)
+    made.messages(0, 0)
+    assert made.due(0) == SECOND_NS // 2
+    assert made.messages(SECOND_NS // 2, 0)
+    assert made.due(SECOND_NS // 2) == SECOND_NS // 2 + 2 * SECOND_NS
+
+
 def changes(published: Published, key: str) -> list[tuple[int, Any]]:
     """When a value became another one in what was published."""
     found: list[tuple[int, Any]] = []

@@ -288,6 +288,20 @@ def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path
 # --- status, with stand-ins for systemctl and journalctl
 
 
+def test_closed_folders_on_the_way_are_found(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    (tmp_path / "a").mkdir(mode=0o755)
+    (tmp_path / "a/b").mkdir(mode=0o750)
+    (tmp_path / "a/b/x").write_text("x")
+    found = service_machine.closed_to_others(tmp_path / "a/b/x")
+    assert found is not None
+    (tmp_path / "a/b").chmod(0o711)
+    (tmp_path / "a/b/x").chmod(0o640)
+    below = [service_machine.closed_to_others(tmp_path / name) for name in ("a/b/x", "a/b")]
+    outside = service_machine.closed_to_others(tmp_path.parent)
+    assert below == ([tmp_path / "a/b/x", None] if outside is None else [outside, outside])
+
+
 SYSTEMCTL = """#!{python}
 import json, sys
 said = json.load(open({file!r}))

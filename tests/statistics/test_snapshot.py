@@ -16,6 +16,7 @@ from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     PortFacts,
     StoreFacts,
+    process_facts,
     program_facts,
     start_ticks,
     with_rates,
@@ -163,6 +164,19 @@ def test_rates_are_per_second_between_two_documents() -> None:
     }
     assert with_rates(before, None)["rates"] is None
     assert with_rates(before, before)["rates"] is None
+
+
+def test_the_figures_of_the_process_are_those_of_proc(tmp_path: Path) -> None:
+    before = process_facts()
+    opened = [(tmp_path / f"{n}").open("w") for n in range(5)]
+    after = process_facts()
+    for file in opened:
+        file.close()
+    assert after.open_fds == before.open_fds + 5
+    assert after.threads == len(list(Path("/proc/self/task").iterdir()))
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    resident = next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmRSS"))
+    assert abs(after.rss_bytes - resident) < 0.2 * resident
 
 
 def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> None:
