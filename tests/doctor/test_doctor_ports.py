@@ -168,10 +168,10 @@ DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlo
         # the line itself
         (uart("ttyS0", "serial8250", "brcm,bcm2835-aux-uart"), S0, False, "port.parity", ERROR, "dtoverlay=disable-bt"),
         (uart("ttyS0", "bcm2835-aux-uart"), S0, False, "port.parity", ERROR, "ttyAMA0"),
-        (lambda t: t.ftdi(latency=16), BY_ID, True, "port.latency", NOTE, "16 ms"),
+        (lambda t: t.ftdi(latency=16), BY_ID, True, "port.latency", OK, "16 ms; the gateway asks for 1 ms"),
         (
             all_of(lambda t: t.ftdi(latency=16), process(*RUN, opens=[USB0])),
-            *(BY_ID, False, "port.latency", WARNING, "service install"),
+            *(BY_ID, False, "port.latency", WARNING, "latency_timer"),
         ),
         (
             all_of(ftdi, file("/sys/devices/pci0/usb1/1-1/power/control", "auto\n")),

@@ -17,7 +17,7 @@ import pytest
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime import statistics as statistics_module
-from kontronik_can_gw.runtime.claims import Claims
+from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.snapshot import STALE_NS
 from kontronik_can_gw.runtime.statistics import PERIOD_NS, Report, Statistics
 from kontronik_can_gw.telemetry import SECOND

@@ -68,9 +68,7 @@ def test_what_escs_send_arrives_at_a_subscriber(
                         assert found["available"] is True
                 run.stop()
                 heard.wait("kontronik/chain/esc1/available", b"offline")
-                wait_for(
-                    lambda: heard.of("kontronik/chain/esc1/state")[-1].json["link_state"] == "Lost", 10, "a lost link"
-                )
+                wait_for(lambda: heard.of("kontronik/chain/esc1/state")[-1].json["link_state"] == "Lost", "a lost link")
                 assert heard.of("kontronik/chain/available")[-1].payload == b"online"
                 gateway.end()
                 heard.wait("kontronik/chain/available", b"offline")
