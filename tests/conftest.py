@@ -8,6 +8,11 @@ import os
 
 if not os.environ.get("KCG_VCAN"):
     import can  # noqa: F401
+    from hypothesis import HealthCheck, settings
+
+    # the same examples in every run, and none is judged by how long it took
+    settings.register_profile("suite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile("suite")
 
 
 def pytest_collection_finish() -> None:

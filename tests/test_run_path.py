@@ -106,7 +106,7 @@ def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
     with PtyEsc() as esc, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind("\0" + bus)
         listener.listen(1)
-        listener.settimeout(30)
+        listener.settimeout(60)
         config = folder / "gateway.toml"
         can = '[can]\ninterface = "socketcan"\nchannel = "lo"\n'
         config.write_text(f'{can}{tables.format(port=free_port())}[[esc]]\nport = "{esc.path}"\n')
@@ -122,7 +122,7 @@ def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
                 peer.settimeout(0.1)
                 _until_values(peer, esc)
             process.send_signal(signal.SIGTERM)
-            _, said = process.communicate(timeout=10)
+            _, said = process.communicate(timeout=60)
         finally:
             process.kill()
             process.communicate()
@@ -132,7 +132,7 @@ def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
 
 def _until_values(peer: socket.socket, esc: PtyEsc) -> None:
     """Feed the ESC's frames until its voltage, 24.42 V, is on the bus: by a DBC message, or by a PDO."""
-    until = time.monotonic() + 30
+    until = time.monotonic() + 60
     while time.monotonic() < until:
         esc.write(LIVE)
         try:

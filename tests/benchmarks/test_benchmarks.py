@@ -1,4 +1,4 @@
-"""The benchmarks themselves: all are listed, the programs they compare agree, and a short run gives a table and JSON. No time is judged."""
+"""The benchmarks as a program: all are listed, and a short run gives a table and JSON. No time is judged."""
 
 import json
 import subprocess
@@ -6,17 +6,11 @@ import sys
 from pathlib import Path
 
 import bench
-import live_equal
 import pytest
 import registry
 from registry import Benchmark, Context, Figure, LeftOut, NotEqual
 
 BENCH = Path(__file__).with_name("bench.py")
-
-
-@pytest.fixture(scope="module")
-def context(tmp_path_factory: pytest.TempPathFactory) -> Context:
-    return Context(tmp_path_factory.mktemp("bench"), seconds=0.3, rounds=1, quick=True)
 
 
 def test_every_module_has_benchmarks_and_every_benchmark_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -32,48 +26,11 @@ def test_an_unknown_name_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "bench: there is no benchmark cqu. See --list.\n"
 
 
-@pytest.mark.parametrize("seed", [2, 3])
-def test_the_pieces_hold_every_byte_once(seed: int) -> None:
-    data = live_equal.stream(60, seed)
-    cut, lives = live_equal.pieces(data)
-    rest, whole, ends = cut, b"", 0
-    while rest:
-        size = rest[0] & 0x7F
-        whole += rest[1 : 1 + size]
-        ends += rest[0] >> 7
-        rest = rest[1 + size :]
-    assert whole == data
-    assert ends == len(lives) > 40
-
-
-def test_c_and_the_obvious_program_send_what_the_gateway_sends(context: Context) -> None:
-    try:
-        figures = live_equal.equal(context)
-    except LeftOut as reason:
-        pytest.skip(str(reason))
-    assert [figure.reached for figure in figures] == [True] * 3  # our values, C's frames, the obvious program's
-
-
-@pytest.mark.parametrize("program", ["ours", "core", "obvious"])
-def test_the_driver_whose_instructions_are_counted_gets_all_frames_through(program: str) -> None:
-    command = [sys.executable, str(BENCH.with_name("instruction_driver.py")), program, "30"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-
-
-def test_a_difference_is_found() -> None:
-    ours = {0x110: ["01", "02"], 0x190: ["03"]}
-    assert live_equal.first_difference("c", ours, {0x110: ["01", "02"], 0x190: ["03"]}) == ""
-    assert live_equal.first_difference("c", ours, {0x110: ["01", "FF"], 0x190: ["03"]}) == (
-        "id 110h, frame 1: ours 02, c FF"
-    )
-    assert live_equal.first_difference("c", ours, {0x110: ["01", "02"]}) == "id 190h: ours 1 frames, c 0"
-
-
+@pytest.mark.extended
 def test_a_short_run_gives_a_table_and_json(tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     command = [sys.executable, str(BENCH), "--quick", "--only", "many", "--json", str(file)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     document = json.loads(file.read_text())
     (result,) = document["benchmarks"]

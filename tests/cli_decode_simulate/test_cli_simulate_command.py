@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+from command_line import refused
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.protocol import Deframer, Device, Frame, InfoData, Layout, LiveData, OperatingError
@@ -123,85 +123,10 @@ def test_a_gateway_that_transmits_is_reported_loudly() -> None:
     assert process.returncode == 1
 
 
-def test_sixty_four_escs_keep_their_pace() -> None:
-    result = subprocess.run(
-        [*COMMAND, "--esc", "64", "--seconds", "1"], capture_output=True, timeout=60, text=True, check=True
-    )
-    assert len(result.stdout.splitlines()) == 64
-    expected = [len(SimulatedEsc(start_ns=n * 10_000_000 // 64).frames_until(10**9 - 1)) for n in range(64)]
-    sent = [line.split(" frames")[0] for line in result.stderr.splitlines()]
-    assert sent == [f"esc{n + 1}: {expected[n]}" for n in range(64)]
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("--esc 0", "--esc 0: outside 1..1000."),
-        ("--esc two", "--esc two: not a whole number."),
-        ("--rate fast", "--rate fast: not a number."),
-        ("--rate nan", "--rate nan: outside 0.1..10000."),
-        ("--seed x", "--seed x: not a whole number."),
-        ("--seconds never", "--seconds never: 'never' is not a time. Give for example 5s, 200ms or 2min."),
-        ("--seconds -1", "--seconds -1: '-1' is not a time. Give for example 5s, 200ms or 2min."),
-        ("--layout v5", "--layout v5: no such layout. There are: v4, legacy, mixed."),
-        ("--device kosmic", "--device kosmic: no such name as 'kosmic'. Did you mean kosmik?"),
-        ("--firmware 4", "--firmware 4: not a version. Give for example 1.14."),
-        ("--cells 101", "--cells 101: outside 1..100."),
-        ("--variant 1024", "--variant 1024: outside 0..1023."),
-        ("--noise -1", "--noise -1: outside 0..1000."),
-        ("--lose-bytes 2", "--lose-bytes 2: outside 0..1. Give a share such as 0.001 or 0.1%."),
-        ("--flip-bits 200%", "--flip-bits 200%: outside 0..100. Give a share such as 0.001 or 0.1%."),
-        (
-            "--dropout 2s",
-            "--dropout 2s: the interval is missing. Give for example 2s/10s: 2 s of silence in every 10 s.",
-        ),
-        ("--dropout 2s/1s", "--dropout 2s/1s: the silence must be shorter than the interval. Give for example 2s/10s."),
-        ("--error undervoltag@1s", "--error undervoltag@1s: no such name as 'undervoltag'. Did you mean undervoltage?"),
-        ("--error undervoltage", "--error undervoltage: the time is missing. Give for example undervoltage@5s+2s."),
-        ("--error undervoltage@1s+", "--error undervoltage@1s+: '' is not a time. Give for example 5s, 200ms or 2min."),
-        (
-            "--swap-device uhv",
-            "--swap-device uhv: the time is missing. Give for example kolibri@20s or jivepro:legacy@20s.",
-        ),
-        ("--swap-device uhv:x@1s", "--swap-device uhv:x@1s: no such layout. There are: v4, legacy."),
-        ("--esc 2 --link esc", "--link esc: needs {n} in the path, for the number of each of the 2 ESCs."),
-        ("--out x.bin", "--out x.bin: has no end. Give --seconds."),
-        ("--out x.bin --seconds 1 --link y", "--link: there is no pseudo terminal with --out. Give one of the two."),
-    ],
-)
-def test_each_bad_value_gives_one_clear_line_and_exit_code_2(
-    words: str, expected: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = words.split()
-    if arguments[1].startswith("-"):
-        arguments = [f"{arguments[0]}={arguments[1]}"]
-    assert main(["simulate", *arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.err == f"kontronik-can-gw simulate: {expected}\n"
-    assert captured.out == ""
-
-
-def test_a_file_that_cannot_be_written_gives_one_clear_line_and_exit_code_1(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "missing" / "out.bin"
-    assert main(["simulate", "--seconds", "1", "--out", str(out)]) == 1
-    expected = f"kontronik-can-gw simulate: --out {out}: cannot be written: No such file or directory.\n"
-    assert capsys.readouterr().err == expected
-
-
-def test_a_real_file_in_the_links_place_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_real_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
     link = tmp_path / "esc2"
     link.write_text("precious")
-    assert main(["simulate", "--esc", "2", "--link", str(tmp_path / "esc{n}"), "--seconds", "1"]) == 1
-    assert "exists and is not a symbolic link" in capsys.readouterr().err
+    said = refused(1, "simulate", "--esc", "2", "--link", tmp_path / "esc{n}", "--seconds", "1")
+    assert "exists and is not a symbolic link" in said
     assert [file.name for file in tmp_path.iterdir()] == ["esc2"]
     assert link.read_text() == "precious"
-
-
-def test_the_help_shows_every_option_and_examples(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="0"):
-        main(["simulate", "--help"])
-    text = capsys.readouterr().out
-    assert "--swap-device NAME[:LAYOUT]@TIME" in text
-    assert "examples:" in text

@@ -1,13 +1,14 @@
 """Recordings to convert: a capture of two ESCs, a CAN log, plain bytes. Made once a session."""
 
 import random
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import cantools.database
-from capture_bench import START, Bench, made
+from capture_bench import Bench, made
+from simulated_bus import capture_file
 
-from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.protocol import Device
@@ -23,23 +24,9 @@ def convert(*words: object) -> int:
 
 
 @cache
-def capture_bytes(escs: int = 2, seed: int = 3, seconds: float = 6, devices: tuple[str, ...] = ()) -> bytes:
+def capture_bytes(escs: int = 2, seed: int = 3, seconds: float = 6, devices: Sequence[str] = ()) -> bytes:
     """A capture file in which everything happens. ``devices``: what is learnt of the ESCs at its end."""
-    bench = Bench(*made(escs)).live(seed, seconds)
-    header = bench.setup.header() | {
-        "run": "r",
-        "part": 0,
-        "created_ns": START,
-        "monotonic_ns": START,
-        "wall_ns": WALL_NS,
-    }
-    parts = [block(b"H", 0, json_payload(header))]
-    for number, at in enumerate(range(0, len(bench.entries), 300)):
-        parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
-    if devices:
-        learnt = [{"device": name, "variant": 200, "firmware": "1.2", "layout": "V4"} for name in devices]
-        parts.append(block(b"I", len(parts), json_payload({"devices": learnt})))
-    return b"".join([*parts, block(b"E", len(parts), b"")])
+    return capture_file(Bench(*made(escs)).live(seed, seconds), WALL_NS, devices)
 
 
 @cache

@@ -1,6 +1,5 @@
 """CAN logs are written as python-can reads them and read as python-can writes them, frame by frame, to the microsecond."""
 
-import io
 from pathlib import Path
 
 import can
@@ -69,21 +68,6 @@ def test_what_python_can_writes_is_read(tmp_path: Path, format_: str) -> None:
     assert max(abs(a[0] - b[0]) for a, b in zip(found, items, strict=True)) <= 1000
 
 
-@pytest.mark.parametrize("format_", FORMATS)
-def test_the_same_frames_give_the_same_bytes(tmp_path: Path, format_: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    import time
-
-    items = some_frames(50)
-    first, second = tmp_path / "a", tmp_path / "b"
-    now = time.time()
-    for folder, moment in ((first, now), (second, now + 12345)):
-        folder.mkdir()
-        monkeypatch.setattr(time, "time", lambda moment=moment: moment)
-        write_log(folder / f"log{SUFFIX[format_]}", format_, items)
-    one, other = ((folder / f"log{SUFFIX[format_]}").read_bytes() for folder in (first, second))
-    assert one == other
-
-
 ITEM = st.builds(
     lambda us, extended, can_id, fd, data, received: (
         us * 1000,
@@ -97,30 +81,6 @@ ITEM = st.builds(
     st.sampled_from((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64)).flatmap(lambda n: st.binary(min_size=n, max_size=n)),
     st.booleans(),
 )
-
-
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(ITEM, max_size=20))
-def test_candump_lines_are_those_of_python_can(items: list[Item]) -> None:
-    items.sort(key=lambda item: item[0])
-    ours, theirs = io.BytesIO(), io.StringIO()
-    writer = CanLogWriter(ours, "candump", 0, channel="can3")
-    library = can.CanutilsLogWriter(theirs, channel="can3")
-    for time_ns, frame, received in items:
-        writer.write(time_ns, frame, received)
-        library.on_message_received(
-            can.Message(
-                time_ns / 1e9,
-                frame.can_id,
-                frame.extended,
-                data=frame.data,
-                is_fd=frame.fd,
-                bitrate_switch=frame.fd,
-                is_rx=received,
-            )
-        )
-    writer.close()
-    assert ours.getvalue().decode() == theirs.getvalue()
 
 
 @pytest.mark.parametrize("format_", ["candump", "asc", "blf", "trc"])
@@ -186,12 +146,6 @@ def test_what_candump_shows_on_the_screen_is_read(tmp_path: Path) -> None:
         (at + 3000, CanFrame(0x123, bytes.fromhex("00112233445566778899AABB"), fd=True), False),
         (at + 6000, CanFrame(0x123, b""), False),
     ]
-
-
-def test_bytes_of_an_esc_are_no_log_whatever_their_name(tmp_path: Path) -> None:
-    path = tmp_path / "esc.log"
-    path.write_bytes(b"KODL\x04" * 100)
-    assert log_format(path) is None
 
 
 def test_asc_with_decimal_base_and_relative_times_is_read(tmp_path: Path) -> None:
@@ -266,18 +220,6 @@ def test_the_content_tells_the_format_before_the_suffix(tmp_path: Path) -> None:
         CanLog(tmp_path / "missing.log")
     with pytest.raises(RunError, match="cannot be opened: Is a directory"):
         CanLog(tmp_path)
-
-
-def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    path = tmp_path / "log.mf4"
-    write_log(path, "mf4", some_frames(5))
-    monkeypatch.setitem(sys.modules, "asammdf", None)
-    with pytest.raises(UserError, match=r"MF4 needs asammdf: pip install 'kontronik-can-gw\[mf4\]'"):
-        CanLog(path)
-    with pytest.raises(UserError, match="MF4 needs asammdf"):
-        write_log(tmp_path / "new.mf4", "mf4", some_frames(5))
 
 
 def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import asammdf
 import cantools.database
-import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 import pyarrow as pa  # type: ignore[import-untyped]
 import pytest
@@ -267,20 +266,6 @@ def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_p
             assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
 
 
-def test_asammdf_makes_a_data_frame_with_gaps(tmp_path: Path) -> None:
-    source = write_candump(tmp_path / "bus.log", candump_lines(600))
-    out = tmp_path / "out.mf4"
-    assert convert(source, out, "--signals", "BatteryVoltage,OperatingState,Undervoltage") == 0
-    with open_input(source) as opened:
-        expected = expected_of(opened)
-    frame = asammdf.MDF(out).to_dataframe()
-    voltage = [math.nan if row["BatteryVoltage"] is None else row["BatteryVoltage"] for row in expected]
-    assert np.array_equal(frame["BatteryVoltage"].to_numpy(), voltage, equal_nan=True)
-    assert [
-        b"NotAvailable" if row["OperatingState"] is None else row["OperatingState"].encode() for row in expected
-    ] == (frame["OperatingState"].tolist())
-
-
 @pytest.mark.parametrize("form", sorted(READ))
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     import time
@@ -309,24 +294,10 @@ def test_signals_are_chosen_by_name_in_the_given_order(tmp_path: Path) -> None:
     assert list(rows[0]) == ["Time", "OperatingState", "BatteryVoltage", "BatteryCurrent", "BatteryPower"]
 
 
-def test_one_signal_alone(tmp_path: Path) -> None:
-    rows = _rows(tmp_path, "--signals", "BatteryVoltage")
-    assert {tuple(row) for row in rows} == {("Time", "BatteryVoltage")}
-    assert rows == [{"Time": r["Time"], "BatteryVoltage": r["BatteryVoltage"]} for r in _rows(tmp_path)]
-
-
 def test_a_cut_has_all_rows_between_the_times_and_keeps_their_times(tmp_path: Path) -> None:
     every = _rows(tmp_path)
     assert _rows(tmp_path, "--from", "1", "--until", "2.5") == [row for row in every if 1 <= row["Time"] <= 2.5]
     assert _rows(tmp_path, "--from", "0", "--until", "0") == every[:1]
-
-
-def test_thinned_rows_are_the_newest_of_each_period(tmp_path: Path) -> None:
-    every = _rows(tmp_path)
-    thin = _rows(tmp_path, "--rate", "10")
-    newest = {int(row["Time"] * 10 + 1e-9): row for row in every}
-    assert thin == list(newest.values())
-    assert len(thin) == pytest.approx(40, abs=1)
 
 
 @given(st.lists(st.integers(0, 10**10), max_size=200), st.floats(0.1, 1000))
@@ -337,21 +308,6 @@ def test_thinning_gives_at_most_the_rate_and_ends_with_the_newest(times: list[in
     assert all(row in rows for row in thin)
     slots = [int(row.time_ns // (1e9 / rate)) for row in thin]
     assert len(slots) == len(set(slots)) == len({int(row.time_ns // (1e9 / rate)) for row in rows})
-
-
-def test_one_esc_of_several(tmp_path: Path) -> None:
-    source = tmp_path / "two.kcap"
-    source.write_bytes(capture_bytes())
-    assert convert(source, tmp_path / "out.csv", "--esc", "e1") == 0
-    heads = (tmp_path / "out.csv").read_text().splitlines()[0].split(",")
-    assert len(heads) > 50
-    assert all(head.startswith("E1") for head in heads[2:])
-
-
-def test_a_first_line_with_the_units(tmp_path: Path) -> None:
-    rows = _rows(tmp_path, "--units-line", "--signals", "BatteryVoltage,OperatingState")
-    assert rows[0] == {"units": {"Time": "s", "BatteryVoltage": "V"}}
-    assert rows[1]["Time"] == 0
 
 
 def test_names_that_are_there_twice_get_their_message_in_front() -> None:

@@ -1,11 +1,9 @@
 """What the tests of ``describe`` share: the program in this process, and inputs that try to break a document."""
 
-import io
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
 
-from kontronik_can_gw.cli import main
+from command_line import run
+
 from kontronik_can_gw.config import shipped
 
 DBC = shipped("dbc/kontronik_esc.dbc")
@@ -15,29 +13,10 @@ NASTY_UNIT = "<b>|V&"
 NASTY_NAME = "Flug | <img src=x> `Daten`"
 
 
-class Done(NamedTuple):
-    """How a run ended."""
-
-    code: int
-    out: str
-    talk: str
-
-
-def program(*words: object) -> Done:
-    """Run the command line in this process."""
-    out, talk = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(talk):
-        try:
-            code: object = main([str(word) for word in words])
-        except SystemExit as end:
-            code = end.code
-    return Done(code if isinstance(code, int) else 0, out.getvalue(), talk.getvalue())
-
-
 def described(*words: object) -> str:
     """What ``describe`` prints; it must not have anything to say."""
-    done = program("describe", *words)
-    assert (done.code, done.talk) == (0, ""), done.talk
+    done = run("describe", *words)
+    assert (done.code, done.err) == (0, ""), done.err
     return done.out
 
 

@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,64 +11,51 @@ from doctor_trees import Tree, grave, only
 
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.runtime.doctor.can_interface import check_can
-from kontronik_can_gw.runtime.doctor.findings import Finding, Severity
+from kontronik_can_gw.runtime.doctor.findings import Severity
 from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER, file_name, messages_lock, node_lock
 
-Change = Callable[[dict[str, Any]], object]
-PLAIN = CanConfig()
+OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR
+PLAIN, FD = CanConfig(), CanConfig(fd=True)
+UP = "sudo ip link set can0 up type can bitrate 500000"
 
 
 def controller() -> dict[str, Any]:
     """An adapter with everything as it should be."""
-    return {
-        "ifname": "can0",
-        "flags": ["NOARP", "UP", "LOWER_UP", "ECHO"],
-        "mtu": 16,
-        "operstate": "UP",
-        "txqlen": 128,
-        "link_type": "can",
-        "linkinfo": {
-            "info_kind": "can",
-            "info_data": {
-                "state": "ERROR-ACTIVE",
-                "berr_counter": {"tx": 0, "rx": 0},
-                "restart_ms": 100,
-                "bittiming": {"bitrate": 500000, "sample_point": "0.875", "tq": 125},
-                "clock": 8000000,
-            },
-            "info_xstats": {
-                "restarts": 0,
-                "bus_error": 0,
-                "arbitration_lost": 0,
-                "error_warning": 0,
-                "error_passive": 0,
-                "bus_off": 0,
-            },
-        },
-        "stats64": {
-            "rx": {"bytes": 0, "packets": 0, "errors": 0, "dropped": 0, "over_errors": 0, "multicast": 0},
-            "tx": {"bytes": 0, "packets": 0, "errors": 0, "dropped": 0, "carrier_errors": 0, "collisions": 0},
-        },
-    }
-
-
-def slcan() -> dict[str, Any]:
-    """The kernel's slcan driver: fixed rates, no bit timing, no restart."""
-    found = controller()
-    found["linkinfo"]["info_data"] = {
-        "ctrlmode_supported": ["LISTEN-ONLY"],
+    counted = ("restarts", "bus_error", "arbitration_lost", "error_warning", "error_passive", "bus_off")
+    of_one_way = {"bytes": 0, "packets": 0, "errors": 0, "dropped": 0}
+    data = {
         "state": "ERROR-ACTIVE",
-        "restart_ms": 0,
-        "bittiming_bitrate": 500000,
-        "bitrate_const": [10000, 20000, 50000, 100000, 125000, 250000, 500000, 800000, 1000000],
-        "clock": 0,
+        "berr_counter": {"tx": 0, "rx": 0},
+        "restart_ms": 100,
+        "bittiming": {"bitrate": 500000, "sample_point": "0.875", "tq": 125},
+        "clock": 8000000,
     }
+    return {
+        "ifname": "can0", "flags": ["NOARP", "UP", "LOWER_UP", "ECHO"], "mtu": 16, "operstate": "UP", "txqlen": 128,
+        "link_type": "can",
+        "linkinfo": {"info_kind": "can", "info_data": data, "info_xstats": dict.fromkeys(counted, 0)},
+        "stats64": {
+            "rx": {**of_one_way, "over_errors": 0, "multicast": 0},
+            "tx": {**of_one_way, "carrier_errors": 0, "collisions": 0},
+        },
+    }  # fmt: skip
+
+
+def info(**data: object) -> dict[str, Any]:
+    """A change below linkinfo/info_data."""
+    return {"linkinfo": {"info_data": data}}
+
+
+def merged(found: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    """``None`` removes a key."""
+    for key, value in change.items():
+        if isinstance(value, dict) and isinstance(found.get(key), dict):
+            merged(found[key], value)
+        elif value is None:
+            del found[key]
+        else:
+            found[key] = value
     return found
-
-
-def info(found: dict[str, Any]) -> dict[str, Any]:
-    data: dict[str, Any] = found["linkinfo"]["info_data"]
-    return data
 
 
 @pytest.fixture
@@ -87,187 +73,114 @@ def interface(tree: Tree, found: dict[str, Any], hardware: bool = True) -> None:
     tree.programs["ip",] = json.dumps([found])
 
 
-def check(tree: Tree, can: CanConfig = PLAIN) -> list[Finding]:
-    return check_can(tree, can)
+DOWN = {"flags": ["NOARP"]}
 
 
-def changed(tree: Tree, change: Change, can: CanConfig = PLAIN) -> list[Finding]:
-    """The findings for a good adapter with one change."""
-    found = controller()
-    change(found)
-    interface(tree, found)
-    return check(tree, can)
+@pytest.mark.parametrize(
+    ("change", "can", "check", "severity", "said"),
+    [
+        ({}, PLAIN, "can.bitrate", OK, "500000 bit/s"),
+        ({"link_type": "ether"}, PLAIN, "can.exists", ERROR, ""),
+        (DOWN | info(state="STOPPED"), PLAIN, "can.up", ERROR, f"{UP} restart-ms 100"),
+        (DOWN | info(state="STOPPED", restart_ms=0, bittiming=None), PLAIN, "can.up", ERROR, f"{UP} restart-ms 100"),
+        (info(bittiming={"bitrate": 250000}), PLAIN, "can.bitrate", ERROR, UP),
+        (info(bittiming={"bitrate": 0}), PLAIN, "can.bitrate", ERROR, UP),
+        (info(bittiming={"sample_point": "0.600"}), PLAIN, "can.sample_point", NOTE, ""),
+        (info(restart_ms=0), PLAIN, "can.restart", ERROR, "restart-ms 100"),
+        (info(restart_ms=5000), PLAIN, "can.restart", WARNING, "restart-ms 100"),
+        (info(restart_ms=1), PLAIN, "can.restart", OK, ""),
+        ({"txqlen": 7}, PLAIN, "can.queue", WARNING, "txqueuelen 128"),
+        ({"txqlen": 10}, PLAIN, "can.queue", OK, ""),
+        (info(berr_counter={"tx": 128, "rx": 7}), PLAIN, "can.state", OK, "transmit 128, receive 7"),
+        (info(state="ERROR-WARNING"), PLAIN, "can.state", WARNING, ""),
+        (info(state="ERROR-PASSIVE"), PLAIN, "can.state", WARNING, ""),
+        (info(state="BUS-OFF"), PLAIN, "can.state", ERROR, ""),
+        (info(state="SLEEPING"), PLAIN, "can.state", WARNING, ""),
+        (info(ctrlmode=["LISTEN-ONLY", "BERR-REPORTING"]), PLAIN, "can.mode", ERROR, "listen-only off"),
+        (info(ctrlmode=["LOOPBACK"]), PLAIN, "can.mode", ERROR, "loopback off"),
+        (info(ctrlmode=["ONE-SHOT"]), PLAIN, "can.mode", WARNING, "one-shot off"),
+        ({}, FD, "can.fd", ERROR, "dbitrate 2000000 fd on"),
+        ({"mtu": 72} | info(data_bittiming={"bitrate": 4000000}), FD, "can.data_bitrate", ERROR, ""),
+        ({"linkinfo": {"info_xstats": {"bus_off": 3}}}, PLAIN, "can.bus_off", WARNING, "3 times"),
+        ({"stats64": {"tx": {"dropped": 9}}}, PLAIN, "can.statistics", NOTE, "9 tx dropped"),
+        (info(termination=120), PLAIN, "can.termination", NOTE, "120 ohm"),
+        (info(termination=0), PLAIN, "can.termination", NOTE, "off"),
+    ],
+)
+def test_what_is_not_as_it_should_be_is_told_with_the_command(
+    tree: Tree, change: dict[str, Any], can: CanConfig, check: str, severity: Severity, said: str
+) -> None:
+    interface(tree, merged(controller(), change))
+    findings = check_can(tree, can)
+    found = only(findings, check)
+    assert found.severity is severity
+    assert said in f"{found.text} {found.command}"
+    assert severity in (OK, NOTE) or found.remedy or found.command
+    assert severity is not ERROR or grave(findings).keys() == {check}, "one cause is told once"
 
 
-def test_a_good_interface_has_nothing_but_ok(tree: Tree) -> None:
-    interface(tree, controller())
-    findings = check(tree)
-    assert grave(findings) == {}
-    assert {finding.group for finding in findings} == {"CAN can0"}
-    assert only(findings, "can.bitrate").text == "500000 bit/s, as can.bitrate says"
-    assert only(findings, "can.sample_point").text == "sample point 87.5%"
+@pytest.mark.parametrize(
+    ("change", "can"),
+    [
+        ({}, PLAIN),
+        (info(ctrlmode=["TRIPLE-SAMPLING", "BERR-REPORTING"]), PLAIN),
+        ({"mtu": 72} | info(data_bittiming={"bitrate": 2000000}), FD),
+    ],
+)
+def test_a_good_interface_has_nothing_but_ok(tree: Tree, change: dict[str, Any], can: CanConfig) -> None:
+    interface(tree, merged(controller(), change))
+    assert grave(check_can(tree, can)) == {}
 
 
 def test_a_missing_interface_is_told_with_those_there_are(tree: Tree) -> None:
-    found = only(check(tree), "can.exists")
-    assert found.severity is Severity.ERROR
-    assert found.command == "sudo ip link add can0 type vcan && sudo ip link set can0 up"
+    found = only(check_can(tree, PLAIN), "can.exists")
+    assert (found.severity, found.command) == (ERROR, "sudo ip link add can0 type vcan && sudo ip link set can0 up")
     tree.file("/sys/class/net/can1/type", "280\n")
     tree.file("/sys/class/net/eth0/type", "1\n")
-    assert only(check(tree), "can.exists").remedy == "Set can.channel: can1"
-
-
-def test_a_network_card_is_no_can_interface(tree: Tree) -> None:
-    found = only(changed(tree, lambda f: f.update(link_type="ether")), "can.exists")
-    assert found.severity is Severity.ERROR
-
-
-def test_an_interface_that_is_down_is_told_with_the_whole_command(tree: Tree) -> None:
-    findings = changed(tree, lambda f: (f["flags"].remove("UP"), info(f).update(state="STOPPED")))
-    found = only(findings, "can.up")
-    assert found.severity is Severity.ERROR
-    assert found.command == "sudo ip link set can0 up type can bitrate 500000 restart-ms 100"
-    assert not [f for f in findings if f.check == "can.state"]
-
-
-@pytest.mark.parametrize("bitrate", [250000, 0])
-def test_another_bit_rate_is_an_error(tree: Tree, bitrate: int) -> None:
-    found = only(changed(tree, lambda f: info(f)["bittiming"].update(bitrate=bitrate)), "can.bitrate")
-    assert found.severity is Severity.ERROR
-    assert found.command.endswith("sudo ip link set can0 up type can bitrate 500000")
-
-
-def test_an_interface_that_was_never_set_up_is_told_once_with_the_command_that_sets_all(tree: Tree) -> None:
-    def change(found: dict[str, Any]) -> None:
-        found["flags"].remove("UP")
-        info(found).pop("bittiming")
-        info(found).update(state="STOPPED", restart_ms=0)
-
-    assert grave(changed(tree, change)) == {"can.up": Severity.ERROR}
-
-
-def test_an_unusual_sample_point_is_noted(tree: Tree) -> None:
-    found = only(changed(tree, lambda f: info(f)["bittiming"].update(sample_point="0.600")), "can.sample_point")
-    assert found.severity is Severity.NOTE
-
-
-@pytest.mark.parametrize(("restart_ms", "severity"), [(0, Severity.ERROR), (5000, Severity.WARNING), (1, Severity.OK)])
-def test_bus_off_must_not_be_for_ever(tree: Tree, restart_ms: int, severity: Severity) -> None:
-    found = only(changed(tree, lambda f: info(f).update(restart_ms=restart_ms)), "can.restart")
-    assert found.severity is severity
-    assert ("restart-ms 100" in found.command) is (severity is not Severity.OK)
+    assert only(check_can(tree, PLAIN), "can.exists").remedy == "Set can.channel: can1"
 
 
 def test_slcan_cannot_restart_and_is_not_told_to(tree: Tree) -> None:
-    interface(tree, slcan(), hardware=False)
-    findings = check(tree)
-    assert grave(findings) == {"can.restart": Severity.NOTE}
+    """The kernel's slcan driver: fixed rates, no bit timing, no restart."""
+    change = info(bittiming=None, restart_ms=0, bittiming_bitrate=500000, bitrate_const=[250000, 500000], clock=0)
+    interface(tree, merged(controller(), change), hardware=False)
+    findings = check_can(tree, PLAIN)
+    assert grave(findings) == {"can.restart": NOTE}
     assert "restart-ms" not in only(findings, "can.restart").command
-    assert only(findings, "can.bitrate").severity is Severity.OK
-
-
-@pytest.mark.parametrize(
-    ("length", "severity"), [(1, Severity.WARNING), (7, Severity.WARNING), (10, Severity.OK), (1000, Severity.OK)]
-)
-def test_the_queue_has_room_for_more_than_the_gateways_share(tree: Tree, length: int, severity: Severity) -> None:
-    found = only(changed(tree, lambda f: f.update(txqlen=length)), "can.queue")
-    assert found.severity is severity
-    assert ("txqueuelen 128" in found.command) is (severity is not Severity.OK)
-
-
-@pytest.mark.parametrize(
-    ("state", "severity"),
-    [
-        ("ERROR-ACTIVE", Severity.OK),
-        ("ERROR-WARNING", Severity.WARNING),
-        ("ERROR-PASSIVE", Severity.WARNING),
-        ("BUS-OFF", Severity.ERROR),
-        ("SLEEPING", Severity.WARNING),
-    ],
-)
-def test_the_controllers_state_is_told_with_its_error_counters(tree: Tree, state: str, severity: Severity) -> None:
-    found = only(changed(tree, lambda f: info(f).update(state=state, berr_counter={"tx": 128, "rx": 7})), "can.state")
-    assert found.severity is severity
-    assert "transmit 128, receive 7" in found.text
-    assert severity is Severity.OK or found.remedy or found.command
-
-
-@pytest.mark.parametrize(
-    ("mode", "severity"),
-    [("LISTEN-ONLY", Severity.ERROR), ("LOOPBACK", Severity.ERROR), ("ONE-SHOT", Severity.WARNING)],
-)
-def test_modes_in_which_frames_do_not_reach_the_bus_are_told(tree: Tree, mode: str, severity: Severity) -> None:
-    found = only(changed(tree, lambda f: info(f).update(ctrlmode=[mode, "BERR-REPORTING"])), "can.mode")
-    assert found.severity is severity
-    assert found.command.endswith(f"{mode.lower()} off")
-
-
-def test_harmless_modes_are_not_told(tree: Tree) -> None:
-    assert grave(changed(tree, lambda f: info(f).update(ctrlmode=["TRIPLE-SAMPLING", "BERR-REPORTING"]))) == {}
-
-
-def test_can_fd_must_be_on_where_the_configuration_wants_it(tree: Tree) -> None:
-    needs = CanConfig(fd=True)
-    found = only(changed(tree, lambda _: None, needs), "can.fd")
-    assert found.severity is Severity.ERROR
-    assert "dbitrate 2000000 fd on" in found.command
-    on: Change = lambda f: (f.update(mtu=72), info(f).update(data_bittiming={"bitrate": 2000000}))  # noqa: E731
-    assert grave(changed(tree, on, needs)) == {}
-    slow: Change = lambda f: (f.update(mtu=72), info(f).update(data_bittiming={"bitrate": 4000000}))  # noqa: E731
-    assert only(changed(tree, slow, needs), "can.data_bitrate").severity is Severity.ERROR
-
-
-def test_what_was_counted_is_told(tree: Tree) -> None:
-    def change(found: dict[str, Any]) -> None:
-        found["linkinfo"]["info_xstats"].update(bus_off=3, error_passive=5)
-        found["stats64"]["tx"]["dropped"] = 9
-
-    findings = changed(tree, change)
-    assert only(findings, "can.bus_off").severity is Severity.WARNING
-    assert "3 times" in only(findings, "can.bus_off").text
-    assert only(findings, "can.statistics").text == "counted so far: 5 error passive, 9 tx dropped"
-
-
-def test_a_termination_that_can_be_switched_is_noted(tree: Tree) -> None:
-    assert "120 ohm" in only(changed(tree, lambda f: info(f).update(termination=120)), "can.termination").text
-    assert "off" in only(changed(tree, lambda f: info(f).update(termination=0)), "can.termination").text
+    assert only(findings, "can.bitrate").severity is OK
 
 
 def test_a_virtual_interface_is_told_as_such_and_has_no_controller(tree: Tree) -> None:
     found = controller() | {"linkinfo": {"info_kind": "vcan"}, "txqlen": 1000, "mtu": 72}
     interface(tree, found, hardware=False)
-    findings = check(tree, CanConfig(fd=True))
-    assert grave(findings) == {"can.exists": Severity.NOTE}
+    findings = check_can(tree, FD)
+    assert grave(findings) == {"can.exists": NOTE}
     assert "virtual" in only(findings, "can.exists").text
-    found["mtu"] = 16
-    interface(tree, found, hardware=False)
-    assert only(check(tree, CanConfig(fd=True)), "can.fd").command.endswith("mtu 72 up")
+    interface(tree, found | {"mtu": 16}, hardware=False)
+    assert only(check_can(tree, FD), "can.fd").command.endswith("mtu 72 up")
 
 
 @pytest.mark.parametrize("shown", [None, "", "[]", "[{}", "Device does not exist.", '[{"linkinfo": []}]'])
 def test_without_ip_or_with_one_that_knows_no_json_sys_is_read(tree: Tree, shown: str | None) -> None:
     folder = "/sys/class/net/can0"
-    numbers = {"type": "280", "flags": "0x40041", "mtu": "16", "tx_queue_len": "10"}
-    for name, text in numbers.items():
+    for name, text in {"type": "280", "flags": "0x40041", "mtu": "16", "tx_queue_len": "10"}.items():
         tree.file(f"{folder}/{name}", text + "\n")
     tree.file(f"{folder}/statistics/tx_dropped", "4\n")
     if shown is not None:
         tree.programs["ip",] = shown
-    findings = check(tree)
-    assert grave(findings) == {"can.details": Severity.NOTE, "can.statistics": Severity.NOTE}
+    assert grave(check_can(tree, PLAIN)) == {"can.details": NOTE, "can.statistics": NOTE}
     tree.file(f"{folder}/flags", "0x40040\n")
-    assert only(check(tree), "can.up").severity is Severity.ERROR
+    assert only(check_can(tree, PLAIN), "can.up").severity is ERROR
 
 
 def test_a_kernel_without_socketcan_is_told_with_the_package(tmp_path: Path) -> None:
     tree = Tree(tmp_path)
-    found = only(check(tree), "can.kernel")
-    assert found.severity is Severity.ERROR
+    found = only(check_can(tree, PLAIN), "can.kernel")
+    assert found.severity is ERROR
     assert f"linux-modules-extra-{platform.release()}" in found.command
-    tree.file(
-        f"/lib/modules/{platform.release()}/modules.dep", "kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz\n"
-    )
-    assert only(check(tree), "can.kernel").severity is Severity.OK
+    modules = "kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz\n"
+    tree.file(f"/lib/modules/{platform.release()}/modules.dep", modules)
+    assert only(check_can(tree, PLAIN), "can.kernel").severity is OK
 
 
 def test_another_gateway_on_this_interface_is_noted(tree: Tree) -> None:
@@ -285,19 +198,15 @@ def test_another_gateway_on_this_interface_is_noted(tree: Tree) -> None:
         lines.append(f"1: FLOCK  ADVISORY  WRITE 90 {place} 0 EOF")
     tree.file("/proc/locks", "\n".join(lines[:-1]) + "\n")
     tree.process(90, "python3", "-m", "kontronik_can_gw", "run")
-    found = only(check(tree), "can.gateway")
-    assert found.severity is Severity.NOTE
+    found = only(check_can(tree, PLAIN), "can.gateway")
+    assert found.severity is NOTE
     assert found.text == "kontronik-can-gw (pid 90) already sends CANopen node 2, 10 and the messages from 680h on"
 
 
-def test_the_driver_of_another_interface_is_only_loaded(tree: Tree) -> None:
-    findings = check(tree, CanConfig("virtual", "x"))
-    assert [f.check for f in findings] == ["can.driver"]
-    assert findings[0].severity is Severity.OK
-
-
-def test_a_driver_that_cannot_be_loaded_is_an_error(tree: Tree, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_driver_of_another_interface_is_only_loaded(tree: Tree, monkeypatch: pytest.MonkeyPatch) -> None:
+    (found,) = check_can(tree, CanConfig("virtual", "x"))
+    assert (found.check, found.severity) == ("can.driver", OK)
     monkeypatch.setattr("can.interfaces.BACKENDS", {"strange": ("no_such_module_of_a_vendor", "Bus")})
-    found = only(check(tree, CanConfig("strange", "x")), "can.driver")
-    assert found.severity is Severity.ERROR
+    found = only(check_can(tree, CanConfig("strange", "x")), "can.driver")
+    assert found.severity is ERROR
     assert "no_such_module_of_a_vendor" in found.text

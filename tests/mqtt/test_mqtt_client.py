@@ -10,9 +10,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
-from mqtt_bench import Mosquitto, Subscriber, free_port, kept, wait_for
+from mqtt_bench import PATIENCE, Mosquitto, Subscriber, free_port, wait_for
 
 from kontronik_can_gw.runtime import mqtt_client
 from kontronik_can_gw.runtime.mqtt_client import Broker, MqttClient, check
@@ -38,7 +39,7 @@ def connecting(broker: Broker) -> Iterator[MqttClient]:
         yield client
         assert client.failure is None
     finally:
-        client.stop(2)
+        client.stop(PATIENCE)
         assert not client.alive
 
 
@@ -46,8 +47,8 @@ def to(port: int, client_id: str = "test", host: str = "127.0.0.1") -> Broker:
     return Broker(host, port, client_id)
 
 
-def waits_until(client: MqttClient, text: str, seconds: float = 10) -> None:
-    wait_for(lambda: text in client.problem, seconds, lambda: f"{text!r} in {client.problem!r}")
+def waits_until(client: MqttClient, text: str) -> None:
+    wait_for(lambda: text in client.problem, lambda: f"{text!r} in {client.problem!r}")
 
 
 @pytest.fixture
@@ -70,7 +71,7 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
     with Subscriber(broker.port, "k/test/#") as heard:
         client.start()
         heard.wait("k/test/other", b"999")
-        client.stop(2)
+        client.stop(PATIENCE)
         heard.wait(ONLINE, b"offline")
     assert [(m.topic, m.payload) for m in heard.heard if not m.retained] == [
         (ONLINE, b"online"),
@@ -81,39 +82,12 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
     ]
 
 
-def test_after_a_restart_of_the_broker_all_that_is_lasting_is_there_again(tmp_path: Path) -> None:
-    made = Mosquitto(tmp_path)
-    try:
-        with connecting(to(made.port)) as client:
-            client.offer("k/test/a", b"1", lasting=True, retain=True)
-            client.offer("k/test/b", b"1", lasting=True, retain=True)
-            wait_for(lambda: len(kept(made.port, "k/#")) == 3, 10, "messages")
-            made.stop()
-            waits_until(client, "connection")
-            client.offer("k/test/b", b"2", lasting=True, retain=True)
-            made.start()
-            wait_for(lambda: client.connected, 10, "a connection")
-            expected = {ONLINE: b"online", "k/test/a": b"1", "k/test/b": b"2"}
-            wait_for(lambda: kept(made.port, "k/#") == expected, 10, "messages")
-    finally:
-        made.stop()
-
-
-def test_hundreds_of_topics_are_all_published(broker: Mosquitto) -> None:
-    with Subscriber(broker.port, "k/many/#") as heard, connecting(to(broker.port)) as client:
-        wait_for(lambda: client.connected, 10, "a connection")
-        for number in range(500):
-            client.offer(f"k/many/{number}", b"x" * 1000, lasting=number % 2 == 0)
-        wait_for(lambda: len(heard.heard) >= 500, 10, lambda: len(heard.heard))
-    assert sorted(message.topic for message in heard.heard) == sorted(f"k/many/{number}" for number in range(500))
-
-
 def test_a_broker_that_takes_nothing_makes_nothing_pile_up(tmp_path: Path, said: pytest.LogCaptureFixture) -> None:
     """It stands still for some seconds: that is said, what waits is replaced, what then comes is new, and the end comes in time."""
     made = Mosquitto(tmp_path)
     try:
         with Subscriber(made.port, "k/test/state") as heard, connecting(to(made.port)) as client:
-            wait_for(lambda: client.connected, 10, "a connection")
+            wait_for(lambda: client.connected, "a connection")
             number = 0
 
             def offer() -> bool:
@@ -124,24 +98,19 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(tmp_path: Path, said:
                 return False
 
             made.freeze(True)
-            wait_for(
-                lambda: offer() or "takes messages too slowly: only the newest are sent" in said.text, 20, "a line"
-            )
+            wait_for(lambda: offer() or "takes messages too slowly: only the newest are sent" in said.text, "a line")
             assert client.replaced > 100
             assert len(client._waiting) <= 1
             assert client.published < 120  # what the kernel took, of several hundred
             made.freeze(False)
-            wait_for(lambda: offer() or "takes messages again" in said.text, 10, "a line")
+            wait_for(lambda: offer() or "takes messages again" in said.text, "a line")
             heard.wait("k/test/state", b"%06d" % number + b"x" * 100_000)
             numbers = [int(message.payload[:6]) for message in heard.heard]
             assert numbers == sorted(numbers)
             made.freeze(True)
-            begin = time.monotonic()
             for _ in range(100):
                 offer()
-            begin = time.monotonic()
-            client.stop(0.3)
-            assert time.monotonic() - begin < 0.4
+            client.stop(0.3)  # it returns though nothing is taken
             made.freeze(False)
     finally:
         made.stop()
@@ -156,12 +125,11 @@ def test_two_with_one_client_id_do_not_throw_each_other_out_for_ever(
     """This broker does not say why it ends a connection."""
     text = "maybe another program uses the client id 'same'. Give each gateway a name of its own (--gateway)."
     with connecting(to(broker.port, "same")) as first, connecting(to(broker.port, "same")) as second:
-        wait_for(lambda: text in first.problem or text in second.problem, 10, lambda: said.text)
-        time.sleep(1)
-        known = said.text.count("connected")
-        time.sleep(1)
-        assert said.text.count("connected") == known
-        assert first.connected is not second.connected
+        wait_for(lambda: text in first.problem or text in second.problem, lambda: said.text)
+        loser, winner = (first, second) if text in first.problem else (second, first)
+        wait_for(lambda: winner.connected, lambda: said.text)
+        assert not loser.connected
+        assert loser._retry.due is not None
     assert 1 <= said.text.count(text) <= 2
 
 
@@ -169,7 +137,6 @@ def test_a_take_over_that_the_broker_tells_of_is_said_once(said: pytest.LogCaptu
     listener, port, got = served(*[b"\x20\x03\x00\x00\x00" + b"\xe0\x02\x8e\x00"] * 10)
     with listener, connecting(to(port)) as client:
         waits_until(client, "another program took over the client id 'test'. Give each gateway a name of its own")
-        time.sleep(0.5)
         assert len(got) == 1
     assert said.text.count("took over") == 1
 
@@ -201,47 +168,19 @@ OLD = b"\x20\x02\x00\x00"
 def test_a_broker_that_knows_only_mqtt_3_is_spoken_to_in_it(refusal: bytes) -> None:
     listener, port, got = served(refusal, OLD, pause_s=0.3)
     with listener, connecting(to(port)) as client:
-        wait_for(lambda: client.connected, 10, lambda: client.problem)
+        wait_for(lambda: client.connected, lambda: client.problem)
     assert [greeting[8] for greeting in got[:2]] == [5, 4]  # protocol level of MQTT 5 and 3.1.1
-
-
-def test_one_that_ends_each_connection_at_once_is_left_alone_for_a_while(said: pytest.LogCaptureFixture) -> None:
-    accepted = b"\x20\x03\x00\x00\x00"
-    listener, port, got = served(*[accepted] * 20)
-    with listener, connecting(to(port)) as client:
-        waits_until(client, "ends each connection at once: maybe another program uses the client id 'test'")
-        time.sleep(1)
-        assert len(got) == 3
 
 
 def test_rubbish_instead_of_an_answer_ends_nothing() -> None:
     rng = random.Random(1)
     rubbish = [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x00" * 100, b"\x20\x7f\x00", bytes(range(256))]
-    rubbish += [b"\x20" + rng.randbytes(rng.randrange(1, 60)) for _ in range(12)]
-    rubbish += [rng.randbytes(rng.randrange(1, 200)) for _ in range(12)]
+    rubbish += [b"\x20" + rng.randbytes(rng.randrange(1, 60)) for _ in range(6)]
+    rubbish += [rng.randbytes(rng.randrange(1, 200)) for _ in range(6)]
     for answer in rubbish:
         listener, port, got = served(answer, answer, pause_s=0)
         with listener, connecting(to(port)):
-            wait_for(lambda got=got: len(got) == 2, 10, answer)  # type: ignore[misc]  # it tries again
-
-
-def test_rubbish_on_a_connection_ends_that_connection_only() -> None:
-    rng = random.Random(2)
-    for _ in range(20):
-        listener, port, got = served(b"\x20\x03\x00\x00\x00" + rng.randbytes(50), b"", pause_s=0)
-        with listener, connecting(to(port)) as client:
-            client.offer("a", b"x", lasting=True)
-            wait_for(lambda got=got: len(got) == 2, 10, "a second attempt")  # type: ignore[misc]
-
-
-def test_a_refusal_says_what_to_do() -> None:
-    for code, text in (
-        (133, "refuses the client id 'test'. Choose another name with --gateway."),
-        (136, "server unavailable"),
-    ):
-        listener, port, _ = served(*[b"\x20\x03\x00" + bytes([code]) + b"\x00"] * 3)
-        with listener, connecting(to(port)) as client:
-            waits_until(client, text)
+            wait_for(lambda got=got: len(got) == 2, answer)  # type: ignore[misc]  # it tries again
 
 
 def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -250,20 +189,19 @@ def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(monkeypatch
         client = MqttClient(to(mute.getsockname()[1]), ONLINE)
         client.start()
         waits_until(client, "does not answer. Is this the port of an MQTT broker?")
-        begin = time.monotonic()
         client.stop(0.3)
-        assert time.monotonic() - begin < 0.35
-        wait_for(lambda: not client.alive, 2, "the end of the thread")
+        wait_for(lambda: not client.alive, "the end of the thread")
 
 
 def test_pauses_grow_and_are_not_all_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     """A fleet that lost its broker does not come back all at once."""
     client = MqttClient(to(free_port()), ONLINE)
     pauses = []
+    monkeypatch.setattr("kontronik_can_gw.runtime.mqtt_client.time.monotonic_ns", lambda: 0)
     for _ in range(14):
         client._failed("x")
         assert client._retry.due is not None
-        pauses.append(client._retry.due - time.monotonic_ns())
+        pauses.append(client._retry.due)
     assert pauses[0] < 0.13 * SECOND
     assert max(pauses) <= 1.25 * mqtt_client.LONGEST_PAUSE_NS
     assert min(pauses[-4:]) > 0.7 * mqtt_client.LONGEST_PAUSE_NS
@@ -320,40 +258,27 @@ def test_tls_with_an_authority_of_ones_own(encrypted: tuple[Mosquitto, Broker, A
     _, right, _ = encrypted
     assert check(right) == []
     with connecting(right) as client:
-        wait_for(lambda: client.connected, 10, lambda: client.problem)
+        wait_for(lambda: client.connected, lambda: client.problem)
         client.offer("k/tls/big", b"x" * 300_000)  # more than a record of TLS, and than the kernel takes at once
-        wait_for(lambda: client.published >= 2, 10, "the message")
+        wait_for(lambda: client.published >= 2, "the message")
 
 
-def test_a_certificate_of_another_authority_is_refused(encrypted: tuple[Mosquitto, Broker, Authority]) -> None:
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"ca_file": "stranger"}, "its certificate is not accepted: "),
+        ({"ca_file": None}, "its certificate is not accepted: "),
+        ({"host": "127.0.0.1"}, "and that --broker is the name in the certificate."),
+        ({"cert_file": None, "key_file": None}, ""),
+    ],
+)
+def test_a_certificate_that_does_not_fit_ends_in_a_problem_and_no_connection(
+    encrypted: tuple[Mosquitto, Broker, Authority], change: dict[str, Any], said: str
+) -> None:
     _, right, stranger = encrypted
-    with connecting(replace(right, ca_file=stranger.certificate)) as client:
-        waits_until(client, "its certificate is not accepted: ")
-    with connecting(replace(right, ca_file=None)) as client:
-        waits_until(client, "its certificate is not accepted: ")
-
-
-def test_a_certificate_for_another_name_is_refused(encrypted: tuple[Mosquitto, Broker, Authority]) -> None:
-    _, right, _ = encrypted
-    with connecting(replace(right, host="127.0.0.1")) as client:
-        waits_until(client, "and that --broker is the name in the certificate.")
-
-
-def test_without_the_certificate_that_the_broker_wants_there_is_no_connection(
-    encrypted: tuple[Mosquitto, Broker, Authority],
-) -> None:
-    _, right, _ = encrypted
-    with connecting(replace(right, cert_file=None, key_file=None)) as client:
-        wait_for(lambda: client.problem, 10, "a problem")
+    if change.get("ca_file"):
+        change = {"ca_file": stranger.certificate}
+    with connecting(replace(right, **change)) as client:
+        wait_for(lambda: client.problem, "a problem")
+        assert said in client.problem
         assert not client.connected
-
-
-def test_plain_text_to_a_port_of_tls_and_tls_to_a_plain_one_are_told_so(
-    encrypted: tuple[Mosquitto, Broker, Authority], broker: Mosquitto
-) -> None:
-    made, _, _ = encrypted
-    with connecting(to(made.port)) as client:
-        waits_until(client, "closed the connection instead of answering. Does it want TLS (--tls)?")
-    with connecting(replace(to(broker.port), tls=True)) as client:
-        wait_for(lambda: client.problem, 10, "a problem")
-        assert "Is this the port for TLS?" in client.problem or "connection reset" in client.problem

@@ -10,7 +10,7 @@ import pytest
 from cantools.database.can import Database
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mqtt_bench import SECOND_NS, START_S, STEP_NS, Timed, flight, layout_of
+from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of
 
 from kontronik_can_gw.dbc_output.unpacker import SignalReader
 from kontronik_can_gw.offline.mqtt_messages import (
@@ -23,12 +23,9 @@ from kontronik_can_gw.offline.mqtt_messages import (
     Topics,
     entity,
     is_ours,
-    iso,
 )
 from kontronik_can_gw.protocol.states import OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults, Phase
-from kontronik_can_gw.sources import Group, sources
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, Phase
 
 TOPICS = Topics("fleet", "boat")
 MS = 1_000_000
@@ -37,7 +34,7 @@ QUIET = EscOptions(profile=(Phase("off", 1000, 0, OperatingState.MotorOff, 0),))
 
 
 def publisher(*names: str, rate: float = 1, **options: Any) -> Publisher:
-    return Publisher(layout_of(*names), TOPICS, rate, **options)
+    return Publisher(layout_of(names), TOPICS, rate, **options)
 
 
 Published = list[tuple[int, Message]]
@@ -88,7 +85,7 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
 
 @pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
 def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str, ...]) -> None:
-    bus = layout_of(*names)
+    bus = layout_of(names)
     frames = flight(bus, 12)
     made = Publisher(bus, TOPICS, 1)
     last = run(made, frames, 12)
@@ -115,22 +112,6 @@ def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str
         assert found["firmware"] == "4.17"
 
 
-def test_the_gateways_own_values_have_a_topic_of_their_own() -> None:
-    bus = layout_of("esc1")
-    frames = flight(bus, 3)
-    found = states(run(Publisher(bus, TOPICS, 1), frames, 3), None)[-1][1]
-    assert (found["gateway_state"], found["esc_count"], found["escs_ok"]) == ("Running", 1, 1)
-    assert found["available"] is True
-    assert not found.keys() & {"battery_voltage", "errors", "motor"}
-
-
-def test_the_time_is_iso_8601_in_utc() -> None:
-    assert iso(START_S * SECOND_NS + 7 * MS) == "2026-09-21T14:13:20.007Z"
-    assert iso(0) == "1970-01-01T00:00:00.000Z"
-    found = states(run(publisher("esc1"), flight(layout_of("esc1"), 2), 2))
-    assert found[0][1]["time"] == iso(START_S * SECOND_NS + found[0][0])
-
-
 def test_without_any_frame_all_is_null_and_not_available() -> None:
     published = run(publisher("esc1"), [], 3)
     for esc in ("esc1", None):
@@ -144,7 +125,7 @@ def test_without_any_frame_all_is_null_and_not_available() -> None:
 def test_errors_have_name_severity_and_meaning_and_make_a_problem() -> None:
     bits = (OperatingError.UNDERVOLTAGE, OperatingError.POWER_STAGE_OVERTEMP_WARNING, SelfTestError.TEST_UNDERVOLTAGE)
     options = EscOptions(faults=Faults(errors=tuple(ErrorWindow(bit, 0) for bit in bits)))
-    found = states(run(publisher("esc1"), flight(layout_of("esc1"), 4, options), 4))[-1][1]
+    found = states(run(publisher("esc1"), flight(layout_of(["esc1"]), 4, [options]), 4))[-1][1]
     named = {error["name"]: (error["severity"], error["meaning"]) for error in found["errors"]}
     assert named["undervoltage"] == ("error", "battery voltage too low")
     assert named["power_stage_overtemp_warning"] == ("warning", "power stage hot")
@@ -152,20 +133,9 @@ def test_errors_have_name_severity_and_meaning_and_make_a_problem() -> None:
     assert found["problem"] is True
 
 
-def test_a_status_or_a_warning_is_no_problem() -> None:
-    options = EscOptions(
-        profile=QUIET.profile,
-        faults=Faults(errors=(ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_WARNING, 0),)),
-    )
-    found = states(run(publisher("esc1"), flight(layout_of("esc1"), 3, options), 3))[-1][1]
-    severities = {error["severity"] for error in found["errors"]}
-    assert severities == {"status", "warning"}  # programming is allowed while the motor is off
-    assert found["problem"] is False
-
-
 def test_no_error_is_an_empty_list_and_not_known_is_null() -> None:
-    bus = layout_of("esc1")
-    frames = flight(bus, 12, silent_from=10)
+    bus = layout_of(["esc1"])
+    frames = flight(bus, 12, until=10)
     published = states(run(publisher("esc1"), frames, 12))
     before = [found for now, found in published if 7 * SECOND_NS < now < 10 * SECOND_NS][-1]
     assert (before["errors"], before["selftest"], before["problem"]) == ([], [], False)
@@ -176,22 +146,12 @@ def test_no_error_is_an_empty_list_and_not_known_is_null() -> None:
     assert 1000 < after["age"] < 2000
 
 
-def test_every_operating_state_has_a_kind() -> None:
-    assert set(KIND_OF_STATE) == set(OperatingState)
-
-
 @pytest.mark.parametrize("state", list(OperatingState))
 def test_the_kind_is_that_of_the_state_that_the_esc_sends(state: OperatingState) -> None:
     options = EscOptions(profile=(Phase("x", 1000, 0, state, 0),))
-    found = states(run(publisher("esc1"), flight(layout_of("esc1"), 2.6, options), 2.6))[-1][1]
+    found = states(run(publisher("esc1"), flight(layout_of(["esc1"]), 2.6, [options]), 2.6))[-1][1]
     assert found["operating_state_raw"] == state
     assert found["motor"] == KIND_OF_STATE[state]
-
-
-def test_a_recording_is_marked_as_one() -> None:
-    frames = flight(layout_of("esc1"), 1)
-    assert states(run(publisher("esc1", replay=True), frames, 1))[0][1]["replay"] is True
-    assert "replay" not in states(run(publisher("esc1"), frames, 1))[0][1]
 
 
 # --- when
@@ -236,7 +196,7 @@ def changes(published: Published, key: str) -> list[tuple[int, Any]]:
 def test_an_error_is_told_at_once_however_slow_the_rate() -> None:
     window = ErrorWindow(OperatingError.OVERVOLTAGE, 3 * SECOND_NS, SECOND_NS)
     options = EscOptions(profile=QUIET.profile, faults=Faults(errors=(window,)))
-    frames = flight(layout_of("esc1"), 6, options)
+    frames = flight(layout_of(["esc1"]), 6, [options])
     published = run(publisher("esc1", rate=0.01), frames, 6)
     times = [now for now, value in changes(published, "problem")]
     assert len(times) == 3  # the first state, the error, its end
@@ -248,7 +208,7 @@ def test_a_new_kind_of_state_and_a_lost_link_are_told_at_once_and_a_new_speed_is
     options = EscOptions(
         profile=(Phase("off", 2, 0, OperatingState.MotorOff, 0), Phase("go", 90, 60, OperatingState.Forward, 5))
     )
-    frames = flight(layout_of("esc1"), 8, options, silent_from=6)
+    frames = flight(layout_of(["esc1"]), 8, [options], until=6)
     published = run(publisher("esc1", rate=0.01), frames, 8)
     kinds = changes(published, "motor")
     assert [kind for _, kind in kinds] == ["idle", "run", None]
@@ -265,7 +225,7 @@ def test_what_comes_and_goes_is_bounded() -> None:
         ErrorWindow(OperatingError.OVERVOLTAGE, start, 30 * MS) for start in range(0, 60 * SECOND_NS, 60 * MS)
     )
     options = EscOptions(profile=QUIET.profile, faults=Faults(errors=windows))
-    frames = flight(layout_of("esc1"), 60, options)
+    frames = flight(layout_of(["esc1"]), 60, [options])
     times = [now for now, _ in states(run(publisher("esc1", rate=0.01), frames, 60))]
     gaps = [b - a for a, b in pairwise(times)]
     assert min(gaps) >= LEAST_PAUSE_NS
@@ -274,7 +234,7 @@ def test_what_comes_and_goes_is_bounded() -> None:
 
 
 def test_a_gateway_that_says_nothing_any_more_is_offline_after_three_seconds() -> None:
-    bus = layout_of("esc1")
+    bus = layout_of(["esc1"])
     frames = [entry for entry in flight(bus, 10) if not 4 * SECOND_NS < entry[0] < 9 * SECOND_NS]
     published = run(publisher("esc1"), frames, 10)
     for esc in (None, "esc1"):
@@ -288,7 +248,7 @@ def test_a_gateway_that_says_nothing_any_more_is_offline_after_three_seconds() -
 
 
 def test_lasting_is_what_must_be_known_later_and_it_comes_before_the_state() -> None:
-    published = run(publisher("esc1", discovery="ha"), flight(layout_of("esc1"), 3), 3)
+    published = run(publisher("esc1", discovery="ha"), flight(layout_of(["esc1"]), 3), 3)
     for _, message in published:
         assert message.lasting is message.retain is not message.topic.endswith("/state")
     topics = [message.topic for _, message in published]
@@ -320,7 +280,7 @@ COMPONENT_KEYS = {
 
 def discovered(*names: str) -> dict[str, dict[str, Any]]:
     """Topic and content of the discovery, after a flight."""
-    bus = layout_of(*names)
+    bus = layout_of(names)
     published = run(Publisher(bus, TOPICS, 1, discovery="homeassistant"), flight(bus, 3), 3)
     return {m.topic: json.loads(m.payload) for _, m in published if m.topic.startswith("homeassistant/")}
 
@@ -329,28 +289,6 @@ def components(found: dict[str, dict[str, Any]]) -> Iterator[tuple[str, str, dic
     for topic, device in found.items():
         for key, component in device["components"].items():
             yield topic, key, component
-
-
-def test_each_esc_and_the_gateway_is_a_device() -> None:
-    found = discovered("left", "right")
-    assert set(found) == {
-        f"homeassistant/device/{name}/config"
-        for name in ("kontronik_boat", "kontronik_boat_left", "kontronik_boat_right")
-    }
-    left = found["homeassistant/device/kontronik_boat_left/config"]
-    assert left["device"] == {
-        "identifiers": ["kontronik_boat_left"],
-        "name": "boat left",
-        "manufacturer": "KONTRONIK",
-        "model": "KOSMIK",
-        "sw_version": "4.17",
-        "via_device": "kontronik_boat",
-    }
-    assert left["availability"] == [{"topic": "fleet/boat/online"}, {"topic": "fleet/boat/left/available"}]
-    assert left["availability_mode"] == "all"
-    assert left["state_topic"] == "fleet/boat/left/state"
-    assert left["origin"]["name"] == "kontronik-can-gw"
-    assert re.fullmatch(r"\w+/(?:[a-zA-Z0-9_-]+/)?[a-zA-Z0-9_-]+/config", "device/kontronik_boat_left/config")
 
 
 def test_every_entity_keeps_to_the_rules_of_home_assistant() -> None:
@@ -375,17 +313,8 @@ def test_every_entity_keeps_to_the_rules_of_home_assistant() -> None:
             assert "options" not in component
 
 
-def test_every_unit_of_ours_has_a_place() -> None:
-    """No source comes to Home Assistant with a unit that it does not know."""
-    known = {unit for units, _ in DEVICE_CLASSES.values() for unit in units}
-    reader = SignalReader(layout_of("esc1").layout)
-    for column in reader.columns:
-        component = entity(column.source, column)
-        assert component is None or component.get("unit_of_measurement") in known
-
-
 def test_names_are_written_as_people_write_them() -> None:
-    columns = {column.source: column for column in SignalReader(layout_of("esc1").layout).columns}
+    columns = {column.source: column for column in SignalReader(layout_of(["esc1"]).layout).columns}
     shown = {
         "bec_voltage": "BEC voltage",
         "pwm_input": "PWM input",
@@ -399,7 +328,7 @@ def test_names_are_written_as_people_write_them() -> None:
 
 
 def test_what_an_entity_shows_is_in_the_state() -> None:
-    bus = layout_of("esc1")
+    bus = layout_of(["esc1"])
     published = run(Publisher(bus, TOPICS, 1, discovery="homeassistant"), flight(bus, 3), 3)
     found = {m.topic: json.loads(m.payload) for _, m in published if m.topic.startswith("homeassistant/")}
     for topic, key, component in components(found):
@@ -415,32 +344,19 @@ def test_what_an_entity_shows_is_in_the_state() -> None:
                 assert isinstance(value, (int, float))
 
 
-def test_what_the_link_says_is_shown_while_the_esc_is_not_heard() -> None:
-    found = discovered("left", "right")["homeassistant/device/kontronik_boat_left/config"]["components"]
-    own = [{"topic": "fleet/boat/online"}, {"topic": "fleet/boat/available"}]
-    assert found["link_state"]["availability"] == own
-    assert found["link_state"]["availability_mode"] == "all"
-    assert "availability" not in found["battery_voltage"]
-    assert all(
-        ("availability" in component) == (sources(EscSettings())[key].group is Group.LINK)
-        for key, component in found.items()
-        if key in sources(EscSettings())
-    )
-
-
 def discoveries(published: Iterable[tuple[int, Message]]) -> list[tuple[int, dict[str, Any]]]:
     topic = TOPICS.discovery("ha", "esc1")
     return [(now, json.loads(m.payload)) for now, m in published if m.topic == topic]
 
 
 def test_an_esc_is_told_of_once_when_it_is_known() -> None:
-    told = discoveries(run(publisher("esc1", discovery="ha"), flight(layout_of("esc1"), 20), 20))
+    told = discoveries(run(publisher("esc1", discovery="ha"), flight(layout_of(["esc1"]), 20), 20))
     assert [found["device"]["model"] for _, found in told] == ["KOSMIK"]
 
 
 def test_an_esc_that_does_not_tell_what_it_is_is_told_of_all_the_same() -> None:
     """Info frames are missing; what was published before a restart is not overwritten too soon."""
-    bus = layout_of("esc1")
+    bus = layout_of(["esc1"])
     info = {c.key for c in SignalReader(bus.layout).columns if c.source in ("device", "firmware_main")}
     frames = [entry for entry in flight(bus, 10) if entry[1].key not in info]
     ((now, found),) = discoveries(run(publisher("esc1", discovery="ha"), frames, 10))
@@ -448,13 +364,6 @@ def test_an_esc_that_does_not_tell_what_it_is_is_told_of_all_the_same() -> None:
     assert "sw_version" not in found["device"]
     assert IDENTITY_NS <= now <= IDENTITY_NS + 1.6 * SECOND_NS
     assert discoveries(run(publisher("esc1", discovery="ha"), [], 10)) == []
-
-
-def test_an_esc_that_goes_away_stays_what_it_is() -> None:
-    options = EscOptions(faults=Faults(dropout=Dropout(15 * SECOND_NS, 20 * SECOND_NS)))
-    frames = flight(layout_of("esc1"), 25, options)
-    told = discoveries(run(publisher("esc1", discovery="ha"), frames, 25))
-    assert [found["device"].get("sw_version") for _, found in told] == ["4.17"]
 
 
 def test_only_the_discovery_of_this_gateway_is_ours() -> None:

@@ -67,15 +67,6 @@ def test_systemd_finds_nothing_to_complain_about_and_hardly_any_exposure(tmp_pat
         assert float(level[1]) <= 2.0
 
 
-def test_the_unit_publishes_for_its_configuration_behind_the_gateway(tmp_path: Path) -> None:
-    plain, instance = (unit.read_text() for unit in units(tmp_path))
-    assert "\nExecStart=/bin/true mqtt -c /etc/kontronik-can-gw/gateway.toml\n" in plain
-    assert "\nExecStart=/bin/true mqtt -c /etc/kontronik-can-gw/%i.toml\n" in instance
-    for line in ("Type=notify", "Restart=always", "WatchdogSec=10s", "User=kontronik-can-gw", "Nice=5"):
-        assert f"\n{line}\n" in plain
-    assert "@" not in re.sub(r"modprobe@can_raw|~?@[a-z-]+", "", plain.partition("\n")[2])
-
-
 def test_it_is_installed_and_enabled_on_request_only(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     configuration(root)
     assert install(root) == 0
@@ -95,16 +86,3 @@ def test_without_a_broker_it_is_installed_but_not_enabled(root: Path, capsys: py
     said = capsys.readouterr().err
     assert "gateway.toml: mqtt.broker is not set. kontronik-can-gw-mqtt.service was not enabled." in said
     assert [path.name for path in (root / WANTS).iterdir()] == ["kontronik-can-gw.service"]
-
-
-def test_an_instance_has_a_publisher_of_its_own(root: Path) -> None:
-    for name in ("left", "right"):
-        configuration(root, name)
-        assert install(root, "--mqtt", "--instance", name) == 0
-    link = root / WANTS / "kontronik-can-gw-mqtt@left.service"
-    assert os.readlink(link) == f"/{UNITS}/kontronik-can-gw-mqtt@.service"
-    assert main(["service", "uninstall", "--root", str(root), "--instance", "left"]) == 0
-    assert sorted(path.name for path in (root / WANTS).iterdir()) == [
-        "kontronik-can-gw-mqtt@right.service",
-        "kontronik-can-gw@right.service",
-    ]

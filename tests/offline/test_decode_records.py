@@ -1,7 +1,5 @@
 """Records from bytes: exact values, in wire order, alike however the stream is cut."""
 
-import csv
-import io
 import json
 
 import pytest
@@ -9,11 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.offline.decode import (
-    COLUMNS,
     Decoder,
     Record,
-    csv_header,
-    csv_lines,
     json_lines,
     physical_fields,
     summary,
@@ -65,18 +60,6 @@ def spoiled_stream() -> bytes:
 
 def test_the_recorded_frames_give_exactly_this_json() -> None:
     assert json_lines(decode(LIVE + INFO)) == LIVE_JSON + INFO_JSON
-
-
-def test_the_recorded_frames_in_the_v4_layout_give_the_same_values() -> None:
-    """Synthetic: the recorded values encoded in the other layout."""
-    (live, info) = (record.copy() for record in decode(LIVE + INFO))
-    live_raw = LiveData(0, 2442, 0, 0, 0, 0, 0, 8024, 1001, 0, 0, 29, 32, 0x20000, 12, 0)
-    info_raw = InfoData(0x0C78, 0x010E, 0, 6, 0, 2414, 0, 0, 0, 0, 0, 5599, 0, 0, 27, 30, 28, 33)
-    assert encode(live_raw, Layout.LEGACY) == LIVE
-    assert encode(info_raw, Layout.LEGACY) == INFO
-    live["layout"] = info["layout"] = "v4"
-    info["offset"] = 40
-    assert decode(encode(live_raw, Layout.V4) + encode(info_raw, Layout.V4)) == [live, info]
 
 
 def test_rubbish_only_moves_the_offsets() -> None:
@@ -138,36 +121,6 @@ def test_printed_floats_read_back_to_the_exact_step(raw: int, signed: int) -> No
     for name in ("battery_voltage", "battery_current", "bec_voltage"):
         assert rows(LiveData)[name].raw(record[name]) == getattr(data, name)
         assert len(repr(record[name]).partition(".")[2]) <= 3
-
-
-def test_csv_holds_what_json_holds() -> None:
-    records = decode(spoiled_stream())
-    assert {record["layout"] for record in records} == {"v4", "legacy"}
-    table = list(csv.DictReader(io.StringIO(csv_header() + csv_lines(records))))
-    lines = [json.loads(line) for line in json_lines(records).splitlines()]
-    assert len(table) == len(lines) == len(records)
-    for row, line in zip(table, lines, strict=True):
-        assert tuple(row) == COLUMNS
-        for column in COLUMNS:
-            value = line.get(column)
-            if isinstance(value, list):
-                assert row[column] == "|".join(value)
-            elif isinstance(value, str):
-                assert row[column] == value
-            else:
-                assert row[column] == ("" if value is None else json.dumps(value))
-
-
-def test_several_names_are_joined_by_a_bar() -> None:
-    text = csv_lines(decode(encode(LiveData(operating_errors=0b11), Layout.V4)))
-    assert ",3,undervoltage|overvoltage," in text
-
-
-def test_each_column_stands_once_and_in_wire_order() -> None:
-    assert len(set(COLUMNS)) == len(COLUMNS)
-    assert COLUMNS[:5] == ("kind", "layout", "offset", "electrical_speed", "battery_voltage")
-    plain = [name for name in COLUMNS if name in LiveData._fields]
-    assert plain == list(LiveData._fields)
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=30))

@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,12 +37,6 @@ def test_every_byte_value_passes_unchanged_and_nothing_is_echoed(esc: PtyEsc) ->
     assert read_exactly(esc.path, 256) == ALL_BYTES
     assert esc.check() == 0
     assert esc.received == 0
-
-
-def test_the_reader_may_come_and_go(esc: PtyEsc) -> None:
-    for _ in range(3):
-        esc.write(b"KODL\n\r\x03\x04")
-        assert read_exactly(esc.path, 8) == b"KODL\n\r\x03\x04"
 
 
 def test_a_transmitting_gateway_is_noticed(esc: PtyEsc) -> None:
@@ -121,22 +114,6 @@ def test_a_real_file_is_never_overwritten(tmp_path: Path, kind: str) -> None:
     assert list(tmp_path.iterdir()) == [link]
 
 
-def test_a_link_in_a_missing_directory_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="no link can be made: No such file"):
-        PtyEsc(tmp_path / "missing" / "esc1")
-
-
-def test_a_relative_link_is_removed_though_the_directory_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    terminal = PtyEsc("esc1")
-    monkeypatch.chdir("/")
-    terminal.close()
-    terminal.close()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_several_escs_run_in_one_thread_and_every_frame_arrives() -> None:
     options = EscOptions(period_ns=2_000_000, info_every=10)
     terminals = [PtyEsc() for _ in range(4)]
@@ -167,9 +144,7 @@ def test_the_run_ends_when_told_and_reports_what_a_gateway_sends(esc: PtyEsc) ->
 
     fd = os.open(esc.path, os.O_RDWR | os.O_NOCTTY)
     os.write(fd, b"+++")
-    begin = time.monotonic()
-    run([(SimulatedEsc(), esc)], seconds=30, stop=over.is_set, on_received=on_received)
+    run([(SimulatedEsc(), esc)], seconds=1e6, stop=over.is_set, on_received=on_received)
     os.close(fd)
-    assert time.monotonic() - begin < 10
     assert guilty == [0]
     assert esc.received == 3

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import patch
 
 import can
 import pytest
@@ -28,6 +29,14 @@ README = (PROJECT / "README.md").read_text(encoding="utf-8")
 CONNECT = 'network.connect(interface="socketcan", channel="can0")'
 EXAMPLES = [block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if CONNECT in block]
 POLL, PDOS, EMERGENCIES, STORE, LSS = EXAMPLES
+pytestmark = pytest.mark.extended
+
+
+@pytest.fixture(autouse=True, scope="module")
+def patient_master() -> Iterator[None]:
+    """The master waits for an answer however loaded the machine is."""
+    with patch("canopen.sdo.client.SdoClient.RESPONSE_TIMEOUT", 60.0):
+        yield
 
 
 @contextmanager
@@ -58,8 +67,8 @@ def gateway(channel: str, store: Path, node_id: int) -> Iterator[None]:
         finally:
             loop.stop()
             stop.set()
-            runner.join(5)
-            feeder.join(5)
+            runner.join(60)
+            feeder.join(60)
         assert esc.received == 0
 
 
@@ -80,7 +89,7 @@ def channel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield "examples"
 
 
-def until(holds: object, seconds: float = 5) -> None:
+def until(holds: object, seconds: float = 60) -> None:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         with contextlib.suppress(Exception):

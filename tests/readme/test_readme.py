@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cantools.database
 import pytest
+from command_line import run
 from readme_tables import README, configuration, with_tables
 
 from kontronik_can_gw.cli import COMMANDS
@@ -111,7 +112,4 @@ def test_a_wheel_carries_dbc_and_example_and_finds_them(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_help_of_every_command_says_what_it_is(command: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "kontronik_can_gw", command, "--help"], capture_output=True, text=True, check=True
-    )
-    assert COMMANDS[command].split()[0].lower() in done.stdout.lower()
+    assert COMMANDS[command].split()[0].lower() in run(command, "--help").out.lower()

@@ -1,6 +1,5 @@
 """A headless Chromium, driven over the DevTools protocol through a pair of pipes: no driver, no port, no library."""
 
-import base64
 import json
 import os
 import select
@@ -75,7 +74,7 @@ class Browser:
         os.close(self._out)
         self._process.terminate()
         try:
-            self._process.wait(10)
+            self._process.wait(60)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -162,36 +161,3 @@ class Browser:
         self.call(
             "Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, button=button, buttons=buttons, clickCount=clicks
         )
-
-    def drag(self, x0: float, x1: float, y: float) -> None:
-        """Press, move in some steps, release."""
-        self.mouse("Moved", x0, y)
-        self.mouse("Pressed", x0, y, buttons=1)
-        for step in range(1, 9):
-            self.mouse("Moved", x0 + (x1 - x0) * step / 8, y, buttons=1)
-        self.mouse("Released", x1, y)
-        self.settle()
-
-    def click(self, x: float, y: float, clicks: int = 1) -> None:
-        """``clicks`` 2: a double click."""
-        self.mouse("Moved", x, y)
-        for number in range(1, clicks + 1):
-            self.mouse("Pressed", x, y, buttons=1, clicks=number)
-            self.mouse("Released", x, y, clicks=number)
-        self.settle()
-
-    def key(self, key: str, *, shift: bool = False) -> None:
-        """Press and release."""
-        modifiers = 8 if shift else 0
-        text = {"text": key} if len(key) == 1 else {}
-        self.call("Input.dispatchKeyEvent", type="keyDown", key=key, modifiers=modifiers, **text)
-        self.call("Input.dispatchKeyEvent", type="keyUp", key=key, modifiers=modifiers)
-        self.settle()
-
-    def picture(self, file: Path, *, full: bool = False) -> None:
-        """A screenshot as PNG."""
-        more: dict[str, object] = {}
-        if full:
-            size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-            more = {"captureBeyondViewport": True, "clip": {**size, "scale": 1}}
-        file.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png", **more)["data"]))

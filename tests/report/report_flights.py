@@ -6,8 +6,8 @@ from fractions import Fraction
 from pathlib import Path
 
 from capture_bench import START, Bench, made
+from simulated_bus import capture_file
 
-from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.dbc_output.expand import expand
 from kontronik_can_gw.dbc_output.layout import DbcSettings, choose_node, load_database
@@ -89,17 +89,7 @@ def write_capture(path: Path, seconds: float, options: Sequence[EscOptions]) -> 
         bench.take(now)
     gateway.stop(now)
     bench.take(now)
-    header = bench.setup.header() | {
-        "run": "r",
-        "part": 0,
-        "created_ns": START,
-        "monotonic_ns": START,
-        "wall_ns": 1_700_000_000 * SECOND,
-    }
-    parts = [block(b"H", 0, json_payload(header))]
-    for number, at in enumerate(range(0, len(bench.entries), 300)):
-        parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
-    path.write_bytes(b"".join([*parts, block(b"E", len(parts), b"")]))
+    path.write_bytes(capture_file(bench))
     return path
 
 

@@ -1,12 +1,11 @@
 """The summary's numbers against pandas and numpy on simulated flights; events against what the simulator was told to do."""
 
-from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 import pytest
-from report_flights import Row, column, dbc_bus, shipped_bus, simulated
+from report_flights import Row, column, shipped_bus, simulated
 
 from kontronik_can_gw.dbc_output.unpacker import SignalReader, Value
 from kontronik_can_gw.offline.layouts import BusLayout
@@ -154,13 +153,6 @@ def test_the_fit_is_that_of_numpy() -> None:
     assert found.stretches == 7
 
 
-def test_no_resistance_without_enough_current() -> None:
-    fit = ResistanceFit()
-    for i in range(5000):
-        fit.take(i * 10_000_000, 25.0 - i % 2 * 0.01, 10 + i % 2)
-    assert fit.finish() is None
-
-
 def test_errors_begin_and_end_when_they_did(flight: Flight) -> None:
     def of(name: str, esc: int = 0) -> list[Event]:
         return [e for e in flight.events if e.kind == "error" and e.name == name and e.esc == esc]
@@ -222,19 +214,6 @@ def test_a_window_is_cut_out_with_the_times_of_the_whole(bus: BusLayout, rows: l
     assert 10 <= (part.start_ns - part.origin_ns) / S < 10.02
     assert 19.98 < (part.end_ns - part.origin_ns) / S <= 20
     assert part.rows == sum(10 * S <= t - rows[0][0] <= 20 * S for t, _ in rows)
-
-
-def test_speeds_that_are_one_and_the_same_are_shown_once() -> None:
-    plain = shipped_bus()
-    flight = analysed(plain, list(simulated(plain, 12)))
-    speed = next(p for p in flight.plots if PLOTS[p.plot].key == "speed")
-    assert [line.source for line in speed.lines] == ["electrical_speed"]
-    geared = dbc_bus(plain.layout.file, pole_pairs=7, gear=Fraction(2))
-    flight = analysed(geared, list(simulated(geared, 12)))
-    speed = next(p for p in flight.plots if PLOTS[p.plot].key == "speed")
-    assert [line.source for line in speed.lines] == ["output_speed", "motor_speed", "electrical_speed"]
-    found = flight.summaries[0].extremes
-    assert found["max electrical_speed"].value == pytest.approx(7 * found["max motor_speed"].value, rel=0.01)
 
 
 def test_counters_that_roll_go_on_and_those_that_begin_again_too() -> None:

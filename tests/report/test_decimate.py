@@ -134,22 +134,6 @@ def test_more_gaps_than_can_be_told_apart_are_wider_and_never_joined(
     assert (whole.finish().times, whole.finish().columns) == (found.times, found.columns)
 
 
-def test_short_gaps_are_blurred_before_long_ones() -> None:
-    """Of a line that flickers, most becomes single points; a line in front of it, and a long gap there, stay as they were."""
-    values: list[Number] = [*range(1000), None, *range(1000)]
-    times = [at * 10_000_000 + (3_000_000_000 if at > 1000 else 0) for at in range(2001)]
-    for at in range(5000):
-        values.append(None if at % 2 else 5)
-        times.append(times[-1] + 1_000_000)
-    decimator = Decimator(1, 100, 200)
-    decimator.feed(times, [values])
-    found = decimator.finish()
-    assert_gaps_are_kept([(value,) for value in values], times, found)
-    at = found.columns[0].index(None)
-    assert (found.times[at - 1 : at + 2], found.columns[0][at + 1]) == (times[999:1002], 0)
-    assert len(found.times) < 1200
-
-
 @given(ROWS, STEPS, st.integers(1, 64), st.lists(st.integers(0, 40), max_size=10))
 def test_chunks_do_not_matter(
     rows: list[tuple[Number, Number]], steps: list[int], points: int, cuts: list[int]
@@ -158,20 +142,3 @@ def test_chunks_do_not_matter(
     one, _ = decimated(rows, times, points, [])
     many, _ = decimated(rows, times, points, cuts)
     assert (one.times, one.columns) == (many.times, many.columns)
-
-
-@given(ROWS, STEPS)
-def test_nothing_changes_where_there_is_room(rows: list[tuple[Number, Number]], steps: list[int]) -> None:
-    times = times_of(rows, steps)
-    found, bucket = decimated(rows, times, 300, [])
-    assert bucket == 1
-    assert found.times == times
-    assert list(zip(*found.columns, strict=True)) == rows
-
-
-def test_the_values_of_a_bucket_keep_their_order() -> None:
-    decimator = Decimator(1, 8)
-    decimator.feed(range(64), [[*range(32), *range(32, 0, -1)]])
-    points = decimator.finish()
-    assert points.columns[0] == [*(v for v in range(32) if v % 16 in (0, 15)), 32, 17, 16, 1]
-    assert points.times == [0, 15, 16, 31, 32, 47, 48, 63]

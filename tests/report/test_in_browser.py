@@ -3,7 +3,6 @@
 import bisect
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from report_browser import MISSING, PROGRAM, Browser
@@ -37,17 +36,6 @@ COUNT = """((key, colour) => {
     if (data[i + 3] > 200 && want.every((w, k) => Math.abs(w - data[i + k]) < 24)) count++;
   }
   return count;
-})"""
-
-# Share of the height in which a red line stands at a time.
-RED_AT = """((key, t) => {
-  const { u } = flight.plots.find((p) => p.key === key), { top, height } = u.bbox;
-  const data = u.ctx.getImageData(Math.round(u.valToPos(t, "x", true)) - 1, top, 3, height).data;
-  let count = 0;
-  for (let i = 0; i < data.length; i += 4) {
-    if (data[i] > 150 && data[i] - data[i + 1] > 60 && data[i] - data[i + 2] > 60) count++;
-  }
-  return count / height;
 })"""
 
 
@@ -108,8 +96,7 @@ def ranges(browser: Browser) -> list[list[float]]:
     return found
 
 
-@pytest.mark.parametrize("name", ["one", "two"])
-@pytest.mark.parametrize("look", ["light", "dark", "phone"])
+@pytest.mark.parametrize(("name", "look"), [("one", "light"), ("two", "dark"), ("two", "phone")])
 def test_every_plot_is_drawn_and_the_page_fits(
     browser: Browser, pages: dict[str, Path], one: Flight, name: str, look: str
 ) -> None:
@@ -125,8 +112,6 @@ def test_every_plot_is_drawn_and_the_page_fits(
     bands = [browser.run(f"{COUNT}('states', flight.data.classes[{group}].{theme})") for group in (0, 3, 4, 5)]
     assert min(bands) > 100, bands
     assert browser.run("document.documentElement.scrollWidth") == width
-    ground = browser.run("getComputedStyle(document.body).backgroundColor")
-    assert ground == ("rgb(16, 19, 23)" if look == "dark" else "rgb(246, 247, 249)")
     assert browser.run("window.hit") is None
 
 
@@ -164,120 +149,11 @@ def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Pa
         assert all((text != "–") == is_known for text in shown), (share, shown)
 
 
-def test_a_drag_zooms_all_plots_and_a_double_click_resets(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"])
-    whole = ranges(browser)
-    (x0, y), (x1, _) = centre(browser, "power", 0.25), centre(browser, "power", 0.5)
-    browser.drag(x0, x1, y)
-    zoomed = ranges(browser)
-    assert all(r == zoomed[0] for r in zoomed)
-    assert zoomed[0] == [pytest.approx(15, abs=0.2), pytest.approx(30, abs=0.2)]
-    browser.click(x0 + 20, y, clicks=2)
-    assert ranges(browser) == whole
-    browser.run("flight.setRange(10, 10.1)")
-    browser.settle()
-    browser.drag(x0, x0 + 40, y)  # less than can be shown
-    low, high = ranges(browser)[0]
-    assert all(r == [low, high] for r in ranges(browser))
-    assert high - low == pytest.approx(0.05)
-
-
-def test_wheel_keys_and_buttons_move_the_range(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"])
-    x, y = centre(browser, "power")
-
-    def span() -> float:
-        low, high = ranges(browser)[0]
-        return high - low
-
-    whole = span()
-    browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=-50, modifiers=2)
-    browser.settle()
-    wheel = span()
-    assert wheel < 0.9 * whole
-    browser.run("document.querySelector('#plot-power .plot').focus({preventScroll: true})")
-    browser.key("+")
-    assert span() == pytest.approx(0.6 * wheel)
-    before = ranges(browser)[0]
-    browser.key("ArrowRight", shift=True)
-    assert ranges(browser)[0][0] > before[0]
-    browser.key("ArrowRight")
-    assert "·" in browser.run("document.getElementById('now').textContent")
-    browser.key("0")
-    assert span() == whole
-    browser.run("document.getElementById('in').click()")
-    assert span() == pytest.approx(whole / 2)
-    browser.run("document.getElementById('all').click()")
-    assert span() == whole
-    browser.run("flight.setRange(-100, 1e6)")
-    assert span() == whole
-
-
-def test_a_plot_off_the_screen_takes_the_range_when_it_is_scrolled_to(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"])
-    browser.run("scrollTo({top: 0, behavior: 'instant'})")
-    browser.settle()
-    browser.run("flight.setRange(10, 20)")
-    centre(browser, "bec_current")
-    browser.settle()
-    last: list[float] = browser.run("(({u}) => [u.scales.x.min, u.scales.x.max])(flight.plots.at(-1))")
-    assert last == [10, 20]
-
-
-def test_events_can_be_searched_sorted_filtered_and_gone_to(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"])
-
-    def texts(column: int = 5) -> list[str]:
-        found: list[str] = browser.run(
-            f"[...document.querySelectorAll('#events tbody td:nth-child({column})')].map((c) => c.textContent)"
-        )
-        return found
-
-    everything = texts()
-    assert {"power stage hot", "battery voltage too low", "No telemetry"} <= set(everything)
-    browser.run("document.querySelector('[data-sort=text]').click()")
-    assert texts() == sorted(everything, key=lambda text: [ord(c) for c in text])
-    browser.run("document.querySelector('[data-kind=state]').click()")
-    assert set(texts(4)) == {"Error", "Warning", "Link"}
-    browser.run(
-        "(() => { const s = document.getElementById('search'); s.value = 'voltage'; s.dispatchEvent(new Event('input')); })()"
-    )
-    assert texts() == ["battery voltage too low"]
-    assert "battery" in texts(6)[0]  # a remedy
-    browser.run("document.querySelector('#events tbody tr').scrollIntoView({behavior: 'instant', block: 'center'})")
-    box = browser.run(
-        "(() => { const r = document.querySelector('#events tbody .at').getBoundingClientRect(); return [r.x + 5, r.y + 5]; })()"
-    )
-    browser.click(*box)
-    low, high = ranges(browser)[3]
-    assert low == pytest.approx(17.5, abs=0.2)
-    assert high == pytest.approx(23, abs=0.2)
-    browser.run("document.querySelector('.tiles [data-at]').click()")
-    assert ranges(browser)[0] != [low, high]
-
-
-def test_marks_of_errors_are_drawn_over_all_plots(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"])
-    browser.run("flight.setRange(17, 22)")
-    assert all(r == [17, 22] for r in ranges(browser))
-    for key in browser.run("flight.plots.map((p) => p.key)"):
-        column = browser.run(f"{RED_AT}('{key}', 20)")
-        assert column > 0.5, key
-
-
 MARKS = """flight.plots.filter((p) => p.key !== "states").map((p) => ({
   key: p.key, told: p.below.hidden ? "" : p.below.textContent, shown: !p.below.hidden && p.below.offsetHeight > 0,
   left: p.u.bbox.left, right: p.u.bbox.left + p.u.bbox.width,
   marks: p.marks.map(({event, x, text, number}) => ({esc: event.esc, what: event.text, from: event.from, x, text, number})),
 }))"""
-# Pixels of a mark's text that are in the colour of errors.
-INK = """((key, at) => {
-  const { u, marks } = flight.plots.find((p) => p.key === key), { left, right, row } = marks[at].text, r = devicePixelRatio;
-  const data = u.ctx.getImageData(left, u.bbox.top - 15 * (row + 1) * r, right - left, 14 * r).data;
-  let count = 0;
-  for (let i = 0; i < data.length; i += 4) if (data[i] > 150 && data[i] - data[i + 1] > 60) count++;
-  return count;
-})"""
 
 
 @pytest.fixture(scope="module")
@@ -291,7 +167,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
         *(ErrorWindow(OperatingError.UNDERVOLTAGE, (16 + 2 * n) * S, S) for n in range(10)),
     )
     written = {}
-    for number, each in ((2, windows[:1]), (4, windows[:2]), (6, windows[:3]), (28, windows)):
+    for number, each in ((4, windows[:2]), (6, windows[:3]), (28, windows)):
         bus = shipped_bus(("left", "right"))
         analysis = Analysis(bus, 2000)
         for time_ns, values in simulated(bus, 40, [EscOptions(faults=Faults(errors=each))] * 2):
@@ -301,8 +177,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     return written
 
 
-@pytest.mark.parametrize("width", [1400, 390])
-@pytest.mark.parametrize("number", [2, 4, 6, 28])
+@pytest.mark.parametrize(("number", "width"), [(4, 1400), (6, 390), (28, 1400)])
 def test_every_error_is_told_at_its_mark_or_by_its_number(
     browser: Browser, faulty: dict[int, Path], number: int, width: int
 ) -> None:
@@ -319,7 +194,6 @@ def test_every_error_is_told_at_its_mark_or_by_its_number(
             if mark["text"]:
                 assert plot["left"] <= mark["text"]["left"] < mark["text"]["right"] <= plot["right"]
                 assert mark["text"]["left"] - mark["x"] < 10
-                assert browser.run(f"{INK}('{plot['key']}', {at})") > 60
             else:
                 assert plot["shown"]
                 assert f"{('left', 'right')[mark['esc']]}: {mark['what']}" in plot["told"]
@@ -332,86 +206,3 @@ def test_every_error_is_told_at_its_mark_or_by_its_number(
         for mark in marks:  # no line runs through a text
             for box in boxes if mark["text"] else ():
                 assert box["row"] >= mark["text"]["row"] or not box["left"] < mark["x"] < box["right"]
-
-
-def test_zooming_in_gives_room_to_the_texts(browser: Browser, faulty: dict[int, Path]) -> None:
-    browser.open(faulty[6], 390, 900, phone=True)
-    assert any(mark["number"] for mark in browser.run(MARKS)[0]["marks"])
-    browser.run("flight.setRange(7, 10)")
-    browser.run("flight.followAll()")
-    browser.settle()
-    for plot in browser.run(MARKS):
-        assert [mark["what"] for mark in plot["marks"] if mark["text"]] == ["battery voltage too low"] * 2
-        assert plot["told"] == ""
-
-
-def test_on_a_phone_nothing_of_several_escs_is_cut(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["two"], 390, 844, phone=True)
-    assert browser.run("document.documentElement.scrollWidth") == 390
-    cut = browser.run(
-        "[...document.querySelectorAll('.groups, .groups *, .scroll, .legend td, .legend th')].filter((node) => { "
-        "const r = node.getBoundingClientRect(); return r.right > 390 || r.left < 0 || "
-        "(node.clientWidth && node.scrollWidth > node.clientWidth + 1); }).map((node) => node.outerHTML.slice(0, 200))"
-    )
-    assert cut == []
-    rows = browser.run(
-        "[...document.querySelectorAll('.numbers tbody tr')].map((row) => [...row.cells].slice(1).map((cell) => "
-        "[getComputedStyle(cell, '::before').content, cell.getBoundingClientRect().top, cell.offsetHeight]))"
-    )
-    assert len(rows) > 15
-    for (left, top, height), (right, below, _) in rows:
-        assert (left, right) == ('"left"', '"right"')
-        assert below > top + height - 1 > top
-
-
-def test_an_esc_can_be_switched_off_and_on(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["two"])
-    colours = browser.run("flight.data.styles.slice(0, 2).map((s) => s.light)")
-
-    def drawn() -> list[Any]:
-        return [browser.run(f"{COUNT}('battery_voltage', '{colour}')") for colour in colours]
-
-    both = drawn()
-    assert min(both) > 50
-    browser.run("document.querySelector('#escs [data-esc=\"1\"]').click()")
-    browser.settle()
-    alone = drawn()
-    assert alone[0] >= both[0]
-    assert alone[1] == 0
-    assert browser.run("document.querySelector('#escs [data-esc=\"1\"]').getAttribute('aria-pressed')") == "false"
-    assert "right" not in browser.run("document.querySelector('#events tbody').textContent")
-    browser.run("document.querySelector('#escs [data-esc=\"1\"]').click()")
-    browser.settle()
-    assert drawn() == both
-
-
-def test_the_theme_can_be_switched_and_printing_is_light(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"], dark=True)
-    browser.run("document.getElementById('theme').click()")
-    assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(246, 247, 249)"
-    browser.settle()
-    assert browser.run(f"{COUNT}('power', flight.data.styles[0].light)") > 100
-    browser.run("document.getElementById('theme').click()")
-    pdf = browser.call("Page.printToPDF", printBackground=True)["data"]
-    assert len(pdf) > 50_000
-    browser.settle()
-    assert browser.run("document.documentElement.className") == "dark"
-    assert browser.run("flight.plots[0].u.width") > 1000
-
-
-def test_two_fingers_zoom(browser: Browser, pages: dict[str, Path]) -> None:
-    browser.open(pages["one"], 390, 844, phone=True)
-    x, y = centre(browser, "power")
-
-    def touch(kind: str, *xs: float) -> None:
-        points = [{"x": at, "y": y, "id": i} for i, at in enumerate(xs)]
-        browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
-
-    touch("touchStart", x - 40)
-    touch("touchStart", x - 40, x + 40)
-    for step in range(1, 5):
-        touch("touchMove", x - 40 - 10 * step, x + 40 + 10 * step)
-    touch("touchEnd")
-    browser.settle()
-    low, high = ranges(browser)[0]
-    assert high - low == pytest.approx(30, rel=0.1)

@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 from report_flights import dbc_bus, shipped_bus, simulated
 
 from kontronik_can_gw.config import shipped
-from kontronik_can_gw.offline.report import page as page_module
 from kontronik_can_gw.offline.report.analysis import Analysis
 from kontronik_can_gw.offline.report.decimate import Number
 from kontronik_can_gw.offline.report.flight import Flight
-from kontronik_can_gw.offline.report.page import clock, duration, encode, number, render, wall_clock
+from kontronik_can_gw.offline.report.page import encode, render
 from kontronik_can_gw.telemetry import SECOND as S
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u2028{{data}}"
@@ -182,31 +181,3 @@ def test_values_come_in_the_sources_units_whatever_the_dbc_has(tmp_path: Path) -
         found.append(analysis.finish())
     assert found[0].summaries[0].extremes == found[1].summaries[0].extremes
     assert found[0].summaries[0].rest_voltage == pytest.approx(found[1].summaries[0].rest_voltage)
-
-
-@pytest.mark.parametrize(
-    ("shown", "expected"),
-    [
-        (clock(0), "0:00.0"),
-        (clock(59_960_000_000), "1:00.0"),
-        (clock(3_661_500_000_000), "1:01:01.5"),
-        (clock(-1_500_000_000), "−0:01.5"),
-        (clock(61_999_000_000, 0), "1:02"),
-        (duration(1_540_000_000), "1.5 s"),
-        (duration(61 * S), "1 min 01 s"),
-        (duration(3725 * S), "1 h 02 min 05 s"),
-        (number(-1234567.891, 1), "−1\u202f234\u202f567.9"),
-        (wall_clock(1_763_751_137 * S), "2025-11-21 18:52:17 UTC"),
-        (wall_clock(10**30), "1000000000000000000000 s of Unix time"),
-    ],
-)
-def test_times_and_numbers_read_well(shown: str, expected: str) -> None:
-    assert shown == expected
-
-
-def test_the_library_comes_with_its_licence_and_version() -> None:
-    folder = Path(page_module.__file__).parent / "vendor"
-    version = re.search(r"uPlot \(v([\d.]+)\)", (folder / "uPlot.iife.min.js").read_text(encoding="utf-8"))
-    assert version is not None
-    assert f"| {version[1]} |" in (folder / "README.md").read_text(encoding="utf-8")
-    assert "MIT License" in (folder / "uPlot.LICENSE").read_text(encoding="utf-8")

@@ -1,6 +1,5 @@
 """What the gateway tells systemd, read from a socket that stands in for systemd's; and how its log lines look to the journal."""
 
-import contextlib
 import logging
 import os
 import secrets
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.runtime.systemd import Notifier, is_journal, log_formatter, priority
+from kontronik_can_gw.runtime.systemd import Notifier, is_journal, log_formatter
 
 
 class Manager:
@@ -168,27 +167,6 @@ def test_the_watchdog_is_for_the_process_that_is_meant(
         assert manager.told() == ([["WATCHDOG=1"]] if half else [])
 
 
-def sockets() -> set[int]:
-    """The descriptors of this process that are sockets."""
-    found = set()
-    for link in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(FileNotFoundError):
-            if str(link.readlink()).startswith("socket:"):
-                found.add(int(link.name))
-    return found
-
-
-def test_one_socket_is_opened_that_no_child_inherits(manager: Manager) -> None:
-    notifier = Notifier(manager.environment())
-    before = sockets()
-    for text in "abc":
-        notifier.status(text)
-    [opened] = sockets() - before
-    assert not os.get_inheritable(opened)
-    notifier.close()
-    assert sockets() == before
-
-
 # --- the log
 
 
@@ -215,10 +193,3 @@ def test_each_line_carries_its_priority(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert formatter is not None
     assert formatter.format(record(logging.ERROR, "lost\nfor good")) == "<3>lost\n<3>for good"
     assert formatter.format(record(logging.INFO, "back")) == "<6>back"
-
-
-@pytest.mark.parametrize(
-    ("level", "number"), [(60, 2), (50, 2), (40, 3), (30, 4), (25, 5), (20, 6), (15, 7), (10, 7), (0, 7)]
-)
-def test_priorities_are_those_of_syslog(level: int, number: int) -> None:
-    assert priority(level) == number

@@ -55,22 +55,6 @@ def document() -> dict[str, Any]:
     return with_nodes(bench.document(ports=ports, can=can, store=StoreFacts(1, "disk full")))
 
 
-def test_every_line_is_a_sample_or_the_help_or_type_of_the_family_that_follows(document: dict[str, Any]) -> None:
-    lines = metrics(document).split("\n")
-    assert lines.pop() == ""
-    name = kind = ""
-    for line in lines:
-        if line.startswith("# HELP "):
-            name = line.split()[2]
-            assert re.fullmatch(r"# HELP \S+ \S.*\.", line), line
-        elif line.startswith("# TYPE "):
-            assert line.split()[2] == name
-            kind = line.split()[3]
-        else:
-            assert re.fullmatch(rf'{name}(\{{([a-z_]+="[^"]*",?)+\}})? -?[0-9][0-9.e+-]*', line), line
-            assert kind in ("gauge", "counter")
-
-
 def test_names_have_the_prefix_counters_end_in_total_and_a_unit_stands_behind_the_name(
     document: dict[str, Any],
 ) -> None:
@@ -145,25 +129,6 @@ def test_what_is_not_available_is_left_out() -> None:
     assert value(document, "kontronik_esc_losses_total", esc="esc1") == 1
     assert "kontronik_canopen_node_state" not in text  # there are no nodes
     assert "kontronik_store" not in text
-
-
-def test_without_any_esc_heard_no_family_of_values_is_begun() -> None:
-    text = metrics(Bench(1).document())
-    assert "battery_voltage" not in text
-    assert 'kontronik_esc_link_state{esc="esc1",state="never-seen"} 1' in text
-
-
-def test_a_state_is_one_of_its_names(document: dict[str, Any]) -> None:
-    for name, now in (("can_state", "unknown"), ("gateway_state", "running")):
-        family = families(document)[f"kontronik_{name}"]
-        assert [s.labels["state"] for s in family.samples if s.value == 1] == [now]
-        assert len(family.samples) > 3
-    states = families(document)["kontronik_canopen_node_state"].samples
-    assert [s.labels for s in states if s.value == 1] == [
-        {"esc": f"esc{n}", "node_id": str(n), "state": "operational"} for n in (1, 2)
-    ]
-    links = families(document)["kontronik_esc_link_state"].samples
-    assert [(s.labels["esc"], s.labels["state"]) for s in links if s.value == 1] == [("esc1", "ok"), ("esc2", "ok")]
 
 
 def test_each_error_bit_is_a_flag_with_its_severity_and_an_unknown_one_shows_when_it_is_set() -> None:

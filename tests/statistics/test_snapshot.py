@@ -1,17 +1,16 @@
 """The document: every value true and fresh or null, every counter there, and figures that come from /proc."""
 
 import os
-import time
 from dataclasses import fields, replace
 from fractions import Fraction
 from pathlib import Path
 
 import pytest
-from statistics_bench import START, Bench, with_nodes
+from statistics_bench import Bench, with_nodes
 
 from kontronik_can_gw.protocol.deframer import Counters
 from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
-from kontronik_can_gw.protocol.states import Device, OperatingError, state_text
+from kontronik_can_gw.protocol.states import OperatingError, state_text
 from kontronik_can_gw.runtime.snapshot import (
     LOG_LINES,
     CanFacts,
@@ -92,16 +91,6 @@ def test_a_lost_esc_has_no_values_but_its_counters_and_its_age() -> None:
     assert lost["frame_rate_hz"] == 0
 
 
-def test_what_a_jivepro_does_not_supply_is_null() -> None:
-    bench = Bench(1, options=EscOptions(device=Device.JIVEPRO))
-    bench.run(3)
-    (esc,) = bench.document()["escs"]
-    assert esc["device"] == "JIVEPro"
-    assert esc["values"]["bec_current"] is None
-    assert esc["values"]["bec_voltage"] is not None
-    assert esc["peak_current_of"] == "battery"
-
-
 def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> None:
     bench = Bench(1, options=EscOptions(faults=Faults(noise=0.5, flipped_bits=1e-4)))
     bench.run(3)
@@ -160,26 +149,6 @@ def test_ports_interface_store_and_log_are_told_as_the_loop_gave_them() -> None:
     assert bench.document()["store"] is None
 
 
-def test_the_head_says_format_clocks_and_process() -> None:
-    bench = Bench(1)
-    bench.run(1)
-    document = bench.document()
-    assert (document["format"], document["program"], document["version"]) == (1, "kontronik-can-gw", "1.2.3")
-    assert document["monotonic_ns"] == START + SECOND
-    assert document["time"] == "2023-11-14T22:13:20Z"
-    assert document["process"] == {
-        "pid": 4711,
-        "start_ticks": 99,
-        "pid_namespace": "pid:[1]",
-        "started": "2026-01-02T03:04:05Z",
-        "uptime_s": 1.0,
-        "rss_bytes": 20_000_000,
-        "open_fds": 12,
-        "threads": 3,
-    }
-    assert document["gateway"] == {"state": "running", "esc_count": 1, "escs_ok": 1}
-
-
 def test_rates_are_per_second_between_two_documents() -> None:
     bench = Bench(2)
     before = with_nodes(bench.document(), sent=100)
@@ -216,9 +185,7 @@ def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> Non
     assert facts.ticks == start_ticks(os.getpid()) > 0
     assert Path(facts.configuration).is_absolute()
     child = os.posix_spawn("/bin/true", ["true"], {})
-    deadline = time.monotonic() + 10
-    while start_ticks(child) > 0 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
     assert start_ticks(child) == -1  # ended, and nobody has asked for its exit code
     os.waitpid(child, 0)
     assert start_ticks(child) == 0
@@ -229,17 +196,3 @@ def test_the_default_file_is_in_the_services_runtime_folder(monkeypatch: pytest.
     assert default_file() is None
     monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/kontronik-can-gw:/run/other")
     assert default_file() == Path("/run/kontronik-can-gw/status.json")
-
-
-def test_a_document_of_eight_escs_is_made_in_a_few_milliseconds() -> None:
-    bench = Bench(8)
-    bench.run(1)
-    bench.document()
-    best = min(_seconds(bench) for _ in range(20))
-    assert best < 0.02  # about 0.7 ms on an idle PC
-
-
-def _seconds(bench: Bench) -> float:
-    begin = time.perf_counter()
-    bench.document()
-    return time.perf_counter() - begin

@@ -1,30 +1,26 @@
 """``status``: which file it reads, what it says of the gateway, its exit codes, and that no content of a file harms it."""
 
 import contextlib
-import fcntl
-import io
 import json
 import os
 import pty
 import re
 import select
 import signal
-import struct
 import subprocess
 import sys
-import termios
 import time
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from statistics_bench import Bench, with_nodes
 
-from kontronik_can_gw.cli import main, status
+from kontronik_can_gw.cli import status
 from kontronik_can_gw.cli.status import HEALTHY, NOT_RUNNING, TROUBLE, Node, Seen, judge, look_at, screen
 from kontronik_can_gw.runtime.snapshot import (
     STALE_NS,
@@ -59,18 +55,25 @@ def words(seen: Seen, size: tuple[int, int] | None = None) -> str:
     return "\n".join("".join(piece.text for piece in line) for line in screen(seen, size))
 
 
-def shell(*arguments: object) -> tuple[int, str, str]:
+def shell(*arguments: object) -> tuple[object, str, str]:
     """Exit code, standard output and standard error of the command."""
-    out, talk = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(talk):
-        code = main(["status", *map(str, arguments)])
-    return code, out.getvalue(), talk.getvalue()
+    done = run("status", *arguments)
+    return done.code, done.out, done.err
+
+
+NOW = 10**15
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command's time stands still."""
+    monkeypatch.setattr("kontronik_can_gw.cli.status.time.monotonic_ns", lambda: NOW)
 
 
 def written(file: Path, bench: Bench, program: ProgramFacts | None = None, **changes: Any) -> Document:
     """A file of this process and this instant."""
     document = bench.document(program=program or program_facts("gateway.toml"))
-    document |= {"monotonic_ns": time.monotonic_ns()} | changes
+    document |= {"monotonic_ns": NOW} | changes
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(document), encoding="utf-8")
     return document
@@ -84,11 +87,6 @@ def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 # --- the judgement
-
-
-def test_a_gateway_that_hears_all_is_healthy() -> None:
-    seen = judged(heard().document())
-    assert (seen.code, seen.sentence, seen.troubles) == (HEALTHY, "running", ())
 
 
 def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
@@ -166,22 +164,22 @@ def test_a_document_of_a_dead_process_or_from_before_the_last_start_of_the_machi
 def test_a_living_writer_is_told_from_a_dead_one_and_from_another_with_its_pid(tmp_path: Path) -> None:
     file, bench, own = tmp_path / "status.json", heard(), program_facts("x")
     written(file, bench)
-    assert look_at(file, time.monotonic_ns()).code == HEALTHY
+    assert look_at(file, NOW).code == HEALTHY
     other = ProgramFacts("x", pid=own.pid, ticks=own.ticks + 1, pid_namespace=own.pid_namespace)
     written(file, bench, other)
-    assert look_at(file, time.monotonic_ns()).sentence == "not running"
+    assert look_at(file, NOW).sentence == "not running"
     child = subprocess.Popen(["sleep", "100"])
     dead = ProgramFacts("x", pid=child.pid, ticks=0, pid_namespace=own.pid_namespace)
     written(file, bench, dead)
-    assert look_at(file, time.monotonic_ns()).code == HEALTHY
+    assert look_at(file, NOW).code == HEALTHY
     child.kill()
-    time.sleep(0.2)  # it has ended, and is not reaped
-    assert look_at(file, time.monotonic_ns()).sentence == "not running"
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and is not reaped
+    assert look_at(file, NOW).sentence == "not running"
     child.wait()
-    assert look_at(file, time.monotonic_ns()).sentence == "not running"
+    assert look_at(file, NOW).sentence == "not running"
     elsewhere = ProgramFacts("x", pid=child.pid, ticks=5, pid_namespace="pid:[7]")  # in a container
     written(file, bench, elsewhere)
-    assert look_at(file, time.monotonic_ns()).code == HEALTHY
+    assert look_at(file, NOW).code == HEALTHY
 
 
 @pytest.mark.parametrize(
@@ -251,9 +249,7 @@ def test_a_faulty_configuration_and_two_sources_are_wrong_usage(tmp_path: Path) 
     (tmp_path / "a.toml").write_text("[xyz]\n", encoding="utf-8")
     assert shell("-c", tmp_path / "a.toml")[0] == 2
     for wrong in (("-c", "a", "--file", "b"), ("--interval", "0"), ("--interval", "nan"), ("--interval", "x")):
-        with pytest.raises(SystemExit) as caught:
-            shell(*wrong)
-        assert caught.value.code == 2
+        assert shell(*wrong)[0] == 2
 
 
 def test_json_is_one_document_with_the_judgement_and_what_the_file_held(tmp_path: Path) -> None:
@@ -264,7 +260,7 @@ def test_json_is_one_document_with_the_judgement_and_what_the_file_held(tmp_path
     assert (code, talk) == (HEALTHY, "")
     assert gateway["document"] == document
     assert (gateway["file"], gateway["exit_code"], gateway["status"]) == (str(file), 0, "running")
-    assert 0 <= gateway["age_s"] < 3
+    assert gateway["age_s"] == 0
     code, out, talk = shell("--file", tmp_path / "none", "--json")
     (gateway,) = json.loads(out)["gateways"]
     assert (code, talk, gateway["document"]) == (NOT_RUNNING, "", None)
@@ -300,55 +296,6 @@ def crowded() -> Document:
     return with_rates(later, before)
 
 
-def test_eight_escs_with_faults_fit_into_80_columns_and_24_lines() -> None:
-    seen = judged(crowded())
-    shown = words(seen, (80, 22)).split("\n")
-    assert len(shown) == 22
-    too_long = [line for line in shown if len(line) > 80]
-    assert too_long == []
-    assert sum(line.startswith("tailrotor_0") and " ok " in line for line in shown) == 7
-    assert any(re.match(r"tailrotor_06 +port error", line) for line in shown)
-    assert any("port not open: /dev/serial/by-id" in line for line in shown)
-    assert re.fullmatch(r"\.\.\. and \d+ lines more: --once shows them", shown[-1])
-
-
-def test_at_once_everything_is_shown() -> None:
-    shown = words(judged(crowded()))
-    assert "14:03:00" in shown and "14:03:19" in shown
-    assert "esc8: node 8 operational, 400/s" in shown
-    assert "battery voltage too low; battery voltage too high" in shown
-    assert "error was found" not in shown  # a mere summary of the others
-
-
-def test_values_are_in_their_columns_and_a_dash_where_there_is_none() -> None:
-    bench = heard(2, 6)
-    bench.silent.add(1)
-    bench.run(1)
-    lines = words(judged(bench.document())).split("\n")
-    head = next(line.split() for line in lines if line.startswith("ESC"))
-    assert head == ["ESC", "link", "Hz", "age", "ms", "V", "A", "1/min", "°C", "CRC", "line", "lost"]
-    values = bench.document()["escs"][0]["values"]
-    ok = next(line.split() for line in lines if line.startswith("esc1"))
-    assert ok[1:3] == ["ok", "100"]
-    assert ok[4:8] == [
-        f"{values['battery_voltage']:.2f}",
-        f"{values['battery_current']:.1f}",
-        f"{values['motor_speed']:.0f}",
-        f"{values['power_stage_temperature']:.0f}",
-    ]
-    lost = next(line.split() for line in lines if line.startswith("esc2"))
-    assert lost[1] == "lost" and lost[4:8] == ["-", "-", "-", "-"] and lost[-1] == "1"
-
-
-def test_the_last_events_fill_what_room_there_is() -> None:
-    document = heard(1).document(log_lines=[f"event {n}" for n in range(20)])
-    for height in range(8, 40):
-        shown = words(judged(document), (80, height)).split("\n")
-        assert len(shown) <= height
-        if len(shown) > 8:
-            assert shown[-1].strip() == "event 19"
-
-
 def test_nothing_that_a_terminal_might_obey_comes_from_a_file(tmp_path: Path) -> None:
     evil = "\x1b[2J\x1b]0;x\x07\r\n\x9b[31m\u202e"
     document = heard().document(log_lines=[evil])
@@ -358,7 +305,7 @@ def test_nothing_that_a_terminal_might_obey_comes_from_a_file(tmp_path: Path) ->
     shown = words(judged(document))
     assert all(char.isprintable() or char == "\n" for char in shown)
     document["process"]["pid_namespace"] = ""
-    (tmp_path / "s").write_text(json.dumps(document | {"monotonic_ns": time.monotonic_ns()}), encoding="utf-8")
+    (tmp_path / "s").write_text(json.dumps(document | {"monotonic_ns": NOW}), encoding="utf-8")
     _, out, _ = shell("--file", tmp_path / "s")
     assert all(char.isprintable() or char == "\n" for char in out)
 
@@ -402,91 +349,42 @@ def test_no_document_makes_anything_but_lines(changes: list[tuple[tuple[Any, ...
 # --- the process
 
 
-def program(*arguments: object, **more: Any) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "kontronik_can_gw", "status", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **more)
-
-
-def test_in_a_pipe_it_is_shown_once_without_colour(tmp_path: Path) -> None:
-    file = tmp_path / "status.json"
-    written(file, heard())
-    done = program("--file", file)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "\x1b" not in done.stdout
-    assert "esc1" in done.stdout and "esc2" in done.stdout
-
-
-class Terminal:
-    """The command on a terminal of 80 columns and 24 lines."""
-
-    def __init__(self, *arguments: object, **environment: str) -> None:
-        self.master, slave = pty.openpty()
-        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-        environment = {"TERM": "xterm-256color", **environment}
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "kontronik_can_gw", "status", *map(str, arguments)],
-            stdin=slave,
-            stdout=slave,
-            stderr=slave,
-            env=os.environ | environment,
-            start_new_session=True,
-        )
-        os.close(slave)
-        self.text = ""
-
-    def until(self, text: str) -> None:
-        """Wait for words, wherever their line is broken."""
-        end = time.monotonic() + 30
-        while text not in " ".join(re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text).split()):
-            assert time.monotonic() < end, self.text
-            if select.select([self.master], [], [], 0.1)[0]:
-                self.text += os.read(self.master, 65536).decode("utf-8", "replace")
-
-    def end(self, number: int) -> int:
-        self.process.send_signal(number)
-        code = self.process.wait(30)
-        with contextlib.suppress(OSError):
-            while select.select([self.master], [], [], 0.1)[0]:
-                self.text += os.read(self.master, 65536).decode("utf-8", "replace")
-        os.close(self.master)
-        return code
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_on_a_terminal_it_is_live_and_ends_by_a_signal_with_0_and_the_cursor_shown(tmp_path: Path, number: int) -> None:
     file = tmp_path / "status.json"
-    written(file, heard())
-    terminal = Terminal("--file", file, "--interval", "0.1")
-    terminal.until("Ctrl-C ends.")
-    written(file, heard(change=lambda bench: bench.gateway.set_can_state(CanState.BUS_OFF, bench.now)))
-    terminal.until("CAN can0 is bus-off")
-    file.unlink()
-    terminal.until("there is no such file")
-    assert terminal.end(number) == 0
-    assert "Traceback" not in terminal.text
-    assert terminal.text.rindex("\x1b[?25h") > terminal.text.rindex("\x1b[?25l")
+    document = written(file, heard(), monotonic_ns=time.clock_gettime_ns(time.CLOCK_MONOTONIC))
+    master, slave = pty.openpty()
+    command = [sys.executable, "-m", "kontronik_can_gw", "status", "--file", str(file), "--interval", "0.1"]
+    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"}
+    process = subprocess.Popen(
+        command, stdin=slave, stdout=slave, stderr=slave, env=environment, start_new_session=True
+    )
+    os.close(slave)
+    text = ""
 
+    def until(wanted: str) -> None:
+        """Wait for words, wherever their line is broken."""
+        nonlocal text
+        end = time.monotonic() + 60
+        while wanted not in " ".join(re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text).split()):
+            assert time.monotonic() < end, text
+            if select.select([master], [], [], 0.1)[0]:
+                text += os.read(master, 65536).decode("utf-8", "replace")
 
-def test_on_a_terminal_without_colour_no_colour_is_set(tmp_path: Path) -> None:
-    file = tmp_path / "status.json"
-    written(file, heard())
-    terminal = Terminal("--file", file, NO_COLOR="1")
-    terminal.until("Ctrl-C ends.")
-    assert terminal.end(signal.SIGINT) == 0
-    assert not re.search(r"\x1b\[[0-9;]*3[0-7]m", terminal.text)
-
-
-def test_on_a_terminal_that_can_do_nothing_it_is_shown_once(tmp_path: Path) -> None:
-    file = tmp_path / "status.json"
-    written(file, heard())
-    terminal = Terminal("--file", file, TERM="dumb")
-    terminal.until("esc2")
-    assert terminal.process.wait(30) == 0
-    os.close(terminal.master)
-
-
-def test_on_a_terminal_a_missing_file_ends_it_with_one_line(tmp_path: Path) -> None:
-    terminal = Terminal("--file", tmp_path / "none")
-    terminal.until("not running: there is no such file")
-    assert terminal.process.wait(30) == NOT_RUNNING
-    os.close(terminal.master)
+    try:
+        until("Ctrl-C ends.")
+        document["monotonic_ns"] -= 100 * SECOND
+        file.write_text(json.dumps(document), encoding="utf-8")
+        until("does not answer since")
+        file.unlink()
+        until("there is no such file")
+        process.send_signal(number)
+        with contextlib.suppress(OSError):  # the other end has closed
+            while data := os.read(master, 65536):
+                text += data.decode("utf-8", "replace")
+        assert process.wait(60) == 0
+    finally:
+        process.kill()
+        os.close(master)
+    assert "Traceback" not in text
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")

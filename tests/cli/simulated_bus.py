@@ -1,15 +1,12 @@
-"""What a bus sees of simulated ESCs: the frames of a real gateway core, with their times. And a screen as text."""
+"""What a bus sees of simulated ESCs: the frames of a real gateway core, with their times; and a clock that tests move."""
 
-import io
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.text import Text
+from capture_bench import START, Bench
 
+from kontronik_can_gw.capture import block, data_payload, json_payload
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.cli.status import Line
 from kontronik_can_gw.config import parse
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
@@ -19,6 +16,7 @@ from kontronik_can_gw.simulator import FLIGHT, SECOND_NS, ErrorWindow, EscOption
 from kontronik_can_gw.sources import GatewayState
 
 STEP_NS = 10_000_000
+START_S = 1_790_000_000
 FLYING = tuple(phase._replace(duration_s=phase.duration_s * 0.4, ramp_s=phase.ramp_s * 0.4) for phase in FLIGHT)
 Timed = list[tuple[int, CanFrame]]
 
@@ -59,7 +57,7 @@ def with_errors(*bits: OperatingError | SelfTestError) -> EscOptions:
     return EscOptions(profile=FLYING, faults=Faults(errors=tuple(ErrorWindow(bit, 0) for bit in bits)))
 
 
-def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float = 1_790_000_000.0) -> Path:
+def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float = START_S) -> Path:
     """A candump log."""
     lines = []
     for now, frame in frames:
@@ -69,23 +67,30 @@ def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float =
     return path
 
 
-def as_texts(lines: Sequence[Line]) -> list[str]:
-    """The words alone."""
-    return ["".join(piece.text for piece in line) for line in lines]
+class Clock:
+    """Time that passes only by being slept; for what takes the module ``time``."""
+
+    def __init__(self, now: float = 100.0) -> None:
+        self.now = now
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def monotonic_ns(self) -> int:
+        return round(self.now * 1e9)
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds > 0, "a busy loop"
+        self.now += seconds
 
 
-def drawn(lines: Sequence[Line], size: tuple[int, int], *, colour: bool = True) -> str:
-    """What a terminal is sent for a screen."""
-    console = Console(
-        file=io.StringIO(), force_terminal=True, width=size[0], height=size[1], no_color=not colour,
-        color_system="truecolor", highlight=False, record=True,
-    )  # fmt: skip
-    for line in lines:
-        console.print(Text.assemble(*((p.text, p.style) for p in line), no_wrap=True, overflow="crop", end="\n"))
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
-
-
-def plain(text: str) -> str:
-    """Without control sequences."""
-    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
+def capture_file(bench: Bench, wall_ns: int = 1_700_000_000 * SECOND_NS, devices: Sequence[str] = ()) -> bytes:
+    """What was recorded, as the file of a capture. ``devices``: what is learnt of the ESCs at its end."""
+    times = {"created_ns": START, "monotonic_ns": START, "wall_ns": wall_ns}
+    parts = [block(b"H", 0, json_payload(bench.setup.header() | {"run": "r", "part": 0} | times))]
+    for number, at in enumerate(range(0, len(bench.entries), 300)):
+        parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
+    if devices:
+        learnt = [{"device": name, "variant": 200, "firmware": "1.2", "layout": "V4"} for name in devices]
+        parts.append(block(b"I", len(parts), json_payload({"devices": learnt})))
+    return b"".join([*parts, block(b"E", len(parts), b"")])

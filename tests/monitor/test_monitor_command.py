@@ -1,0 +1,243 @@
+"""The command: --once and lines from a bus and from files; clear lines for mistakes; nothing is ever sent."""
+
+import ast
+import inspect
+import itertools
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from capture_bench import Bench, made
+from command_line import Done, run, written
+from simulated_bus import Clock, Timed, capture_file, flight, layout_of, with_errors, write_log
+
+from kontronik_can_gw.cli import monitor, monitor_screen
+from kontronik_can_gw.cli.monitor import Recording
+from kontronik_can_gw.config import CanConfig, shipped
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.offline import monitor as model
+from kontronik_can_gw.offline.inputs import open_input
+from kontronik_can_gw.protocol.states import OperatingError
+from kontronik_can_gw.runtime import bus_listener
+from kontronik_can_gw.simulator import SECOND_NS, EscOptions, SimulatedEsc
+
+DBC = shipped("dbc/kontronik_esc.dbc")
+ONE = layout_of(["esc1"])
+
+
+class FakeBus:
+    """In place of the listener: frames at their times of a clock; Ctrl-C is pressed when all have come."""
+
+    frames: ClassVar[Timed] = []
+    clock: ClassVar[Clock]
+
+    def __init__(self, config: CanConfig, keys: frozenset[int]) -> None:
+        self.problem = ""
+        self.config = config
+        self._begin = FakeBus.clock.monotonic_ns()
+        self._rest = list(FakeBus.frames)
+
+    def receive(self, seconds: float) -> list[CanFrame]:
+        if seconds > 0:
+            FakeBus.clock.sleep(seconds)
+        now = FakeBus.clock.monotonic_ns() - self._begin
+        due = list(itertools.takewhile(lambda timed: timed[0] <= now, self._rest))
+        del self._rest[: len(due)]
+        if FakeBus.frames and not self._rest:
+            signal.raise_signal(signal.SIGINT)
+        return [frame for _, frame in due]
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(monitor, "time", clock)
+    return clock
+
+
+@pytest.fixture
+def on_bus(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> type[FakeBus]:
+    monkeypatch.setattr(bus_listener, "BusListener", FakeBus)
+    monkeypatch.setattr(FakeBus, "frames", [])
+    FakeBus.clock = clock
+    return FakeBus
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """What the command does with signals is undone."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    assert {number: signal.getsignal(number) for number in before} == before
+
+
+def document(done: Done) -> dict[str, Any]:
+    assert done.code == 0, done.err
+    assert done.out.count("\n") == 1, "one line"
+    found = json.loads(done.out)
+    assert isinstance(found, dict)
+    return found
+
+
+# --- from the bus
+
+
+def test_once_ends_when_all_cyclic_messages_have_come(on_bus: type[FakeBus], clock: Clock) -> None:
+    on_bus.frames = flight(ONE, 20, [with_errors(OperatingError.UNDERVOLTAGE)])
+    found = document(run("monitor", "--dbc", DBC, "--channel", "can7", "--once", "--timeout", 15))
+    assert clock.now - 100 < 2
+    assert (found["interface"], found["dbc"]) == ("can7", "kontronik_esc.dbc")
+    assert found["gateway"]["state"] == "Running"
+    (esc,) = found["escs"]
+    assert (esc["name"], esc["link"], esc["errors"]) == ("esc1", "Ok", ["undervoltage"])
+    assert 20 < esc["values"]["battery_voltage"] < 26
+
+
+def test_once_takes_what_there_is_at_the_timeout(on_bus: type[FakeBus], clock: Clock) -> None:
+    speed = next(plan.can_id for plan in ONE.layout.messages if plan.name == "EscSpeed")
+    on_bus.frames = [(now, frame) for now, frame in flight(ONE, 10) if frame.can_id == speed]
+    found = document(run("monitor", "--dbc", DBC, "--once", "--timeout", 0.5))
+    assert clock.now == pytest.approx(100.5)
+    values = found["escs"][0]["values"]
+    assert values["battery_voltage"] is not None
+    assert values["battery_current"] is found["escs"][0]["state"] is found["gateway"]["state"] is None
+
+
+def test_without_any_frame_it_is_one_line_with_the_channel_of_configuration_or_option(
+    on_bus: type[FakeBus], tmp_path: Path
+) -> None:
+    toml = written(tmp_path / "g.toml", '[can]\nchannel = "can3"\n[[esc]]\nport = "/dev/ttyX"\n')
+    for words, channel in (([], "can3"), (["--channel", "can4"], "can4")):
+        done = run("monitor", "-c", toml, "--once", "--timeout", 0.2, *words)
+        assert (done.code, done.out, done.err.count("\n")) == (1, "", 1)
+        assert f"no frame of kontronik_esc.dbc on {channel} for 0.2 s. Is the gateway running" in done.err
+
+
+def test_lines_are_written_where_there_is_no_terminal(on_bus: type[FakeBus]) -> None:
+    on_bus.frames = flight(ONE, 5)
+    done = run("monitor", "--interval", 1)
+    lines = done.out.splitlines()
+    assert done.code == 0
+    assert len(lines) == 5 and all("  esc1  link " in line for line in lines)
+    assert "\x1b" not in done.out
+    assert "none sent" in done.err
+
+
+def test_nothing_in_the_monitor_can_send() -> None:
+    """The way to the bus has no method to send with, and its sources call none."""
+    assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
+    for module in (monitor, monitor_screen, model, bus_listener):
+        for node in ast.walk(ast.parse(inspect.getsource(module))):
+            if isinstance(node, ast.Attribute):
+                assert "send" not in node.attr, f"{module.__name__}:{node.lineno}"
+
+
+def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(tmp_path: Path) -> None:
+    """Some adapters are written to at opening; to an ESC nothing may be written."""
+    port = written(tmp_path / "ttyESC", "")
+    toml = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n[[esc]]\nport = "{port}"\n')
+    done = run("monitor", "-c", toml, "--interface", "slcan", "--channel", f"{port}@115200")
+    assert done.code == 2
+    assert "nothing may be sent to an ESC" in done.err
+
+
+# --- from a file
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_log(tmp_path_factory.mktemp("logs") / "flight.log", flight(ONE, 12))
+
+
+def test_once_of_a_log_tells_what_holds_at_its_end(log: Path) -> None:
+    found = document(run("monitor", log, "--once"))
+    frames = flight(ONE, 12)
+    assert (found["file"], found["frames"]) == ("flight.log", len(frames))
+    last: dict[str, Any] = {}
+    for _, frame in frames:
+        last.update(ONE.database.decode_message(frame.can_id, frame.data))  # type: ignore[arg-type]
+    values = found["escs"][0]["values"]
+    assert values["battery_voltage"] == pytest.approx(last["BatteryVoltage"])
+    assert values["consumed_charge"] == last["ConsumedCharge"]
+    assert found["time"].startswith("2026-09-21T")
+
+
+def test_a_log_is_played_in_lines(log: Path, clock: Clock) -> None:
+    done = run("monitor", log, "--speed", 10, "--interval", 0.25)
+    assert done.code == 0
+    assert clock.now - 100 == pytest.approx(1.2, abs=0.1)
+    lines = done.out.splitlines()
+    assert len(lines) == 5
+    assert lines[-1].lstrip().startswith("12.0 s")
+    assert f"{len(flight(ONE, 12))} frames of kontronik_esc.dbc seen on flight.log, none sent" in done.err
+
+
+def test_a_log_without_our_frames_is_told_so(tmp_path: Path, clock: Clock) -> None:
+    file = write_log(tmp_path / "x.log", [(n * SECOND_NS, CanFrame(0x123, b"\0")) for n in range(3)])
+    done = run("monitor", file, "--once")
+    assert (done.code, done.out) == (1, "")
+    assert "x.log: holds no frame of kontronik_esc.dbc. Give its DBC (--dbc)." in done.err
+    done = run("monitor", file)
+    assert done.code == 0
+    assert "x.log holds no frame of kontronik_esc.dbc" in done.err
+
+
+def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) -> None:
+    bench = Bench(*made(2)).live(3, 8, wild=False)
+    file = written(tmp_path / "x.kcap", capture_file(bench))
+    found = document(run("monitor", file, "--once"))
+    assert [esc["name"] for esc in found["escs"]] == ["e0", "e1"]
+    assert found["time"].startswith("2023-11-14T")
+    assert found["frames"] == len(bench.sent)
+    assert all(20 < esc["values"]["battery_voltage"] < 26 for esc in found["escs"])
+    assert "  e1  link " in run("monitor", file, "--speed", 20, "--interval", 0.1).out
+    done = run("monitor", file, "--dbc", DBC)
+    assert (done.code, done.out) == (2, "")
+    assert "x.kcap: is a capture, which holds its own DBC. Leave -c and --dbc out." in done.err
+
+
+def test_plain_bytes_of_a_uart_are_watched(tmp_path: Path) -> None:
+    esc = SimulatedEsc(EscOptions(), seed=1)
+    file = written(tmp_path / "bytes.bin", b"".join(sent.wire for sent in esc.frames_until(9 * SECOND_NS)))
+    found = document(run("monitor", file, "--once"))
+    assert found["time"] is None
+    assert found["escs"][0]["link"] == "Ok"
+    assert found["escs"][0]["values"]["motor_speed"] > 0
+
+
+@pytest.mark.parametrize("speed", [0.5, 4])
+def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float) -> None:
+    taken: list[tuple[float, int]] = []
+    with open_input(log) as opened:
+        recording = Recording(opened, speed)
+        first = recording.now()
+        while not recording.ended:
+            recording.pump(lambda _frame, now: taken.append((clock.now, now)), clock.now + 0.1)
+    assert len(taken) == len(flight(ONE, 12))
+    assert all(-1e-6 <= when - 100 - (now - first) / SECOND_NS / speed <= 0.11 for when, now in taken)
+    assert "END OF FILE" in recording.where().progress
+
+
+# --- mistakes
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--interface", "sockcan"], 2, "Did you mean socketcan?"),
+        (["--interface", "socketcan", "--channel", "nocan7"], 1, "CAN interface nocan7: "),
+    ],
+)
+def test_a_mistake_is_one_line_with_the_remedy(
+    words: list[str], code: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run("monitor", *words)
+    assert (done.code, done.out) == (code, "")
+    assert said in done.err.splitlines()[-1]

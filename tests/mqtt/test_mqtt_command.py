@@ -1,0 +1,35 @@
+"""``kontronik-can-gw mqtt`` without a broker: each mistake is one line with the remedy."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import refused, written
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--broker", "127.0.0.1:1", "--ca-file", "x"], 2, "--tls"),
+        (
+            ["--broker", "127.0.0.1:1", "--username", "x", "--password-file", "empty"], 1,
+            "has no password on its first line",
+        ),
+        (["--broker", "127.0.0.1:1", "--tls", "--ca-file", "empty"], 1, "is not a certificate in PEM form"),
+        (["--broker", "127.0.0.1:1", "--interface", "socketcan", "--channel", "no0"], 1, "no0"),
+        (["--broker", "127.0.0.1:1", "--discovery", "empty"], 2, "is a file. Give FILE before the options."),
+    ],
+)  # fmt: skip
+def test_each_mistake_is_one_line_with_the_remedy(
+    words: list[str], code: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "empty", "\nx")
+    assert said in refused(code, "mqtt", *words)
+
+
+def test_without_the_library_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith(("paho", "kontronik_can_gw.runtime.mqtt_client"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "paho", None)
+    assert refused(1, "mqtt", "--broker", "x") == "needs paho-mqtt 2: pip install 'kontronik-can-gw[mqtt]'"
