@@ -29,7 +29,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import NoReturn
 from xml.etree import ElementTree as ET
 
@@ -109,10 +108,8 @@ def missing(step: str) -> str:
     needed, _ = NEEDS.get(step, ((), ""))
     for program in needed:
         if program == "vcan":
-            which = subprocess.run(
-                ["python", "tests/vm/vm_run.py", "--which"], cwd=PROJECT, capture_output=True, check=False
-            )
-            if which.returncode:
+            which = ["python", "tests/vm/vm_run.py", "--which"]
+            if subprocess.run(which, cwd=PROJECT, capture_output=True, check=False).returncode:
                 return "a kernel with vcan, or a virtual machine that has it"
         elif shutil.which(program) is None:
             return program
@@ -127,9 +124,8 @@ def run(step: str, limit_s: float, scratch: Path, keep: Path, arguments: Sequenc
         return result
     report = scratch / f"{step}.xml"
     words = {"report": report, "scratch": scratch, "keep": keep}
-    command = STEPS[step].format(
-        args=shlex.join(arguments), **{key: shlex.quote(str(value)) for key, value in words.items()}
-    )
+    quoted = {key: shlex.quote(str(value)) for key, value in words.items()}
+    command = STEPS[step].format(args=shlex.join(arguments), **quoted)
     with printing:
         print(f"== {step}: {command}", flush=True)
     begin = time.monotonic()
@@ -148,10 +144,9 @@ def run(step: str, limit_s: float, scratch: Path, keep: Path, arguments: Sequenc
         running.discard(process)
         result.seconds = time.monotonic() - begin
         log.seek(0)
+        printed = f"\n== {step}, what it printed\n{log.read().decode(errors='replace')}"
         with printing:
-            print(
-                f"\n== {step}, what it printed\n{log.read().decode(errors='replace')}" if not live else "", flush=True
-            )
+            print("" if live else printed, flush=True)
     if "{report}" not in STEPS[step]:
         result.passed, result.failed = int(not code), int(bool(code))
     elif report.exists():
@@ -173,10 +168,11 @@ def end(process: subprocess.Popen[bytes]) -> None:
             os.killpg(process.pid, signal.SIGKILL)
 
 
-def leave(number: int, _frame: FrameType | None) -> NoReturn:
+def leave(folder: str, number: int) -> NoReturn:
     for process in list(running):
         end(process)
-    os._exit(128 + number)  # the lanes' threads wait for nothing more
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(128 + number)  # or the lanes would go on with their next steps
 
 
 def summarize(results: Sequence[Result], strict: bool) -> int:
@@ -206,9 +202,7 @@ def main() -> int:
         own, arguments = own[:at], own[at + 1 :]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tier", choices=TIERS)
-    parser.add_argument(
-        "--only", action="append", choices=STEPS, metavar="STEP", help="this step of the tier; may be repeated"
-    )
+    parser.add_argument("--only", action="append", choices=STEPS, metavar="STEP")
     parser.add_argument("--keep", type=Path, metavar="FOLDER")
     args = parser.parse_args(own)
     lanes = [[step for step in lane if args.only is None or step in args.only] for lane in TIERS[args.tier]]
@@ -216,9 +210,9 @@ def main() -> int:
     if not lanes:
         parser.error(f"{args.tier} has the steps {', '.join(step for lane in TIERS[args.tier] for step in lane)}")
     os.environ["PATH"] = PATH
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, leave)
     with tempfile.TemporaryDirectory(prefix="kcg-test.", ignore_cleanup_errors=True) as folder:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda number, _frame: leave(folder, number))
         scratch = Path(folder)
         keep = args.keep.resolve() if args.keep else scratch
         keep.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ lost values while much was taken is not judged, and is run once at a quieter mom
 
 import argparse
 import contextlib
+import os
 import subprocess
 import sys
 import tempfile
@@ -29,6 +30,7 @@ class Sample(NamedTuple):
     at_s: float
     stolen: int
     total: int
+    idle: int
     waited_s: float = 0.0
     """For a processor, by all that belongs to the virtual machine."""
 
@@ -42,7 +44,7 @@ class Sample(NamedTuple):
 def sample(text: str, at_s: float, waited_s: float = 0.0) -> Sample:
     """Of the first line of /proc/stat: user, nice, system, idle, iowait, irq, softirq, load."""
     ticks = [int(word) for word in text.split("\n", 1)[0].split()[1:9]]
-    return Sample(at_s, ticks[7], sum(ticks), waited_s)
+    return Sample(at_s, ticks[7], sum(ticks), ticks[3] + ticks[4], waited_s)
 
 
 def worst_share(samples: Sequence[Sample], begin_s: float, end_s: float) -> float:
@@ -67,7 +69,8 @@ class Load:
         self.samples: list[Sample] = []
         self.machine: int | None = None
         """The process that has started the virtual machine, in a session of its own."""
-        self._waits: dict[str, int] = {}
+        self.waits: dict[str, int] = {}
+        """What each thread of it has waited so far, in ns."""
         self._waited_ns = 0
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -82,30 +85,36 @@ class Load:
     def _add_waits(self) -> None:
         """What each thread of the virtual machine has waited since the last time; its processes come and go."""
         sessions: dict[str, list[Path]] = {}
-        mine = ""
+        mine: list[str] = []  # it starts another one that watches over it
         for stat in Path("/proc").glob("[0-9]*/stat") if self.machine else ():
             with contextlib.suppress(OSError):
-                _, parent, _, session, *_ = stat.read_text().rpartition(")")[2].split()
+                _, parent, _, session, *_ = stat.read_text(errors="replace").rpartition(")")[2].split()
                 sessions.setdefault(session, []).append(stat.parent)
-                if parent == str(self.machine) and session == stat.parent.name:
-                    mine = session
-        for process in sessions.get(mine, ()):
+                if parent == str(self.machine):
+                    mine.append(session)
+        for process in (each for session in mine for each in sessions[session]):
             for file in process.glob("task/*/schedstat"):
                 with contextlib.suppress(OSError, IndexError):
                     waited = int(file.read_text().split()[1])
-                    self._waited_ns += waited - self._waits.get(str(file), 0)
-                    self._waits[str(file)] = waited
+                    self._waited_ns += waited - self.waits.get(str(file), 0)
+                    self.waits[str(file)] = waited
 
     def _run(self) -> None:
         while not self._stop.wait(0.5):
             self.take()
 
     def quiet(self) -> bool:
-        """Wait for five quiet seconds; False if they do not come soon."""
+        """Wait for five seconds in which a processor was free and the host took nothing; False if they do not come soon."""
+        self.machine = None
         end = time.monotonic() + QUIET_WITHIN_S
         while time.monotonic() < end:
+            self.take()
+            before = self.samples[-1]
             time.sleep(WINDOW_S)
-            if worst_share(self.samples, time.monotonic() - WINDOW_S, time.monotonic()) < MAX_TAKEN / 2:
+            self.take()
+            after = self.samples[-1]
+            free = (after.idle - before.idle) / (after.total - before.total)
+            if after.share(before) < MAX_TAKEN / 2 and free > 0.8 / (os.cpu_count() or 1):
                 return True
         return False
 

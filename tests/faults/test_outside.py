@@ -1,6 +1,8 @@
 """What the runner of the fault programme makes of rows that ran while processor time was taken away."""
 
 import itertools
+import os
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +10,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from fault_report import FAILED, GOOD, NOT_JUDGED, Report, Row
-from outside import Sample, conclude, judge, sample, worst_share
+from outside import Load, Sample, conclude, judge, sample, worst_share
 
 
 def row(name: str = "x", taken: float = 0.0, **counts: Any) -> Row:
@@ -89,7 +91,7 @@ def test_states_stand_in_both_reports_and_a_deferred_failure_fails(
 def at(*shares: float) -> list[Sample]:
     """Two samples a second of a machine with two processors, of which such shares were taken."""
     stolen = itertools.accumulate([0, *(round(100 * share) for share in shares)])
-    return [Sample(n / 2, each, 100 * n) for n, each in enumerate(stolen)]
+    return [Sample(n / 2, each, 100 * n, 0) for n, each in enumerate(stolen)]
 
 
 def test_the_worst_five_seconds_count() -> None:
@@ -101,9 +103,24 @@ def test_the_worst_five_seconds_count() -> None:
 
 
 def test_waiting_behind_other_work_counts_like_steal() -> None:
-    assert worst_share([Sample(n / 2, 0, 100 * n, 0.1 * n) for n in range(40)], 0, 19) == pytest.approx(0.2)
+    assert worst_share([Sample(n / 2, 0, 100 * n, 0, 0.1 * n) for n in range(40)], 0, 19) == pytest.approx(0.2)
+
+
+def test_all_that_the_virtual_machine_started_in_sessions_of_its_own_is_watched() -> None:
+    load = Load()
+    load.machine = os.getpid()
+    children = [subprocess.Popen(["sleep", "600"], start_new_session=True) for _ in range(2)]
+    try:
+        load.take()
+        watched = {file.split("/")[2] for file in load.waits}
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+    assert {str(child.pid) for child in children} <= watched
+    assert str(os.getpid()) not in watched
 
 
 def test_the_kernels_line_is_read() -> None:
     text = "cpu  10 20 30 400 50 6 7 80 9 9\ncpu0 1 1 1 1 1 1 1 1 1 1\n"
-    assert sample(text, 1.5) == (1.5, 80, 603, 0.0)
+    assert sample(text, 1.5) == (1.5, 80, 603, 450, 0.0)

@@ -296,8 +296,11 @@ def test_a_node_hears_again_when_its_interface_was_down(vcan: str, run_node: Cal
             with pytest.raises(OSError, match="down"):
                 peer.receive(0)
             wait_for(lambda port=port: running.loop.can.port not in (None, port), "open again")  # type: ignore[misc]
-            wait_for(lambda: node.status.can_state is CanState.ERROR_ACTIVE, "error active")
+            node.waiting.append(CanFrame(0x582, b"here", queued=True))
+            running.wake()
+            assert peer.receive() == (0x582, b"here")
             assert peer.ask(0x602, b"again") == (0x582, b"again")
+            wait_for(lambda: node.status.can_state is CanState.ERROR_ACTIVE, "error active")
 
 
 def test_a_node_hears_again_when_its_interface_was_removed(vcan: str, run_node: Callable[[Node], Running]) -> None:
