@@ -42,13 +42,14 @@ def begun(folder: Path, clock: Callable[[], int] = time.monotonic_ns, **more: ob
 
 def entries(count: int, since: int = 0) -> list[Entry]:
     return [
-        Entry(1000 + n, Kind.BYTES, n % 3, bytes((n & 255,)) * (n % 50), n % 2) for n in range(since, since + count)
+        Entry(1000 + n, Kind.BYTES, n % 3, bytes((n & 255,)) * (n % 50), n % 2, 900 + n)
+        for n in range(since, since + count)
     ]
 
 
 def put(to: Recorder, listed: list[Entry]) -> None:
     for entry in listed:
-        to.put(entry.time_ns, entry.kind, entry.esc, entry.data, entry.flags)
+        to.put(*entry)
 
 
 def recorded(folder: Path) -> list[Entry]:

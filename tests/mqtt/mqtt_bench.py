@@ -275,7 +275,7 @@ def flight(bus: BusLayout, seconds: float, *options: EscOptions, silent_from: fl
         for index, esc in enumerate(simulated):
             for sent in esc.frames_until(now):
                 if now < silent_from * SECOND_NS:
-                    gateway.receive_bytes(index, sent.wire, now)
+                    gateway.receive_bytes(index, sent.wire, now, now)
         gateway.advance(now)
         frames += [(now, frame) for frame in gateway.take_frames()]
     return frames

@@ -83,7 +83,7 @@ def drive(gateway: Gateway, turns: range, each_turn: Callable[[int, int], object
             wire = INFO + wire
         if turn % 97 == 0:
             wire = wire[:9] + b"?" + wire[10:]
-        gateway.receive_bytes(esc, wire, now)
+        gateway.receive_bytes(esc, wire, now, now)
         if turn % 700 == 0:
             gateway.port_lost(esc, now)
             gateway.port_opened(esc, now)
@@ -91,8 +91,8 @@ def drive(gateway: Gateway, turns: range, each_turn: Callable[[int, int], object
             gateway.set_can_state(CanState.BUS_OFF if turn % 600 else CanState.ERROR_ACTIVE, now)
         if turn % 50 == 0:
             for request in ("4018100100000000", "4008100000000000", "4000400000000000"):
-                gateway.receive_frame(CanFrame(0x601 + esc, bytes.fromhex(request)), now)
-            gateway.receive_frame(CanFrame(0x000, bytes([1, 0])), now)
+                gateway.receive_frame(CanFrame(0x601 + esc, bytes.fromhex(request)), now, now)
+            gateway.receive_frame(CanFrame(0x000, bytes([1, 0])), now, now)
         gateway.advance(now)
         gateway.take_link_changes()
         gateway.take_conflicts()

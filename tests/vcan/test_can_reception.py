@@ -85,7 +85,7 @@ def all_of(port: CanPort) -> list[CanFrame]:
     """What waits, to the end."""
     frames: list[CanFrame] = []
     while readable(port, 0.05):
-        frames += port.receive()
+        frames += [frame for frame, _ in port.receive()]
     return frames
 
 
@@ -193,7 +193,7 @@ class Node(Gateway):
     def receive_ids(self) -> frozenset[int]:
         return self.ids
 
-    def receive_frame(self, frame: CanFrame, now: int) -> None:
+    def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
         if frame.can_id % 2 == 0:
             self.waiting.append(CanFrame(frame.can_id - 0x80, frame.data, queued=True))
             return
