@@ -70,6 +70,7 @@ class Gateway:
         self._conflict_news: list[Conflict] = []
         self._follow_ids()
         self._link_changes: list[int] = []
+        self._dropped = False
         self._told_ns = now
         self.shortest_timeout_ns = self._shortest_timeout()
         """Of all ESCs: live data of one is not available after this."""
@@ -186,13 +187,12 @@ class Gateway:
     def held_up(self, now: int, dropped: bool) -> None:
         """The process was held up. Commands that waited are obeyed, SYNCs that waited are not answered any more.
 
-        ``dropped``: measurements that waited to be sent were dropped: they are made anew.
+        ``dropped``: measurements that waited to be sent were dropped: they are made anew with the next ``advance``, of what has come by then.
         """
         self._expire(now)
-        if dropped:
-            self._output.start(now)
+        self._dropped = dropped
         if self.nodes is not None:
-            self.nodes.held_up(now, dropped)
+            self.nodes.held_up(now)
 
     def set_can_state(self, state: CanState, now: int) -> None:
         """What the runtime knows of the CAN controller."""
@@ -212,6 +212,11 @@ class Gateway:
         """Let time pass: time-outs, cyclic messages."""
         if now >= self._next_expiry:
             self._expire(now)
+        if self._dropped:
+            self._dropped = False
+            self._output.start(now)
+            if self.nodes is not None:
+                self.nodes.make_anew(now)
         self._output.advance(now)
         if self.nodes is not None:
             self.nodes.advance(now)

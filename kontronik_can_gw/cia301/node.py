@@ -193,7 +193,8 @@ class Node:
         self._next_overrun = 0
         self._off_bus = False
         self._outage = False
-        self._held_up_ns = -NEVER
+        self.held_up_ns = -NEVER
+        """A SYNC from before is not answered."""
         self._live = False  # for the edge of 1029h:2
         history = sum(1 for _ in dictionary.subs(0x1003))
         self.emergencies = Emergencies(self._send_emergency, max(1, history))
@@ -370,10 +371,9 @@ class Node:
             self._tell_again(now)
         self._set_due()
 
-    def held_up(self, now: int, dropped: bool) -> None:
-        """The process was held up until ``now``: a SYNC from before is not answered. ``dropped``: PDOs were; say once more what is."""
-        self._held_up_ns = now
-        if dropped and self.state is NmtState.OPERATIONAL:
+    def make_anew(self, now: int) -> None:
+        """PDOs that waited to be sent were dropped: say once more what is."""
+        if self.state is NmtState.OPERATIONAL:
             for tpdo in self.tpdos:
                 tpdo.tell_again(now)
             self._set_due()
@@ -489,7 +489,7 @@ class Node:
         self.emergencies.set(GatewayError.SYNC_LENGTH, counter is None, now)
         if counter is not None and self.state is NmtState.OPERATIONAL:
             for tpdo in self.tpdos:
-                tpdo.on_sync(counter, now, answer=at > self._held_up_ns)
+                tpdo.on_sync(counter, now, answer=at > self.held_up_ns)
         self._set_due()
 
     def _on_heartbeat(self, node_id: int, data: bytes, now: int, at: int) -> None:

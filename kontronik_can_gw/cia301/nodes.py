@@ -162,10 +162,15 @@ class Nodes:
             node.can_returned(now)
         self._after(now)
 
-    def held_up(self, now: int, dropped: bool) -> None:
-        """The process was held up; ``dropped``: PDOs that waited to be sent were dropped."""
+    def held_up(self, now: int) -> None:
+        """The process was held up until ``now``: a SYNC from before is not answered."""
         for node in self.nodes:
-            node.held_up(now, dropped)
+            node.held_up_ns = now
+
+    def make_anew(self, now: int) -> None:
+        """PDOs that waited to be sent were dropped: say once more what is."""
+        for node in self.nodes:
+            node.make_anew(now)
         self._after(now)
 
     def collision(self, node_index: int, present: bool, now: int) -> None:

@@ -27,6 +27,7 @@ class Bench:
         self.world = World()
         canopen = {"enabled": True, "self_start": True, "store": "/nowhere"}
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
+        self.layout = loaded.layout
         self.loop: Loop = loop_in(self.world, patch, loaded.escs, loaded.layout, loaded.canopen)
         self.wire = self.world.wires[0]
         self.loop.open()
@@ -181,6 +182,7 @@ def test_a_wall_clock_that_was_set_moves_no_heartbeat(bench: Bench) -> None:
 
 def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench: Bench) -> None:
     bus = bench.world.bus
+    bench.write(*WATCH)  # nothing is sent because telemetry is lost
     bus.answer = Sent.BUSY
     for n in range(5):
         bus.came(REQUEST, bytes((0x40, n, 0x99, 0, 0, 0, 0, 0)))
@@ -189,12 +191,15 @@ def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench
     assert len(bench.loop.can.mailboxes) > 5
     bus.take()
     bus.answer = Sent.OK
-    bench.hold_up()
+    bench.world.now += HELD_UP_NS
+    bench.wire.send(bench.world.now - 10 * MS)
+    bench.loop.turn()
     sent = bench.take()
     assert [data[1] for can_id, data in sent if can_id == ANSWER] == list(range(5))
     speeds = {int.from_bytes(data[:3], "little") for can_id, data in sent if can_id == SPEED}
-    assert speeds
-    assert old not in speeds
+    assert speeds == {old + 1}
+    dbc = {message.can_id for message in bench.layout.messages if message.cycle_ns <= HELD_UP_NS}
+    assert dbc <= {can_id for can_id, _ in sent}, "what was dropped is made anew at once"
 
 
 def test_in_the_middle_of_a_turn_the_rest_is_late_too_but_answers_are_not_lost(bench: Bench) -> None:
