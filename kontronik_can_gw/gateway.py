@@ -187,7 +187,7 @@ class Gateway:
     def held_up(self, now: int, dropped: bool) -> None:
         """The process was held up. Commands that waited are obeyed, SYNCs that waited are not answered any more.
 
-        ``dropped``: measurements that waited to be sent were dropped: they are made anew with the next ``advance``, of what has come by then.
+        ``dropped``: measurements that waited to be sent were dropped: they are made anew with the next ``advance``, of what came by then.
         """
         self._expire(now)
         self._dropped = dropped

@@ -30,7 +30,7 @@ from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, one_by_one
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import MS, EscSettings
+from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 NO_MESSAGES = Layout("x", "Gw", ())
@@ -240,6 +240,55 @@ def test_a_remote_frame_is_sent_as_one(socket_port: tuple[CanPort, FakeSocket]) 
     port, fake = socket_port
     port.send(CanFrame(0x701, b"", remote=True))
     assert fake.sent == [packet(0x701 | REMOTE)]
+
+
+@pytest.mark.parametrize(
+    ("ancillary", "came"),
+    [
+        ([(socket.SOL_SOCKET, 64, struct.pack("=qq", 1_700_000_000, 250_000_000))], 41_750 * MS),
+        ([(socket.SOL_SOCKET, 35, struct.pack("=ii", 1_700_000_000, 250_000_000))], 41_750 * MS),
+        (
+            [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_SOCKET, 35, struct.pack("=qq", 1_700_000_000, 0))],
+            41_500 * MS,
+        ),
+        ([(socket.SOL_SOCKET, 64, bytes(3))], None),
+        ([(socket.IPPROTO_TCP, 64, bytes(16))], None),
+        ([], None),
+    ],
+)
+def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
+    socket_port: tuple[CanPort, FakeSocket],
+    monkeypatch: pytest.MonkeyPatch,
+    ancillary: list[tuple[int, int, bytes]],
+    came: int | None,
+) -> None:
+    clock = SimpleNamespace(time_ns=lambda: 1_700_000_000_500_000_000, monotonic_ns=lambda: 42 * SECOND)
+    monkeypatch.setattr(can_port, "time", clock)
+    port, fake = socket_port
+    port.set_receive_ids({1})
+    fake.inbox, fake.ancillary = [packet(1)], ancillary
+    assert fake.options[64] == 1, "the kernel is asked for them"
+    assert port.receive() == [(CanFrame(1, b""), came)]
+
+
+class DatagramSocket(socket.socket):
+    """As a CAN socket: the kernel counts what waits in it in the same way."""
+
+    def setsockopt(self, level: int, *rest: Any) -> None:
+        if level != socket.SOL_CAN_RAW:
+            super().setsockopt(level, *rest)
+
+
+def test_the_kernel_holds_six_frames_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What waits there cannot be overtaken by newer values."""
+    ours, others = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with others, DatagramSocket(fileno=ours.detach()) as mine:
+        monkeypatch.setattr(can_port, "_open", lambda _: SimpleNamespace(socket=mine))
+        port = CanPort(CanConfig())
+        answers = [port.send(CanFrame(n, bytes(8))) for n in range(30)]
+    taken = answers.index(Sent.FULL)
+    assert 1 <= taken <= 6
+    assert set(answers[taken:]) == {Sent.FULL}
 
 
 # --- python-can's own bus, read by a thread

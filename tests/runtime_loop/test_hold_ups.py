@@ -3,11 +3,12 @@
 import random
 from bisect import bisect_left
 from collections.abc import Iterator
+from itertools import pairwise
 
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from wire_world import NOT_AVAILABLE, Wire, World, layout_of, live, loop_in, run
+from wire_world import CAN_FD, NOT_AVAILABLE, Wire, World, layout_of, live, loop_in, run
 
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.loop import Loop
@@ -196,6 +197,47 @@ def test_what_waited_beyond_one_read_is_dated_by_its_place_in_the_stream(monkeyp
     loop.close()
     assert wire.waiting == 0
     assert abs(wire.frames[-1] - esc.live_bound_ns) <= NS_PER_BYTE
+
+
+class Signs:
+    """A service manager's socket: when the loop said that it is alive."""
+
+    present = True
+    watchdog_ns = 500 * MS
+
+    def __init__(self, world: World) -> None:
+        self.fed: list[int] = []
+        self._world = world
+
+    def watchdog(self) -> None:
+        self.fed.append(self._world.now)
+
+    def ready(self, status: str = "") -> None:
+        pass
+
+    status = ready
+
+
+@pytest.mark.parametrize("blind", [set(), {1000}, {CAN_FD}, {1000, CAN_FD}], ids=["none", "port", "CAN", "everything"])
+def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
+    monkeypatch: pytest.MonkeyPatch, blind: set[int]
+) -> None:
+    world = World()
+    signs = Signs(world)
+    loop = loop_in(world, monkeypatch, notifier=signs)  # type: ignore[arg-type]
+    loop.open()
+    loop.begin()
+    begin, end = world.now, world.now + 20 * SECOND
+    world.wires[0].stream(begin, end, 10 * MS)
+    for at in range(begin, end, 10 * MS):
+        world.bus.came(0x100, b"", at)
+    run(loop, world, begin + 5 * SECOND)
+    assert all(late - early <= 600 * MS for early, late in pairwise([begin, *signs.fed, world.now]))
+    world.blind = blind
+    run(loop, world, end)
+    loop.close()
+    fed = [at for at in signs.fed if at > begin + 6200 * MS]
+    assert len(fed) == 0 if blind else len(fed) > 20
 
 
 def test_bytes_that_came_while_the_interface_opened_are_as_old_as_that(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -311,6 +311,62 @@ def test_times_never_run_backwards_when_reads_are_closer_than_the_wire_allows() 
     assert telemetry.live_ns >= SECOND + 10 * MS
 
 
+# --- arrival: what is known of when bytes came
+
+WIRE = 39 * NS_PER_BYTE
+"""From the first byte of a live frame to its last."""
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["interval not known yet", "100 Hz"])
+@pytest.mark.parametrize("noise", [0, 1], ids=["a frame alone", "with another byte"])
+@pytest.mark.parametrize(
+    ("waited", "bound", "shown"),
+    # before the read nothing had come; the frame's end came at the earliest; its age as shown where the interval is known
+    [
+        (0, 0, 0),
+        (2 * MS, 0, 0),
+        (WIRE, 0, 0),
+        (10 * MS + WIRE, 10 * MS, 0),
+        (10 * MS + WIRE + 1, 10 * MS + 1, 10 * MS + 1),
+        (TIMEOUT + WIRE, TIMEOUT, TIMEOUT),
+        (TIMEOUT + WIRE + 1, None, None),
+    ],
+)
+def test_time_outs_count_from_when_bytes_can_have_come_and_ages_do_beyond_an_interval(
+    known: bool, noise: int, waited: int, bound: int | None, shown: int | None
+) -> None:
+    telemetry = esc()
+    now = TIMEOUT + (stream(telemetry, SECOND, 2.5) if known else SECOND)
+    data, since = bytes(noise) + live(5), now - waited - noise * NS_PER_BYTE
+    if not telemetry.receive_live(data, now, since):
+        telemetry.receive(data, now, since)
+    if bound is None or shown is None:
+        assert telemetry.live is None or telemetry.live.electrical_speed != 5
+        assert telemetry.late_frames == 1
+        return
+    assert telemetry.live is not None
+    assert (telemetry.live.electrical_speed, now - telemetry.live_bound_ns) == (5, bound)
+    assert telemetry.live_ns == now - (shown if known else bound)
+    telemetry.advance(now - bound + TIMEOUT)
+    assert telemetry.live is not None
+    telemetry.advance(now - bound + TIMEOUT + 1)
+    assert telemetry.live is None
+
+
+def test_an_info_frame_is_late_by_its_own_time_out() -> None:
+    telemetry = alive()
+    now = 30 * SECOND
+    telemetry.receive(info(), now, now - INFO_TIMEOUT_NS)
+    assert telemetry.info is not None
+    assert (
+        telemetry.last_info_ns
+        == telemetry.info_bound_ns
+        == now - INFO_TIMEOUT_NS + WIRE + (len(info()) - 40) * NS_PER_BYTE
+    )
+    telemetry.receive(info(), 2 * now, 2 * now - INFO_TIMEOUT_NS - SECOND)
+    assert (telemetry.info, telemetry.late_frames) == (None, 1)
+
+
 # --- derived values
 
 
