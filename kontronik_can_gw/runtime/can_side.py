@@ -335,7 +335,7 @@ class CanSide:
                     self._gateway.receive_frame(frame, now, now if at is None else min(max(at, since), now))
                     if self.tap is not None:
                         self.tap(frame, now, True)
-                if self._drained:
+                if self._drained or (at := frames[-1][1]) is None or at > now:  # what waited has been read
                     break
             self._reads = 1
             self._follow_reception(now)

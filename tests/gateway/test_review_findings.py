@@ -410,49 +410,6 @@ def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(tmp_path: Path) -> None
         loop.close()
 
 
-class StoppedBus(StoppedBusBase):
-    """A CAN port in which the process is suspended for 20 s, once."""
-
-    def __init__(self, loop: Loop, esc: PtyEsc, clock: list[int]) -> None:
-        self.loop, self.esc, self.clock = loop, esc, clock
-        self.sent: list[CanFrame] = []
-        self.stopped = False
-
-    def send(self, frame: CanFrame) -> Sent:
-        self.sent.append(frame)
-        if not self.stopped and len(self.sent) == 5:
-            self.stopped = True
-            self.esc.write(frame_of(LiveData(electrical_speed=77_777)))  # waits in the port for 20 s
-            self.clock[0] += 20 * SECOND
-        elif len(self.sent) < 5:
-            self.esc.write(frame_of(LiveData(electrical_speed=1000 + len(self.sent))))
-        else:
-            self.loop.stop()
-        return Sent.OK
-
-
-def test_a_suspension_at_any_place_of_the_loop_makes_what_waits_old(tmp_path: Path) -> None:
-    message = 'BO_ 256 M: 8 Gw\n SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
-    clock = [0]
-
-    def now() -> int:
-        clock[0] += MS
-        return clock[0]
-
-    with PtyEsc() as esc:
-        gateway = gateway_of(tmp_path, HEAD + message + TAIL)
-        loop = Loop(gateway, [esc.path], CanConfig(interface="virtual", channel="suspended"), clock=now)
-        loop.open()
-        bus = StoppedBus(loop, esc, clock)
-        loop.can._close_port()
-        loop.can.port = bus  # type: ignore[assignment]
-        loop.run()
-    speeds = [int.from_bytes(frame.data[:4], "little") for frame in bus.sent]
-    assert bus.stopped
-    assert 77_777 not in speeds
-    assert speeds[-1] == 0xFFFFFFFF
-
-
 def test_closed_standard_streams_never_lend_their_number_to_a_port(tmp_path: Path) -> None:
     """With descriptor 2 closed a port could get that number, and what is said on standard error would go to the ESC."""
     import subprocess

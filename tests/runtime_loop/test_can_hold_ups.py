@@ -8,6 +8,7 @@ from wire_world import World, loop_in, run
 from kontronik_can_gw.cia301.nmt import NmtState
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import GatewayState
@@ -23,8 +24,9 @@ WATCH = ("23 16 10 01 2c 01 05 00", "2f 29 10 01 01 00 00 00", "2b 00 21 04 60 e
 class Bench:
     """A gateway with a CANopen node 1 that runs, and telemetry of 100 Hz."""
 
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+    def __init__(self, patch: pytest.MonkeyPatch, opening_ns: int = 0) -> None:
         self.world = World()
+        self.world.opening_ns = opening_ns
         canopen = {"enabled": True, "self_start": True, "store": "/nowhere"}
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.layout = loaded.layout
@@ -101,12 +103,41 @@ def test_a_command_that_waited_is_obeyed_and_answered_once(
     assert bench.state is state
 
 
+def test_an_interface_that_takes_long_to_open_is_no_hold_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Bench(monkeypatch, opening_ns=HELD_UP_NS)
+    world = made.world
+    assert of(made.take(), HEARTBEAT)[0] == (HEARTBEAT, "00")
+    made.loop.can._lost(Sent.GONE, world.now)
+    made.run(2 * SECOND)
+    assert of(made.take(), HEARTBEAT)[0] == (HEARTBEAT, "00"), "the node boots again"
+    assert "suspended" not in "".join(made.loop.conditions.recent)
+    made.loop.close()
+
+
 def test_requests_that_waited_are_answered_all_in_their_order(bench: Bench) -> None:
     """More than are read at once."""
     for n in range(300):
         bench.world.bus.came(REQUEST, bytes((0x40, n & 255, 0x99, 0, 0, 0, 0, 0)), bench.world.now + n * MS)
     bench.hold_up()
     assert [data[1] for can_id, data in bench.take() if can_id == ANSWER] == [n & 255 for n in range(300)]
+
+
+def test_behind_a_hold_up_a_flood_is_read_as_far_as_it_had_come(bench: Bench) -> None:
+    """What comes while it is read waits for its turn, as ever."""
+    start, bus = bench.world.now + HELD_UP_NS, bench.world.bus
+    receive = bus.receive
+
+    def slow_receive() -> list[tuple[CanFrame, int | None]]:
+        bench.world.now += 10 * MS
+        return receive()
+
+    for n in range(10_000):  # 8 in each ms
+        bus.came(REQUEST, bytes((0x80, 0, 0, 0, 0, 0, 0, 0)), start - 50 * MS + n * MS // 8)
+    bus.receive = slow_receive  # type: ignore[method-assign]
+    bench.world.now = start
+    bench.loop.turn()
+    assert start + 60 * MS <= bench.world.now <= start + 90 * MS
+    assert bus.inbox[0][1] > start
 
 
 def test_a_block_upload_goes_on(bench: Bench) -> None:
