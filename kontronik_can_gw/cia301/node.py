@@ -37,6 +37,8 @@ CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
 _NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTICS})
 """Objects that can be written and are no part of a configuration."""
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
+_CATCHING_UP_NS = SECOND // 2
+"""So long behind a hold-up no heartbeat is missed that has not been seen to be late: what came meanwhile is read bit by bit."""
 FrameTaker = Callable[[bytes, int, int], None]
 """Is given a frame's data, the time, and when the frame came."""
 _SELF_START_OFF = 4
@@ -193,8 +195,7 @@ class Node:
         self._next_overrun = 0
         self._off_bus = False
         self._outage = False
-        self.held_up_ns = -NEVER
-        """A SYNC from before is not answered."""
+        self._held_up_ns = self._judged_from = -NEVER
         self._live = False  # for the edge of 1029h:2
         history = sum(1 for _ in dictionary.subs(0x1003))
         self.emergencies = Emergencies(self._send_emergency, max(1, history))
@@ -371,6 +372,11 @@ class Node:
             self._tell_again(now)
         self._set_due()
 
+    def held_up(self, now: int) -> None:
+        """The process was held up until ``now``: a SYNC from before is not answered, a heartbeat may still wait to be read."""
+        self._held_up_ns, self._judged_from = now, now + _CATCHING_UP_NS
+        self._set_due()
+
     def make_anew(self, now: int) -> None:
         """PDOs that waited to be sent were dropped: say once more what is."""
         if self.state is NmtState.OPERATIONAL:
@@ -401,7 +407,8 @@ class Node:
             return
         if self.producer.ticks(now):
             self._send(heartbeat.COB_ID + self.node_id, bytes([self.state]))
-        self._judge_heartbeats(now, now)
+        if now >= self._judged_from:
+            self._judge_heartbeats(now, now)
         self.sdo.advance(now)
         self.emergencies.advance(now)
         for tpdo in self.tpdos:
@@ -489,7 +496,7 @@ class Node:
         self.emergencies.set(GatewayError.SYNC_LENGTH, counter is None, now)
         if counter is not None and self.state is NmtState.OPERATIONAL:
             for tpdo in self.tpdos:
-                tpdo.on_sync(counter, now, answer=at > self.held_up_ns)
+                tpdo.on_sync(counter, now, answer=at > self._held_up_ns)
         self._set_due()
 
     def _on_heartbeat(self, node_id: int, data: bytes, now: int, at: int) -> None:
@@ -595,7 +602,7 @@ class Node:
         self._live = esc.live is not None
 
     def _set_due(self) -> None:
-        due = [self.producer.due, self.consumer.due, self.emergencies.due]
+        due = [self.producer.due, max(self.consumer.due, self._judged_from), self.emergencies.due]
         if (sdo := self.sdo.next_deadline()) is not None:
             due.append(sdo)
         self._followers = [tpdo for tpdo in self.tpdos if tpdo.follows_live]

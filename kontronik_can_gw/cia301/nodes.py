@@ -163,9 +163,10 @@ class Nodes:
         self._after(now)
 
     def held_up(self, now: int) -> None:
-        """The process was held up until ``now``: a SYNC from before is not answered."""
+        """The process was held up until ``now``."""
         for node in self.nodes:
-            node.held_up_ns = now
+            node.held_up(now)
+        self._after(now)
 
     def make_anew(self, now: int) -> None:
         """PDOs that waited to be sent were dropped: say once more what is."""

@@ -32,7 +32,6 @@ ASK_RESTARTING_NS, SETTLING_NS = 20 * MS, 200 * MS
 _OK = Sent.OK
 MAX_LATE_NS = 250 * MS
 """Measurements that are handed over later than this, or the shortest telemetry time-out, are old."""
-_MAX_READS = 32
 RESTARTED_NS = SECOND
 """So long behind a restart a driver may go on telling of bus-off."""
 
@@ -79,7 +78,6 @@ class CanSide:
         self._restarted_ns = -RESTARTED_NS
         self._served = True
         self._drained = True
-        self._reads = 1
         self._seen_waiting = False
         self._monitor: LinkMonitor | None = None
         self._ask_due: int | None = None
@@ -326,18 +324,14 @@ class CanSide:
             self._watch(selectors.EVENT_READ)
         if events & selectors.EVENT_READ:
             since = self._selector.before if self._drained else 0
-            for _ in range(self._reads):
-                frames = self.port.receive()
-                self._drained = len(frames) < RECEIVE_LIMIT
-                self._gateway.status.received_frames += len(frames)
-                for frame, at in frames:
-                    # a wall clock that was set moves no frame out of the time in which it must have come
-                    self._gateway.receive_frame(frame, now, now if at is None else min(max(at, since), now))
-                    if self.tap is not None:
-                        self.tap(frame, now, True)
-                if self._drained or (at := frames[-1][1]) is None or at > now:  # what waited has been read
-                    break
-            self._reads = 1
+            frames = self.port.receive()
+            self._drained = len(frames) < RECEIVE_LIMIT
+            self._gateway.status.received_frames += len(frames)
+            for frame, at in frames:
+                # a wall clock that was set moves no frame out of the time in which it must have come
+                self._gateway.receive_frame(frame, now, now if at is None else min(max(at, since), now))
+                if self.tap is not None:
+                    self.tap(frame, now, True)
             self._follow_reception(now)
 
     def is_stuck(self) -> bool:
@@ -347,9 +341,8 @@ class CanSide:
         self._served, self._seen_waiting = False, waiting
         return stuck
 
-    def follow_hold_up(self) -> bool:
+    def drop_measurements(self) -> bool:
         """Throw away the measurements that wait to be sent; True where there were any. Answers stay, in their order."""
-        self._reads = _MAX_READS  # a heartbeat that waits must not be taken for one that stayed away
         dropped = self.mailboxes.drop_measurements()
         self._count_losses()
         return dropped

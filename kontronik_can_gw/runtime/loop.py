@@ -254,7 +254,7 @@ class Loop:
         """What was measured before is old; commands and answers are not (how old bytes are, ``since`` tells)."""
         text = f"the process was suspended for {late / SECOND:.1f} s: measurements that waited to be sent are dropped and made anew"
         self.conditions.event("suspended", text, now)
-        self.gateway.held_up(now, self.can.follow_hold_up())
+        self.gateway.held_up(now, self.can.drop_measurements())
 
     def _reopen(self, now: int) -> int:
         """Open what is due. Returns the time: it may have taken long on a slow machine."""
