@@ -20,6 +20,9 @@ is a table, then the data of its entries one behind the other::
     entries  16 bytes each: u64 time in ns of the recording machine's monotonic clock, u8 kind (``Kind``), u8 flags, u16 index (of the ESC),
              u32 length of its data
 
+From version 2 on the data of BYTES and FRAME begins with a u64 on the clock of the entry's time: none of the bytes had come by then; or
+the CAN frame came then. Version 1 does not tell: there it is the entry's own time.
+
 Times do not decrease. The entries are every call that the gateway's core was given, in order: played again they give every CAN frame that
 was sent, at its time.
 """
@@ -35,7 +38,9 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 
 SUFFIX = ".kcap"
 MAGIC = b"KCB1"
-FORMAT, VERSION = "kontronik-can-gw capture", 1
+FORMAT, VERSION = "kontronik-can-gw capture", 2
+VERSIONS = (1, 2)
+"""Those that are read."""
 LARGEST_PAYLOAD = 1 << 23
 _PATIENCE = 1 << 28
 _HEAD = struct.Struct("<4scBHIII")
@@ -47,6 +52,7 @@ _FRAME = struct.Struct("<IB")
 _FD, _REMOTE = 1, 2
 _COUNTERS = struct.Struct("<8Q")
 _NUMBER = struct.Struct("<Q")
+_CAME = struct.Struct("<Q")
 
 
 class Kind(IntEnum):
@@ -83,16 +89,25 @@ class Kind(IntEnum):
     """The frames that were taken last were thrown away: the interface was down, or in bus-off."""
     STATE = 19
     """JSON: what a replay that begins here cannot know (energy, run time and losses of the ESCs, state of the bus)."""
+    HELD_UP = 20
+    """The process had been held up; flags 1: measurements that waited to be sent were dropped."""
+
+
+_WITH_ARRIVAL = frozenset({Kind.BYTES, Kind.FRAME})
 
 
 class Entry(NamedTuple):
-    """One entry. ``time_ns``: the recording machine's monotonic clock."""
+    """One entry. Times: the recording machine's monotonic clock.
+
+    ``came_ns``: none of the BYTES had come by then, the FRAME came then; None where that is not known: at ``time_ns``.
+    """
 
     time_ns: int
     kind: int
     esc: int = 0
     data: bytes = b""
     flags: int = 0
+    came_ns: int | None = None
 
 
 class Block(NamedTuple):
@@ -136,12 +151,14 @@ def read_json(payload: bytes) -> dict[str, Any]:
     return content
 
 
-def data_payload(entries: Iterable[tuple[int, int, int, bytes, int]]) -> bytes:
+def data_payload(entries: Iterable[tuple[int, int, int, bytes, int, int | None]]) -> bytes:
     """Payload of a data block, from tuples as of ``Entry``."""
     table = bytearray()
     data = []
     count = 0
-    for time_ns, kind, index, content, flags in entries:
+    for time_ns, kind, index, content, flags, came_ns in entries:
+        if kind in _WITH_ARRIVAL:
+            content = _CAME.pack(time_ns if came_ns is None else came_ns) + content
         table += _ENTRY.pack(time_ns, kind, flags, index, len(content))
         if content:
             data.append(content)
@@ -149,7 +166,7 @@ def data_payload(entries: Iterable[tuple[int, int, int, bytes, int]]) -> bytes:
     return b"".join((_COUNT.pack(count), table, *data))
 
 
-def read_entries(payload: bytes) -> Iterator[Entry]:
+def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
     """The entries of a data block. ValueError where its table does not fit it."""
     if len(payload) < _COUNT.size:
         raise ValueError("has no table")
@@ -158,7 +175,12 @@ def read_entries(payload: bytes) -> Iterator[Entry]:
     if at > len(payload):
         raise ValueError("is shorter than its table")
     for time_ns, kind, flags, index, length in _ENTRY.iter_unpack(payload[_COUNT.size : at]):
-        yield Entry(time_ns, kind, index, payload[at : at + length], flags)
+        data, came_ns = payload[at : at + length], None
+        if version > 1 and kind in _WITH_ARRIVAL:
+            if length < _CAME.size:
+                raise ValueError("has an entry without its time of arrival")
+            came_ns, data = _CAME.unpack_from(data)[0], data[_CAME.size :]
+        yield Entry(time_ns, kind, index, data, flags, came_ns)
         at += length
     if at != len(payload):
         raise ValueError("is not as long as its table says")

@@ -2,7 +2,7 @@
 
 JSON keys of the header (beside those that run and recorder add: created_ns, run, part, monotonic_ns, wall_ns, devices, state)::
 
-    format, version      "kontronik-can-gw capture", 1
+    format, version      "kontronik-can-gw capture", 2
     program              version, python, machine
     configuration        the effective TOML text; file: where it stood
     escs                 settings of each ESC (gear as "31/4"), as they held
@@ -18,7 +18,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.capture import FORMAT, VERSION
+from kontronik_can_gw.capture import FORMAT, VERSION, VERSIONS
 from kontronik_can_gw.cia301.eds import load as eds_of
 from kontronik_can_gw.cia301.node import NodeSettings
 from kontronik_can_gw.cia301.nodes import CanopenSetup
@@ -84,9 +84,9 @@ class CaptureSetup:
         """From a capture's header. ValueError, with the reason, for what is none of ours."""
         if header.get("format") != FORMAT:
             raise ValueError("the header is not that of a capture")
-        if header.get("version") != VERSION:
+        if header.get("version") not in VERSIONS:
             raise ValueError(
-                f"capture version {header.get('version')} is unknown, this program knows version {VERSION}"
+                f"capture version {header.get('version')} is unknown, this program knows versions up to {VERSION}"
             )
         try:
             _check(header)

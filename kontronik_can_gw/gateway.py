@@ -70,7 +70,10 @@ class Gateway:
         self._conflict_news: list[Conflict] = []
         self._follow_ids()
         self._link_changes: list[int] = []
+        self._dropped = False
         self._told_ns = now
+        self.shortest_timeout_ns = self._shortest_timeout()
+        """Of all ESCs: live data of one is not available after this."""
         self._next_expiry = 0
         """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
@@ -94,14 +97,14 @@ class Gateway:
         self.status.state = GatewayState.STOPPING
         self._output.on_gateway_change(now, at_once=True)
 
-    def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
-        """Bytes of one ESC's UART, read at ``now``."""
+    def receive_bytes(self, esc: int, data: bytes, now: int, since: int) -> None:
+        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
         if now >= self._next_expiry:
             self._expire(now, but=esc)  # a message may hold values of several ESCs
-        elif self.escs[esc].receive_live(data, now):
+        elif self.escs[esc].receive_live(data, now, since):
             self._follow(esc, _LIVE, now)
             return
-        for events in self.escs[esc].receive_each(data, now):
+        for events in self.escs[esc].receive_each(data, now, since):
             self._follow(esc, events, now)
 
     @property
@@ -114,14 +117,14 @@ class Gateway:
             self._follow_ids()
         return self._receive_ids
 
-    def receive_frame(self, frame: CanFrame, now: int) -> None:
-        """A data frame of somebody else with one of ``receive_ids``, received at ``now``."""
+    def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
+        """A data frame of somebody else with one of ``receive_ids``, read at ``now``; it came ``at``."""
         self._follow_ids()
         if (own := self._own_ids.get(frame.key)) is not None and not frame.remote:
             self._collide(frame.key, own, now)
         if self.nodes is not None:
             self._expire(now)
-            self.nodes.receive(frame, now)
+            self.nodes.receive(frame, now, at)
 
     def can_opened(self, now: int) -> None:
         """The interface was opened (again): what we sent before may still come back, and is no conflict."""
@@ -181,6 +184,16 @@ class Gateway:
         if self.nodes is not None:
             self.nodes.can_returned(now)
 
+    def held_up(self, now: int, dropped: bool) -> None:
+        """The process was held up. Commands that waited are obeyed, SYNCs that waited are not answered any more.
+
+        ``dropped``: measurements that waited to be sent were dropped: they are made anew with the next ``advance``, of what came by then.
+        """
+        self._expire(now)
+        self._dropped = dropped
+        if self.nodes is not None:
+            self.nodes.held_up(now)
+
     def set_can_state(self, state: CanState, now: int) -> None:
         """What the runtime knows of the CAN controller."""
         self._expire(now)
@@ -199,6 +212,11 @@ class Gateway:
         """Let time pass: time-outs, cyclic messages."""
         if now >= self._next_expiry:
             self._expire(now)
+        if self._dropped:
+            self._dropped = False
+            self._output.start(now)
+            if self.nodes is not None:
+                self.nodes.make_anew(now)
         self._output.advance(now)
         if self.nodes is not None:
             self.nodes.advance(now)
@@ -325,4 +343,8 @@ class Gateway:
         """Settings that came over the bus: they hold for everything that is sent, the DBC's messages too."""
         self.escs[esc].apply(settings)
         self._output.apply(esc, settings)
+        self.shortest_timeout_ns = self._shortest_timeout()
         self._next_expiry = 0
+
+    def _shortest_timeout(self) -> int:
+        return min(esc.settings.timeout_ns for esc in self.escs)

@@ -101,9 +101,15 @@ class Mailboxes:
             count += 1
         return count, Sent.OK
 
+    def drop_measurements(self) -> bool:
+        """Drop what waits in slots; True where something did."""
+        count = len(self._slots)
+        self.replaced += count
+        self._slots.clear()
+        return bool(count)
+
     def clear(self) -> None:
         """Drop what waits: it is old by the time it could go."""
-        self.replaced += len(self._slots)
+        self.drop_measurements()
         self.dropped += len(self._queue)
-        self._slots.clear()
         self._queue.clear()

@@ -2,6 +2,12 @@
 
 ``now`` is integer nanoseconds of one monotonic clock. What this object shows as ``live`` or ``info`` is fresh; what is not fresh,
 or not known of the device now on the line, is None.
+
+Arrival. No byte of a read came before ``since``, and on the wire one byte follows another: byte k of a read (1 ...) came at
+``since`` + (k - 1) byte times at the earliest. Time-outs count from there (the bound): nothing outlives its time-out, however late
+it is read. Ages, energy and run time count from the time of the read, less the bytes that came after the frame, unless that is
+more than the link's usual interval after the bound: then from the bound, too. So an age shown is never smaller than the truth by more than
+one interval. An adapter that bundles bytes adds what it holds them back for (1 ms; 16 ms where that cannot be set).
 """
 
 from collections import deque
@@ -75,9 +81,10 @@ class EscTelemetry:
 
     Attributes read by the packers: ``live``, ``info`` (None where not available), ``link``, ``layout`` (0 unknown, 1 V4,
     2 legacy), ``cells`` (0 unknown), ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``,
-    ``energy`` (drawn from the battery, milliwatt nanoseconds), ``run_time`` (ns with the motor turning), ``live_ns`` (time of
-    the newest live frame's last byte, None before the first). ``last_live`` and ``last_info`` are the newest ever, fresh or not, of the
-    layout now on the line; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
+    ``energy`` (drawn from the battery, milliwatt nanoseconds), ``run_time`` (ns with the motor turning), ``live_ns`` and
+    ``last_info_ns`` (time of the newest live and info frame's last byte, as ages are shown, None before the first). ``live_bound_ns`` and
+    ``info_bound_ns`` are the earliest that byte can have come, for time-outs. ``last_live`` and ``last_info`` are the newest ever, fresh or
+    not, of the layout now on the line; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
     """
 
     def __init__(self, settings: EscSettings, now: int) -> None:
@@ -96,7 +103,8 @@ class EscTelemetry:
         self.energy = 0
         self.run_time = 0
         self.live_ns: int | None = None
-        self.info_ns: int | None = None
+        self.live_bound_ns = 0
+        self.info_bound_ns: int | None = None
         self.last_info_ns: int | None = None
         self.line_errors = 0
         self.base = Counters()
@@ -107,8 +115,9 @@ class EscTelemetry:
         self._deframer = Deframer()
         self._arrivals: deque[tuple[int, int]] = (
             deque()
-        )  # (stream position behind a chunk, its time) while bytes are pending
+        )  # (stream position behind a chunk, the bound of its last byte) while bytes are pending
         self._last_power = 0
+        self._interval_ns = 0  # between live frames, as usual; 0: not known
         self._window_ns = now
         self._window_counters = Counters()
         self._diagnosis_counters = Counters()  # at the start of the window before
@@ -143,68 +152,84 @@ class EscTelemetry:
         self.base = self.counters.copy()
         self.base_losses, self.base_line_errors = self.losses, self.line_errors
 
-    def receive(self, data: bytes, now: int) -> int:
-        """Take bytes that were read at ``now``, all frames at once."""
+    def receive(self, data: bytes, now: int, since: int) -> int:
+        """Take bytes that were read at ``now`` and came after ``since``, all frames at once."""
         events = Event.NONE
-        for found in self.receive_each(data, now):
+        for found in self.receive_each(data, now, since):
             events |= found
         return events
 
-    def receive_each(self, data: bytes, now: int) -> Iterable[int]:
-        """Take bytes that were read at ``now``; the events of each frame in turn, so that none is passed over: iterate to the end.
+    def receive_each(self, data: bytes, now: int, since: int) -> Iterable[int]:
+        """Take bytes that were read at ``now`` and came after ``since``; the events of each frame in turn: iterate to the end.
 
         An unfinished frame older than the time-out is given up first.
         """
         if events := self._expire(now):
-            return self._receive_behind(events, data, now)
+            return self._receive_behind(events, data, now, since)
         deframer, arrivals = self._deframer, self._arrivals
         if arrivals and now - arrivals[0][1] > self.settings.timeout_ns:
             self.late_frames += len(deframer.flush())
             arrivals.clear()
+        bound = since + (len(data) - 1) * NS_PER_BYTE
+        if bound > now:  # a pseudo terminal is faster than the wire
+            bound = now
         frames = deframer.feed(data)
         end = deframer.counters.bytes
         if pending := deframer.pending:
-            arrivals.append((end, now))
+            arrivals.append((end, bound))
             while arrivals[0][0] <= end - pending:
                 arrivals.popleft()
         elif arrivals:
             arrivals.clear()
-        if len(frames) == 1:
-            form, at, _ = frame = frames[0]
-            if at + form.length == end and self.link is not _NEVER_SEEN:
-                return (self._accept(frame, now),)  # as nearly always: its last byte has just come
-        return self._accept_each(frames, end, now)
+        if not frames and self.link is not _NEVER_SEEN:
+            return ()
+        return self._accept_each(frames, end, now, bound)
 
-    def receive_live(self, data: bytes, now: int) -> bool:
+    def receive_live(self, data: bytes, now: int, since: int) -> bool:
         """What ``receive_each`` does where nothing is too old, one live frame has come, whole and alone, and nothing but it is new.
 
         False for anything else: then nothing has happened. True: the event is LIVE.
         """
-        if (old := self.live) is None or self.layout != 1 or (values := self._deframer.take_live(data)) is None:
+        bound = since + (len(data) - 1) * NS_PER_BYTE
+        if bound > now:
+            bound = now
+        late = now - bound
+        if (
+            (old := self.live) is None
+            or self.layout != 1
+            or late > self.settings.timeout_ns
+            or (values := self._deframer.take_live(data)) is None
+        ):
             return False
+        when = now if late <= self._interval_ns else bound
         before: int = self.live_ns  # type: ignore[assignment]  # there is a live frame
-        if now > before:  # a pseudo terminal is faster than the wire
+        if when > before:
             if self._last_power > 0:
-                self.energy += self._last_power * (now - before)
+                self.energy += self._last_power * (when - before)
             if old[0]:
-                self.run_time += now - before
-            self.live_ns = now
+                self.run_time += when - before
+            self.live_ns = when
+        if bound > self.live_bound_ns:
+            self.live_bound_ns = bound
         self.live = self.last_live = _new(LiveData, values)
         self.live_values = values
         self._last_power = values[1] * values[2]
         return True
 
-    def _receive_behind(self, events: int, data: bytes, now: int) -> Iterator[int]:
+    def _receive_behind(self, events: int, data: bytes, now: int, since: int) -> Iterator[int]:
         yield events
-        yield from self.receive_each(data, now)
+        yield from self.receive_each(data, now, since)
 
-    def _accept_each(self, frames: list[Frame], end: int, now: int) -> Iterator[int]:
+    def _accept_each(self, frames: list[Frame], end: int, now: int, bound: int) -> Iterator[int]:
+        """``bound``: of the last byte of the read, which is at ``end``."""
+        shown = now if now - bound <= self._interval_ns else bound
         for frame in frames:
-            when = now - (end - frame.offset - frame.form.length) * NS_PER_BYTE
-            if now - when > self.settings.timeout_ns:  # with so many bytes behind it in one read it is old already
+            after = (end - frame.offset - frame.form.length) * NS_PER_BYTE
+            limit = INFO_TIMEOUT_NS if isinstance(frame.data, InfoData) else self.settings.timeout_ns
+            if now - bound + after > limit:  # with so many bytes behind it in one read it is old already
                 self.late_frames += 1
             else:
-                yield self._accept(frame, when)
+                yield self._accept(frame, shown - after, bound - after)
         if self.link is LinkState.NEVER_SEEN:
             yield self._set_link(LinkState.SEARCHING)
 
@@ -230,17 +255,17 @@ class EscTelemetry:
     def next_deadline(self) -> int:
         """When ``advance`` has something to do."""
         deadline = self._window_ns + SECOND
-        if self.live is not None and self.live_ns is not None:
-            deadline = min(deadline, self.live_ns + self.settings.timeout_ns + 1)
-        if self.info_ns is not None:
-            deadline = min(deadline, self.info_ns + INFO_TIMEOUT_NS + 1)
+        if self.live is not None:
+            deadline = min(deadline, self.live_bound_ns + self.settings.timeout_ns + 1)
+        if self.info_bound_ns is not None:
+            deadline = min(deadline, self.info_bound_ns + INFO_TIMEOUT_NS + 1)
         return deadline
 
     def diagnosis(self) -> str | None:
         """Why no frame comes, in words, from the bytes of one to two seconds; None while frames come."""
         return None if self.up else self.counters.diagnosis(self._diagnosis_counters)
 
-    def _accept(self, frame: Frame, when: int) -> int:
+    def _accept(self, frame: Frame, when: int, bound: int) -> int:
         form, _, data = frame
         layout = 1 if form.layout is _V4 else _LEGACY
         events = Event.NONE
@@ -254,14 +279,16 @@ class EscTelemetry:
             if self.info is not None and data.device_and_variant != self.info.device_and_variant:
                 events |= Event.LINK
             self.info = self.last_info = data
-            self.info_ns = self.last_info_ns = when
+            self.last_info_ns, self.info_bound_ns = when, bound
             self.cells = self.settings.cell_count or data.cell_count
             return events | Event.INFO
         if layout == _LEGACY and frame.suspect:
             self.suspect_frames += 1
         if (before := self.live_ns) is not None:
             if when < before:
-                when = before  # a pseudo terminal is faster than the wire
+                when = before
+            if bound < self.live_bound_ns:
+                bound = self.live_bound_ns
             if self.live is not None:
                 if self._last_power > 0:
                     self.energy += self._last_power * (when - before)
@@ -270,25 +297,26 @@ class EscTelemetry:
         self._last_power = data.battery_voltage * data.battery_current
         self.live = self.last_live = data
         self.live_values = tuple(data)
-        self.live_ns = when
+        self.live_ns, self.live_bound_ns = when, bound
         if self.link is not _OK and self.link is not _DEGRADED:
             events |= self._set_link(_OK)
             self.frame_rate = None
+            self._interval_ns = 0
             self._window_ns = when
             self._window_counters = self._diagnosis_counters = self.counters.copy()
         return events | Event.LIVE
 
     def _forget_device(self) -> None:
         self.info = None
-        self.info_ns = None
+        self.info_bound_ns = None
         self.cells = self.settings.cell_count
 
     def _expire(self, now: int) -> int:
         events = Event.NONE
-        if self.live is not None and self.live_ns is not None and now - self.live_ns > self.settings.timeout_ns:
+        if self.live is not None and now - self.live_bound_ns > self.settings.timeout_ns:
             self.losses += 1
             events |= self._lose(LinkState.LOST)
-        if self.info is not None and self.info_ns is not None and now - self.info_ns > INFO_TIMEOUT_NS:
+        if self.info_bound_ns is not None and now - self.info_bound_ns > INFO_TIMEOUT_NS:
             self._forget_device()
             events |= Event.INFO
         return events
@@ -314,6 +342,7 @@ class EscTelemetry:
         old, new = self._window_counters, self.counters
         frames = new.live - old.live
         self.frame_rate = round(frames * 10 * SECOND / (now - self._window_ns)) if self.up else 0
+        self._interval_ns = (now - self._window_ns) // frames if self.up and frames else 0
         dropped, received = new.dropped_bytes - old.dropped_bytes, new.bytes - old.bytes
         bad = (
             new.crc_errors - old.crc_errors >= self.settings.crc_error_threshold

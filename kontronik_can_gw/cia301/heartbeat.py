@@ -76,12 +76,12 @@ class Consumer:
     def due(self) -> int:
         return min((w.due for w in self._watched.values()), default=NEVER)
 
-    def receive(self, node_id: int, now: int) -> bool:
+    def receive(self, node_id: int, at: int) -> bool:
         """A heartbeat (or boot-up message) came. True if the node had been lost."""
         watched = self._watched.get(node_id)
         if watched is None:
             return False
-        watched.due = now + watched.timeout
+        watched.due = at + watched.timeout
         was_lost, watched.lost = watched.lost, False
         return was_lost
 

@@ -37,6 +37,10 @@ CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
 _NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTICS})
 """Objects that can be written and are no part of a configuration."""
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
+_CATCHING_UP_NS = SECOND // 2
+"""So long behind a hold-up no heartbeat is missed that has not been seen to be late: what came meanwhile is read bit by bit."""
+FrameTaker = Callable[[bytes, int, int], None]
+"""Is given a frame's data, the time, and when the frame came."""
 _SELF_START_OFF = 4
 _MOST_SAVES = 4
 _LEAST_TIMEOUT_MS, _MOST_TIMEOUT_MS = 20, 60_000  # whatever the limits of an EDS are
@@ -191,6 +195,7 @@ class Node:
         self._next_overrun = 0
         self._off_bus = False
         self._outage = False
+        self._held_up_ns = self._judged_from = -NEVER
         self._live = False  # for the edge of 1029h:2
         history = sum(1 for _ in dictionary.subs(0x1003))
         self.emergencies = Emergencies(self._send_emergency, max(1, history))
@@ -266,7 +271,7 @@ class Node:
         """COB-IDs that this node would choose by its defaults with another node-ID."""
         return {cob_id for _, _, cob_id in default_ids(self.dictionary, node_id)}
 
-    def routes(self) -> Iterator[tuple[int, Callable[[bytes, int], None]]]:
+    def routes(self) -> Iterator[tuple[int, FrameTaker]]:
         """COB-IDs this node listens to, and who takes them."""
         yield LSS_REQUEST, self._on_lss
         if self.node_id == UNCONFIGURED:
@@ -367,6 +372,18 @@ class Node:
             self._tell_again(now)
         self._set_due()
 
+    def held_up(self, now: int) -> None:
+        """The process was held up until ``now``: a SYNC from before is not answered, a heartbeat may still wait to be read."""
+        self._held_up_ns, self._judged_from = now, now + _CATCHING_UP_NS
+        self._set_due()
+
+    def make_anew(self, now: int) -> None:
+        """PDOs that waited to be sent were dropped: say once more what is."""
+        if self.state is NmtState.OPERATIONAL:
+            for tpdo in self.tpdos:
+                tpdo.tell_again(now)
+            self._set_due()
+
     def overrun(self, now: int) -> None:
         """Received frames were lost in the controller: said once a second at most."""
         if now < self._next_overrun:
@@ -390,9 +407,8 @@ class Node:
             return
         if self.producer.ticks(now):
             self._send(heartbeat.COB_ID + self.node_id, bytes([self.state]))
-        for node_id in self.consumer.advance(now):
-            self.emergencies.set(GatewayError.HEARTBEAT_LOST, True, now, node_id)
-            self._communication_error(now)
+        if now >= self._judged_from:
+            self._judge_heartbeats(now, now)
         self.sdo.advance(now)
         self.emergencies.advance(now)
         for tpdo in self.tpdos:
@@ -452,7 +468,7 @@ class Node:
 
     # --- frames in
 
-    def _on_nmt(self, data: bytes, now: int) -> None:
+    def _on_nmt(self, data: bytes, now: int, _at: int) -> None:
         command = nmt.command(data, self.node_id)
         if command is None:
             return
@@ -464,31 +480,37 @@ class Node:
             self._enter(nmt.STATE_AFTER[command], now)
         self._set_due()
 
-    def _on_sdo(self, data: bytes, now: int) -> None:
+    def _on_sdo(self, data: bytes, now: int, _at: int) -> None:
         if self.state in _VALID:
             self.sdo.receive(data, now)
             self._set_due()
 
-    def _on_lss(self, data: bytes, now: int) -> None:
+    def _on_lss(self, data: bytes, now: int, _at: int) -> None:
         self.lss.receive(data, now)
         self._set_due()
 
-    def _on_sync(self, data: bytes, now: int) -> None:
+    def _on_sync(self, data: bytes, now: int, at: int) -> None:
         if self.state not in _VALID:
             return
         counter = sync.counter(data, self.dictionary.number(0x1019))
         self.emergencies.set(GatewayError.SYNC_LENGTH, counter is None, now)
         if counter is not None and self.state is NmtState.OPERATIONAL:
             for tpdo in self.tpdos:
-                tpdo.on_sync(counter, now)
+                tpdo.on_sync(counter, now, answer=at > self._held_up_ns)
         self._set_due()
 
-    def _on_heartbeat(self, node_id: int, data: bytes, now: int) -> None:
+    def _on_heartbeat(self, node_id: int, data: bytes, now: int, at: int) -> None:
         if len(data) != 1:
             return
-        if self.consumer.receive(node_id, now):
+        self._judge_heartbeats(at, now)  # it may have come too late, and others not at all
+        if self.consumer.receive(node_id, at):
             self.emergencies.set(GatewayError.HEARTBEAT_LOST, False, now, node_id)
         self._set_due()
+
+    def _judge_heartbeats(self, until: int, now: int) -> None:
+        for node_id in self.consumer.advance(until):
+            self.emergencies.set(GatewayError.HEARTBEAT_LOST, True, now, node_id)
+            self._communication_error(now)
 
     # --- frames out
 
@@ -580,7 +602,7 @@ class Node:
         self._live = esc.live is not None
 
     def _set_due(self) -> None:
-        due = [self.producer.due, self.consumer.due, self.emergencies.due]
+        due = [self.producer.due, max(self.consumer.due, self._judged_from), self.emergencies.due]
         if (sdo := self.sdo.next_deadline()) is not None:
             due.append(sdo)
         self._followers = [tpdo for tpdo in self.tpdos if tpdo.follows_live]

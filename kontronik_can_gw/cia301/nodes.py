@@ -13,6 +13,7 @@ from kontronik_can_gw.cia301.node import (
     LSS_REQUEST,
     SDO_ANSWER,
     SDO_REQUEST,
+    FrameTaker,
     Node,
     NodeSettings,
     esc_settings,
@@ -87,7 +88,7 @@ class Nodes:
         """Grows with each change of a node's NMT state or node-ID."""
         self._settings_changed = settings_changed
         self._foreign_ids = foreign_ids or {}
-        self._routes: dict[int, list[Callable[[bytes, int], None]]] = {}
+        self._routes: dict[int, list[FrameTaker]] = {}
         self._rerouted = True
         self._watched: frozenset[int] = frozenset()
         self._to_watchers: deque[CanFrame] = deque()
@@ -109,8 +110,8 @@ class Nodes:
             node.power_on(now)
         self._after(now)
 
-    def receive(self, frame: CanFrame, now: int) -> None:
-        """A frame from the bus. 29-bit and RTR frames are not CANopen frames of ours."""
+    def receive(self, frame: CanFrame, now: int, at: int) -> None:
+        """A frame from the bus, which came ``at``. 29-bit and RTR frames are not CANopen frames of ours."""
         if frame.extended or frame.remote or frame.fd:
             return
         begin = len(self.frames)
@@ -118,7 +119,7 @@ class Nodes:
             for node in self.nodes:
                 node.release_ids()
         for taker in self._routes.get(frame.can_id, ()):
-            taker(frame.data, now)
+            taker(frame.data, now, at)
         if frame.can_id == LSS_REQUEST:
             # what several slaves say at the same time is one frame on a bus
             self.frames[begin:] = dict.fromkeys(self.frames[begin:])
@@ -159,6 +160,18 @@ class Nodes:
             return
         for node in self.nodes:
             node.can_returned(now)
+        self._after(now)
+
+    def held_up(self, now: int) -> None:
+        """The process was held up until ``now``."""
+        for node in self.nodes:
+            node.held_up(now)
+        self._after(now)
+
+    def make_anew(self, now: int) -> None:
+        """PDOs that waited to be sent were dropped: say once more what is."""
+        for node in self.nodes:
+            node.make_anew(now)
         self._after(now)
 
     def collision(self, node_index: int, present: bool, now: int) -> None:
@@ -268,7 +281,7 @@ class Nodes:
         while self._to_watchers:  # what we send does not come back from the bus: one of our nodes may watch another
             frame = self._to_watchers.popleft()
             for taker in self._routes.get(frame.can_id, ()):
-                taker(frame.data, now)
+                taker(frame.data, now, now)
         if self._rerouted:
             self._rerouted = False
             self._watched = frozenset(

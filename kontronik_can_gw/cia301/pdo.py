@@ -363,8 +363,8 @@ class Tpdo:
         if self._started and self._running and self._status_mask:
             self._news(now)
 
-    def on_sync(self, counter: int, now: int) -> None:
-        """A SYNC message; ``counter`` 0 where it has none."""
+    def on_sync(self, counter: int, now: int, answer: bool = True) -> None:
+        """A SYNC message; ``counter`` 0 where it has none. Without ``answer`` it is only counted."""
         if not self._started or not self._running or self._type > 240:
             return
         if self._sync_waits and counter:
@@ -372,13 +372,14 @@ class Tpdo:
                 return
             self._sync_waits = False  # this SYNC counts as the first
         if self._type == 0:
-            if self._fresh:
+            if self._fresh and answer:
                 self._send(now)
             return
         self._syncs += 1
         if self._syncs >= self._type:
             self._syncs = 0
-            self._send(now)
+            if answer:
+                self._send(now)
 
     def advance(self, now: int) -> None:
         """Event timer, and what the inhibit time held back."""

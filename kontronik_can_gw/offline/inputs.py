@@ -351,7 +351,7 @@ class CaptureInput(_Base):
             expected, ended = found.number + 1, found.kind == b"E"
             try:
                 if found.kind == b"D":
-                    yield from read_entries(found.payload)
+                    yield from read_entries(found.payload, self.header["version"])
                 elif found.kind == b"I":
                     self._devices = read_json(found.payload).get("devices", self._devices)
                     self._describe()

@@ -67,19 +67,21 @@ class Replay:
         return found
 
     def _play(self, entry: Entry) -> list[TimedFrame]:
-        now, kind, esc, data, flags = entry
+        now, kind, esc, data, flags, came = entry
+        if came is None:
+            came = now
         gateway = self.gateway
         if not self._started and kind == Kind.ADVANCE:  # the beginning is missing
             self._midway = True
             self._start(now, True)
         if kind == Kind.BYTES:
-            gateway.receive_bytes(esc, data, now)
+            gateway.receive_bytes(esc, data, now, came)
         elif kind == Kind.ADVANCE:
             gateway.advance(now)
             self._take(now)
         elif kind == Kind.FRAME:
             frame = read_frame(data)
-            gateway.receive_frame(frame, now)
+            gateway.receive_frame(frame, now, came)
             return [TimedFrame(now, frame, True)]
         elif kind == Kind.START:
             self._start(now, bool(flags))
@@ -99,7 +101,7 @@ class Replay:
         return []
 
     def _play_rare(self, entry: Entry) -> None:
-        now, kind, esc, data, flags = entry
+        now, kind, esc, data, flags, _ = entry
         gateway = self.gateway
         match kind:
             case Kind.PORT_OPENED:
@@ -110,6 +112,8 @@ class Replay:
                 gateway.can_opened(now)
             case Kind.CAN_RETURNED:
                 gateway.can_returned(now)
+            case Kind.HELD_UP:
+                gateway.held_up(now, bool(flags))
             case Kind.CAN_STATE:
                 gateway.set_can_state(CanState(flags), now)
             case Kind.OVERRUN:
@@ -187,7 +191,7 @@ class BytesFollower:
         while (due := gateway.next_deadline()) < now:
             gateway.advance(due)
             found += [TimedFrame(due, frame) for frame in in_order(gateway.take_frames(), waiting)]
-        gateway.receive_bytes(0, data, now)
+        gateway.receive_bytes(0, data, now, now)
         gateway.advance(now)
         found += [TimedFrame(now, frame) for frame in in_order(gateway.take_frames(), waiting)]
         gateway.take_link_changes()

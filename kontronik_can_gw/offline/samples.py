@@ -98,7 +98,7 @@ class SampledGateway(Gateway):
             self.start(now)
         while (due := self.next_deadline()) < now:
             self.advance(due)
-        self.receive_bytes(0, data, now)
+        self.receive_bytes(0, data, now, now)
         self.advance(now)
         self.take_frames()
         self.take_link_changes()

@@ -97,7 +97,7 @@ class BusListener:
         frames: list[CanFrame] = []
         while len(frames) < _MOST_AT_ONCE:
             new = self._port.receive()
-            frames += new
+            frames += [frame for frame, _ in new]
             if len(new) < RECEIVE_LIMIT:
                 break
         self.lost_frames += self._port.overruns

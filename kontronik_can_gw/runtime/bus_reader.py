@@ -7,6 +7,7 @@ What may touch what: ``_run`` belongs to the thread, everything else to the loop
 import logging
 import os
 import threading
+import time
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -32,7 +33,7 @@ class BusReader:
         self.dropped = 0
         """Frames that came while the queue was full."""
         self._bus = bus
-        self._frames: deque[CanFrame] = deque()
+        self._frames: deque[tuple[CanFrame, int]] = deque()
         self._stopping = False
         self._lock = threading.Lock()
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -43,8 +44,11 @@ class BusReader:
     def fileno(self) -> int:
         return self._fd
 
-    def take(self, limit: int) -> list[CanFrame]:
-        """The oldest frames that wait, at most ``limit``; the descriptor stays readable while more do."""
+    def take(self, limit: int) -> list[tuple[CanFrame, int]]:
+        """The oldest frames that wait, at most ``limit``, with the times at which they were read.
+
+        The descriptor stays readable while more wait.
+        """
         try:
             os.eventfd_read(self._fd)
         except BlockingIOError:
@@ -79,7 +83,9 @@ class BusReader:
                     self.dropped += 1
                 else:
                     data, extended = bytes(message.data), message.is_extended_id
-                    self._frames.append(CanFrame(message.arbitration_id, data, extended, message.is_fd))
+                    frame = CanFrame(message.arbitration_id, data, extended, message.is_fd)
+                    # what drivers put into ``timestamp`` counts from anything
+                    self._frames.append((frame, time.monotonic_ns()))
                     self._wake()
         except Exception as error:  # what a driver lets out when its adapter has gone: CanError, OSError, TypeError ...
             if not self._stopping:

@@ -25,6 +25,7 @@ from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
 from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import SECOND
 
 if TYPE_CHECKING:
     import can
@@ -51,6 +52,10 @@ _CTRL_RX_OVERFLOW, _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x01, 0x0C, 0x30
 _OK = Sent.OK
 _DOWN, _UNKNOWN = CanState.DOWN, CanState.UNKNOWN
 _CAN_RAW_ERR_FILTER = 2
+_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD = 64, 35
+"""Times of reception, of two 64-bit numbers on every machine; and of kernels before 5.1, of the machine's own."""
+_TIMES = {16: struct.Struct("=qq"), 8: struct.Struct("=ii")}
+_ANCILLARY_SIZE = 64
 _SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
 """The kernel's figures of a socket; the last one counts what it dropped for want of room."""
 
@@ -79,6 +84,10 @@ class CanPort:
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 0)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+            for option in (_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD):
+                with contextlib.suppress(OSError):
+                    self._socket.setsockopt(socket.SOL_SOCKET, option, 1)
+                    break
             self._socket.setblocking(False)
 
     def fileno(self) -> int | None:
@@ -128,8 +137,11 @@ class CanPort:
                 self._reader = BusReader(self._bus, self._ids)
             self._reader.ids = self._ids
 
-    def receive(self) -> list[CanFrame]:
-        """The data frames that have come, oldest first, at most RECEIVE_LIMIT; follow the controller's state from error frames."""
+    def receive(self) -> list[tuple[CanFrame, int | None]]:
+        """The data frames that have come, oldest first, at most RECEIVE_LIMIT; follow the controller's state from error frames.
+
+        With each the time at which it came, on the monotonic clock; None where that is not known.
+        """
         return self._receive(RECEIVE_LIMIT)
 
     def discard(self) -> None:
@@ -184,19 +196,19 @@ class CanPort:
         ):  # an interface that is gone may fail in its own ways; nothing is left to do
             self._bus.shutdown()
 
-    def _receive(self, limit: int) -> list[CanFrame]:
+    def _receive(self, limit: int) -> list[tuple[CanFrame, int | None]]:
+        frames: list[tuple[CanFrame, int | None]] = []
         if self._reader is not None:
-            frames = self._reader.take(limit)
+            frames += self._reader.take(limit)
             if self._reader.failed:
                 self.state = CanState.DOWN
             self._note_drops()
             return frames
-        frames = []
         if self._socket is None:
             return frames
         for _ in range(limit):
             try:
-                data = self._socket.recv(_FD.size)
+                data, ancillary, _, _ = self._socket.recvmsg(_FD.size, _ANCILLARY_SIZE)
             except BlockingIOError:
                 break
             except OSError as error:
@@ -214,7 +226,8 @@ class CanPort:
             if can_id & _ERROR_FLAG:
                 self._follow(can_id, content[1])
             elif can_id in self._ids:  # with another flag set, of a remote frame, it is none of ours
-                frames.append(CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd))
+                frame = CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd)
+                frames.append((frame, _monotonic(ancillary)))
         else:
             self._note_drops()  # there was more than we take at once: perhaps more than the kernel holds
         return frames
@@ -297,6 +310,15 @@ class CanPort:
         except Exception:  # what a driver lets out when its adapter has gone: OSError, termios.error ...
             return Sent.GONE
         return Sent.OK
+
+
+def _monotonic(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
+    """The time of reception that came with a frame, on the monotonic clock."""
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind in (_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD) and len(data) in _TIMES:
+            seconds, ns = _TIMES[len(data)].unpack(data)
+            return int(seconds * SECOND + ns - time.time_ns() + time.monotonic_ns())
+    return None
 
 
 def one_by_one(

@@ -13,7 +13,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame, frame_of
 from kontronik_can_gw.gateway import Conflict, Gateway
 from kontronik_can_gw.mailboxes import Mailboxes, Sent, are_images, stand_alone
-from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, socketcan_error
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
@@ -30,6 +30,8 @@ ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
 """How often the kernel is asked for the controller's state: as a rule, and in bus-off."""
 ASK_RESTARTING_NS, SETTLING_NS = 20 * MS, 200 * MS
 _OK = Sent.OK
+MAX_LATE_NS = 250 * MS
+"""Measurements that are handed over later than this, or the shortest telemetry time-out, are old."""
 RESTARTED_NS = SECOND
 """So long behind a restart a driver may go on telling of bus-off."""
 
@@ -60,8 +62,6 @@ class CanSide:
         self._conditions = conditions
         self._esc_at = esc_at
         self._clock = clock
-        self.longest_turn_ns = SECOND // 4
-        """A frame that is to go out so long after its turn began is old by now."""
         self._turn_ns = 0
         self._retry = Retry(LONGEST_RETRY_NS)
         self._locks = Locks(report=lambda text: conditions.say(logging.WARNING, text))
@@ -77,6 +77,7 @@ class CanSide:
         self._runs_since: int | None = None
         self._restarted_ns = -RESTARTED_NS
         self._served = True
+        self._drained = True
         self._seen_waiting = False
         self._monitor: LinkMonitor | None = None
         self._ask_due: int | None = None
@@ -95,6 +96,11 @@ class CanSide:
     def rests(self, now: int) -> bool:
         """True where ``reopen`` and ``ask_if_due`` have nothing to do, and the port was not opened just now."""
         return self.port is not None and not self.just_opened and (self._ask_due is None or now < self._ask_due)
+
+    @property
+    def longest_turn_ns(self) -> int:
+        """A frame that is to go out so long after its turn began is old by now."""
+        return min(MAX_LATE_NS, self._gateway.shortest_timeout_ns)
 
     @property
     def is_open(self) -> bool:
@@ -317,10 +323,13 @@ class CanSide:
             self._busy_until = None
             self._watch(selectors.EVENT_READ)
         if events & selectors.EVENT_READ:
+            since = self._selector.before if self._drained else 0
             frames = self.port.receive()
+            self._drained = len(frames) < RECEIVE_LIMIT
             self._gateway.status.received_frames += len(frames)
-            for frame in frames:
-                self._gateway.receive_frame(frame, now)
+            for frame, at in frames:
+                # a wall clock that was set moves no frame out of the time in which it must have come
+                self._gateway.receive_frame(frame, now, now if at is None else min(max(at, since), now))
                 if self.tap is not None:
                     self.tap(frame, now, True)
             self._follow_reception(now)
@@ -332,15 +341,11 @@ class CanSide:
         self._served, self._seen_waiting = False, waiting
         return stuck
 
-    def discard(self, now: int) -> None:
-        """Throw away what waits in both directions: it is old."""
-        waited = len(self.mailboxes)
-        self.clear()
-        if self.port is not None:
-            self.port.discard()
-            self._follow_reception(now)
-        if waited:  # an answer is too late by now, but what is wrong has to be known
-            self._gateway.can_returned(now)
+    def drop_measurements(self) -> bool:
+        """Throw away the measurements that wait to be sent; True where there were any. Answers stay, in their order."""
+        dropped = self.mailboxes.drop_measurements()
+        self._count_losses()
+        return dropped
 
     def clear(self) -> None:
         """Throw away what waits to be sent."""
@@ -395,7 +400,7 @@ class CanSide:
             if not self._is_proven:
                 self._works(now)
         elif answer is Sent.LATE:
-            return  # the next turn throws it away
+            return  # what is old of it the next turn drops
         else:
             status.send_failures += 1
             if answer in (Sent.BUSY, Sent.FULL):

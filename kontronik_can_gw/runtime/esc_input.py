@@ -2,6 +2,8 @@
 
 import logging
 import selectors
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
@@ -21,7 +23,7 @@ from kontronik_can_gw.runtime.serial_port import (
     is_mini_uart,
 )
 from kontronik_can_gw.runtime.snapshot import PortFacts
-from kontronik_can_gw.telemetry import SECOND, LinkState
+from kontronik_can_gw.telemetry import NS_PER_BYTE, SECOND, LinkState
 
 LONGEST_RETRY_NS = SECOND
 DIAGNOSIS_NS = 3 * SECOND
@@ -43,6 +45,7 @@ class EscInput:
         selector: Registry,
         conditions: Conditions,
         lost: "set[EscInput]",
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.path = path
         self.port: SerialPort | None = None
@@ -56,6 +59,11 @@ class EscInput:
         self._gateway = gateway
         self._selector = selector
         self._conditions = conditions
+        self._clock = clock
+        self._empty_ns = 0
+        """The port was empty then."""
+        self._undrained_ns: int | None = None
+        """The last read left something, which came after this."""
         self._retry = Retry(LONGEST_RETRY_NS)
         self._diagnosis_due = 0
         self._diagnosed: set[str] = set()
@@ -100,6 +108,7 @@ class EscInput:
             unplugged = isinstance(error, NoPort) and self.reopened >= 0  # which was said when it was lost
             self._failed(str(error), now, quiet=unplugged)
             return
+        self._empty_ns, self._undrained_ns = self._clock(), None
         port.discard()  # what came before we listened has no time
         self.port = port
         self.identity = port.identity()
@@ -149,17 +158,17 @@ class EscInput:
             if not self._proven:  # a port that goes as soon as it has come is tried more and more seldom
                 self._proven = True
                 self._retry.succeeded()
-            self._gateway.receive_bytes(self._index, data, now)
+            since = self._undrained_ns
+            if since is None:
+                since = max(self._empty_ns, self._selector.before)
+            # nothing came faster than the wire allows
+            self._undrained_ns = None if self.port.drained else min(now, since + len(data) * NS_PER_BYTE)
+            self._gateway.receive_bytes(self._index, data, now, since)
 
     def reopen(self, now: int, others: tuple[Identity | None, ...] = ()) -> None:
         """Try again what is due."""
         if self in self._lost and now >= self.due:
             self.open(now, True, others)
-
-    def discard(self) -> None:
-        """Throw away what waits to be read."""
-        if self.port is not None:
-            self.port.discard()
 
     def close(self) -> None:
         """Close the port."""

@@ -35,8 +35,10 @@ from kontronik_can_gw.telemetry import MS, SECOND
 
 log = logging.getLogger("kontronik_can_gw")
 
-LEAST_SUSPENDED_NS, SUSPENDED_NS = 20 * MS, 250 * MS
-"""A loop that comes round this much too late was held up or suspended: what waits on the ports is old."""
+MIN_HELD_UP_NS = 20 * MS
+"""A loop that comes round this much too late at least, and by ``can_side.longest_turn``, was held up."""
+_LOOKS_PER_TIMEOUT = 8
+"""The ports are looked at so often within the shortest telemetry time-out at least: by how much of it a value may go early."""
 STATUS_NS = SECOND
 """The service manager is told a line at most this often."""
 LOOK_NS = 100 * MS
@@ -61,6 +63,7 @@ class Loop:
         statistics: Statistics | None = None,
         program: ProgramFacts | None = None,
         recorder: Recorder | None = None,
+        poller: Poller | None = None,
     ) -> None:
         self.gateway = gateway
         self.conditions = Conditions()
@@ -86,10 +89,10 @@ class Loop:
         self._reloader = reloader
         self._reload_asked = False
         self._stopping = False
-        self._poller = Poller()
+        self._poller = poller or Poller(clock)
         self._lost: set[EscInput] = set()
         self.escs = [
-            EscInput(i, path, gateway, self._poller, self.conditions, self._lost) for i, path in enumerate(ports)
+            EscInput(i, path, gateway, self._poller, self.conditions, self._lost, clock) for i, path in enumerate(ports)
         ]
         self.can = CanSide(can_config, gateway, self._poller, self.conditions, self._esc_at, clock)
         if recorder is not None and recorder.wants_frames:
@@ -139,8 +142,6 @@ class Loop:
         except UserError:
             self.close()
             raise
-        for esc in self.escs:
-            esc.discard()  # an interface may take seconds to open
         if self.can.port is not None:
             self.can.port.discard()  # a node that has not booted yet hears nothing
         self.conditions.release()
@@ -167,15 +168,18 @@ class Loop:
         """Wait until something has come or is due, and do it."""
         gateway, can, clock = self.gateway, self.can, self._clock
         last = self._now
-        pause = self._next_deadline() - clock()
+        due = self._next_deadline()
+        pause = min(due, last + gateway.shortest_timeout_ns // _LOOKS_PER_TIMEOUT) - clock()
         if pause < 0:
             pause = 0
         ready = self._poller.wait(pause)
-        now = clock()
+        now = self._poller.now
         late = now - last - pause
-        if late > LEAST_SUSPENDED_NS and late > self._suspended_ns():
-            self._discard_input(late, now)
-            ready = []  # what they announced is gone; a hang-up comes again
+        if late > MIN_HELD_UP_NS and late > can.longest_turn_ns:
+            self._follow_hold_up(late, now)
+        elif not ready and now < due:  # only looked
+            self._now = now
+            return
         for handler, events in ready:
             handler(now, events)
         if self._lost or not can.rests(now):
@@ -246,20 +250,14 @@ class Loop:
         """The name of the ESC that a path leads to."""
         return next((esc.name for esc in self.escs if esc.is_at(path)), None)
 
-    def _suspended_ns(self) -> int:
-        """Held up for longer, what waits on the ports is old: a master may change the ESCs' time-outs."""
-        return min([SUSPENDED_NS, *(esc.settings.timeout_ns for esc in self.gateway.escs)])
-
-    def _discard_input(self, late: int, now: int) -> None:
-        text = f"the process was suspended for {late / SECOND:.1f} s: what waited on the serial ports and for CAN is thrown away"
+    def _follow_hold_up(self, late: int, now: int) -> None:
+        """What was measured before is old; commands and answers are not (how old bytes are, ``since`` tells)."""
+        text = f"the process was suspended for {late / SECOND:.1f} s: measurements that waited to be sent are dropped and made anew"
         self.conditions.event("suspended", text, now)
-        self.can.discard(now)
-        for esc in self.escs:
-            esc.discard()
+        self.gateway.held_up(now, self.can.drop_measurements())
 
     def _reopen(self, now: int) -> int:
-        """Open what is due. Returns the time: it may have taken long on a slow machine, and what came meanwhile is old then."""
-        begin = now
+        """Open what is due. Returns the time: it may have taken long on a slow machine."""
         for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
             esc.reopen(now, self._others(esc))
         self.can.reopen(now)
@@ -267,9 +265,6 @@ class Loop:
         if self._lost or not self.can.is_open or self.can.just_opened:
             self.can.just_opened = False
             now = max(now, self._clock())
-            if now - begin > self._suspended_ns():
-                for esc in self.escs:
-                    esc.discard()
         return now
 
     # --- parameters
@@ -415,7 +410,6 @@ class Loop:
     def _look_round(self, now: int) -> None:
         """What need not be done each time the loop comes round."""
         self._look_due = now + LOOK_NS
-        self.can.longest_turn_ns = self._suspended_ns()
         if self._reload_asked:
             self._begin_reload()
         for esc in self.escs:

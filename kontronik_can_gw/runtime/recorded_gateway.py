@@ -10,8 +10,8 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import EscSettings
 
-Put = Callable[[int, int, int, bytes, int], None]
-"""(time, kind, ESC's index, data, flags), as the fields of ``capture.Entry``."""
+Put = Callable[[int, int, int, bytes, int, int | None], None]
+"""(time, kind, ESC's index, data, flags, time of arrival), as the fields of ``capture.Entry``."""
 
 
 class RecordedGateway(Gateway):
@@ -39,14 +39,18 @@ class RecordedGateway(Gateway):
         self._note(now, Kind.STOP)
         super().stop(now)
 
-    def receive_bytes(self, esc: int, data: bytes, now: int) -> None:
-        self._note(now, Kind.BYTES, esc, data)
-        super().receive_bytes(esc, data, now)
+    def receive_bytes(self, esc: int, data: bytes, now: int, since: int) -> None:
+        self._note(now, Kind.BYTES, esc, data, came=since)
+        super().receive_bytes(esc, data, now, since)
 
-    def receive_frame(self, frame: CanFrame, now: int) -> None:
+    def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
         self._note_line_errors(now)
-        self._note(now, Kind.FRAME, data=frame_data(frame))
-        super().receive_frame(frame, now)
+        self._note(now, Kind.FRAME, data=frame_data(frame), came=at)
+        super().receive_frame(frame, now, at)
+
+    def held_up(self, now: int, dropped: bool) -> None:
+        self._note(now, Kind.HELD_UP, flags=int(dropped))
+        super().held_up(now, dropped)
 
     def can_opened(self, now: int) -> None:
         self._note(now, Kind.CAN_OPENED)
@@ -92,20 +96,22 @@ class RecordedGateway(Gateway):
         return frames
 
     def not_sent(self, now: int) -> None:
-        self._put(now, Kind.NOT_SENT, 0, b"", 0)
+        self._put(now, Kind.NOT_SENT, 0, b"", 0, None)
 
     def _note_line_errors(self, now: int) -> None:
         for esc, (state, known) in enumerate(zip(self.escs, self._line_errors, strict=True)):
             if state.line_errors != known:
                 self._line_errors[esc] = state.line_errors
-                self._put(now, Kind.LINE_ERRORS, esc, number_data(state.line_errors), 0)
+                self._put(now, Kind.LINE_ERRORS, esc, number_data(state.line_errors), 0, None)
 
-    def _note(self, now: int, kind: Kind, esc: int = 0, data: bytes = b"", flags: int = 0) -> None:
+    def _note(
+        self, now: int, kind: Kind, esc: int = 0, data: bytes = b"", flags: int = 0, came: int | None = None
+    ) -> None:
         counters = self._counters_now()
         if counters != self._counters:
             self._counters = counters
-            self._put(now, Kind.COUNTERS, 0, counters_data(counters), 0)
-        self._put(now, kind, esc, data, flags)
+            self._put(now, Kind.COUNTERS, 0, counters_data(counters), 0, None)
+        self._put(now, kind, esc, data, flags, came)
 
     def _counters_now(self) -> tuple[int, ...]:
         s = self.status

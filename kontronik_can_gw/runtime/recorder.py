@@ -42,8 +42,8 @@ _JUMP_NS = SECOND // 10
 _SLOW_NS = 5 * SECOND
 _MB = 1_000_000
 
-Item = tuple[int, int, int, Any, int]
-"""(time, kind, ESC, data, flags), as of ``capture.Entry``."""
+Item = tuple[int, int, int, Any, int, int | None]
+"""(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
 _SENT, _RECEIVED = 100, 101
 """Kinds of items for the CAN log only; their data is the frame."""
 
@@ -142,12 +142,12 @@ class Recorder:
             raise RunError("captures: the system gives no thread to write them")
         self._thread = thread
 
-    def put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int) -> None:
+    def put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None) -> None:
         """Record an entry, as of ``capture.Entry``. Never waits."""
         if len(self._entries) >= CAPACITY:
             self._overflowed += 1
         else:
-            self._entries.append((time_ns, kind, esc, data, flags))
+            self._entries.append((time_ns, kind, esc, data, flags, came_ns))
 
     @property
     def wants_frames(self) -> bool:
@@ -159,7 +159,7 @@ class Recorder:
         if len(self._entries) >= CAPACITY:
             self._frames_lost += 1
         else:
-            self._entries.append((time_ns, _RECEIVED if received else _SENT, 0, frame, 0))
+            self._entries.append((time_ns, _RECEIVED if received else _SENT, 0, frame, 0, None))
 
     def note(self, gateway: Gateway, now: int) -> None:
         """How the gateway is now: what a replay of a later part begins with, and what is known of the devices."""
@@ -259,13 +259,13 @@ class Recorder:
         last = items[-1][0]
         if (lost := self._overflowed + self._unwritten - file.lost) > 0:
             file.lost += lost
-            items.append((last, Kind.LOST, 0, number_data(lost), 0))
+            items.append((last, Kind.LOST, 0, number_data(lost), 0, None))
         if now - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = now
             offset = time.time_ns() - self._clock()
             if abs(offset - self._offset) > _STEP_NS:
                 self._offset = offset
-                items.append((last, Kind.CLOCK, 0, number_data(last + offset), 0))
+                items.append((last, Kind.CLOCK, 0, number_data(last + offset), 0, None))
 
     def _may_write(self, now: int) -> bool:
         if self._file is None and now < self._retry_ns:
@@ -431,7 +431,7 @@ class _Files:
                 self.write(b"H", self._header)
                 self._header = None
         if self._log is not None:
-            for time_ns, kind, _, frame, _ in items:
+            for time_ns, kind, _, frame, _, _ in items:
                 if kind >= _SENT:
                     self._log.add(frame, time_ns + offset, kind == _RECEIVED)
 

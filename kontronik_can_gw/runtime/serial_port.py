@@ -22,6 +22,7 @@ from kontronik_can_gw.errors import RunError
 
 BAUD_RATE = 115_200
 READ_SIZE = 4096
+_MAX_READS = 4
 
 _TIOCGICOUNT = 0x545D
 MINI_UART = "brcm,bcm2835-aux-uart"
@@ -69,6 +70,12 @@ class SerialPort:
             os.close(quiet)
         self._fd = self._serial.fileno()
         self._real_path = os.path.realpath(path)
+        self.drained = True
+        """Whether the last ``read`` left nothing."""
+        mode = termios.tcgetattr(self._fd)
+        mode[6][termios.VMIN] = 1  # so that an empty port does not look like one that hung up
+        with contextlib.suppress(termios.error):
+            termios.tcsetattr(self._fd, termios.TCSANOW, mode)
         self._settings = termios.tcgetattr(self._fd)
         if not is_pty:
             with contextlib.suppress(OSError):
@@ -80,16 +87,28 @@ class SerialPort:
         return self._fd
 
     def read(self) -> bytes:
-        """What has come; call it only when the port is readable. PortLost when the port has gone."""
-        try:
-            data = os.read(self._fd, READ_SIZE)
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            raise PortLost(error.strerror or str(error)) from None
-        if not data:
-            raise PortLost("hung up")
-        return data
+        """What has come. PortLost when the port has gone.
+
+        A short read does not tell that nothing more waits: the kernel passes on what it has further back only when it is asked again.
+        """
+        found = b""
+        self.drained = False
+        for _ in range(_MAX_READS):
+            try:
+                data = os.read(self._fd, READ_SIZE)
+            except BlockingIOError:
+                self.drained = True
+                break
+            except OSError as error:
+                if found:
+                    break  # it comes again
+                raise PortLost(error.strerror or str(error)) from None
+            if not data:
+                if found:
+                    break
+                raise PortLost("hung up")
+            found += data
+        return found
 
     def settings_hold(self) -> bool:
         """Whether the port still is as it was set; if not it is set again. (Another program, as stty, can change it at any time.)"""

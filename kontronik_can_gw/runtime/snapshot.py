@@ -247,9 +247,9 @@ def name_in_words(name: str) -> str:
 def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
     """One ESC. What is not fresh at ``now`` is None, whatever the last call of ``advance`` knew."""
     live, info = esc.live, esc.info
-    if live is not None and (esc.live_ns is None or now - esc.live_ns > esc.settings.timeout_ns):
+    if live is not None and now - esc.live_bound_ns > esc.settings.timeout_ns:
         live = None
-    if info is not None and (esc.info_ns is None or now - esc.info_ns > INFO_TIMEOUT_NS):
+    if info is not None and (esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS):
         info = None
     readers = _readers(esc.settings.pole_pairs, esc.settings.gear)
     alarms = None if live is None else _alarms(live.operating_errors)

@@ -132,7 +132,7 @@ def core(folder: Path, all_frames: list[bytes]) -> int:
     gateway.start(now)
     for frame in all_frames:
         now += PERIOD_NS
-        gateway.receive_bytes(0, frame, now)
+        gateway.receive_bytes(0, frame, now, now)
         gateway.advance(now)
         count += len(gateway.take_ready())
     return count

@@ -210,14 +210,14 @@ def test_a_simulated_esc_on_a_bad_line(tmp_path: Path, seed: int) -> None:
     assert count > whole * 0.3
 
 
-@pytest.mark.parametrize("rate", [0.5, 3.3, 7, 50, 99.9, 200, 333.3, 1000, 20_000])
-@pytest.mark.parametrize("info_each", [0, 3, 100])
+@pytest.mark.parametrize("rate", [0.5, 7, 99.9, 333.3, 20_000])
+@pytest.mark.parametrize("info_each", [0, 3])
 def test_any_rate(tmp_path: Path, rate: float, info_each: int) -> None:
     count = 450 if rate < 50 else 2500
     check(tmp_path / "a.bin", flight(int(rate), count, info_each=info_each), rate=rate, block=777)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_damage_of_every_kind(tmp_path: Path, seed: int) -> None:
     source = random.Random(seed)
     fly = Flight(source, source.choice(list(Layout)))
@@ -290,7 +290,7 @@ def test_nothing_to_find(tmp_path: Path, stream: bytes) -> None:
 
 
 @pytest.mark.parametrize("kind", [CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE])
-@pytest.mark.parametrize(("cycle", "delay"), [(10, 0), (30, 0), (100, 25), (35, 7), (20, 50), (1000, 500), (7, 10)])
+@pytest.mark.parametrize(("cycle", "delay"), [(10, 0), (35, 7), (20, 50), (1000, 500)])
 @pytest.mark.parametrize("maker", [crc_message, paged_message])
 def test_every_way_to_send(tmp_path: Path, kind: int, cycle: int, delay: int, maker: object) -> None:
     message = crc_message() if maker is crc_message else paged_message()
@@ -301,7 +301,7 @@ def test_every_way_to_send(tmp_path: Path, kind: int, cycle: int, delay: int, ma
     check(tmp_path / "a.bin", damaged(flight(5, 300, info_each=20), source, 2), layout, 300, block=100)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(12))
 def test_random_layouts(tmp_path: Path, seed: int) -> None:
     """Signals of all sources, types, places; multiplexed, of both id lengths, of CAN FD; sent in every way."""
     source = random.Random(seed)

@@ -91,7 +91,7 @@ def test_a_simulated_esc(tmp_path: Path, device: Device) -> None:
     assert count > rows * 0.9
 
 
-@pytest.mark.parametrize("rate", [2, 3.7, 20, 50, 101, 333, 12_345, 1e6])
+@pytest.mark.parametrize("rate", [2, 20, 101, 12_345, 1e6])
 def test_any_rate(tmp_path: Path, rate: float) -> None:
     """At 100 Hz and above an info frame goes into the row in front of it; slowly enough, information goes stale."""
     source = Wandering(random.Random(7))
@@ -163,7 +163,7 @@ def test_any_damage(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None
     )
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_random_layouts(tmp_path: Path, seed: int) -> None:
     source = random.Random(seed)
     layout = random_layout(source, source.choice([3, 12]))

@@ -86,7 +86,7 @@ def test_any_stream_in_any_chunks(stream: bytes, largest: int, least: int) -> No
     check(stream, 1 << 22, least)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_random_streams(seed: int) -> None:
     source = random.Random(seed)
     stream = random_stream(source, 60)
@@ -94,7 +94,7 @@ def test_random_streams(seed: int) -> None:
         check(stream, source.choice([1, 7, 44, 45, 100, 1000, 1 << 20]), source.choice([1, 2, 5]))
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(8))
 def test_long_streams_with_damage(seed: int) -> None:
     source = random.Random(1000 + seed)
     stream = b"".join(

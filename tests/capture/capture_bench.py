@@ -52,8 +52,8 @@ class Bench:
         self._saves: list[int] = []
         self._is_open = True
 
-    def _put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int) -> None:
-        self.entries.append(Entry(time_ns, kind, esc, data, flags))
+    def _put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None) -> None:
+        self.entries.append(Entry(time_ns, kind, esc, data, flags, came_ns))
 
     def take(self, now: int) -> None:
         frames = in_order(self.gateway.take_frames(), self._waiting)
@@ -90,13 +90,14 @@ class Bench:
             now = max(now + 1, min(gateway.next_deadline(), now + rng.randrange(1, 12 * MS)) + late)
             if wild and rng.random() < 0.002:
                 now += rng.randrange(400 * MS)
+                gateway.held_up(now, rng.random() < 0.5)
             for index, esc in enumerate(escs):
                 data = b"".join(sent.wire for sent in esc.frames_until(now))
                 if data and open_ports[index]:
                     cut = rng.randrange(len(data) + 1)
                     for part in (data[:cut], data[cut:]):
                         if part:
-                            gateway.receive_bytes(index, part, now)
+                            gateway.receive_bytes(index, part, now, now - rng.choice([0, rng.randrange(20 * MS)]))
             if wild:
                 self._happens(rng, now, open_ports)
             gateway.advance(now)
@@ -140,4 +141,4 @@ class Bench:
                 ]
             )
             gateway.status.received_frames += 1
-            gateway.receive_frame(CanFrame(can_id & 0x7FF, data), now)
+            gateway.receive_frame(CanFrame(can_id & 0x7FF, data), now, now - rng.randrange(50 * MS))

@@ -5,7 +5,6 @@ import itertools
 import json
 import random
 import struct
-import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import pytest
 from capture_bench import START, Bench, made
 
+from kontronik_can_gw import capture
 from kontronik_can_gw.capture import MAGIC, Block, Entry, Kind, Scanner, block, data_payload, json_payload
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.offline.inputs import CaptureInput, open_input
@@ -81,28 +81,26 @@ def read_all(path: Path) -> None:
     assert all(line.isprintable() for line in lines)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_wrong_values_in_the_header(seed: int, header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "a.kcap"
-    data = block(b"D", 1, data_payload(bench.entries[:60])) + block(b"E", 2, b"")
+    data = block(b"D", 1, data_payload(bench.entries[:40])) + block(b"E", 2, b"")
     combinations = list(itertools.product(places(header), (*VALUES, GONE)))
     random.Random(seed).shuffle(combinations)
-    for place, value in combinations[:50]:
+    for place, value in combinations[:40]:
         if not place and value is GONE:
             continue
         document = changed(header, place, value)
         payload = json_payload(document) if isinstance(document, dict) else json.dumps(document).encode()
         path.write_bytes(block(b"H", 0, payload) + data)
-        begin = time.monotonic()
         read_all(path)
-        assert time.monotonic() - begin < 20, (place, str(value)[:20])
 
 
 def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "a.kcap"
     rng = random.Random(4)
-    for _ in range(25):
-        entries = list(bench.entries[:150])
+    for _ in range(15):
+        entries = list(bench.entries[:100])
         for _ in range(20):
             at = rng.randrange(len(entries))
             entry = entries[at]
@@ -131,15 +129,22 @@ def test_json_that_is_nested_without_end(header: dict[str, Any], tmp_path: Path)
     read_all(path)
 
 
-def test_what_only_looks_like_blocks_costs_no_more_than_a_while() -> None:
+def test_what_only_looks_like_blocks_costs_no_more_than_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
     """Heads that promise megabytes, one behind the other: each would have to be read to its end."""
     head = struct.pack("<4scBHIII", MAGIC, b"D", 0, 0, 8_000_000, 8_000_000, 0) + b"\0\0\0\0"
     good = block(b"D", 7, b"good")
     data = head * 3000 + bytes(9_000_000) + good
-    begin = time.monotonic()
+    costs = [0]
+    real = capture._payload
+
+    def counting(buffer: bytearray, deflated: int, stored: int, size: int) -> bytes | None:
+        costs[0] += stored
+        return real(buffer, deflated, stored, size)
+
+    monkeypatch.setattr(capture, "_payload", counting)
     scanner = Scanner()
     found = scanner.feed(data) + scanner.flush()
-    assert time.monotonic() - begin < 20
+    assert 1 << 27 < costs[0] < 1 << 29, "of 24 GB that are promised"
     assert [b.payload for b in found if isinstance(b, Block)] in ([b"good"], [])
     few = Scanner()
     found = few.feed(head * 5 + bytes(9_000_000) + good) + few.flush()

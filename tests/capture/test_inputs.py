@@ -72,7 +72,7 @@ def plain_run(seconds: float, escs: int = 1, faults: Faults | None = None) -> tu
             gateway.advance(deadline)
             bench.take(deadline)
         if sent.wire:
-            gateway.receive_bytes(index, sent.wire, now)
+            gateway.receive_bytes(index, sent.wire, now, now)
         gateway.advance(now)
         bench.take(now)
     return bench, meant
@@ -267,7 +267,7 @@ def test_every_value_of_the_shipped_dbc_reads_as_cantools_reads_it() -> None:
         (b"hello world\n" * 50, "is no capture"),
         (block(b"D", 0, data_payload([])), "has no header"),
         (block(b"H", 0, b"[]"), "has no header"),
-        (block(b"H", 0, b'{"format": "kontronik-can-gw capture", "version": 2}'), "version 2 is unknown"),
+        (block(b"H", 0, b'{"format": "kontronik-can-gw capture", "version": 3}'), "version 3 is unknown"),
     ],
 )
 def test_what_is_no_recording_is_said_in_one_line(content: bytes, words: str, tmp_path: Path) -> None:

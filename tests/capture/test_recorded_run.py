@@ -21,11 +21,20 @@ from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 
 
-def until(condition: Callable[[], bool], what: str, seconds: float = 20) -> None:
+def until(condition: Callable[[], bool], what: str, seconds: float = 120) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, what
         time.sleep(0.01)
+
+
+ENOUGH = 12_000
+"""Bytes of a capture with its header, which stands there twice, and some data."""
+
+
+def size_of(folder: Path, pattern: str = "*") -> int:
+    """What has been written so far; 0 where there is no folder yet."""
+    return sum(path.stat().st_size for path in folder.glob(pattern))
 
 
 @contextmanager
@@ -65,7 +74,7 @@ class Run:
 
     def end(self, number: int = signal.SIGTERM) -> int:
         self.process.send_signal(number)
-        return self.process.wait(10)
+        return self.process.wait(120)
 
 
 @pytest.fixture
@@ -96,7 +105,7 @@ def test_the_log_beside_a_capture_is_what_a_replay_gives(start: Callable[..., Ru
         config.write_text(configuration(ports, 'can_log = "candump"', canopen))
         run = start(config, "--record", tmp_path / "captures")
         run.wait_for("esc2: telemetry ok")
-        time.sleep(3)
+        until(lambda: size_of(tmp_path / "captures", "*.log") > 40_000, "a second's frames in the log")
         assert run.end() == 0
     [log] = (tmp_path / "captures").glob("*.log")
     again = tmp_path / "again.log"
@@ -118,11 +127,10 @@ def test_a_reload_ends_one_capture_and_begins_another(start: Callable[..., Run],
         config.write_text(configuration(ports, 'directory = "one"'))
         run = start(config)
         run.wait_for("esc1: telemetry ok")
-        time.sleep(2.5)
+        until(lambda: size_of(tmp_path / "one") > ENOUGH, "what was recorded first")
         config.write_text(configuration(ports, 'directory = "two"'))
         run.process.send_signal(signal.SIGHUP)
-        until(lambda: (tmp_path / "two").is_dir() and bool(list((tmp_path / "two").iterdir())), "a second capture")
-        time.sleep(2)
+        until(lambda: size_of(tmp_path / "two") > ENOUGH, "a second capture")
         threads = len(os.listdir(f"/proc/{run.process.pid}/task"))
         config.write_text(configuration(ports))
         run.process.send_signal(signal.SIGHUP)
@@ -135,13 +143,13 @@ def test_a_reload_ends_one_capture_and_begins_another(start: Callable[..., Run],
             assert found.damage == [], name
         assert kinds[-1] in (Kind.STOP, Kind.STATE)
         assert kinds.count(Kind.START) == kinds.count(Kind.STOP) == 1
-        assert kinds.count(Kind.BYTES) > 100
+        assert kinds.count(Kind.BYTES) > 20
     with open_input(tmp_path / "one") as one, open_input(tmp_path / "two") as two:
         assert isinstance(one, CaptureInput)
         assert isinstance(two, CaptureInput)
         list(one.samples())
         state = two.header["state"]
-        assert state["started_ns"] <= two.header["created_ns"] - 2 * 10**9  # the run goes on
+        assert state["started_ns"] <= one.header["monotonic_ns"] < two.header["created_ns"], "the run goes on"
         assert json.dumps(state)
 
 
@@ -155,7 +163,7 @@ def test_a_folder_that_cannot_be_made(wait: bool, start: Callable[..., Run], tmp
         words = ["--wait"] if wait else []
         run = start(config, "--record", tmp_path / "file" / "captures", *words)
         if not wait:
-            assert run.process.wait(10) == 1
+            assert run.process.wait(120) == 1
             assert run.log.count("\n") == 1
             assert "Give another folder (record.directory, --record)" in run.log
             return
@@ -172,8 +180,7 @@ def test_the_logs_of_several_parts_are_what_a_replay_of_all_gives(start: Callabl
         run.wait_for("esc1: telemetry ok")
         run.wait_for(f"recording to {tmp_path}/captures, parts of 1 MB")
         folder = tmp_path / "captures"
-        until(lambda: len(list(folder.glob("*.kcap"))) > 2, "parts", 60)
-        time.sleep(1)
+        until(lambda: len(list(folder.glob("*.kcap"))) > 1, "parts", 600)
         assert run.end() == 0
     logs = b"".join(log.read_bytes() for log in sorted(folder.glob("*.log")))
     again = tmp_path / "again.log"

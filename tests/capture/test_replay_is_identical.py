@@ -46,6 +46,24 @@ def test_the_silent_gateway_too() -> None:
     assert [frame for frame in replayed(bench) if not frame.received] == bench.sent
 
 
+def test_frames_that_were_thrown_away_are_not_replayed() -> None:
+    """The interface was down when they were to be handed over: a NOT_SENT entry behind the turn in which they were made."""
+    bench = Bench(*made(1))
+    gateway, now = bench.gateway, START
+    gateway.port_opened(0, now)
+    gateway.start(now)
+    bench.take(now)
+    for n in range(1, 30):
+        now += 50 * 10**6
+        bench._is_open = not 10 <= n < 20
+        gateway.advance(now)
+        bench.take(now)
+    assert sum(entry.kind == 18 for entry in bench.entries) > 3
+    times = {frame.time_ns for frame in replayed(bench)}
+    assert times == {frame.time_ns for frame in bench.sent}
+    assert not [at for at in times if START + 450 * 10**6 < at < START + 1000 * 10**6]
+
+
 def test_what_was_received_is_told_as_received() -> None:
     bench = Bench(*made(1, True)).live(7, 6)
     received = [frame for frame in replayed(bench) if frame.received]

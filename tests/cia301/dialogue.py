@@ -167,12 +167,12 @@ class Bench:
         """A frame from the bus."""
         if isinstance(data, str):
             data = bytes.fromhex(data)
-        self.gateway.receive_frame(CanFrame(can_id, data, **flags), self.now)
+        self.gateway.receive_frame(CanFrame(can_id, data, **flags), self.now, self.now)
         self._collect()
 
     def uart(self, frame: bytes, esc: int = 0) -> None:
         """Bytes from an ESC."""
-        self.gateway.receive_bytes(esc, frame, self.now)
+        self.gateway.receive_bytes(esc, frame, self.now, self.now)
         self._collect()
 
     def start(self, node: int = 0) -> "Bench":
@@ -203,7 +203,7 @@ class Bench:
 
     def ask(self, node: int, request: bytes) -> bytes:
         """One request and its one answer."""
-        self.gateway.receive_frame(CanFrame(0x600 + node, request), self.now)
+        self.gateway.receive_frame(CanFrame(0x600 + node, request), self.now, self.now)
         self._collect()
         return self._answer(node)
 

@@ -84,13 +84,13 @@ def happen(bench: Bench, what: tuple[Any, ...]) -> None:
     gateway, now = bench.gateway, bench.now
     match what:
         case "frame", frame:
-            gateway.receive_frame(frame, now)
+            gateway.receive_frame(frame, now, now)
         case "uart", esc, word:
-            gateway.receive_bytes(esc, live(operating_errors=word, electrical_speed=word), now)
+            gateway.receive_bytes(esc, live(operating_errors=word, electrical_speed=word), now, now)
         case "info", esc:
-            gateway.receive_bytes(esc, info(device_and_variant=1 << 10, cell_count=6), now)
+            gateway.receive_bytes(esc, info(device_and_variant=1 << 10, cell_count=6), now, now)
         case "bytes", esc, data:
-            gateway.receive_bytes(esc, data, now)
+            gateway.receive_bytes(esc, data, now, now)
         case "can", state:
             gateway.set_can_state(state, now)
         case "lost", esc:
@@ -207,7 +207,7 @@ def test_each_sdo_request_gets_exactly_one_right_answer_from_its_node(requests: 
         node_id, client = request.can_id - 0x600, request.data[0] >> 5
         server = bench.nodes[node_id - 1].sdo
         in_block[node_id] &= server.busy
-        bench.gateway.receive_frame(request, bench.now)
+        bench.gateway.receive_frame(request, bench.now, bench.now)
         bench.answer_saves()
         answers = [frame for frame in bench.take() if 0x581 <= frame.can_id <= 0x5FF]
         assert [(node.node_id, node.state) for node in bench.nodes] == before
@@ -231,7 +231,7 @@ def test_no_sdo_answer_comes_from_a_node_that_was_not_asked(story: list[CanFrame
     bench = Bench(NODES, changes=NO_HEARTBEAT)
     for frame in story:
         asked = {node.node_id for node in bench.nodes if frame.can_id == 0x600 + node.node_id}
-        bench.gateway.receive_frame(frame, bench.now)
+        bench.gateway.receive_frame(frame, bench.now, bench.now)
         bench._collect()
         for answer in bench.take():
             if 0x581 <= answer.can_id <= 0x5FF:
@@ -270,7 +270,7 @@ def test_the_state_changes_only_by_nmt_commands(story: list[CanFrame]) -> None:
     for frame in story:
         if frame.can_id in (0x601, 0x602) and frame.data[1:3] == b"\x01\x21":
             continue  # 2101h: another node-ID from the next reset on
-        bench.gateway.receive_frame(frame, bench.now)
+        bench.gateway.receive_frame(frame, bench.now, bench.now)
         bench._collect()
         heard = bench.take()
         for model, node in zip(models, bench.nodes, strict=True):
@@ -290,7 +290,7 @@ def test_heartbeats_tell_the_state_at_their_times(story: list[CanFrame | int]) -
         if isinstance(part, CanFrame):
             boot_ups = model.boot_ups
             model.take(part)
-            bench.gateway.receive_frame(part, bench.now)
+            bench.gateway.receive_frame(part, bench.now, bench.now)
             bench.gateway.take_frames()
             booted = bench.now if model.boot_ups > boot_ups else booted
             continue
@@ -310,7 +310,7 @@ def test_a_node_says_nothing_unless_asked_but_by_its_timers(story: list[CanFrame
     bench = Bench(NODES, changes=NO_HEARTBEAT)
     for frame in story:
         listened = bench.gateway.receive_ids
-        bench.gateway.receive_frame(frame, bench.now)
+        bench.gateway.receive_frame(frame, bench.now, bench.now)
         bench._collect()
         heard = bench.take()
         if frame.extended or frame.remote or frame.can_id not in listened:

@@ -114,9 +114,9 @@ def happen(source: random.Random, benches: Sequence[Bench], now: int) -> None:
     for bench in benches:
         gateway = bench.gateway
         if choice < 0.8:
-            gateway.receive_bytes(esc, data, now)
+            gateway.receive_bytes(esc, data, now, now)
         for frame in frames:
-            gateway.receive_frame(frame, now)
+            gateway.receive_frame(frame, now, now)
         if 0.88 <= choice < 0.885:
             gateway.port_lost(esc, now)
         elif 0.88 <= choice < 0.9:

@@ -46,7 +46,7 @@ def flight(
         for index, esc in enumerate(simulated):
             for sent in esc.frames_until(now):
                 if now < until * SECOND_NS:
-                    gateway.receive_bytes(index, sent.wire, now)
+                    gateway.receive_bytes(index, sent.wire, now, now)
         gateway.advance(now)
         frames += [(now, frame) for frame in gateway.take_frames()]
     return frames

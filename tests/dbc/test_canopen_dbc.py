@@ -93,7 +93,7 @@ class Bench:
         self.database = read(dbc_text(canopen_dbc.database(self.nodes, self.escs)))
 
     def operational(self, now: int) -> None:
-        self.gateway.receive_frame(CanFrame(0, b"\x01\x00"), now)
+        self.gateway.receive_frame(CanFrame(0, b"\x01\x00"), now, now)
         self.take()
 
     def run(self, until: int) -> None:
@@ -104,7 +104,7 @@ class Bench:
         )
         for when, esc, wire in events:
             self.until(when)
-            self.gateway.receive_bytes(esc, wire, when)
+            self.gateway.receive_bytes(esc, wire, when, when)
             self.take()
         self.until(until)
 
@@ -141,7 +141,7 @@ class Bench:
                 assert value == wanted, name
 
     def sdo(self, request: str, now: int, node_id: int = 1) -> str:
-        self.gateway.receive_frame(CanFrame(0x600 + node_id, bytes.fromhex(request)), now)
+        self.gateway.receive_frame(CanFrame(0x600 + node_id, bytes.fromhex(request)), now, now)
         for esc, stored in self.gateway.take_saves():
             self.stored = stored
             self.gateway.saved(esc, None, now)
@@ -500,7 +500,7 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
     bench.remap(2, 0x381, [0x22050020])
     bench.write(0x1803, 1, 0xC0000481, 4)
     bench.describe_anew()
-    bench.gateway.receive_frame(CanFrame(0, b"\x01\x00"), 3 * MS)
+    bench.gateway.receive_frame(CanFrame(0, b"\x01\x00"), 3 * MS, 3 * MS)
     decoded: dict[str, Any] = {}
     for sent in bench.gateway.take_frames():
         values: Any = bench.database.decode_message(sent.can_id, sent.data)

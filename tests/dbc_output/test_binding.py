@@ -55,9 +55,9 @@ def frames_of(layout: Layout, lives: Sequence[LiveData | None], info: InfoData |
     gateway = Gateway([EscSettings(name, 7) for name in names], layout, 0)
     for index, live in enumerate(lives):
         if info is not None:
-            gateway.receive_bytes(index, encode(info, WireLayout.V4), 50 * MS)
+            gateway.receive_bytes(index, encode(info, WireLayout.V4), 50 * MS, 50 * MS)
         if live is not None:
-            gateway.receive_bytes(index, encode(live, WireLayout.V4), 50 * MS)
+            gateway.receive_bytes(index, encode(live, WireLayout.V4), 50 * MS, 50 * MS)
     return [
         CanFrame(
             plan.can_id, compile_pack(plan)(gateway.escs, gateway.status, 50 * MS, 0, 0).to_bytes(plan.length, "little")
@@ -368,7 +368,9 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(at: int, data_i
     gateway = Gateway([EscSettings("esc1", 7, Fraction(1))], layout, 0)
     gateway.start(0)
     for n in range(40):
-        gateway.receive_bytes(0, encode(LIVE._replace(battery_voltage=n * 100), WireLayout.V4), (50 + n * 10) * MS)
+        gateway.receive_bytes(
+            0, encode(LIVE._replace(battery_voltage=n * 100), WireLayout.V4), (50 + n * 10) * MS, (50 + n * 10) * MS
+        )
     frames = gateway.take_frames()
     assert [get(frame.data, counter_at, 4, True) for frame in frames] == [n % 15 for n in range(41)]
     for frame in frames:
@@ -384,6 +386,6 @@ def test_with_a_crc_the_alive_counter_never_shows_15(length: int, modulus: int) 
     layout = layout_of([Msg("M", 1, 8, [Sig("Crc8", 0, 8), Sig("Alive", 8, length), Sig("BatteryVoltage", 16, 16)])])
     gateway = Gateway([EscSettings("esc1")], layout, 0)
     for n in range(40):
-        gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), (50 + n * 10) * MS)
+        gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), (50 + n * 10) * MS, (50 + n * 10) * MS)
     frames = gateway.take_frames()
     assert [get(frame.data, 8, length, True) for frame in frames] == [n % modulus for n in range(40)]

@@ -102,7 +102,7 @@ def refusals(database: Database, file: str, node: str) -> tuple[str, ...]:
 def check_frames(database: Database, layout: Layout, bound: dict[str, str]) -> None:
     """Each value is the nearest step to the truth, or outside the signal's range; a start value is what the file says."""
     gateway = Gateway([ESC], layout, 0)
-    gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), 50 * MS)
+    gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), 50 * MS, 50 * MS)
     for plan in layout.messages:
         # cantools' codec wants sorted signals, which our loading does not give it
         of = database.get_message_by_name(plan.name)
@@ -150,7 +150,7 @@ def test_a_diesel_of_vw_can_be_worked_with_by_the_keys_of_the_configuration() ->
     layout = prepare(database, "vw_mqb.dbc", [ESC], settings)[1]
     assert [plan.name for plan in layout.messages] == ["Motor_12", "Motor_14"]
     gateway = Gateway([ESC], layout, 0)
-    gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), 50 * MS)
+    gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), 50 * MS, 50 * MS)
     data = compile_pack(layout.messages[0])(gateway.escs, gateway.status, 50 * MS, 9, 0).to_bytes(8, "little")
     read = database.get_message_by_name("Motor_12").decode_simple(data, decode_choices=False)
     assert (read["MO_Drehzahl_01"], read["Motor_12_BZ"], read["MO_Mom_neg_verfuegbar"], read["Motor_12_CRC"]) == (

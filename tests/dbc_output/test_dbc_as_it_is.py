@@ -221,7 +221,7 @@ def test_only_what_is_chosen_has_to_be_right_and_many_unbound_signals_come_with_
 def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() -> None:
     layout = compiled(ECU, node="Gateway", messages=["Motor_2?"], unbound="start_value", bind={"Gear": 5})
     gateway = Gateway([EscSettings("esc1", 7)], layout, 0)
-    gateway.receive_bytes(0, encode(LiveData(battery_voltage=4442), WireLayout.V4), 50 * MS)
+    gateway.receive_bytes(0, encode(LiveData(battery_voltage=4442), WireLayout.V4), 50 * MS, 50 * MS)
     database = parse_database((HEAD + ECU).encode(), "my.dbc")
     read: dict[str, Any] = {}
     for plan in layout.messages:
@@ -389,7 +389,7 @@ def test_a_flag_without_a_code_is_0_without_telemetry_or_what_is_asked_for(
     pack, gateway = compile_pack(plan), Gateway([EscSettings("esc1", 7)], Layout("", "", ()), 0)
     assert pack(gateway.escs, gateway.status, 0, 0, 0) == raw
     for word in (0, 1):
-        gateway.receive_bytes(0, encode(LiveData(operating_errors=word), WireLayout.V4), 50 * MS)
+        gateway.receive_bytes(0, encode(LiveData(operating_errors=word), WireLayout.V4), 50 * MS, 50 * MS)
         value = (word - plan.signals[0].offset) / plan.signals[0].factor
         assert pack(gateway.escs, gateway.status, 50 * MS, 0, 0) == value % (1 << plan.signals[0].length)
 

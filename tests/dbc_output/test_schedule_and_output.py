@@ -80,11 +80,11 @@ class Bench:
         self.take()
 
     def live(self, data: LiveData = LIVE, esc: int = 0) -> None:
-        self.gateway.receive_bytes(esc, encode(data, WireLayout.V4), self.now)
+        self.gateway.receive_bytes(esc, encode(data, WireLayout.V4), self.now, self.now)
         self.take()
 
     def info(self, data: InfoData, esc: int = 0) -> None:
-        self.gateway.receive_bytes(esc, encode(data, WireLayout.V4), self.now)
+        self.gateway.receive_bytes(esc, encode(data, WireLayout.V4), self.now, self.now)
         self.take()
 
     def feed(self, until: int, period: int = 10 * MS, data: LiveData = LIVE) -> None:
@@ -225,7 +225,7 @@ def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too
     for _ in range(250):
         bench.until(bench.now + 10 * MS)
         if bench.now < SECOND:
-            bench.gateway.receive_bytes(0, b"noise " * 5, bench.now)
+            bench.gateway.receive_bytes(0, b"noise " * 5, bench.now, bench.now)
             bench.take()
         bench.live()
         lives += 1
@@ -371,7 +371,7 @@ def test_frames_that_only_half_arrive_never_bring_a_value() -> None:
     data = encode(volts(1234), WireLayout.V4)
     for n in range(50):
         bench.until(n * 20 * MS)
-        bench.gateway.receive_bytes(0, data[: 1 + n % 39], bench.now)
+        bench.gateway.receive_bytes(0, data[: 1 + n % 39], bench.now, bench.now)
         bench.take()
     assert set(bench.raws()) == {65535}
 
@@ -619,9 +619,9 @@ def test_in_a_long_random_run_every_frame_is_the_telemetry_of_that_instant(seed:
                 rng.choice((WireLayout.V4, WireLayout.V4, WireLayout.LEGACY)) if rng.random() < 0.02 else WireLayout.V4
             )
             if rng.random() < 0.05:
-                gateway.receive_bytes(esc, encode(random_info(rng), wire), now)
+                gateway.receive_bytes(esc, encode(random_info(rng), wire), now, now)
             elif rng.random() < 0.05:
-                gateway.receive_bytes(esc, rng.randbytes(rng.randrange(60)), now)
+                gateway.receive_bytes(esc, rng.randbytes(rng.randrange(60)), now, now)
             elif rng.random() < 0.005:
                 gateway.port_lost(esc, now)
                 judge.last_live.pop(esc, None)
@@ -630,7 +630,7 @@ def test_in_a_long_random_run_every_frame_is_the_telemetry_of_that_instant(seed:
                 data = random_live(rng)
                 before = gateway.escs[esc].live_ns
                 judge.last_live[esc], old = (now, data), judge.last_live.get(esc)
-                gateway.receive_bytes(esc, encode(data, wire), now)
+                gateway.receive_bytes(esc, encode(data, wire), now, now)
                 if gateway.escs[esc].live_ns == before:  # swallowed by rubbish before it: the old one counts
                     judge.last_live.pop(esc)
                     if old is not None:

@@ -95,10 +95,10 @@ def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(
         made.take_frames()
         command = {1: 0x2F, 4: 0x23}[size]
         data = bytes((command, index & 0xFF, index >> 8, sub)) + value.to_bytes(4, "little")
-        made.receive_frame(CanFrame(0x601, data), 0)
+        made.receive_frame(CanFrame(0x601, data), 0, 0)
         assert [f.data[0] for f in made.take_frames() if f.can_id == 0x581] == [0x60]
     live = bytes.fromhex("4B4F444C 00000000 8A09" + "0000" * 5 + "581F E903 00 00 1D 20 00000200 0C 00 39234C14")
-    made.receive_bytes(0, live, SECOND)
+    made.receive_bytes(0, live, SECOND, SECOND)
     made.take_frames()
     made.advance(2 * SECOND)
     sent = [frame.data for frame in made.take_frames() if frame.can_id == 0x1A1]

@@ -81,7 +81,7 @@ def test_on_loss_every_page_of_a_multiplexed_message_is_said_to_be_not_available
     gateway.start(0)
     for n in range(12):
         gateway.receive_bytes(
-            0, frame_of(LiveData(battery_voltage=5000 + n, motor_current=n, bec_voltage=n)), n * 10 * MS
+            0, frame_of(LiveData(battery_voltage=5000 + n, motor_current=n, bec_voltage=n)), n * 10 * MS, n * 10 * MS
         )
         until(gateway, n * 10 * MS, n * 10 * MS + 9 * MS)
     after = [frame for _, frame in until(gateway, 120 * MS, 2 * SECOND)]
@@ -94,7 +94,7 @@ def test_after_an_outage_of_the_bus_what_has_no_cycle_is_said_again(tmp_path: Pa
     message = 'BO_ 256 M: 8 Gw\n SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
     gateway = gateway_of(tmp_path, HEAD + message + TAIL)
     gateway.start(0)
-    gateway.receive_bytes(0, frame_of(LiveData(electrical_speed=30_000)), 10 * MS)
+    gateway.receive_bytes(0, frame_of(LiveData(electrical_speed=30_000)), 10 * MS, 10 * MS)
     until(gateway, 10 * MS, 20 * MS)
     until(gateway, 20 * MS, SECOND)  # lost meanwhile, and what was said of it did not reach the bus
     gateway.can_returned(SECOND)
@@ -119,7 +119,7 @@ BO_ 258 Self: 8 Gw
     for n in range(3000):
         now = n * 10 * MS
         bad = good[:20] + b"\x55" + good[21:]
-        gateway.receive_bytes(0, good if n % 10 else bad, now)
+        gateway.receive_bytes(0, good if n % 10 else bad, now, now)
         for _, frame in until(gateway, now, now + 9 * MS):
             seen[frame.can_id] = frame.data
     counters = gateway.escs[0].counters
@@ -138,7 +138,7 @@ def test_a_cycle_that_meets_the_minimum_distance_is_put_off_not_lost(tmp_path: P
     times = []
     for n in range(1000):
         now = n * 10 * MS
-        gateway.receive_bytes(0, frame_of(LiveData(electrical_speed=n // 35)), now)
+        gateway.receive_bytes(0, frame_of(LiveData(electrical_speed=n // 35)), now, now)
         times += [when for when, _ in until(gateway, now, now + 9_999_999)]
     gaps = [(b - a) / MS for a, b in pairwise(times)]
     assert min(gaps) >= 90
@@ -150,7 +150,7 @@ def test_a_fault_of_one_frame_is_not_passed_over_when_two_come_in_one_read(tmp_p
     gateway = gateway_of(tmp_path, HEAD + message + TAIL + 'BA_ "GenMsgSendType" BO_ 256 2;\n')
     gateway.start(0)
     gateway.take_frames()
-    gateway.receive_bytes(0, frame_of(LiveData(operating_errors=1)) + frame_of(LiveData()), 100 * MS)
+    gateway.receive_bytes(0, frame_of(LiveData(operating_errors=1)) + frame_of(LiveData()), 100 * MS, 100 * MS)
     assert [frame.data[0] for frame in gateway.take_frames()] == [1, 0]
 
 
@@ -284,7 +284,7 @@ def test_a_read_of_many_old_frames_is_no_flood_of_link_changes(tmp_path: Path) -
     gateway = gateway_of(tmp_path, HEAD + message + TAIL)
     gateway.start(0)
     gateway.take_frames()
-    gateway.receive_bytes(0, b"".join(frame_of(LiveData(electrical_speed=n)) for n in range(100)), SECOND)
+    gateway.receive_bytes(0, b"".join(frame_of(LiveData(electrical_speed=n)) for n in range(100)), SECOND, SECOND)
     assert gateway.take_link_changes() == [0]
     assert gateway.escs[0].losses == 0
     assert gateway.escs[0].late_frames > 20
@@ -297,7 +297,7 @@ def test_a_page_that_changes_often_does_not_starve_the_cycle_of_the_others(tmp_p
     gateway.start(0)
     pages = {0: 0, 1: 0, 2: 0}
     for n in range(1000):
-        gateway.receive_bytes(0, frame_of(LiveData(battery_voltage=n)), n * 10 * MS)
+        gateway.receive_bytes(0, frame_of(LiveData(battery_voltage=n)), n * 10 * MS, n * 10 * MS)
         for _, frame in until(gateway, n * 10 * MS, n * 10 * MS + 9 * MS):
             pages[frame.data[0]] += 1
     assert pages[0] >= 990
@@ -339,7 +339,7 @@ def test_a_link_change_without_live_data_is_told_by_event_messages_that_show_it(
 """
     gateway = gateway_of(tmp_path, HEAD + message + TAIL)
     gateway.start(0)
-    gateway.receive_bytes(0, frame_of(LiveData()), 10 * MS)
+    gateway.receive_bytes(0, frame_of(LiveData()), 10 * MS, 10 * MS)
     until(gateway, 10 * MS, SECOND)
     gateway.port_lost(0, SECOND)
     assert [frame.data[4] for frame in gateway.take_frames()] == [5]
@@ -359,7 +359,7 @@ def test_info_that_runs_out_is_said_on_every_page(tmp_path: Path) -> None:
         data = frame_of(LiveData())
         if n % 100 == 0 and n < 500:
             data += codec.encode(InfoData(min_battery_voltage=1, max_battery_voltage=2), codec.Layout.V4)
-        gateway.receive_bytes(0, data, now)
+        gateway.receive_bytes(0, data, now, now)
         for _, frame in until(gateway, now, now + 9 * MS):
             last[frame.data[0]] = frame.data[1:3]
     assert last == {0: b"\xff\xff", 1: b"\xff\xff"}
@@ -408,49 +408,6 @@ def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(tmp_path: Path) -> None
         assert not bus.closed
         assert len(bus.sent) > 500
         loop.close()
-
-
-class StoppedBus(StoppedBusBase):
-    """A CAN port in which the process is suspended for 20 s, once."""
-
-    def __init__(self, loop: Loop, esc: PtyEsc, clock: list[int]) -> None:
-        self.loop, self.esc, self.clock = loop, esc, clock
-        self.sent: list[CanFrame] = []
-        self.stopped = False
-
-    def send(self, frame: CanFrame) -> Sent:
-        self.sent.append(frame)
-        if not self.stopped and len(self.sent) == 5:
-            self.stopped = True
-            self.esc.write(frame_of(LiveData(electrical_speed=77_777)))  # waits in the port for 20 s
-            self.clock[0] += 20 * SECOND
-        elif len(self.sent) < 5:
-            self.esc.write(frame_of(LiveData(electrical_speed=1000 + len(self.sent))))
-        else:
-            self.loop.stop()
-        return Sent.OK
-
-
-def test_a_suspension_at_any_place_of_the_loop_makes_what_waits_old(tmp_path: Path) -> None:
-    message = 'BO_ 256 M: 8 Gw\n SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
-    clock = [0]
-
-    def now() -> int:
-        clock[0] += MS
-        return clock[0]
-
-    with PtyEsc() as esc:
-        gateway = gateway_of(tmp_path, HEAD + message + TAIL)
-        loop = Loop(gateway, [esc.path], CanConfig(interface="virtual", channel="suspended"), clock=now)
-        loop.open()
-        bus = StoppedBus(loop, esc, clock)
-        loop.can._close_port()
-        loop.can.port = bus  # type: ignore[assignment]
-        loop.run()
-    speeds = [int.from_bytes(frame.data[:4], "little") for frame in bus.sent]
-    assert bus.stopped
-    assert 77_777 not in speeds
-    assert speeds[-1] == 0xFFFFFFFF
 
 
 def test_closed_standard_streams_never_lend_their_number_to_a_port(tmp_path: Path) -> None:
@@ -509,7 +466,7 @@ def test_a_loss_during_an_outage_is_told_behind_it_though_nothing_else_is_sent(
         while clock[0] < 3 * SECOND:
             clock[0] += 10 * MS
             if clock[0] <= 200 * MS:
-                gateway.receive_bytes(0, frame_of(LiveData(electrical_speed=5000)), clock[0])
+                gateway.receive_bytes(0, frame_of(LiveData(electrical_speed=5000)), clock[0], clock[0])
             loop._reopen(clock[0])
             gateway.advance(clock[0])
             loop.can.transmit(clock[0])

@@ -54,7 +54,7 @@ def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(caplog: pyt
     try:
         with caplog.at_level(logging.INFO, "kontronik_can_gw"):
             gateway.start(0)
-            gateway.receive_bytes(0, live, MS)
+            gateway.receive_bytes(0, live, MS, MS)
             loop.can.transmit(MS)
             assert CanFrame(0x701, b"\0", queued=True) in port.sent
             port.stopped = True

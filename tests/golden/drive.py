@@ -74,6 +74,7 @@ class Drive:
         self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.canopen)
         self._waiting = Mailboxes()
         self._open = True
+        self._looked = 0
 
     @property
     def deadline(self) -> int:
@@ -81,18 +82,21 @@ class Drive:
         return self._gateway.next_deadline()
 
     def advance(self, now: int) -> None:
+        self._looked = now
         self._gateway.advance(now)
 
     def uart(self, esc: int, data: bytes, now: int) -> None:
-        """Bytes that are read from the port of an ESC (0 ...)."""
-        self._gateway.receive_bytes(esc, data, now)
+        """Bytes that are read from the port of an ESC (0 ...). They came just now, but where a deadline was missed."""
+        if self.deadline >= now:
+            self._looked = now
+        self._gateway.receive_bytes(esc, data, now, self._looked)
 
     def put(self, frame: Frame, now: int) -> None:
         """A frame from the bus. What no filter lets pass the gateway is never given."""
         can = CanFrame(frame.can_id, frame.data, frame.extended, frame.fd, remote=frame.remote)
         if can.key in self._gateway.receive_ids:
             self._gateway.status.received_frames += 1
-            self._gateway.receive_frame(can, now)
+            self._gateway.receive_frame(can, now, now)
 
     def happen(self, verb: str, words: Sequence[str], now: int) -> None:
         """Anything else: see README.md."""

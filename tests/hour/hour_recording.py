@@ -16,7 +16,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from kontronik_can_gw.capture import Kind, block, data_payload, json_payload, number_data
+from kontronik_can_gw.capture import Entry, Kind, block, data_payload, json_payload, number_data
 from kontronik_can_gw.capture_setup import CaptureSetup
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.cli.recording import setup_of
@@ -158,16 +158,16 @@ class _Writer:
     def __init__(self, file: IO[bytes], setup: CaptureSetup) -> None:
         self._file = file
         self._number = 0
-        self._entries: list[tuple[int, int, int, bytes, int]] = []
+        self._entries: list[Entry] = []
         self._begun = START
         header = setup.header() | {"run": "a1b2c3d4e5f60718", "part": 0, "created_ns": START}
         self._block(b"H", json_payload(header | {"monotonic_ns": START, "wall_ns": WALL, "devices": []}))
 
-    def put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int) -> None:
+    def put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None) -> None:
         if time_ns - self._begun >= _BLOCK_NS:
             self._begun = time_ns
             self.flush()
-        self._entries.append((time_ns, kind, esc, data, flags))
+        self._entries.append(Entry(time_ns, kind, esc, data, flags, came_ns))
 
     def flush(self) -> None:
         if self._entries:
@@ -255,7 +255,7 @@ def record(path: Path, seconds: float, escs: int = 1, seed: int = 1) -> Recordin
                 gateway.advance(at)
                 take(at)
             turns(read.time_ns)
-            gateway.receive_bytes(read.esc, read.data, read.time_ns)
+            gateway.receive_bytes(read.esc, read.data, read.time_ns, read.time_ns)
             gateway.advance(read.time_ns)
             take(read.time_ns)
         turns(end)

@@ -141,7 +141,7 @@ def gapped() -> Timed:
     for now in range(0, 8 * SECOND_NS, STEP_NS):
         for sent in esc.frames_until(now):
             if not 2 * SECOND_NS <= now < 5 * SECOND_NS:
-                gateway.receive_bytes(0, sent.wire, now)
+                gateway.receive_bytes(0, sent.wire, now, now)
         gateway.advance(now)
         frames += [(now, frame) for frame in gateway.take_frames()]
     return frames

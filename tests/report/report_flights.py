@@ -61,7 +61,7 @@ def simulated(
             for frame in gateway.take_frames():
                 view.take(frame.key, frame.data, deadline)
         for sent in escs[index].frames_until(now):
-            gateway.receive_bytes(index, alter(index, now, sent.wire), now)
+            gateway.receive_bytes(index, alter(index, now, sent.wire), now, now)
         gateway.advance(now)
         for frame in gateway.take_frames():
             view.take(frame.key, frame.data, now)
@@ -84,7 +84,7 @@ def write_capture(path: Path, seconds: float, options: Sequence[EscOptions]) -> 
         now = max(now + 1, min(gateway.next_deadline(), now + 10 * MS))
         for index, esc in enumerate(escs):
             if data := b"".join(sent.wire for sent in esc.frames_until(now)):
-                gateway.receive_bytes(index, data, now)
+                gateway.receive_bytes(index, data, now, now)
         gateway.advance(now)
         bench.take(now)
     gateway.stop(now)

@@ -37,7 +37,7 @@ NO_MESSAGES = Layout("x", "Gw", ())
 _numbers = itertools.count()
 
 
-def wait_for(condition: Callable[[], bool], what: str, seconds: float = 5) -> None:
+def wait_for(condition: Callable[[], bool], what: str, seconds: float = 120) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, f"{what}: not within {seconds} s"
@@ -54,6 +54,7 @@ class FakeSocket:
         self.inbox: list[bytes | int] = []
         self.sent: list[bytes] = []
         self.options: dict[int, bytes | int] = {}
+        self.ancillary: list[tuple[int, int, bytes]] = []
         self.drops = 0
         self.fault = 0
 
@@ -74,13 +75,18 @@ class FakeSocket:
     def send(self, data: bytes) -> None:
         self.sent.append(data)
 
-    def recv(self, _size: int) -> bytes:
+    def recvmsg(self, _size: int, _ancillary_size: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, None]:
         if not self.inbox:
             raise BlockingIOError
         data = self.inbox.pop(0)
         if isinstance(data, int):
             raise OSError(data, os.strerror(data))
-        return data
+        return data, self.ancillary, 0, None
+
+
+def frames_of(port: CanPort) -> list[CanFrame]:
+    """What comes, without its times."""
+    return [frame for frame, _ in port.receive()]
 
 
 @pytest.fixture
@@ -164,7 +170,7 @@ def test_only_data_frames_with_the_wanted_ids_are_handed_on(socket_port: tuple[C
         packet(ERROR | 0x40, bytes(8)),
         packet(0x000, bytes(2)),
     ]
-    assert port.receive() == [
+    assert frames_of(port) == [
         CanFrame(0x601, b"abc"),
         CanFrame(0x602, b"y", extended=True),
         CanFrame(0x601, b"CAN FD", fd=True),
@@ -215,10 +221,10 @@ def test_an_error_does_not_end_reception(socket_port: tuple[CanPort, FakeSocket]
     port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox = [packet(1, b"a"), number, packet(1, b"b")]
-    assert port.receive() == [CanFrame(1, b"a")]
+    assert frames_of(port) == [CanFrame(1, b"a")]
     assert port.state is (CanState.UNKNOWN if number == errno.EIO else CanState.DOWN)
     assert port.gone is (number == errno.ENODEV)
-    assert port.receive() == [CanFrame(1, b"b")]
+    assert frames_of(port) == [CanFrame(1, b"b")]
     assert port.send(CanFrame(2, b"")) is (Sent.GONE if number == errno.ENODEV else Sent.OK)
 
 
@@ -234,6 +240,55 @@ def test_a_remote_frame_is_sent_as_one(socket_port: tuple[CanPort, FakeSocket]) 
     port, fake = socket_port
     port.send(CanFrame(0x701, b"", remote=True))
     assert fake.sent == [packet(0x701 | REMOTE)]
+
+
+@pytest.mark.parametrize(
+    ("ancillary", "came"),
+    [
+        ([(socket.SOL_SOCKET, 64, struct.pack("=qq", 1_700_000_000, 250_000_000))], 41_750 * MS),
+        ([(socket.SOL_SOCKET, 35, struct.pack("=ii", 1_700_000_000, 250_000_000))], 41_750 * MS),
+        (
+            [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_SOCKET, 35, struct.pack("=qq", 1_700_000_000, 0))],
+            41_500 * MS,
+        ),
+        ([(socket.SOL_SOCKET, 64, bytes(3))], None),
+        ([(socket.IPPROTO_TCP, 64, bytes(16))], None),
+        ([], None),
+    ],
+)
+def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
+    socket_port: tuple[CanPort, FakeSocket],
+    monkeypatch: pytest.MonkeyPatch,
+    ancillary: list[tuple[int, int, bytes]],
+    came: int | None,
+) -> None:
+    clock = SimpleNamespace(time_ns=lambda: 1_700_000_000_500_000_000, monotonic_ns=lambda: 42 * SECOND)
+    monkeypatch.setattr(can_port, "time", clock)
+    port, fake = socket_port
+    port.set_receive_ids({1})
+    fake.inbox, fake.ancillary = [packet(1)], ancillary
+    assert fake.options[64] == 1, "the kernel is asked for them"
+    assert port.receive() == [(CanFrame(1, b""), came)]
+
+
+class DatagramSocket(socket.socket):
+    """As a CAN socket: the kernel counts what waits in it in the same way."""
+
+    def setsockopt(self, level: int, *rest: Any) -> None:
+        if level != socket.SOL_CAN_RAW:
+            super().setsockopt(level, *rest)
+
+
+def test_the_kernel_holds_six_frames_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What waits there cannot be overtaken by newer values."""
+    ours, others = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with others, DatagramSocket(fileno=ours.detach()) as mine:
+        monkeypatch.setattr(can_port, "_open", lambda _: SimpleNamespace(socket=mine))
+        port = CanPort(CanConfig())
+        answers = [port.send(CanFrame(n, bytes(8))) for n in range(30)]
+    taken = answers.index(Sent.FULL)
+    assert 1 <= taken <= 6
+    assert set(answers[taken:]) == {Sent.FULL}
 
 
 # --- python-can's own bus, read by a thread
@@ -256,7 +311,7 @@ def virtual() -> Iterator[tuple[CanPort, can.BusABC]]:
     assert readers() == [], "a thread was left"
 
 
-def readable(port: CanPort, seconds: float = 5) -> bool:
+def readable(port: CanPort, seconds: float = 120) -> bool:
     fd = port.fileno()
     assert fd is not None
     return bool(select.select([fd], [], [], seconds)[0])
@@ -267,7 +322,7 @@ def receive(port: CanPort, count: int) -> list[CanFrame]:
     frames: list[CanFrame] = []
     while len(frames) < count:
         assert readable(port), f"{len(frames)} of {count} frames"
-        frames += port.receive()
+        frames += frames_of(port)
     return frames
 
 
@@ -412,9 +467,7 @@ def test_closing_ends_a_thread_that_waits_and_gives_back_every_descriptor() -> N
     for _ in range(5):
         with virtual() as (port, _other):
             port.set_receive_ids({1})
-            begin = time.monotonic()
             port.close()
-            assert time.monotonic() - begin < 1
             assert readers() == []
     assert descriptors() == before
 
@@ -428,17 +481,17 @@ def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(monkeypatch:
 
         def holding(timeout: float | None) -> can.Message:
             waiting.set()
-            held.wait(10)
+            held.wait(600)
             return message(1, b"late")
 
         monkeypatch.setattr(port._bus, "recv", holding)
         port.set_receive_ids({1})
-        assert waiting.wait(5)
+        assert waiting.wait(120)
         port.close()
         others = [os.eventfd(0, os.EFD_NONBLOCK) for _ in range(8)]  # one has the number that the thread's had
         (left,) = readers()
         held.set()
-        left.join(5)
+        left.join(120)
         for fd in others:
             with pytest.raises(BlockingIOError):
                 os.eventfd_read(fd)
@@ -462,7 +515,7 @@ class Node(Gateway):
     def receive_ids(self) -> frozenset[int]:
         return self.ids
 
-    def receive_frame(self, frame: CanFrame, now: int) -> None:
+    def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
         self.received.append((now, frame))
         self.waiting.append(CanFrame(frame.can_id - 0x80, frame.data, queued=True))
 
@@ -490,7 +543,7 @@ def running(node: Node, channel: str) -> Iterator[Loop]:
             yield loop
         finally:
             loop.stop()
-            thread.join(5)
+            thread.join(120)
             assert not thread.is_alive()
     assert readers() == []
 
@@ -501,7 +554,7 @@ def test_the_loop_answers_requests_and_follows_ids_that_change() -> None:
         for n in range(20):
             other.send(message(0x601, bytes((n,))))
         for n in range(20):
-            answer = other.recv(5)
+            answer = other.recv(120)
             assert answer is not None
             assert (answer.arbitration_id, bytes(answer.data)) == (0x581, bytes((n,)))
         assert node.status.received_frames == 20
@@ -512,7 +565,7 @@ def test_the_loop_answers_requests_and_follows_ids_that_change() -> None:
         wait_for(lambda: port._ids == node.ids, "the new ids")
         other.send(message(0x601))
         other.send(message(0x602, b"x"))
-        answer = other.recv(5)
+        answer = other.recv(120)
         assert answer is not None
         assert (answer.arbitration_id, bytes(answer.data)) == (0x582, b"x")
         assert node.status.dropped_frames == 0
@@ -530,7 +583,7 @@ def test_the_loop_opens_an_adapter_anew_when_its_reader_failed(monkeypatch: pyte
         monkeypatch.setattr(first._bus, "recv", failing)
         wait_for(lambda: loop.can.port not in (None, first), "another port")
         other.send(message(0x601, b"x"))
-        answer = other.recv(5)
+        answer = other.recv(120)
         assert answer is not None
         assert (answer.arbitration_id, bytes(answer.data)) == (0x581, b"x")
         assert len(readers()) == 1
@@ -556,9 +609,9 @@ class ScriptedPort:
     def set_receive_ids(self, ids: object) -> None:
         pass
 
-    def receive(self) -> list[CanFrame]:
+    def receive(self) -> list[tuple[CanFrame, int | None]]:
         frames, self.inbox = self.inbox[:RECEIVE_LIMIT], self.inbox[RECEIVE_LIMIT:]
-        return frames
+        return [(frame, None) for frame in frames]
 
     def note_state(self, state: CanState) -> None:
         self.bus_off_count += state is CanState.BUS_OFF
@@ -662,16 +715,6 @@ def test_in_bus_off_nothing_is_handed_to_the_controller_and_the_newest_goes_firs
     loop.can.transmit(10 * MS)
     assert [frame.data for frame in port.sent] == [b"new"]
     assert (node.status.can_state, loop.can.complaint) == (CanState.ERROR_ACTIVE, "")
-
-
-def test_requests_from_before_a_suspension_are_thrown_away(scripted: tuple[Loop, Node, ScriptedPort]) -> None:
-    loop, node, port = scripted
-    port.inbox = [CanFrame(0x601, b"old")] * 200
-    loop.can.mailboxes.put(CanFrame(0x581, b"old", queued=True))
-    loop._discard_input(3 * SECOND, 4 * SECOND)
-    loop.can.serve(4 * SECOND)
-    assert (port.discarded, node.received) == (200, [])
-    assert node.status.dropped_frames == 1
 
 
 def test_a_port_that_was_closed_in_this_round_is_not_served(scripted: tuple[Loop, Node, ScriptedPort]) -> None:

@@ -98,6 +98,8 @@ class Kernel:
 class Selector(selectors.SelectSelector):
     """Takes any file, because nothing is waited for."""
 
+    before = 0
+
     def register(self, fileobj: object, events: int, data: object = None) -> selectors.SelectorKey:
         return selectors.SelectorKey(fileobj, 0, events, data)  # type: ignore[arg-type]
 
@@ -268,10 +270,10 @@ def test_old_news_of_a_link_that_was_down_does_not_close_what_was_opened_since(b
 def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(bench: Bench, kernel: Kernel) -> None:
     kernel.facts = ACTIVE
     bench.start()
-    bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now)
+    bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now, bench.now)
     assert bench.gateway.status.id_conflicts == 0
     bench.turn(300)
-    bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now)
+    bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now, bench.now)
     assert bench.gateway.status.id_conflicts == 1
 
 

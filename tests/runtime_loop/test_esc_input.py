@@ -3,7 +3,6 @@
 import fcntl
 import logging
 import os
-import selectors
 import termios
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from kontronik_can_gw.protocol.fields import LiveData
 from kontronik_can_gw.runtime import esc_input, serial_port
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
+from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.serial_port import Identity, PortLost, find_adapter, is_mini_uart
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 
@@ -40,6 +40,7 @@ class Port:
         self.waits_to_be_read = False
         self.looks = 0
         self.hold = True
+        self.drained = True
         self.pipe = PtyEsc()
 
     def fileno(self) -> int:
@@ -73,7 +74,7 @@ class Bench:
         escs = [EscSettings(name) for name in ("left", "right")[: len(paths)]]
         self.gateway = Gateway(escs, Layout("x", "Gw", ()), 0)
         self.conditions = Conditions()
-        self.selector = selectors.DefaultSelector()
+        self.selector = Poller(lambda: 0)
         self.lost: set[EscInput] = set()
         self.escs = [
             EscInput(n, path, self.gateway, self.selector, self.conditions, self.lost) for n, path in enumerate(paths)

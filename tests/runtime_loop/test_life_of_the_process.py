@@ -1,4 +1,4 @@
-"""The whole program under a stand-in of the service manager: ready, alive, reloaded, frozen, begun anew, ended."""
+"""The whole program under a stand-in of the service manager: ready, alive, reloaded, ended."""
 
 import json
 import os
@@ -18,23 +18,24 @@ from kontronik_can_gw.protocol.codec import Layout, encode
 from kontronik_can_gw.protocol.fields import LiveData
 
 LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), Layout.V4)
+LIMIT_S = 120
+"""For what comes; nothing is judged by how long it takes."""
 WATCHDOG_S = 1.0
+"""What the program is told; nobody enforces it here."""
 
 
 class Manager:
-    """What systemd does with a unit of Type=notify, WatchdogSec= and Restart=always, as far as it goes without systemd."""
+    """What systemd hears of a unit of Type=notify with WatchdogSec=."""
 
     def __init__(self, folder: Path, config: Path) -> None:
         self.config = config
         self.path = folder / "notify"
         self.messages: list[dict[str, str]] = []
-        self.restarts = 0
         self.lines: list[str] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(self.path))
         self._socket.settimeout(0.05)
         self._folder = folder
-        self._fed = time.monotonic()
         self._ending = False
         self.process = self._start()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -55,7 +56,6 @@ class Manager:
             env=environment,
         )
         threading.Thread(target=self._read, args=(process,), daemon=True).start()
-        self._fed = time.monotonic() + 20  # TimeoutStartSec: until it is ready
         return process
 
     def _read(self, process: subprocess.Popen[str]) -> None:
@@ -69,29 +69,26 @@ class Manager:
             try:
                 message = dict(line.split("=", 1) for line in self._socket.recv(4096).decode().splitlines())
                 self.messages.append(message)
-                if "WATCHDOG" in message or "READY" in message:
-                    self._fed = time.monotonic()
             except TimeoutError:
                 pass
-            if time.monotonic() - self._fed > WATCHDOG_S and self.process.poll() is None:
-                self.process.send_signal(signal.SIGABRT)  # which a stopped process does not take before SIGKILL
-                self.process.kill()
-                self.process.wait()
-                self.restarts += 1
-                self.process = self._start()
 
     def said(self, key: str) -> list[str]:
         return [message[key] for message in list(self.messages) if key in message]
 
-    def wait(self, condition: Callable[[], bool], what: str, seconds: float = 20) -> float:
-        begin = time.monotonic()
-        while not condition():
-            assert time.monotonic() - begin < seconds, f"{what}: not within {seconds} s\n" + "\n".join(self.lines)
-            time.sleep(0.01)
-        return time.monotonic() - begin
+    def heard_to_the_end(self, key: str) -> list[str]:
+        """What was said by a process that has ended."""
+        self._ending = True
+        self._thread.join()
+        return self.said(key)
 
-    def logged(self, text: str, seconds: float = 20) -> None:
-        self.wait(lambda: any(text in line for line in list(self.lines)), text, seconds)
+    def wait(self, condition: Callable[[], bool], what: str) -> None:
+        end = time.monotonic() + LIMIT_S
+        while not condition():
+            assert time.monotonic() < end and self.process.poll() is None, f"{what}: never\n" + "\n".join(self.lines)
+            time.sleep(0.01)
+
+    def logged(self, text: str) -> None:
+        self.wait(lambda: any(text in line for line in list(self.lines)), text)
 
     def close(self) -> None:
         self._ending = True
@@ -144,22 +141,9 @@ def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(manage
         stop.set()
         thread.join()
     manager.process.send_signal(signal.SIGTERM)
-    assert manager.process.wait(5) == 0
-    manager.wait(lambda: manager.said("STOPPING") == ["1"], "STOPPING")
-    assert manager.restarts == 0
+    assert manager.process.wait(LIMIT_S) == 0
+    assert manager.heard_to_the_end("STOPPING") == ["1"]
     assert not (manager.path.parent / "status.json").exists()
-
-
-def test_a_loop_that_is_frozen_is_begun_anew(manager: Manager) -> None:
-    """The manager's rule: no sign of life for WatchdogSec, so it is killed and started again."""
-    first = manager.process.pid
-    manager.process.send_signal(signal.SIGSTOP)
-    manager.wait(lambda: manager.restarts == 1, "the restart")
-    manager.wait(lambda: len(manager.said("READY")) == 2, "READY again")
-    assert manager.process.pid != first
-    signs = len(manager.said("WATCHDOG"))
-    manager.wait(lambda: len(manager.said("WATCHDOG")) > signs + 3, "signs of life")
-    assert manager.restarts == 1
 
 
 def test_a_hang_up_reads_the_configuration_again(manager: Manager, esc: PtyEsc) -> None:
@@ -187,7 +171,6 @@ def test_a_hang_up_reads_the_configuration_again(manager: Manager, esc: PtyEsc) 
     process.send_signal(signal.SIGHUP)
     manager.logged(f"esc1: {esc.path} is open")
     assert process.poll() is None
-    assert manager.restarts == 0
 
 
 def test_no_request_to_read_again_is_lost(manager: Manager, esc: PtyEsc) -> None:
@@ -195,7 +178,6 @@ def test_no_request_to_read_again_is_lost(manager: Manager, esc: PtyEsc) -> None
     for n in range(2, 8):
         manager.config.write_text(configuration(esc.path, "life").replace("pole_pairs = 7", f"pole_pairs = {n}"))
         manager.process.send_signal(signal.SIGHUP)
-        time.sleep(0.03 * n)
     manager.config.write_text(configuration(esc.path, "life").replace("[[esc]]", '[[esc]]\nname = "last"'))
     manager.process.send_signal(signal.SIGHUP)
     manager.logged(f"last: {esc.path} is open")
@@ -225,7 +207,7 @@ def test_a_second_gateway_on_the_same_port_is_refused_with_a_line(manager: Manag
         [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(manager.config)],
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=LIMIT_S,
         check=False,
     )
     assert done.returncode == 1
@@ -233,33 +215,20 @@ def test_a_second_gateway_on_the_same_port_is_refused_with_a_line(manager: Manag
     assert "is in use by another program" in line
 
 
-def test_a_gateway_that_was_killed_is_right_again_within_a_second(tmp_path: Path, esc: PtyEsc) -> None:
-    """From the start of the new process to its first value; the best of three, because others use this machine too."""
+def test_a_gateway_that_was_killed_leaves_nothing_in_the_way_of_the_next(tmp_path: Path, esc: PtyEsc) -> None:
+    """Neither port, nor node-ID, nor store."""
     config = tmp_path / "gateway.toml"
     more = f'[canopen]\nenabled = true\nstore = "{tmp_path}"'
     config.write_text(configuration(esc.path, f"killed-{os.getpid()}", more))
-    stop = threading.Event()
-
-    def talk() -> None:
-        while not stop.wait(0.01):
+    command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)]
+    for _ in range(2):
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stderr is not None
+            lines = iter(process.stderr)
+            assert any("is open" in line for line in lines)
             esc.write(LIVE)
-
-    thread = threading.Thread(target=talk)
-    thread.start()
-    took = []
-    try:
-        for _ in range(3):
-            begin = time.monotonic()
-            command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)]
-            with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-                assert process.stderr is not None
-                assert any("telemetry ok" in line for line in process.stderr)
-                took.append(time.monotonic() - begin)
-                process.kill()
-    finally:
-        stop.set()
-        thread.join()
-    assert min(took) < 1, took
+            assert any("telemetry ok" in line for line in lines)
+            process.kill()
 
 
 def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path: Path) -> None:
@@ -267,7 +236,7 @@ def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path:
     config.write_text("nonsense")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
         listening.bind(str(tmp_path / "notify"))
-        listening.settimeout(20)
+        listening.settimeout(LIMIT_S)
         process = subprocess.Popen(
             [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)],
             stderr=subprocess.PIPE,
@@ -277,6 +246,6 @@ def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path:
         assert said.startswith("STATUS=cannot start: ")
         assert process.poll() is None
         process.terminate()
-        _, errors = process.communicate(timeout=10)
+        _, errors = process.communicate(timeout=LIMIT_S)
     assert b"is not valid TOML" in errors
     assert b"Traceback" not in errors

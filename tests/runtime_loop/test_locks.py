@@ -3,7 +3,6 @@
 import errno
 import fcntl
 import os
-import selectors
 import socket
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from kontronik_can_gw.runtime.locks import (
     network_namespace,
     node_lock,
 )
+from kontronik_can_gw.runtime.poller import Poller
 
 CHANNEL = "can0"
 NODE = node_lock(CHANNEL, 5)
@@ -130,8 +130,7 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_op
     try:
         for _ in range(2):
             gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
-            selector = selectors.DefaultSelector()
-            sides.append(CanSide(loaded.config.can, gateway, selector, Conditions()))
+            sides.append(CanSide(loaded.config.can, gateway, Poller(), Conditions()))
         sides[0].open(0, wait=True)
         with pytest.raises(RunError, match=f"messages from 680h|CANopen node 42 on {CHANNEL}"):
             sides[1].open(0, wait=True)

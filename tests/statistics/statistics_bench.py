@@ -50,7 +50,7 @@ class Bench:
             for number, simulated in enumerate(self.simulated):
                 for frame in simulated.frames_until(self.now):
                     if number not in self.silent:
-                        self.gateway.receive_bytes(number, frame.wire, self.now)
+                        self.gateway.receive_bytes(number, frame.wire, self.now, self.now)
                         self.sent[number].append(frame.data)
             self.gateway.advance(self.now)
 

@@ -20,15 +20,15 @@ FLIGHT = [
 
 def read(telemetry: EscTelemetry, data: bytes, now: int) -> bool:
     """As the gateway gives what it has read; True if it was taken as one live frame."""
-    if telemetry.receive_live(data, now):
+    if telemetry.receive_live(data, now, now):
         return True
-    telemetry.receive(data, now)
+    telemetry.receive(data, now, now)
     return False
 
 
 def started() -> tuple[EscTelemetry, int]:
     telemetry = EscTelemetry(EscSettings(), 0)
-    telemetry.receive(encode(LiveData(), Layout.V4), SECOND)
+    telemetry.receive(encode(LiveData(), Layout.V4), SECOND, SECOND)
     return telemetry, SECOND
 
 
@@ -100,7 +100,7 @@ FRAME = encode(FLIGHT[0], Layout.V4)
 def test_of_anything_else_nothing_has_happened(data: bytes) -> None:
     telemetry, now = started()
     before = telemetry.counters.copy()
-    assert not telemetry.receive_live(data, now + STEP)
+    assert not telemetry.receive_live(data, now + STEP, now + STEP)
     assert (telemetry.counters, telemetry.live, telemetry.live_ns) == (before, LiveData(), now)
 
 
@@ -111,9 +111,9 @@ def test_where_two_layouts_match_it_is_the_shorter() -> None:
 
 
 def test_not_while_bytes_are_pending_or_there_is_no_live_frame_yet() -> None:
-    assert not EscTelemetry(EscSettings(), 0).receive_live(FRAME, SECOND)
+    assert not EscTelemetry(EscSettings(), 0).receive_live(FRAME, SECOND, SECOND)
     telemetry, now = started()
-    telemetry.receive(b"KOD", now)
+    telemetry.receive(b"KOD", now, now)
     assert not read(telemetry, FRAME, now + STEP)
     assert telemetry.counters.live == 2
     assert telemetry.live == FLIGHT[0]

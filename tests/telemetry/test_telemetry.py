@@ -45,10 +45,15 @@ def esc(**known: int) -> EscTelemetry:
     return EscTelemetry(EscSettings(timeout_ns=known.pop("timeout_ns", TIMEOUT), **known), 0)  # type: ignore[arg-type]
 
 
+def read(telemetry: EscTelemetry, data: bytes, now: int) -> int:
+    """Bytes that came just now, as far as one knows: the port was empty a moment ago."""
+    return telemetry.receive(data, now, now)
+
+
 def alive(now: int = SECOND) -> EscTelemetry:
     """An ESC whose first live frame was read at ``now``."""
     telemetry = esc()
-    telemetry.receive(live(), now)
+    read(telemetry, live(), now)
     assert link_of(telemetry) is LinkState.OK
     return telemetry
 
@@ -69,7 +74,7 @@ def stream(
     while now < begin + seconds * SECOND:
         while telemetry.next_deadline() <= now:
             telemetry.advance(max(telemetry.next_deadline(), 0))
-        telemetry.receive(extra + (frame or live()), now)
+        read(telemetry, extra + (frame or live()), now)
         now += period
     return now - period
 
@@ -94,9 +99,9 @@ def test_before_the_first_byte_nothing_was_ever_seen_and_nothing_is_available() 
 
 def test_bytes_without_a_frame_are_a_search() -> None:
     telemetry = esc()
-    assert telemetry.receive(NOISE, 1) & Event.LINK
+    assert read(telemetry, NOISE, 1) & Event.LINK
     assert link_of(telemetry) is LinkState.SEARCHING
-    assert not telemetry.receive(NOISE, 2) & Event.LINK
+    assert not read(telemetry, NOISE, 2) & Event.LINK
 
 
 @pytest.mark.parametrize("before", [b"", NOISE])
@@ -104,8 +109,8 @@ def test_bytes_without_a_frame_are_a_search() -> None:
 def test_the_first_live_frame_makes_the_link_ok(before: bytes, layout: Layout) -> None:
     telemetry = esc()
     if before:
-        telemetry.receive(before, 1)
-    events = telemetry.receive(live(7, layout), 2 * MS)
+        read(telemetry, before, 1)
+    events = read(telemetry, live(7, layout), 2 * MS)
     assert link_of(telemetry) is LinkState.OK
     assert events & Event.LINK
     assert events & Event.LIVE
@@ -116,7 +121,7 @@ def test_the_first_live_frame_makes_the_link_ok(before: bytes, layout: Layout) -
 
 def test_info_frames_alone_do_not_make_the_link_ok() -> None:
     telemetry = esc()
-    assert telemetry.receive(info(), MS) & Event.INFO
+    assert read(telemetry, info(), MS) & Event.INFO
     assert link_of(telemetry) is LinkState.SEARCHING
     assert telemetry.info is not None
 
@@ -124,7 +129,7 @@ def test_info_frames_alone_do_not_make_the_link_ok() -> None:
 def test_five_crc_errors_in_a_second_degrade_the_link_and_a_clean_second_mends_it() -> None:
     telemetry = alive(SECOND)
     for n in range(5):
-        telemetry.receive(BROKEN + live(), SECOND + (n + 1) * 10 * MS)
+        read(telemetry, BROKEN + live(), SECOND + (n + 1) * 10 * MS)
     now = stream(telemetry, SECOND + 60 * MS, 1)
     assert link_of(telemetry) is LinkState.DEGRADED
     assert telemetry.live is not None
@@ -137,7 +142,7 @@ def test_four_crc_errors_in_a_second_do_not_degrade_the_link() -> None:
     now = SECOND
     for n in range(4):
         now = SECOND + (n + 1) * 10 * MS
-        telemetry.receive(BROKEN + live(), now)
+        read(telemetry, BROKEN + live(), now)
     for _ in range(15):
         now = stream(telemetry, now + 10 * MS, 0.1)
         assert link_of(telemetry) is LinkState.OK
@@ -156,10 +161,10 @@ def test_a_silent_line_is_lost_and_a_frame_brings_it_back() -> None:
     assert events & Event.LINK
     assert events & Event.LIVE
     assert (telemetry.link, telemetry.losses, telemetry.frame_rate) == (LinkState.LOST, 1, 0)
-    telemetry.receive(NOISE, 2 * SECOND)
-    telemetry.receive(info(), 2 * SECOND + 5 * MS)
+    read(telemetry, NOISE, 2 * SECOND)
+    read(telemetry, info(), 2 * SECOND + 5 * MS)
     assert link_of(telemetry) is LinkState.LOST
-    assert telemetry.receive(live(), 3 * SECOND) & Event.LINK
+    assert read(telemetry, live(), 3 * SECOND) & Event.LINK
     assert (telemetry.link, telemetry.losses) == (LinkState.OK, 1)
 
 
@@ -173,7 +178,7 @@ def test_a_degraded_link_can_be_lost() -> None:
 
 def test_a_loss_that_is_seen_by_the_next_frame_counts_too() -> None:
     telemetry = alive(SECOND)
-    events = telemetry.receive(live(5), SECOND + TIMEOUT + 1)
+    events = read(telemetry, live(5), SECOND + TIMEOUT + 1)
     assert telemetry.losses == 1
     assert events & Event.LINK
     assert link_of(telemetry) is LinkState.OK
@@ -183,7 +188,7 @@ def test_a_loss_that_is_seen_by_the_next_frame_counts_too() -> None:
 def test_a_lost_port_is_an_error_until_it_is_open_again(seen: bool) -> None:
     telemetry = esc()
     if seen:
-        telemetry.receive(info() + live(), SECOND)
+        read(telemetry, info() + live(), SECOND)
     events = telemetry.port_lost()
     assert events & Event.LINK
     assert bool(events & Event.LIVE) is seen
@@ -193,9 +198,9 @@ def test_a_lost_port_is_an_error_until_it_is_open_again(seen: bool) -> None:
     assert telemetry.port_lost() == Event.NONE
     assert telemetry.port_opened() == Event.LINK
     assert link_of(telemetry) is (LinkState.LOST if seen else LinkState.NEVER_SEEN)
-    telemetry.receive(NOISE, 4 * SECOND)
+    read(telemetry, NOISE, 4 * SECOND)
     assert link_of(telemetry) is (LinkState.LOST if seen else LinkState.SEARCHING)
-    telemetry.receive(live(), 5 * SECOND)
+    read(telemetry, live(), 5 * SECOND)
     assert link_of(telemetry) is LinkState.OK
 
 
@@ -208,10 +213,10 @@ def test_opening_a_port_that_was_never_lost_changes_nothing() -> None:
 def test_a_frame_is_not_put_together_from_before_and_after_a_lost_port() -> None:
     telemetry = esc()
     frame = live()
-    telemetry.receive(frame[:30], SECOND)
+    read(telemetry, frame[:30], SECOND)
     telemetry.port_lost()
     telemetry.port_opened()
-    telemetry.receive(frame[30:], SECOND + MS)
+    read(telemetry, frame[30:], SECOND + MS)
     assert telemetry.live is None
 
 
@@ -221,7 +226,7 @@ def test_a_frame_is_not_put_together_from_before_and_after_a_lost_port() -> None
 @pytest.mark.parametrize("timeout", [20 * MS, TIMEOUT, 60 * SECOND])
 def test_live_data_lasts_for_the_time_out_and_not_a_nanosecond_longer(timeout: int) -> None:
     telemetry = esc(timeout_ns=timeout)
-    telemetry.receive(live(), SECOND)
+    read(telemetry, live(), SECOND)
     telemetry.advance(SECOND + timeout)
     assert telemetry.live is not None
     assert telemetry.up
@@ -242,10 +247,10 @@ def test_the_age_is_told_in_milliseconds_also_after_the_loss() -> None:
 def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(gap: int, taken: bool) -> None:
     telemetry = esc()
     frame = live()
-    telemetry.receive(NOISE + frame[:1], SECOND)
-    telemetry.receive(frame[1:], SECOND + gap)
+    read(telemetry, NOISE + frame[:1], SECOND)
+    read(telemetry, frame[1:], SECOND + gap)
     assert (telemetry.live is not None) is taken
-    telemetry.receive(live(3), SECOND + gap + 10 * MS)
+    read(telemetry, live(3), SECOND + gap + 10 * MS)
     assert telemetry.live is not None
     assert telemetry.live.electrical_speed == 3
 
@@ -253,34 +258,34 @@ def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(gap: in
 def test_a_stuttering_frame_is_given_up_by_the_age_of_its_first_byte_not_of_its_last_chunk() -> None:
     telemetry = esc()
     for n, byte in enumerate(live()):
-        telemetry.receive(bytes((byte,)), SECOND + n * 10 * MS)  # 390 ms for a frame
+        read(telemetry, bytes((byte,)), SECOND + n * 10 * MS)  # 390 ms for a frame
     assert telemetry.live is None
     telemetry = esc()
     for n, byte in enumerate(live()):
-        telemetry.receive(bytes((byte,)), SECOND + n * 6 * MS)  # 234 ms
+        read(telemetry, bytes((byte,)), SECOND + n * 6 * MS)  # 234 ms
     assert telemetry.live is not None
     assert telemetry.live_ns == SECOND + 39 * 6 * MS
 
 
 def test_a_whole_frame_behind_an_old_undecided_header_does_not_become_a_new_value() -> None:
     telemetry = esc(timeout_ns=100 * MS)
-    telemetry.receive(b"KODL" + live(5)[:39], SECOND)
-    telemetry.receive(live(5)[39:], SECOND + 101 * MS)
+    read(telemetry, b"KODL" + live(5)[:39], SECOND)
+    read(telemetry, live(5)[39:], SECOND + 101 * MS)
     assert telemetry.live is None
 
 
 def test_frames_found_when_old_bytes_are_given_up_are_counted_as_late_and_not_shown() -> None:
     telemetry = esc(timeout_ns=100 * MS)
     hidden = b"KODI" + live(5, Layout.LEGACY)  # whole, but the header in front could still be a frame of 44 bytes
-    telemetry.receive(hidden, SECOND)
+    read(telemetry, hidden, SECOND)
     assert telemetry.live is None
-    telemetry.receive(b"", SECOND + 100 * MS + 1)
+    read(telemetry, b"", SECOND + 100 * MS + 1)
     assert (telemetry.live, telemetry.late_frames) == (None, 1)
 
 
 def test_bytes_that_were_bundled_in_one_read_get_the_times_they_had_on_the_wire() -> None:
     telemetry = esc()
-    telemetry.receive(live(1) + live(2) + live(3) + NOISE, SECOND)
+    read(telemetry, live(1) + live(2) + live(3) + NOISE, SECOND)
     assert telemetry.live is not None
     assert telemetry.live.electrical_speed == 3
     assert telemetry.live_ns == SECOND - 20 * NS_PER_BYTE
@@ -290,20 +295,77 @@ def test_bytes_that_were_bundled_in_one_read_get_the_times_they_had_on_the_wire(
 
 def test_a_frame_whose_last_byte_is_older_than_the_time_out_when_it_is_read_is_not_shown() -> None:
     telemetry = esc(timeout_ns=100 * MS)
-    telemetry.receive(live() + b"\x55" * 4000, 10 * SECOND)  # 4000 bytes take 382 ms
+    read(telemetry, live() + b"\x55" * 4000, 10 * SECOND)  # 4000 bytes take 382 ms
     assert telemetry.live is None
     assert link_of(telemetry) is not LinkState.OK
 
 
 def test_times_never_run_backwards_when_reads_are_closer_than_the_wire_allows() -> None:
     telemetry = alive(SECOND)
-    telemetry.receive(live(), SECOND + 10 * MS)
+    read(telemetry, live(), SECOND + 10 * MS)
     before = telemetry.energy, telemetry.run_time
-    telemetry.receive(live() + b"\x55" * 300, SECOND + 11 * MS)
+    read(telemetry, live() + b"\x55" * 300, SECOND + 11 * MS)
     assert telemetry.energy >= before[0]
     assert telemetry.run_time >= before[1]
     assert telemetry.live_ns is not None
     assert telemetry.live_ns >= SECOND + 10 * MS
+
+
+# --- arrival: what is known of when bytes came
+
+WIRE = 39 * NS_PER_BYTE
+"""From the first byte of a live frame to its last."""
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["interval not known yet", "100 Hz"])
+@pytest.mark.parametrize("noise", [0, 1], ids=["a frame alone", "with another byte"])
+@pytest.mark.parametrize(
+    ("waited", "bound", "shown"),
+    # before the read nothing had come; the frame's end came at the earliest; its age as shown where the interval is known
+    [
+        (0, 0, 0),
+        (2 * MS, 0, 0),
+        (WIRE, 0, 0),
+        (10 * MS + WIRE, 10 * MS, 0),
+        (10 * MS + WIRE + 1, 10 * MS + 1, 10 * MS + 1),
+        (TIMEOUT + WIRE, TIMEOUT, TIMEOUT),
+        (TIMEOUT + WIRE + 1, None, None),
+    ],
+)
+def test_time_outs_count_from_when_bytes_can_have_come_and_ages_do_beyond_an_interval(
+    known: bool, noise: int, waited: int, bound: int | None, shown: int | None
+) -> None:
+    telemetry = esc()
+    now = TIMEOUT + (stream(telemetry, SECOND, 2.5) if known else SECOND)
+    data, since = bytes(noise) + live(5), now - waited - noise * NS_PER_BYTE
+    if not telemetry.receive_live(data, now, since):
+        telemetry.receive(data, now, since)
+    if bound is None or shown is None:
+        assert telemetry.live is None or telemetry.live.electrical_speed != 5
+        assert telemetry.late_frames == 1
+        return
+    assert telemetry.live is not None
+    assert (telemetry.live.electrical_speed, now - telemetry.live_bound_ns) == (5, bound)
+    assert telemetry.live_ns == now - (shown if known else bound)
+    telemetry.advance(now - bound + TIMEOUT)
+    assert telemetry.live is not None
+    telemetry.advance(now - bound + TIMEOUT + 1)
+    assert telemetry.live is None
+
+
+def test_an_info_frame_is_late_by_its_own_time_out() -> None:
+    telemetry = alive()
+    now = 30 * SECOND
+    telemetry.receive(info(), now, now - INFO_TIMEOUT_NS)
+    assert telemetry.info is not None
+    assert (
+        telemetry.last_info_ns
+        == telemetry.info_bound_ns
+        == now - INFO_TIMEOUT_NS + WIRE + (len(info()) - 40) * NS_PER_BYTE
+    )
+    telemetry.receive(info(), 2 * now, 2 * now - INFO_TIMEOUT_NS - SECOND)
+    assert info_of(telemetry) is None
+    assert telemetry.late_frames == 1
 
 
 # --- derived values
@@ -321,7 +383,7 @@ def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight()
         watt_seconds += max(0.0, before.data.battery_voltage / 100 * before.data.battery_current / 10) * seconds
         run_seconds += seconds if before.data.electrical_speed else 0
     for each in sent:
-        telemetry.receive(each.wire, SECOND + each.time_ns)
+        read(telemetry, each.wire, SECOND + each.time_ns)
     known = sources(EscSettings())
     assert value(known["energy_used"], telemetry) == pytest.approx(watt_seconds / 3600, rel=1e-9)
     assert value(known["motor_run_time"], telemetry) == pytest.approx(run_seconds, rel=1e-9)
@@ -331,14 +393,14 @@ def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight()
 
 def test_energy_is_not_counted_over_a_gap_and_is_kept_over_a_loss() -> None:
     telemetry = alive(SECOND)
-    telemetry.receive(live(), SECOND + 100 * MS)
+    read(telemetry, live(), SECOND + 100 * MS)
     kept = telemetry.energy
     assert kept == 100 * MS * 2400 * 100
-    telemetry.receive(live(), 20 * SECOND)
+    read(telemetry, live(), 20 * SECOND)
     assert (telemetry.energy, telemetry.run_time) == (kept, 100 * MS)
     telemetry.port_lost()
     telemetry.port_opened()
-    telemetry.receive(live(), 20 * SECOND + 10 * MS)
+    read(telemetry, live(), 20 * SECOND + 10 * MS)
     assert (telemetry.energy, telemetry.run_time) == (kept, 100 * MS)
 
 
@@ -346,7 +408,7 @@ def test_one_watt_hour_is_one_watt_for_an_hour() -> None:
     telemetry = esc(timeout_ns=60 * SECOND)
     one_watt = encode(LiveData(battery_voltage=1000, battery_current=1), Layout.V4)
     for minute in range(61):
-        telemetry.receive(one_watt, minute * 60 * SECOND)
+        read(telemetry, one_watt, minute * 60 * SECOND)
     assert telemetry.energy == MW_NS_PER_WH
     assert telemetry.run_time == 0
 
@@ -354,9 +416,9 @@ def test_one_watt_hour_is_one_watt_for_an_hour() -> None:
 def test_power_is_negative_in_regeneration_and_gives_no_energy() -> None:
     telemetry = esc()
     braking = encode(LIVE._replace(battery_current=-50), Layout.V4)
-    telemetry.receive(braking, SECOND)
+    read(telemetry, braking, SECOND)
     assert value(sources(EscSettings())["battery_power"], telemetry) == 24.0 * -5.0
-    telemetry.receive(braking, SECOND + 10 * MS)
+    read(telemetry, braking, SECOND + 10 * MS)
     assert telemetry.energy == 0
     assert telemetry.run_time == 10 * MS
 
@@ -367,9 +429,9 @@ def test_the_mean_cell_voltage_is_that_of_the_configured_cells_else_of_the_cells
 ) -> None:
     telemetry = esc(cell_count=override)
     source = sources(telemetry.settings)["mean_cell_voltage"]
-    telemetry.receive(live(), SECOND)
+    read(telemetry, live(), SECOND)
     assert telemetry.cells == override
-    telemetry.receive(info(cells=told), SECOND + 10 * MS)
+    read(telemetry, info(cells=told), SECOND + 10 * MS)
     assert telemetry.cells == cells
     assert source.supplied == "esc.cells"
     if cells:
@@ -394,7 +456,7 @@ def test_the_frame_rate_is_known_after_a_second_in_tenths_of_hertz(rate: int) ->
 def test_the_frame_rate_is_right_when_time_was_let_pass_too_late() -> None:
     telemetry = alive(SECOND)
     for n in range(1, 151):
-        telemetry.receive(live(), SECOND + n * 10 * MS)
+        read(telemetry, live(), SECOND + n * 10 * MS)
     telemetry.advance(SECOND + 1500 * MS)
     assert telemetry.frame_rate == 1000
 
@@ -420,7 +482,7 @@ def test_bec_current_is_supplied_by_all_but_a_jivepro_and_at_0_only_by_a_known_d
 ) -> None:
     telemetry = alive()
     if device is not None:
-        telemetry.receive(info(device), SECOND + 10 * MS)
+        read(telemetry, info(device), SECOND + 10 * MS)
     assert telemetry.bec_current_supplied(raw) is supplied
 
 
@@ -428,9 +490,9 @@ def test_bec_current_is_supplied_by_all_but_a_jivepro_and_at_0_only_by_a_known_d
 @pytest.mark.parametrize("kind", ["live", "info"])
 def test_another_layout_is_another_device_of_which_nothing_is_known(old: Layout, new: Layout, kind: str) -> None:
     telemetry = esc()
-    telemetry.receive(live(1, old) + info(Device.KOSMIK, old), SECOND)
+    read(telemetry, live(1, old) + info(Device.KOSMIK, old), SECOND)
     assert telemetry.info is not None
-    events = telemetry.receive(live(2, new) if kind == "live" else info(Device.JIVEPRO, new, 3), SECOND + 10 * MS)
+    events = read(telemetry, live(2, new) if kind == "live" else info(Device.JIVEPRO, new, 3), SECOND + 10 * MS)
     assert events & Event.LINK
     assert events & Event.INFO
     assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[new]
@@ -446,17 +508,17 @@ def test_another_layout_is_another_device_of_which_nothing_is_known(old: Layout,
 
 def test_another_device_in_the_same_layout_is_told_as_a_change_and_the_same_device_is_not() -> None:
     telemetry = alive()
-    telemetry.receive(info(Device.KOSMIK), SECOND + 10 * MS)
-    assert telemetry.receive(info(Device.KOSMIK, cells=7), SECOND + 20 * MS) == Event.INFO
-    assert telemetry.receive(info(Device.KOLIBRI, cells=12), SECOND + 30 * MS) == Event.INFO | Event.LINK
-    assert telemetry.receive(info(Device.KOLIBRI, variant=80), SECOND + 40 * MS) == Event.INFO | Event.LINK
+    read(telemetry, info(Device.KOSMIK), SECOND + 10 * MS)
+    assert read(telemetry, info(Device.KOSMIK, cells=7), SECOND + 20 * MS) == Event.INFO
+    assert read(telemetry, info(Device.KOLIBRI, cells=12), SECOND + 30 * MS) == Event.INFO | Event.LINK
+    assert read(telemetry, info(Device.KOLIBRI, variant=80), SECOND + 40 * MS) == Event.INFO | Event.LINK
     assert telemetry.info is not None
     assert (telemetry.info.device, telemetry.info.variant, telemetry.cells) == (Device.KOLIBRI, 80, 6)
 
 
 def test_info_is_forgotten_with_the_loss_of_telemetry() -> None:
     telemetry = alive()
-    telemetry.receive(info(), SECOND + 10 * MS)
+    read(telemetry, info(), SECOND + 10 * MS)
     events = telemetry.advance(SECOND + TIMEOUT + 1)
     assert events == Event.LIVE | Event.INFO | Event.LINK
     assert (telemetry.info, telemetry.cells) == (None, 0)
@@ -464,9 +526,9 @@ def test_info_is_forgotten_with_the_loss_of_telemetry() -> None:
 
 def test_info_without_news_is_forgotten_after_its_time_out_and_not_before() -> None:
     telemetry = alive()
-    telemetry.receive(info(), SECOND)
+    read(telemetry, info(), SECOND)
     for n in range(1, 101):
-        telemetry.receive(live(), SECOND + n * INFO_TIMEOUT_NS // 100)
+        read(telemetry, live(), SECOND + n * INFO_TIMEOUT_NS // 100)
     assert telemetry.info is not None
     assert telemetry.advance(SECOND + INFO_TIMEOUT_NS + 1) & Event.INFO
     assert info_of(telemetry) is None
@@ -475,7 +537,7 @@ def test_info_without_news_is_forgotten_after_its_time_out_and_not_before() -> N
 
 def test_the_deadline_says_when_info_is_to_be_forgotten() -> None:
     telemetry = esc()
-    telemetry.receive(info(), SECOND + 300 * MS)
+    read(telemetry, info(), SECOND + 300 * MS)
     for _ in range(100):
         if telemetry.next_deadline() > SECOND + 300 * MS + INFO_TIMEOUT_NS + 1:
             break
@@ -488,8 +550,8 @@ def test_the_deadline_says_when_info_is_to_be_forgotten() -> None:
 
 def test_the_counters_are_those_of_the_whole_stream() -> None:
     telemetry = esc()
-    telemetry.receive(NOISE + live() + BROKEN + live(layout=Layout.LEGACY) + info(), SECOND)
-    telemetry.receive(encode(LIVE._replace(operating_state=27), Layout.LEGACY), SECOND + 10 * MS)
+    read(telemetry, NOISE + live() + BROKEN + live(layout=Layout.LEGACY) + info(), SECOND)
+    read(telemetry, encode(LIVE._replace(operating_state=27), Layout.LEGACY), SECOND + 10 * MS)
     telemetry.advance(50 * SECOND)
     counters = telemetry.counters
     assert (counters.live_v4, counters.live_legacy, counters.info_v4) == (1, 2, 1)
@@ -500,7 +562,7 @@ def test_the_counters_are_those_of_the_whole_stream() -> None:
 
 def test_a_state_that_cannot_be_is_suspect_only_where_the_crc_does_not_cover_it() -> None:
     telemetry = esc()
-    telemetry.receive(encode(LIVE._replace(operating_state=27), Layout.V4), SECOND)
+    read(telemetry, encode(LIVE._replace(operating_state=27), Layout.V4), SECOND)
     assert telemetry.suspect_frames == 0
 
 
@@ -518,7 +580,7 @@ def test_there_is_no_diagnosis_while_telemetry_comes_and_one_when_not() -> None:
 def test_the_diagnosis_does_not_depend_on_how_long_ago_the_second_began() -> None:
     telemetry = esc()
     for n in range(1, 61):
-        telemetry.receive(bytes((0x55, 0xAA)) * 10, n * 50 * MS - MS)
+        read(telemetry, bytes((0x55, 0xAA)) * 10, n * 50 * MS - MS)
         telemetry.advance(n * 50 * MS)
         said = telemetry.diagnosis()
         assert said is not None
@@ -581,7 +643,7 @@ def test_what_is_shown_was_received_within_the_time_out_whatever_comes(seed: int
     for n, (piece, now) in enumerate(timed):
         if advance:
             telemetry.advance(now)
-        telemetry.receive(piece, now)
+        read(telemetry, piece, now)
         if telemetry.live is not None:
             assert telemetry.live in fresh_frames(timed[: n + 1], now)
             assert telemetry.live_ns is not None
@@ -601,7 +663,7 @@ def test_random_bytes_at_random_times_never_raise(chunks: list[tuple[bytes, int]
     now = 0
     for data, pause in chunks:
         now += pause
-        telemetry.receive(data, now)
+        read(telemetry, data, now)
         telemetry.advance(now)
         telemetry.diagnosis()
     assert telemetry.counters.bytes == sum(len(data) for data, _ in chunks)
@@ -619,8 +681,8 @@ def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_dead
             assert seldom.next_deadline() > due
             often.advance(due)
             assert (seldom.live, seldom.info, seldom.link) == (often.live, often.info, often.link)
-        seldom.receive(piece, now)
-        often.receive(piece, now)
+        read(seldom, piece, now)
+        read(often, piece, now)
         often.advance(now)
         seldom.advance(now)
         assert seldom.next_deadline() > now
@@ -641,8 +703,8 @@ def test_a_clean_stream_loses_nothing_however_it_is_cut(seed: int) -> None:
         frame = live(number, layout)
         cut = source.randrange(len(frame))
         begin = number * 10 * MS
-        telemetry.receive(frame[:cut], begin + cut * NS_PER_BYTE)
-        telemetry.receive(frame[cut:], begin + len(frame) * NS_PER_BYTE)
+        read(telemetry, frame[:cut], begin + cut * NS_PER_BYTE)
+        read(telemetry, frame[cut:], begin + len(frame) * NS_PER_BYTE)
         assert telemetry.live is not None
         assert telemetry.live.electrical_speed == number
         assert telemetry.live_ns == begin + len(frame) * NS_PER_BYTE

@@ -25,7 +25,7 @@ from kontronik_can_gw.protocol import LiveData, encode
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.telemetry import SECOND, EscSettings
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 CLASSIC = struct.Struct("=IB3x8s")
@@ -85,7 +85,10 @@ def all_of(port: CanPort) -> list[CanFrame]:
     """What waits, to the end."""
     frames: list[CanFrame] = []
     while readable(port, 0.05):
-        frames += port.receive()
+        for frame, at in port.receive():
+            assert at is not None, "the kernel tells when a frame came"
+            assert 0 <= time.monotonic_ns() - at < 60 * SECOND
+            frames.append(frame)
     return frames
 
 
@@ -193,7 +196,7 @@ class Node(Gateway):
     def receive_ids(self) -> frozenset[int]:
         return self.ids
 
-    def receive_frame(self, frame: CanFrame, now: int) -> None:
+    def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
         if frame.can_id % 2 == 0:
             self.waiting.append(CanFrame(frame.can_id - 0x80, frame.data, queued=True))
             return

@@ -304,10 +304,10 @@ class Steady:
         def fresh_until(state: int) -> tuple[int, int]:
             """Up to when live data and information are fresh."""
             live_until = int(live_times[lives[state]]) + timeout
-            if esc.info_ns is None:
+            if esc.info_bound_ns is None:
                 return live_until, _ROOM
             infos = state - int(lives[state])
-            info_ns = times[int(info_at[infos - 1]) + 1] if infos else esc.info_ns
+            info_ns = times[int(info_at[infos - 1]) + 1] if infos else esc.info_bound_ns
             return live_until, info_ns + INFO_TIMEOUT_NS
 
         def deadline(state: int) -> int:
@@ -372,12 +372,12 @@ class Steady:
         if len(self._live):
             esc.live = esc.last_live = LiveData._make(self._live[-1].item())
             esc.energy, esc.run_time, esc.suspect_frames = int(energy), int(run_time), int(suspects)
-            esc.live_ns = int(live_ns)
+            esc.live_ns = esc.live_bound_ns = int(live_ns)
             esc._last_power = esc.live.battery_voltage * esc.live.battery_current
         if len(self._info):
             esc.info = esc.last_info = InfoData._make(self._info[-1].item())
             at = int(np.flatnonzero(~self.is_live)[-1]) + 1
-            esc.info_ns = esc.last_info_ns = int(self.times[at])
+            esc.info_bound_ns = esc.last_info_ns = int(self.times[at])
             esc.cells = esc.settings.cell_count or esc.info.cell_count
         deframer = esc._deframer
         for name in Counters.__dataclass_fields__:
@@ -433,9 +433,9 @@ class Quiet(Steady):
 
     def _informed(self, count: int) -> int:
         """How many frames come while information is fresh."""
-        if self.esc.info_ns is None:
+        if self.esc.info_bound_ns is None:
             return count
-        known = np.concatenate(([self.esc.info_ns], self.times[1 : count + 1][~self.is_live[:count]]))
+        known = np.concatenate(([self.esc.info_bound_ns], self.times[1 : count + 1][~self.is_live[:count]]))
         if np.diff(known, append=self.times[count]).max() <= INFO_TIMEOUT_NS:
             return count
         seen = np.arange(count) - self.live_rows[:count]

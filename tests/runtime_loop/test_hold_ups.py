@@ -1,0 +1,271 @@
+"""What a process that was held up shows: no value is older than its time-out, and none that is fresh is lost."""
+
+import random
+from bisect import bisect_left
+from collections.abc import Iterator
+from itertools import pairwise
+
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from wire_world import CAN_FD, NOT_AVAILABLE, Wire, World, layout_of, live, loop_in, run
+
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings
+
+
+def shown(frame: CanFrame) -> tuple[int, int]:
+    """(number of the ESC's frame, age in ms)."""
+    return int.from_bytes(frame.data[:4], "little"), int.from_bytes(frame.data[4:6], "little")
+
+
+def values(world: World, esc: int = 0) -> Iterator[tuple[int, int, int]]:
+    """(time, number, age in ms) of what was sent while there was a value."""
+    for at, frame in world.bus.sent:
+        number, age = shown(frame)
+        if frame.can_id == 0x100 + esc and number != NOT_AVAILABLE:
+            yield at, number, age
+
+
+def begin(patch: pytest.MonkeyPatch, world: World, *escs: EscSettings) -> Loop:
+    loop = loop_in(world, patch, escs)
+    loop.open()
+    loop.begin()
+    return loop
+
+
+def oldest(world: World, wire: Wire) -> int:
+    """How old the oldest value was that was sent, since the kernel had it."""
+    return max(at - wire.frames[number - 1] for at, number, _ in values(world))
+
+
+@pytest.mark.parametrize("stopped_ms", [50, 100, 200, 240, 260, 300, 400])
+@pytest.mark.parametrize("timeout_ms", [60, 100, 250])
+def test_a_value_that_waited_while_the_process_was_stopped_is_not_taken_for_new(
+    monkeypatch: pytest.MonkeyPatch, stopped_ms: int, timeout_ms: int
+) -> None:
+    world = World()
+    (wire,) = world.wires
+    start = world.now
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=timeout_ms * MS))
+    wire.stream(start, start + 500 * MS, 10 * MS)
+    wire.send(start + 520 * MS)  # the last one, while the process stands still
+    run(loop, world, start + 512 * MS)
+    world.now += stopped_ms * MS
+    run(loop, world, start + 3 * SECOND)
+    loop.close()
+    assert oldest(world, wire) <= timeout_ms * MS
+    assert shown(world.bus.sent[-1][1])[0] == NOT_AVAILABLE
+
+
+def test_a_wait_that_ends_with_nothing_though_bytes_came_does_not_hide_when_they_came(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Stopped in the middle of a wait: behind it there is nothing to tell that the bytes are old but the last look."""
+    world = World()
+    (wire,) = world.wires
+    start = world.now
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=250 * MS))
+    wire.stream(start, start + 300 * MS, 10 * MS)
+    run(loop, world, start + 320 * MS)
+    wire.send(start + 325 * MS)
+    stops = iter([200 * MS])
+    world.hold_up = lambda: next(stops, 0)
+    run(loop, world, start + 2 * SECOND)
+    loop.close()
+    assert oldest(world, wire) <= 250 * MS
+
+
+@pytest.mark.parametrize("bundled", [False, True])
+@pytest.mark.parametrize("neighbour_ms", [0, 7, 10, 33])
+@pytest.mark.parametrize("jitter_us", [0, 1000])
+def test_nothing_of_a_link_of_20_hz_is_lost_with_a_time_out_of_60_ms(
+    monkeypatch: pytest.MonkeyPatch, bundled: bool, neighbour_ms: int, jitter_us: int
+) -> None:
+    rng = random.Random(neighbour_ms)
+    world = World(2)
+    start, end = world.now, world.now + 30 * SECOND
+    timeout = 60 * MS
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=timeout), EscSettings("esc2"))
+    for n in range(600):
+        world.wires[0].send(start + n * 50 * MS + rng.randrange(jitter_us * 1000 + 1), bundled)
+    if neighbour_ms:
+        world.wires[1].stream(start, end, neighbour_ms * MS + 13_000)
+    world.hold_up = lambda: rng.randrange(1_000_000)  # as any process is
+    run(loop, world, end)
+    esc = loop.gateway.escs[0]
+    loop.close()
+    assert (esc.losses, esc.late_frames, esc.counters.live) == (0, 0, 600)
+    assert oldest(world, world.wires[0]) <= timeout
+
+
+TWO = (EscSettings("esc1", timeout_ns=20 * MS), EscSettings("esc2"))
+LAYOUTS = {count: layout_of(TWO[:count]) for count in (1, 2)}
+
+
+@settings(max_examples=25, deadline=None, phases=[Phase.generate])  # a seed cannot be made simpler
+@given(
+    st.integers(0, 2**32),
+    st.sampled_from([20, 60, 100, 250, 1000]),
+    st.sampled_from([8, 10, 20, 50]),
+    st.sampled_from([0, 0.002, 0.05]),
+    st.booleans(),
+    st.booleans(),
+)
+def test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true(
+    seed: int, timeout_ms: int, period_ms: int, stops: float, neighbour: bool, bundled: bool
+) -> None:
+    rng = random.Random(seed)
+    world = World(1 + neighbour)
+    wire, start = world.wires[0], world.now
+    timeout, period = timeout_ms * MS, period_ms * MS
+    escs = (EscSettings("esc1", timeout_ns=timeout), TWO[1])[: 1 + neighbour]
+    at = start + rng.randrange(period)
+    while at < start + 4 * SECOND:
+        wire.send(at, bundled)
+        gap = rng.random() < 0.01
+        at += max(4 * MS, period + (rng.randrange(2 * timeout) if gap else rng.randrange(-MS, MS)))
+    if neighbour:
+        world.wires[1].stream(start, start + 4 * SECOND, 17 * MS)
+    world.hold_up = lambda: rng.randrange(400 * MS) if rng.random() < stops else rng.randrange(MS // 10)
+    with pytest.MonkeyPatch.context() as patch:
+        loop = loop_in(world, patch, escs, LAYOUTS[len(escs)])
+        loop.open()
+        loop.begin()
+        lost: list[tuple[int, int]] = []
+        while world.now < start + 5 * SECOND:
+            losses, looked = loop.gateway.escs[0].losses, world.looked
+            loop.turn()
+            lost += [(world.now, looked)] * (loop.gateway.escs[0].losses - losses)
+        loop.close()
+    for sent, number, age in values(world):
+        truth = sent - wire.frames[number - 1]
+        if bundled:  # what the adapter held back came sooner than the wire allows
+            truth -= 40 * NS_PER_BYTE
+        assert truth <= timeout
+        assert (age + 1) * MS >= truth - period - 2 * MS  # ages are shown in whole ms, the period has jitter
+    for when, looked in lost:  # none is given up earlier than by the time between the two looks between which it came
+        newest = max(whole for whole in wire.frames if whole <= looked)
+        look = bisect_left(world.looks, newest)
+        between = world.looks[look] - world.looks[look - 1]
+        assert when - newest >= timeout - between
+        assert stops or between <= timeout // 4
+
+
+def test_the_loop_looks_at_its_ports_eight_times_within_the_shortest_time_out_whatever_a_master_makes_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(2)
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=SECOND), EscSettings("esc2"))
+    for timeout in (SECOND, 60 * MS, 20 * MS, 400 * MS):
+        loop.gateway._apply(0, EscSettings("esc1", timeout_ns=timeout))
+        world.looks.clear()
+        run(loop, world, world.now + 2 * SECOND)
+        longest = max(b - a for a, b in zip(world.looks, world.looks[1:], strict=False))
+        assert longest <= -(-min(timeout, 250 * MS) // 8 // MS) * MS  # a wait is rounded up to a millisecond
+    loop.close()
+
+
+def test_a_port_that_never_drains_is_as_old_as_the_wire_allows_and_no_older(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pseudo terminal whose writer is faster than any wire; and more than one read in a port that waited."""
+    world = World()
+    (wire,) = world.wires
+    start = world.now
+    loop = begin(monkeypatch, world, EscSettings("esc1"))
+    for _ in range(20_000):
+        wire.put(live(1), [start] * 40)
+    for _ in range(40):
+        loop.turn()
+    esc = loop.gateway.escs[0]
+    assert wire.waiting > 0
+    assert esc.up
+    assert (esc.live_bound_ns, esc.losses) == (world.now, 0)
+    loop.close()
+
+
+def test_what_waited_beyond_one_read_is_dated_by_its_place_in_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World()
+    (wire,) = world.wires
+    start = world.now
+    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=20 * SECOND))
+    wire.stream(start, start + 8 * SECOND, 40 * NS_PER_BYTE)  # without a pause: 83 kB
+    world.now += 9 * SECOND
+    for _ in range(8):
+        loop.turn()
+    esc = loop.gateway.escs[0]
+    loop.close()
+    assert wire.waiting == 0
+    assert abs(wire.frames[-1] - esc.live_bound_ns) <= NS_PER_BYTE
+
+
+class Signs:
+    """A service manager's socket: when the loop said that it is alive."""
+
+    present = True
+    watchdog_ns = 500 * MS
+
+    def __init__(self, world: World) -> None:
+        self.fed: list[int] = []
+        self._world = world
+
+    def watchdog(self) -> None:
+        self.fed.append(self._world.now)
+
+    def ready(self, status: str = "") -> None:
+        pass
+
+    status = ready
+
+
+@pytest.mark.parametrize("blind", [set(), {1000}, {CAN_FD}, {1000, CAN_FD}], ids=["none", "port", "CAN", "everything"])
+def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
+    monkeypatch: pytest.MonkeyPatch, blind: set[int]
+) -> None:
+    world = World()
+    signs = Signs(world)
+    loop = loop_in(world, monkeypatch, notifier=signs)  # type: ignore[arg-type]
+    loop.open()
+    loop.begin()
+    begin, end = world.now, world.now + 10 * SECOND
+    world.wires[0].stream(begin, end, 20 * MS)
+    for at in range(begin, end, 50 * MS):
+        world.bus.came(0x100, b"", at)
+    run(loop, world, begin + 3 * SECOND)
+    assert all(late - early <= 600 * MS for early, late in pairwise([begin, *signs.fed, world.now]))
+    world.blind = blind
+    run(loop, world, end)
+    loop.close()
+    fed = [at for at in signs.fed if at > begin + 4200 * MS]
+    assert len(fed) == 0 if blind else len(fed) > 8
+
+
+def test_bytes_that_came_while_the_interface_opened_are_as_old_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World()
+    (wire,) = world.wires
+    world.opening_ns = 3 * SECOND
+    wire.send(world.now + 100 * MS)
+    loop = begin(monkeypatch, world, EscSettings("esc1"))
+    run(loop, world, world.now + 50 * MS)
+    assert loop.gateway.escs[0].counters.live == 1
+    assert list(values(world)) == []
+    wire.send(world.now)
+    run(loop, world, world.now + 50 * MS)
+    assert {number for _, number, _ in values(world)} == {2}
+    loop.close()
+
+
+def test_bytes_that_came_while_an_interface_was_tried_again_are_as_old_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World()
+    (wire,) = world.wires
+    start = world.now
+    world.there, world.opening_ns = False, 400 * MS
+    loop = begin(monkeypatch, world, EscSettings("esc1"))
+    wire.stream(start + 410 * MS, start + 2 * SECOND, 100 * MS)
+    run(loop, world, start + 2 * SECOND)
+    world.there, world.opening_ns = True, 100 * MS
+    run(loop, world, start + 4 * SECOND)
+    wire.send(world.now)
+    run(loop, world, world.now + 50 * MS)
+    loop.close()
+    assert {number for _, number, _ in values(world)} == {len(wire.frames)}

@@ -1,0 +1,296 @@
+"""A loop in a world without a clock: wires that bytes come on, the kernel's buffers, a bus, and a process that is held up.
+
+Time goes on only where the loop waits, and where a test says that the process is held up.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Sequence
+
+import pytest
+
+from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, parse_database
+from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Sent
+from kontronik_can_gw.protocol.codec import Layout as WireLayout
+from kontronik_can_gw.protocol.codec import encode
+from kontronik_can_gw.protocol.fields import LiveData
+from kontronik_can_gw.runtime import can_side, esc_input
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, one_by_one
+from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.runtime.poller import Handler
+from kontronik_can_gw.runtime.serial_port import Identity
+from kontronik_can_gw.runtime.systemd import Notifier
+from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings
+
+NOT_AVAILABLE = 0xFFFFFFFF
+_FIRST_PORT, CAN_FD = 1000, 2000
+_MAX_READ = 4 * 4096
+_DBC = """VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: Gw Car
+
+{messages}
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange";
+BA_DEF_DEF_ "GenMsgCycleTime" 20;
+BA_DEF_DEF_ "GenMsgSendType" "CyclicAndEvent";
+"""
+_MESSAGE = """BO_ {can_id} M{number}: 8 Gw
+ SG_ {esc}ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car
+ SG_ {esc}DataAge : 32|16@1+ (1,0) [0|0] "ms" Car
+
+"""
+
+
+def layout_of(escs: Sequence[EscSettings]) -> Layout:
+    """For each ESC a message 100h, 101h ... with speed and age, sent with each frame and every 20 ms."""
+    prefix = [f"{esc.name}" if len(escs) > 1 else "" for esc in escs]
+    messages = "".join(_MESSAGE.format(can_id=256 + n, number=n, esc=name) for n, name in enumerate(prefix))
+    text = _DBC.format(messages=messages).encode()
+    return prepare(parse_database(text, "w.dbc"), "w.dbc", escs, DbcSettings(), fd_allowed=False)[1]
+
+
+def live(speed: int) -> bytes:
+    return encode(LiveData(electrical_speed=speed, battery_voltage=2400, battery_current=100), WireLayout.V4)
+
+
+class Wire:
+    """A serial port: what comes, and when the kernel has it. Frames have their number as speed."""
+
+    drained = True
+
+    def __init__(self, world: "World", number: int) -> None:
+        self.path = f"/fake/{number}"
+        self.arrivals: list[int] = []
+        """When each byte was in the kernel's buffer."""
+        self.frames: list[int] = []
+        """When each frame was there whole."""
+        self.discarded = False
+        self._world = world
+        self._number = number
+        self._bytes = bytearray()
+        self._read = 0
+
+    def send(self, at: int, bundled: bool = False) -> None:
+        """The next frame begins ``at``. Bundled: an adapter hands its bytes over all at once."""
+        data = live(len(self.frames) + 1)
+        self.put(data, [at + (len(data) if bundled else n + 1) * NS_PER_BYTE for n in range(len(data))])
+        self.frames.append(self.arrivals[-1])
+
+    def put(self, data: bytes, times: Iterable[int]) -> None:
+        self._bytes += data
+        self.arrivals += times
+
+    def stream(self, begin: int, end: int, period: int, bundled: bool = False) -> None:
+        for at in range(begin, end, period):
+            self.send(at, bundled)
+
+    @property
+    def waiting(self) -> int:
+        return bisect_right(self.arrivals, self._world.now) - self._read
+
+    @property
+    def next_arrival(self) -> int | None:
+        """When it becomes readable; in the past where it is."""
+        return self.arrivals[self._read] if self._read < len(self.arrivals) else None
+
+    # as a SerialPort
+
+    def fileno(self) -> int:
+        return _FIRST_PORT + self._number
+
+    def read(self) -> bytes:
+        count = min(self.waiting, _MAX_READ)
+        data = bytes(self._bytes[self._read : self._read + count])
+        self._read += count
+        self.drained = not self.waiting
+        return data
+
+    @property
+    def waits_to_be_read(self) -> bool:
+        return bool(self.waiting)
+
+    def discard(self) -> None:
+        self._read += self.waiting
+
+    def identity(self) -> Identity | None:
+        return None
+
+    def line_errors(self) -> dict[str, int]:
+        return {}
+
+    def settings_hold(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+class Bus:
+    """A CAN interface: ``sent`` with times, ``inbox`` with the times at which frames came."""
+
+    tells_busy_from_gone = True
+    gone = False
+
+    def __init__(self, world: "World") -> None:
+        self.state = CanState.ERROR_ACTIVE
+        self.bus_off_count = self.overruns = 0
+        self.sent: list[tuple[int, CanFrame]] = []
+        self.inbox: list[tuple[CanFrame, int]] = []
+        self.clock_error = 0
+        """Of the times that are told."""
+        self.answer = Sent.OK
+        self.on_send: Callable[[CanFrame], None] = lambda _frame: None
+        self._world = world
+
+    def came(self, can_id: int, data: bytes = b"", at: int | None = None) -> None:
+        self.inbox.append((CanFrame(can_id, data), self._world.now if at is None else at))
+
+    def take(self) -> list[tuple[int, bytes]]:
+        """What was sent since the last call."""
+        sent, self.sent = self.sent, []
+        return [(frame.can_id, frame.data) for _, frame in sent]
+
+    # as a CanPort
+
+    def fileno(self) -> int:
+        return CAN_FD
+
+    def set_receive_ids(self, ids: object) -> None:
+        pass
+
+    @property
+    def waits_to_be_read(self) -> bool:
+        return bool(self.inbox) and self.inbox[0][1] <= self._world.now
+
+    def receive(self) -> list[tuple[CanFrame, int | None]]:
+        found: list[tuple[CanFrame, int | None]] = []
+        while self.waits_to_be_read and len(found) < RECEIVE_LIMIT:
+            frame, at = self.inbox.pop(0)
+            found.append((frame, at + self.clock_error))
+        return found
+
+    def discard(self) -> None:
+        while self.receive():
+            pass
+
+    def send(self, frame: CanFrame) -> Sent:
+        if self.answer is Sent.OK:
+            self.sent.append((self._world.now, frame))
+            self.on_send(frame)
+        return self.answer
+
+    def send_all(self, frames: Sequence[CanFrame | bytes], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
+        return one_by_one(self.send, frames, clock, latest)
+
+    def close(self) -> None:
+        pass
+
+
+class World:
+    """``now`` is the clock. As a Poller it waits by letting time pass, and ``hold_up`` says for how long the process gets no processor.
+
+    ``blind``: descriptors that the loop is never told of.
+    """
+
+    def __init__(self, wires: int = 1) -> None:
+        self.now = self.looked = self.before = 7 * SECOND
+        self.wires = [Wire(self, n) for n in range(wires)]
+        self.bus = Bus(self)
+        self.looks: list[int] = [self.now]
+        self.hold_up: Callable[[], int] = lambda: 0
+        """How long the process stands still behind a wait, before it looks at the clock, in ns."""
+        self.opening_ns = 0
+        self.there = True
+        self.blind: set[int] = set()
+        self.handlers: dict[int, Handler] = {}
+
+    def clock(self) -> int:
+        return self.now
+
+    def register(self, fileobj: int, _events: int, data: Handler) -> None:
+        self.handlers[fileobj] = data
+
+    modify = register
+
+    def unregister(self, fileobj: int) -> None:
+        del self.handlers[fileobj]
+
+    def close(self) -> None:
+        pass
+
+    def wait(self, pause_ns: int) -> list[tuple[Handler, int]]:
+        if pause_ns > 0:
+            self.now = max(self.now, min(self.now + -(-pause_ns // MS) * MS, *self._arrivals()))
+        self.now += self.hold_up()
+        self.before, self.looked = self.looked, self.now
+        self.looks.append(self.now)
+        ready = [(wire.fileno(), wire.waits_to_be_read) for wire in self.wires]
+        ready.append((CAN_FD, self.bus.waits_to_be_read))
+        return [
+            (self.handlers[fd], 1) for fd, is_ready in ready if is_ready and fd in self.handlers.keys() - self.blind
+        ]
+
+    def _arrivals(self) -> list[int]:
+        found = [wire.next_arrival for wire in self.wires if wire.fileno() not in self.blind]
+        if CAN_FD not in self.blind and self.bus.inbox:
+            found.append(self.bus.inbox[0][1])
+        return [at for at in found if at is not None] or [1 << 62]
+
+
+class FakePoller:
+    """The World as the loop's poller: it has a clock of the same name."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.register, self.modify, self.unregister = world.register, world.modify, world.unregister
+        self.wait, self.close = world.wait, world.close
+
+    @property
+    def now(self) -> int:
+        return self._world.looked
+
+    @property
+    def before(self) -> int:
+        return self._world.before
+
+
+def loop_in(
+    world: World,
+    patch: pytest.MonkeyPatch,
+    escs: Sequence[EscSettings] = (EscSettings("esc1"),),
+    layout: Layout | None = None,
+    canopen: CanopenSetup | None = None,
+    notifier: Notifier | None = None,
+) -> Loop:
+    """A loop whose ports, bus, and time are the world's. Not open yet."""
+
+    def open_bus(_config: object) -> Bus:
+        world.now += world.opening_ns
+        if not world.there:
+            raise RunError("can0: there is none.")
+        return world.bus
+
+    by_path = {wire.path: wire for wire in world.wires}
+    patch.setattr(can_side, "CanPort", open_bus)
+    patch.setattr(esc_input, "SerialPort", by_path.__getitem__)
+    gateway = Gateway(escs, layout or layout_of(escs), world.now, canopen=canopen)
+    config = CanConfig(interface="virtual", channel="world")
+    poller = FakePoller(world)
+    paths = list(by_path)
+    return Loop(gateway, paths, config, True, clock=world.clock, poller=poller, notifier=notifier)  # type: ignore[arg-type]
+
+
+def run(loop: Loop, world: World, until: int) -> None:
+    while world.now < until:
+        loop.turn()
