@@ -92,7 +92,7 @@ def _canopen(args: argparse.Namespace) -> "Database":
 
 
 def _database(args: argparse.Namespace) -> "Database":
-    from kontronik_can_gw.dbc_output.expand import expand
+    from kontronik_can_gw.dbc_output.expand import among_canopen, expand
     from kontronik_can_gw.dbc_output.layout import DbcSettings, choose_node, load_database
     from kontronik_can_gw.dbc_output.prepare import prepare
 
@@ -111,7 +111,10 @@ def _database(args: argparse.Namespace) -> "Database":
     for line in ignored:
         say(f"warning: {line}")
     node = choose_node(database, args.node, str(file))
-    database, bind = expand(database, node, escs, str(file), None, args.base_id, args.id_step)
+    plain = database
+    database, bind = expand(plain, node, escs, str(file), None, args.base_id, args.id_step)
+    if args.base_id is None and (reason := among_canopen(plain, database, node)):
+        raise UserError(f"{file}: for {len(escs)} ESCs, {reason}")
     prepare(
         database, str(file), escs, DbcSettings(bind, node), fd_allowed=True
     )  # refuses what the gateway would refuse

@@ -99,8 +99,25 @@ def expand(
     return result, out_bind
 
 
+def among_canopen(database: "Database", expanded: "Database", node: str) -> str:
+    """What is wrong where 11-bit ids of ``node`` left the range that CANopen leaves free (CiA 301, 7.3.5); empty where none did."""
+    low, high = _SDO_END + 1, _RESTRICTED - 1
+
+    def ids(of: "Database") -> list[int]:
+        return [m.frame_id for m in of.messages if node in m.senders and not m.is_extended_frame]
+
+    known, made = set(ids(database)), ids(expanded)
+    left = [can_id for can_id in made if can_id not in known and not low <= can_id <= high]
+    if not left or not any(low <= can_id <= high for can_id in known):
+        return ""
+    return (
+        f"{len(left)} of {len(made)} ids leave {low:X}h..{high:X}h, up to {max(left):X}h, where CANopen has its own. "
+        "Take fewer ESCs, a DBC with 29-bit ids, or an explicit lowest id (dbc.base_id, --base-id)."
+    )
+
+
 def _id_problems(moves: Sequence[tuple[int, int, bool]], count: int, base_id: int | None) -> list[str]:
-    """A line for ids that no frame can have, one for 11-bit ids that leave the free range. ``moves``: from, to, 29 bits."""
+    """A line for ids that no frame can have. ``moves``: from, to, 29 bits."""
     problems = []
     why = f"for {count} ESCs" if base_id is None else f"with {base_id:X}h as the lowest id"
     for extended, limit in ((False, 0x7FF), (True, 0x1FFFFFFF)):
@@ -111,13 +128,6 @@ def _id_problems(moves: Sequence[tuple[int, int, bool]], count: int, base_id: in
             problems.append(
                 f"{why}, {len(outside)} of {len(moves)} messages lie outside 0..{limit:X}h, up to {max(outside):X}h.{remedy}"
             )
-    low, high = _SDO_END + 1, _RESTRICTED - 1
-    left = [made for old, made, extended in moves if not extended and low <= old <= high and not low <= made <= high]
-    if left and base_id is None and not problems:
-        problems.append(
-            f"{why}, {len(left)} of {len(moves)} ids leave {low:X}h..{high:X}h, up to {max(left):X}h, where CANopen has its own. "
-            "Take fewer ESCs, a DBC with 29-bit ids, or an explicit lowest id (dbc.base_id, --base-id)."
-        )
     return problems
 
 

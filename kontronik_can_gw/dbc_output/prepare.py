@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc_output.expand import expand, needs_expansion
+from kontronik_can_gw.dbc_output.expand import among_canopen, expand, needs_expansion
 from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, choose_node, compile_layout
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.telemetry import EscSettings
@@ -29,10 +29,15 @@ def prepare(
     node = choose_node(database, settings.node, file)
     if settings.messages:
         database = _with_chosen(database, node, settings.messages, file)
+    warnings: tuple[str, ...] = ()
     if needs_expansion(database, node, escs, settings.bind) or settings.base_id is not None:
-        database, bind = expand(database, node, escs, file, dict(settings.bind), settings.base_id, settings.id_step)
+        plain = database
+        database, bind = expand(plain, node, escs, file, dict(settings.bind), settings.base_id, settings.id_step)
         settings = replace(settings, bind=bind)
-    return database, compile_layout(database, file, escs, settings, taken_ids, fd_allowed)
+        if settings.base_id is None and (reason := among_canopen(plain, database, node)):
+            warnings = (f"{file}: for {len(escs)} ESCs, {reason}",)
+    layout = compile_layout(database, file, escs, settings, taken_ids, fd_allowed)
+    return database, replace(layout, warnings=(*layout.warnings, *warnings))
 
 
 def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file: str) -> "Database":

@@ -372,13 +372,13 @@ class FakeSocket:
             raise OSError(number, os.strerror(number))
         self.sent.append(data)
 
-    def recv(self, _size: int) -> bytes:
+    def recvmsg(self, _size: int, _ancillary_size: int) -> tuple[bytes, list[Any], int, None]:
         if not self.inbox:
             raise BlockingIOError
         data = self.inbox.pop(0)
         if isinstance(data, int):
             raise OSError(data, os.strerror(data))
-        return data
+        return data, [], 0, None
 
 
 @pytest.fixture

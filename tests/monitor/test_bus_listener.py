@@ -84,9 +84,9 @@ class FakePort:
     def fileno(self) -> None:
         return None
 
-    def receive(self) -> list[CanFrame]:
+    def receive(self) -> list[tuple[CanFrame, int | None]]:
         frames, self.inbox = self.inbox, []
-        return frames
+        return [(frame, None) for frame in frames]
 
     def close(self) -> None:
         self.closed = True
