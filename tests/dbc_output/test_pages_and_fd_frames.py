@@ -55,7 +55,7 @@ def sent_until(gateway: Gateway, when: int) -> list[CanFrame]:
 
 def live(gateway: Gateway, now: int, *values: int) -> list[CanFrame]:
     data = LiveData(battery_voltage=values[0], throttle=values[1], bec_temperature=values[2])
-    gateway.receive_bytes(0, encode(data, WireLayout.V4), now)
+    gateway.receive_bytes(0, encode(data, WireLayout.V4), now, now)
     return gateway.take_frames()
 
 
