@@ -1,10 +1,11 @@
-"""Frames that no further event brings, and frames that are not classic ones of 11 bits: what stands in them, and that they go."""
+"""Frames that no further event brings, frames that are not classic ones of 11 bits, frames after a change of settings."""
 
 from collections.abc import Sequence
 
 import cantools.database
 import pytest
 from cantools.database.can import Database
+from dialogue import QUIET, Bench
 
 from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout
 from kontronik_can_gw.dbc_output.prepare import prepare
@@ -17,7 +18,7 @@ from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: Gateway\n'
 SEND_TYPES = '"cyclic","event","onChange","cyclicAndEvent","cyclicAndOnChange"'
-CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT = range(4)
+CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)
 PAGED = (
     "BO_ 256 EscPaged: 8 Gateway\n"
     ' SG_ Page M : 0|{length}@1{sign} (1,0) [0|0] "" Logger\n'
@@ -133,3 +134,41 @@ def test_a_live_frame_is_followed_by_a_frame_of_the_right_kind(
         assert (frame.can_id, frame.extended, frame.fd) == (number & 0x1FFFFFFF, number >= 1 << 31, fd)
         assert len(frame.data) == size
         assert int.from_bytes(frame.data, "little") == volts << at
+
+
+def test_a_cycle_that_the_minimum_distance_puts_off_is_not_lost() -> None:
+    text = WIDE.format(number=256, size=8, at=0)
+    gateway = Gateway([EscSettings("esc1")], layout(text, CYCLIC_AND_ON_CHANGE, 100, 30), 0)
+    gateway.start(0)
+    live(gateway, 990 * MS, 2400, 0, 0)
+    sent_until(gateway, 1080 * MS)
+    assert len(live(gateway, 1090 * MS, 2401, 0, 0)) == 1
+    found = {ms: len(sent_until(gateway, ms * MS)) for ms in (1100, 1119, 1120, 1199, 1200)}
+    assert found == {1100: 0, 1119: 0, 1120: 1, 1199: 0, 1200: 1}
+
+
+SPEED = (
+    "BO_ 256 EscSpeed: 8 Gateway\n"
+    ' SG_ MotorSpeed : 0|16@1+ (1,0) [0|0] "1/min" Logger\n'
+    ' SG_ BatteryVoltage : 16|16@1+ (0.01,0) [0|0] "V" Logger\n'
+    ' SG_ OutputSpeed : 32|32@1+ (0.5,0) [0|0] "1/min" Logger\n'
+)
+
+
+@pytest.mark.parametrize(("kind", "cycle"), [(EVENT, 0), (CYCLIC, 10), (CYCLIC_AND_EVENT, 10)])
+def test_pole_pairs_and_gear_from_a_master_hold_for_messages_from_the_next_frame_on(kind: int, cycle: int) -> None:
+    bench = Bench(changes=QUIET, layout=layout(SPEED, kind, cycle))
+    bench.wait(1000)
+    for writes, motor, output in (
+        ((), 21_000, 42_000),
+        (("2F 00 21 01 07 00 00 00",), 3_000, 6_000),
+        (("23 00 21 02 05 00 00 00", "23 00 21 03 02 00 00 00"), 3_000, 2_400),
+    ):
+        for request in writes:
+            bench.put(0x601, request)
+        assert [frame.data[0] for frame in bench.take() if frame.can_id == 0x581] == [0x60] * len(writes)
+        bench.uart(encode(LiveData(electrical_speed=21_000, battery_voltage=2442), WireLayout.V4))
+        bench.wait(10)
+        data = [frame.data for frame in bench.take() if frame.can_id == 0x100][-1]
+        values = (data[0:2], data[2:4], data[4:8])
+        assert tuple(int.from_bytes(value, "little") for value in values) == (motor, 2442, output)
