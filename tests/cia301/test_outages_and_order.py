@@ -1,0 +1,120 @@
+"""What goes on a bus by itself: after an outage, from link and gateway counters, in which order; and which ids are a node's own."""
+
+import pytest
+from dialogue import EMPTY, QUIET, Bench, live, tpdo
+
+from kontronik_can_gw.cia301.bindings import GATEWAY, LINK
+from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.mailboxes import Mailboxes, Sent
+from kontronik_can_gw.telemetry import EscSettings
+
+LINK_STATUS = LINK << 16 | 0x0108
+CRC_ERRORS = LINK << 16 | 0x0720
+SENT_FRAMES = GATEWAY << 16 | 0x0320
+
+
+def taken(bench: Bench) -> list[CanFrame]:
+    """Also what a call of the gateway itself has caused."""
+    return [*bench.take(), *bench.gateway.take_frames()]
+
+
+def put_out(frames: list[CanFrame]) -> list[CanFrame]:
+    """As they leave a gateway whose interface was busy until now."""
+    waiting, sent = Mailboxes(), list[CanFrame]()
+    waiting.put_all(frames)
+
+    def send(frame: CanFrame) -> Sent:
+        sent.append(frame)
+        return Sent.OK
+
+    waiting.flush(send)
+    return sent
+
+
+def test_of_what_a_node_answers_nothing_is_overtaken() -> None:
+    """Only measurements are; SDO answers, emergencies and heartbeats of one id all go, in their order."""
+    bench = Bench(changes=QUIET)
+    for request in ("40 00 10 00 00 00 00 00", "40 18 10 01 00 00 00 00", "40 18 10 04 00 00 00 00"):
+        bench.put(0x601, request)
+    bench.uart(live(operating_errors=1))
+    bench.uart(live())
+    for command in (1, 2, 130):
+        bench.put(0, bytes((command, 1)))
+    bench.put(0x601, "40 00 10 00 00 00 00 00")
+    frames = bench.take()
+    assert [frame.can_id for frame in frames] == [0x581] * 3 + [0x81] * 2 + [0x701, 0x581]
+    assert put_out(frames) == frames
+
+
+@pytest.mark.parametrize("kind", [254, 255])
+def test_what_is_sent_on_change_only_is_said_again_after_an_outage(kind: int) -> None:
+    bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, 0, LINK_STATUS), **tpdo(2, kind, 0, 0, 0x20000210)}).start()
+    bench.uart(live())
+    bench.wait(100)
+    bench.take()
+    bench.gateway.can_returned(bench.now)
+    assert [(frame.can_id, frame.data[0] & 7) for frame in taken(bench)] == [(0x181, 2)]
+
+
+@pytest.mark.parametrize(("mapped", "first"), [(CRC_ERRORS, 1), (SENT_FRAMES, 0)])
+def test_counters_of_link_and_gateway_are_sent_each_second(mapped: int, first: int) -> None:
+    """No live frame is news to them; a second is."""
+    bench = Bench(changes={**QUIET, **tpdo(1, 255, 0, 0, mapped)}, escs={"timeout_ns": 60_000_000_000}).start()
+    bench.uart(live()[:-1] + b"\xff" + live())
+    bench.wait(10)
+    bench.take()
+    bench.uart(live())
+    assert bench.take() == []
+    for _ in range(3):
+        bench.wait(1000)
+        [frame] = bench.take()
+        assert frame.can_id == 0x181
+        assert int.from_bytes(frame.data, "little") >= first
+
+
+def test_between_lost_telemetry_and_a_lost_port_there_is_no_moment_without_error() -> None:
+    bench = Bench(changes=QUIET)
+    bench.uart(live())
+    bench.wait(1000)
+    assert [(frame.data[:2].hex(), frame.data[4]) for frame in bench.take()] == [("1075", 1)]
+    bench.gateway.port_lost(0, bench.now)
+    assert [(frame.data[:2].hex(), frame.data[4]) for frame in taken(bench)] == [("1075", 3)]
+    bench.gateway.port_opened(0, bench.now)
+    assert [(frame.data[:2].hex(), frame.data[4]) for frame in taken(bench)] == [("1075", 1)]
+    bench.uart(live())
+    assert [frame.data[:2].hex() for frame in taken(bench)] == ["0000"]
+
+
+def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> None:
+    bench = Bench(changes=QUIET, stored=[Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})])
+    assert sorted(bench.gateway.take_misfits()) == [(0, 0x101700), (0, 0x210001)]
+    for _ in range(3):
+        bench.put(0, "82 01")
+        assert bench.gateway.take_misfits() == [(0, 0x101700)]
+    bench.put(0, "81 01")
+    assert sorted(bench.gateway.take_misfits()) == [(0, 0x101700), (0, 0x210001)]
+
+
+def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:
+    """Locks between gateways are taken while nothing has been sent yet."""
+    setup: CanopenSetup = Bench(node_ids=[5, 9, UNCONFIGURED]).setup
+    gateway = Gateway([EscSettings(f"esc{n}") for n in range(3)], EMPTY, 0, canopen=setup)
+    assert gateway.node_ids == [5, 9, UNCONFIGURED]
+    gateway.start(0)
+    assert gateway.node_ids == [5, 9, UNCONFIGURED]
+
+
+def test_what_the_bus_has_to_carry_is_reckoned_with_the_pace_of_each_pdo() -> None:
+    def rate(*mapped: int, kind: int = 255, timer: int = 0) -> float:
+        bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, timer, *mapped)}).start()
+        assert bench.gateway.nodes is not None
+        return bench.gateway.nodes.frames_per_second()
+
+    assert rate(0x20000210) == 100
+    assert rate(CRC_ERRORS) == rate(SENT_FRAMES) == rate(LINK_STATUS) == 1
+    assert rate(LINK_STATUS, timer=100) == 10
+    assert rate(0x20000210, kind=5) == 2
