@@ -339,9 +339,12 @@ class Loop:
     def _begin_reload(self) -> None:
         if self._reloader is None:
             self._reload_asked = False
-        elif self._reloader.begin():  # otherwise it is being read: once more when that is done
-            self._reload_asked = False
+            return
+        self._reload_asked = False  # before it begins: a signal may ask again at any moment
+        if self._reloader.begin():
             self._notifier.reloading()
+        else:
+            self._reload_asked = True  # it is being read: once more when that is done
 
     def _take_reloaded(self, _now: int, _events: int) -> None:
         assert self._reloader is not None

@@ -3,13 +3,16 @@
 import logging
 import select
 import threading
+from types import SimpleNamespace
 
 import pytest
+from wire_world import World, loop_in, run
 
 from kontronik_can_gw.cli.common import fingerprint
 from kontronik_can_gw.config import parse
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.reload import Reloader
+from kontronik_can_gw.telemetry import SECOND
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -81,3 +84,25 @@ def test_what_belongs_to_another_process_changes_nothing() -> None:
     assert of() == of(mqtt={"broker": "b", "rate": 2})
     assert of() != of(record={"directory": "c"})
     assert of() != of(can={"channel": "can1"})
+
+
+def test_a_request_that_comes_while_a_reading_begins_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A signal's handler runs between any two steps: what it asks for is not answered by the reading that had begun."""
+    world = World()
+    loop = loop_in(world, monkeypatch)
+    begun: list[int] = []
+
+    def begin() -> bool:
+        begun.append(world.now)
+        if len(begun) == 1:
+            loop.reload()
+        return True
+
+    loop._reloader = SimpleNamespace(begin=begin)  # type: ignore[assignment]
+    loop.open()
+    loop.begin()
+    loop.reload()
+    run(loop, world, world.now + SECOND)
+    loop.close()
+    assert len(begun) == 2
+    assert not loop.reload_asked

@@ -1,11 +1,13 @@
 """What happens to the CAN interface happens to the gateway, and heals. More faults, times and losses: the fault programme."""
 
+import signal
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 from encoding import Identity
-from vcan_tools import GatewayProcess, chain, configuration, ip, wait_for
+from vcan_tools import Candump, GatewayProcess, canopen_table, chain, configuration, ip, wait_for
 
 from kontronik_can_gw.offline.pty import PtyEsc
 
@@ -51,6 +53,27 @@ def test_an_interface_that_goes_down_and_up_or_away_and_back_is_used_again(vcan:
         wait_for(lambda: gateway.log.count("frames are sent again") == 3, "the log says that it is back")
         run.feed(times=3)
         assert gateway.end() == 0, gateway.log
+
+
+def test_commands_to_a_stopped_process_are_obeyed_when_it_goes_on(
+    vcan: str, start_gateway: Callable[..., GatewayProcess], tmp_path: Path
+) -> None:
+    with PtyEsc() as port, Candump(vcan) as dump:
+        gateway = start_gateway(configuration(vcan, [port.path]) + canopen_table(tmp_path / "store"))
+        wait_for(lambda: dump.of(0x701), "the boot-up")
+        state = Path(f"/proc/{gateway.process.pid}/stat")
+        gateway.process.send_signal(signal.SIGSTOP)
+        wait_for(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", "it has stopped")
+        for frame in ("601#4000100000000000", "000#8101", "601#4018100100000000"):
+            subprocess.run(["cansend", vcan, frame], check=True)
+        wait_for(lambda: len(dump.of(0x601)) == 2, "the requests are on the bus")
+        time.sleep(0.4)  # longer than 250 ms: a hold-up
+        gateway.process.send_signal(signal.SIGCONT)
+        wait_for(lambda: len(dump.of(0x581)) == 2, "both answers")
+        order = [frame.can_id for frame in dump.frames if frame.can_id in (0x581, 0x701) and frame.data[0] != 0x7F]
+        assert order == [0x701, 0x581, 0x701, 0x581]
+        gateway.wait_for_line("suspended")
+        assert gateway.end() == 0
 
 
 def test_the_controllers_state_is_followed_from_error_frames(vcan: str, tmp_path: Path) -> None:
