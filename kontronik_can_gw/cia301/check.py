@@ -146,11 +146,16 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
                 f"TPDO {tpdo.number + 1}: the defaults of {COMMUNICATION + tpdo.number:04X}h and "
                 f"{MAPPING + tpdo.number:04X}h do not make a PDO of node {node_id} ({error})."
             )
-        if tpdo.valid and not tpdo.mapped:
-            yield (
-                f"TPDO {tpdo.number + 1}: {MAPPING + tpdo.number:04X}h maps nothing, so {COMMUNICATION + tpdo.number:04X}h:01 "
-                "cannot be valid. Map objects, or set bit 31 of its DefaultValue."
-            )
+
+
+def without_objects(nodes: Nodes) -> list[str]:
+    """A line for each TPDO that is valid by its defaults and maps nothing, of all nodes: none of them is ever sent."""
+    numbers = sorted({tpdo.number for node in nodes.nodes for tpdo in node.tpdos if tpdo.valid and not tpdo.mapped})
+    return [
+        f"TPDO {number + 1} is never sent: {MAPPING + number:04X}h maps nothing, so {COMMUNICATION + number:04X}h:01 cannot be valid. "
+        "Map objects, or set bit 31 of its DefaultValue."
+        for number in numbers
+    ]
 
 
 def _shared_ids(dictionary: Dictionary, node_ids: Sequence[int]) -> Iterator[str]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.cia301.check import without_objects
 from kontronik_can_gw.cia301.nodes import CanopenSetup
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
@@ -139,6 +140,7 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     with collecting(problems):
         check_devices(config)
     escs, plain, kept = config.escs, None, None
+    ignored: list[str] = []
     taken: dict[int, str] = {}
     bits = 0.0
     if config.canopen.enabled:
@@ -146,11 +148,11 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
             plain = plain_setup(config)
             nodes = plain.nodes(plain.esc_settings(config.escs))
             taken, bits = nodes.cob_ids(), nodes.bits_per_second()
+            ignored += [f"{plain.eds.name}: {line}" for line in without_objects(nodes)]
         if plain is not None and not problems:
             kept = read_stored(config, store)
             escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
     database, layout, dbc = None, Layout("", "", ()), b""
-    ignored: list[str] = []
     if config.dbc.enabled:
         file = str(config.dbc_path)
         with collecting(problems):

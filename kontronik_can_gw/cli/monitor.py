@@ -174,7 +174,9 @@ def last_ns(opened: "Input") -> int | None:
         scanner = Scanner()
         for found in (*scanner.feed(data), *scanner.flush()):
             if isinstance(found, Block) and found.kind == b"D":
-                last = max((entry.time_ns for entry in read_entries(found.payload)), default=last)
+                last = max(
+                    (entry.time_ns for entry in read_entries(found.payload, opened.header["version"])), default=last
+                )
     return last
 
 

@@ -19,8 +19,8 @@ MAX_BYTES = 8_000_000
 _MAX_TOKENS = 500_000
 """The largest real file has 182 000."""
 _MAX_DIGITS = 400
-_MAX_MESSAGE_BYTES = 1785
-"""SAE J1939's transport protocol; a CAN FD frame has 64."""
+_MAX_MESSAGE_BYTES = 4095
+"""ISO 15765-2, of classic frames; SAE J1939's transport protocol has 1785, a CAN FD frame 64."""
 _MAX_BITS = _MAX_MESSAGE_BYTES * 8
 
 

@@ -69,6 +69,8 @@ class CanPort:
         self.bus_off_count = 0
         """How often the controller went to bus-off; who counts them may set it back to 0."""
         self.overruns = 0
+        self.drained = True
+        """Whether the last ``receive`` left nothing: what it did not return may have been taken, as error frames are."""
         """How often received frames were lost, in the controller or because we were late; who counts them may set it back to 0."""
         self._known_drops = 0
         self._bus: Any = _open(config)
@@ -200,10 +202,12 @@ class CanPort:
         frames: list[tuple[CanFrame, int | None]] = []
         if self._reader is not None:
             frames += self._reader.take(limit)
+            self.drained = len(frames) < limit
             if self._reader.failed:
                 self.state = CanState.DOWN
             self._note_drops()
             return frames
+        self.drained = True
         if self._socket is None:
             return frames
         for _ in range(limit):
@@ -229,6 +233,7 @@ class CanPort:
                 frame = CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd)
                 frames.append((frame, _monotonic(ancillary)))
         else:
+            self.drained = False
             self._note_drops()  # there was more than we take at once: perhaps more than the kernel holds
         return frames
 

@@ -13,7 +13,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame, frame_of
 from kontronik_can_gw.gateway import Conflict, Gateway
 from kontronik_can_gw.mailboxes import Mailboxes, Sent, are_images, stand_alone
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, socketcan_error
+from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
@@ -325,7 +325,7 @@ class CanSide:
         if events & selectors.EVENT_READ:
             since = self._selector.before if self._drained else 0
             frames = self.port.receive()
-            self._drained = len(frames) < RECEIVE_LIMIT
+            self._drained = self.port.drained
             self._gateway.status.received_frames += len(frames)
             for frame, at in frames:
                 # a wall clock that was set moves no frame out of the time in which it must have come

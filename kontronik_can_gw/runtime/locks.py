@@ -26,7 +26,7 @@ PREFIX = ""
 _NAME = "kontronik-can-gw"
 _LONGEST_NAME = 200
 _TRIES = 100
-_OPEN = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
+_OPEN = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
 
 
 class Taken(Exception):
@@ -87,15 +87,16 @@ def lock_file(name: str | Path, folder: int | None = None) -> int:
     """Make a file, lock it, return its descriptor. Taken where another process has it, OSError where it cannot be had.
 
     ``folder``: a descriptor that ``name`` is relative to. No link is followed, and a file is ours only if it belongs to us, to root, or
-    to the folder's owner, to whom root gives those that it makes.
+    to the folder's owner. Root lets the folder's group open those that it makes.
     """
     for _ in range(_TRIES):
         around = Path(name).parent.stat() if folder is None else os.fstat(folder)
         try:
             fd = os.open(name, _OPEN | os.O_CREAT | os.O_EXCL, 0o600, dir_fd=folder)
             if os.geteuid() == 0:
-                with contextlib.suppress(OSError):
-                    os.fchown(fd, around.st_uid, around.st_gid)
+                with contextlib.suppress(OSError):  # root's stays root's; the folder's group may open it
+                    os.fchown(fd, -1, around.st_gid)
+                    os.fchmod(fd, 0o660)
         except FileExistsError:
             try:
                 fd = os.open(name, _OPEN, dir_fd=folder)

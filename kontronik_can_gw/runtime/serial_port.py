@@ -72,11 +72,15 @@ class SerialPort:
         self._real_path = os.path.realpath(path)
         self.drained = True
         """Whether the last ``read`` left nothing."""
-        mode = termios.tcgetattr(self._fd)
-        mode[6][termios.VMIN] = 1  # so that an empty port does not look like one that hung up
-        with contextlib.suppress(termios.error):
-            termios.tcsetattr(self._fd, termios.TCSANOW, mode)
-        self._settings = termios.tcgetattr(self._fd)
+        try:
+            mode = termios.tcgetattr(self._fd)
+            mode[6][termios.VMIN] = 1  # so that an empty port does not look like one that hung up
+            with contextlib.suppress(termios.error):
+                termios.tcsetattr(self._fd, termios.TCSANOW, mode)
+            self._settings = termios.tcgetattr(self._fd)
+        except termios.error as error:  # pulled out at this instant
+            self._serial.close()
+            raise _explained(path, error.args[0], str(error)) from None
         if not is_pty:
             with contextlib.suppress(OSError):
                 fcntl.ioctl(self._fd, termios.TIOCEXCL)

@@ -27,12 +27,12 @@ def nested(depth: int, width: int) -> str:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (f"BO_ 1 Msg: 400000000 A\n {SIGNAL}", "Msg: length in bytes is 400000000, not 0 to 1785"),
+        (f"BO_ 1 Msg: 400000000 A\n {SIGNAL}", "Msg: length in bytes is 400000000, not 0 to 4095"),
         (f"BO_ 1 Msg: // 8\n 400000000 A\n {SIGNAL}", "Msg: length in bytes is 400000000"),
         (f"BO_ 1 Msg: 8 A\n {SIGNAL.replace('|8@', '|4294967295@')}", "Msg.s: length in bits is 4294967295"),
         (
             f"BO_ 1 Msg: 8 A\n {SIGNAL.replace(': 0|', ': 4294967295|')}",
-            "Msg.s: start bit is 4294967295, not 0 to 14279",
+            "Msg.s: start bit is 4294967295, not 0 to 32759",
         ),
         (f"BO_ 1 Msg: 8 A\n {SIGNAL.replace(': 0|', ': -1|')}", "Msg.s: start bit is -1"),
         (f"BO_ 99999999999 Msg: 8 A\n {SIGNAL}", "Msg: CAN id is 99999999999"),

@@ -355,6 +355,10 @@ def test_what_0_5_0_sent_as_e2e_profile_1_by_its_names_goes_on_with_a_warning() 
     text = f'{MESSAGE} SG_ Crc : 0|8@1+ (1,0) [0|0] "" Other\n SG_ Alive : 8|4@1+ (1,0) [0|0] "" Other\n'
     assert any("AUTOSAR E2E profile 1" in line and "= 0x100" in line for line in compiled(text).warnings)
     assert not any("E2E" in line for line in compiled(text, data_ids={"Power": 0x100}).warnings)
+    other = compiled(
+        text.replace("Alive", "MsgNo"), bind={"MsgNo": "alive"}
+    )  # a counter by its binding is one by its name
+    assert [signal.role for signal in other.messages[0].signals] == [Role.CRC, Role.ALIVE]
 
 
 # --- flags without telemetry --------------------------------------------------------------------------------------------

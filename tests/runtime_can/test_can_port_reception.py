@@ -188,6 +188,18 @@ def test_a_call_takes_a_bounded_number_of_frames(socket_port: tuple[CanPort, Fak
     assert sizes == [RECEIVE_LIMIT] * 3 + [200 - 3 * RECEIVE_LIMIT, 0]
 
 
+def test_a_port_is_drained_when_nothing_waits_however_few_frames_were_passed_on(
+    socket_port: tuple[CanPort, FakeSocket],
+) -> None:
+    port, fake = socket_port
+    port.set_receive_ids({1})
+    fake.inbox = [packet(1), packet(ERROR | 0x04, b"\0\x10")] * RECEIVE_LIMIT
+    found = []
+    for _ in range(3):
+        found.append((len(port.receive()), port.drained))
+    assert found == [(RECEIVE_LIMIT // 2, False), (RECEIVE_LIMIT // 2, False), (0, True)]
+
+
 def test_each_way_into_bus_off_is_counted_once(socket_port: tuple[CanPort, FakeSocket]) -> None:
     port, fake = socket_port
     off, restarted = packet(ERROR | 0x40, bytes(8)), packet(ERROR | 0x100, bytes(8))
@@ -611,6 +623,7 @@ class ScriptedPort:
 
     def receive(self) -> list[tuple[CanFrame, int | None]]:
         frames, self.inbox = self.inbox[:RECEIVE_LIMIT], self.inbox[RECEIVE_LIMIT:]
+        self.drained = not self.inbox
         return [(frame, None) for frame in frames]
 
     def note_state(self, state: CanState) -> None:

@@ -1,5 +1,6 @@
 """One ESC's port in the loop: which adapter is opened, what is counted, what is said. Time is passed in, ports are scripted."""
 
+import errno
 import fcntl
 import logging
 import os
@@ -392,6 +393,19 @@ def test_echo_is_off_before_anything_else_is_done_to_a_port(monkeypatch: pytest.
     assert "echo on" not in done
     assert done.count("open") == 2, "once to switch echo off, once to use it: the first stays open until then"
     assert "close" not in done[: [n for n, name in enumerate(done) if name == "open"][1]]
+
+
+def test_an_adapter_that_is_pulled_out_while_it_is_set_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = serial_port._open
+
+    def gone(*arguments: Any) -> Any:
+        port = opened(*arguments)
+        monkeypatch.setattr(termios, "tcgetattr", lambda _fd: (_ for _ in ()).throw(termios.error(errno.EIO, "I/O")))
+        return port
+
+    monkeypatch.setattr(serial_port, "_open", gone)
+    with PtyEsc() as esc, pytest.raises(RunError, match="cannot be opened"):
+        serial_port.SerialPort(esc.path)
 
 
 def test_the_mini_uart_of_a_raspberry_pi_is_known_by_its_device_tree(tmp_path: Path) -> None:

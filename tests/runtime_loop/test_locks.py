@@ -4,6 +4,7 @@ import errno
 import fcntl
 import os
 import socket
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -205,9 +206,10 @@ def test_only_what_is_roots_or_the_services_is_obeyed(folders_owner: int, files_
 def test_the_service_can_lock_what_root_has_made(folder: Path) -> None:
     folder.mkdir(parents=True)
     os.chown(folder, SERVICE, SERVICE)
-    fd = lock_file(str(folder / "x"))
-    assert (folder / "x").stat().st_uid == SERVICE
-    os.close(fd)
+    """And sees that it is root's: who is not the service obeys it."""
+    os.close(lock_file(str(folder / "x")))
+    made = (folder / "x").stat()
+    assert (made.st_uid, made.st_gid, stat.S_IMODE(made.st_mode)) == (0, SERVICE, 0o660)
 
 
 @needs_root

@@ -178,6 +178,7 @@ class Bus:
         while self.waits_to_be_read and len(found) < RECEIVE_LIMIT:
             frame, at = self.inbox.pop(0)
             found.append((frame, at + self.clock_error))
+        self.drained = not self.waits_to_be_read
         return found
 
     def discard(self) -> None:

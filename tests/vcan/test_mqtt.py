@@ -44,7 +44,7 @@ def test_what_escs_send_arrives_at_a_subscriber(
     broker = Mosquitto(tmp_path)
     try:
         with bench(FLIES, FLIES) as run, Subscriber(broker.port, "kontronik/chain/#") as heard:
-            toml = configuration(vcan, [port.path for port in run.ports])
+            toml = configuration(vcan, [port.path for port in run.ports], esc="telemetry_timeout_ms = 5000")
             gateway = start_gateway(toml)
             gateway.wait_for_line("esc2: /dev/pts")
             file = tmp_path / "mqtt.toml"
