@@ -6,7 +6,7 @@ import pytest
 from protocol.reference import ambiguous
 
 from kontronik_can_gw.protocol import InfoData, Layout, LiveData, encode
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry
+from kontronik_can_gw.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings, EscTelemetry
 
 STEP = 10 * MS
 FLIGHT = [
@@ -77,6 +77,18 @@ def test_frames_between_damage_are_at_their_places() -> None:
     assert (counters.dropped_crc, counters.dropped_noise) == (len(broken), 7)
     assert telemetry.live == FLIGHT[0]
     assert telemetry.live_ns == now
+
+
+@pytest.mark.parametrize("behind", [0, 1, 7, 100])
+def test_bytes_behind_a_frame_make_it_as_much_older_whatever_came_before(behind: int) -> None:
+    telemetry, now = started()
+    for _ in range(9):
+        now += STEP
+        read(telemetry, FRAME, now)
+    now += STEP
+    telemetry.receive(FRAME + b"\x55" * behind, now, now)
+    assert telemetry.live_ns == now - behind * NS_PER_BYTE
+    assert telemetry.late_frames == 0
 
 
 FRAME = encode(FLIGHT[0], Layout.V4)
