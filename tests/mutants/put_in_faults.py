@@ -24,7 +24,7 @@ LIST = Path(__file__).with_name("faults.toml")
 NOT_COPIED = (".git", ".venv", ".cache", ".*_cache", ".hypothesis", "__pycache__", "node_modules", "build", "dist")
 LIMIT_FACTOR, LEAST_LIMIT_S = 20, 60
 """CPU time for tests with a fault, in proportion to that without."""
-BLOCKED_S = 3600
+BLOCKED_S = 900
 FAILED, BROKEN_AT_IMPORT = 1, 2  # pytest's
 
 
