@@ -38,7 +38,7 @@ _NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTI
 """Objects that can be written and are no part of a configuration."""
 _VALID = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 _CATCHING_UP_NS = SECOND // 2
-"""So long behind a hold-up no heartbeat is missed that has not been seen to be late: what came meanwhile is read bit by bit."""
+"""After a hold-up no heartbeat is missed for this long unless it was seen to be late: what came meanwhile is read piece by piece."""
 FrameTaker = Callable[[bytes, int, int], None]
 """Is given a frame's data, the time, and when the frame came."""
 _SELF_START_OFF = 4

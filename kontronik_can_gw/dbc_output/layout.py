@@ -587,10 +587,10 @@ class _Compiler:
         fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
         one = len(alive) == 1 and alive[0].high >= 14
         key = f"dbc.e2e_data_ids.{message.name} = 0x{message.frame_id & 0xFFFF:X}"
-        if one:
-            bound = self.binder.bound(message.name, alive[0].name)
-            counter = bound if isinstance(bound, str) else alive[0].name
-        if not asked and not (fits and one and counters.is_e2e(crc.name, counter)):
+        by_names = one and counters.is_e2e(
+            crc.name, str(self.binder.bound(message.name, alive[0].name) or alive[0].name)
+        )
+        if not asked and not (fits and by_names):
             self.problems.append(
                 f"{where}.{crc.name}: the DBC does not say how this checksum is made. AUTOSAR E2E profile 1 (8 bits on a byte border, "
                 f"beside exactly one alive counter, 0 to 14) is chosen by {key}. Otherwise bind it to a constant, if receivers take "

@@ -1,7 +1,7 @@
 """Waiting for many descriptors at once: poll(2) with a handler for each.
 
-What there is, and what was not there at a known time, is found by a look of its own behind each wait: a process that was stopped while it
-waited is told that nothing has come once the wait's time is over (PEP 475). And by poll, not epoll, which does not ask a
+What there is, and what was not there at a known time, is found by a look of its own after each wait: a process that was stopped while it
+waited hears that nothing has come once the wait's time is over (PEP 475). And by poll, not epoll, which does not ask a
 terminal whether bytes are still on their way to it inside the kernel.
 """
 
