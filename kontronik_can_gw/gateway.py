@@ -77,14 +77,6 @@ class Gateway:
         self._next_expiry = 0
         """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
-    def take_over(self, old: "Gateway") -> None:
-        """Go on with what an earlier gateway counted: of ESCs with the same name energy, run time and losses."""
-        before = {esc.settings.name: esc for esc in old.escs}
-        for esc in self.escs:
-            if (other := before.get(esc.settings.name)) is not None:
-                esc.energy, esc.run_time, esc.losses = other.energy, other.run_time, other.losses
-        self.status.started_ns = old.status.started_ns
-
     def start(self, now: int, can_open: bool = True) -> None:
         """The runtime has opened what it could: run. Nodes boot when there is a bus that can hear it."""
         self.status.state = GatewayState.RUNNING

@@ -6,14 +6,13 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cia301.check import without_objects
 from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
@@ -24,7 +23,7 @@ from kontronik_can_gw.cli.node_setup import (
     read_stored,
     with_stored,
 )
-from kontronik_can_gw.config import Config, EscConfig, MqttConfig, examine
+from kontronik_can_gw.config import Config, EscConfig, examine
 from kontronik_can_gw.dbc_output.layout import Layout, normalize, parse_database, read_dbc
 from kontronik_can_gw.dbc_output.loss import unreported
 from kontronik_can_gw.dbc_output.prepare import check_load, prepare
@@ -101,19 +100,6 @@ def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) 
     return loaded
 
 
-def fingerprint(config: Config) -> bytes:
-    """What a configuration is made of: its keys and the content of its DBC and EDS. [mqtt] is another process's.
-
-    To be compared only, so it is no digest: for one OpenSSL would be loaded, which takes 4 MB.
-    """
-    found = [repr(replace(config, file="", mqtt=MqttConfig())).encode()]
-    for path, used in ((config.dbc_path, config.dbc.enabled), (config.eds_path, config.canopen.enabled)):
-        if used:
-            with suppress(OSError):  # removed since
-                found.append(path.read_bytes())
-    return b"\0".join(found)
-
-
 def check_devices(config: Config) -> None:
     """What leads to one device by two names: two ESCs on one port, or the CAN adapter on an ESC's. UserError with each."""
     problems = []
@@ -176,22 +162,6 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc)
 
 
-def with_store(loaded: Loaded, store: ParameterStore | None) -> Loaded:
-    """The same configuration as it is in memory, with a store of its own and what is in there now."""
-    if loaded.canopen is None:
-        return replace(loaded, store=store)
-    config = loaded.config
-    kept = read_stored(config, store)
-    plain = replace(loaded.canopen, stored=(Stored(),) * len(config.esc))
-    escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
-    foreign = {message.can_id: message.name for message in loaded.layout.messages if not message.extended}
-    canopen, given_way = with_stored(plain, kept.stored, config, escs, foreign)
-    warnings = (*given_way, *kept.warnings)
-    return replace(
-        loaded, escs=escs, canopen=canopen, store=store, damaged=tuple(kept.damaged), warnings=tuple(warnings)
-    )
-
-
 @contextmanager
 def logging_to_stderr() -> Iterator[None]:
     """Log lines to standard error, by a thread; under systemd without time, with the priorities that journald reads."""
@@ -213,10 +183,9 @@ def logging_to_stderr() -> Iterator[None]:
 
 
 @contextmanager
-def stopping_on_signals(stop: Callable[[], None], reload: Callable[[], None] | None = None) -> Iterator[None]:
-    """SIGTERM and SIGINT call ``stop``, once more end the process at once. SIGHUP calls ``reload``; ``stop`` if the terminal has gone."""
-    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # as by nohup: it is to survive its terminal
-    has_terminal = _has_terminal() and not ignored
+def stopping_on_signals(stop: Callable[[], None], is_service: bool = False) -> Iterator[None]:
+    """SIGTERM and SIGINT call ``stop``, once more end the process at once. SIGHUP ends a service only if its terminal has gone."""
+    has_terminal = _has_terminal() and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN  # ignored: as by nohup
 
     def end(_number: int, _frame: object) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -224,14 +193,14 @@ def stopping_on_signals(stop: Callable[[], None], reload: Callable[[], None] | N
         stop()
 
     def hang_up(_number: int, _frame: object) -> None:
-        if reload is None or (has_terminal and not _has_terminal()):
+        if has_terminal and not _has_terminal():
             log.warning("the terminal was closed: ending (nohup, setsid or a service goes on)")
             stop()
         else:
-            reload()
+            log.warning("SIGHUP is ignored: the configuration is read at the start only. Restart for another one.")
 
     handlers = {signal.SIGTERM: end, signal.SIGINT: end}
-    if reload is not None:
+    if is_service:
         handlers[signal.SIGHUP] = hang_up
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:

@@ -1,9 +1,8 @@
 """The live gateway: one selector loop over serial ports, CAN interface and time. No thread is started here.
 
-What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` and ``reload`` may be called from elsewhere (a
-signal handler, another thread). Threads of their own have the parameter store (store.py), the reading of another configuration
-(reload.py), the statistics (statistics.py), captures (recorder.py), the log (log_writer.py), and reception where python-can has no
-descriptor (bus_reader.py).
+What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` may be called from elsewhere (a signal handler,
+another thread). Threads of their own have the parameter store (store.py), the statistics (statistics.py), captures (recorder.py),
+the log (log_writer.py), and reception where python-can has no descriptor (bus_reader.py).
 """
 
 import contextlib
@@ -25,7 +24,6 @@ from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
 from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.recorder import Recorder
-from kontronik_can_gw.runtime.reload import Reloader
 from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, name_in_words, process_facts, snapshot
 from kontronik_can_gw.runtime.statistics import Statistics
@@ -47,7 +45,7 @@ _LAST_SAVE_S = 0.2
 
 
 class Loop:
-    """Owns ports, interface and gateway while it runs. ``reloader`` reads another configuration when ``reload`` asks for it."""
+    """Owns ports, interface and gateway while it runs."""
 
     def __init__(
         self,
@@ -59,7 +57,6 @@ class Loop:
         status_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
         notifier: Notifier | None = None,
-        reloader: Reloader | None = None,
         statistics: Statistics | None = None,
         program: ProgramFacts | None = None,
         recorder: Recorder | None = None,
@@ -86,8 +83,6 @@ class Loop:
         self._program = program or ProgramFacts("")
         self._store_error = ""
         self._recorder = recorder
-        self._reloader = reloader
-        self._reload_asked = False
         self._stopping = False
         self._poller = poller or Poller(clock)
         self._lost: set[EscInput] = set()
@@ -101,31 +96,11 @@ class Loop:
         self._poller.register(self._wake_read, selectors.EVENT_READ, self._woken)
         if store is not None:
             self._poller.register(store.fileno(), selectors.EVENT_READ, self._take_kept)
-        if reloader is not None:
-            self._poller.register(reloader.fileno(), selectors.EVENT_READ, self._take_reloaded)
 
     def stop(self) -> None:
         """End ``run`` soon; safe in a signal handler and from another thread."""
         self._stopping = True
         self._wake()
-
-    def reload(self) -> None:
-        """Read the configuration again; safe in a signal handler. ``run`` ends if it is another one."""
-        self._reload_asked = True
-        self._look_due = 0
-        self._wake()
-
-    @property
-    def reload_asked(self) -> bool:
-        """True while a request to read the configuration again has not been followed."""
-        return self._reload_asked
-
-    def take_over(self, old: "Loop") -> None:
-        """Know what an earlier loop learnt: which adapter is which ESC's."""
-        known = {(esc.name, esc.path): esc.identity for esc in old.escs}
-        for esc in self.escs:
-            esc.identity = known.get((esc.name, esc.path))
-        self.conditions.recent.extend(old.conditions.recent)
 
     def open(self) -> None:
         """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
@@ -148,7 +123,7 @@ class Loop:
         self._publish(now)  # the first time takes the longest
 
     def run(self) -> None:
-        """Until ``stop``, or until there is another configuration. Then a last status is sent and everything is closed."""
+        """Until ``stop``. Then a last status is sent and everything is closed."""
         self.begin()
         try:
             while not self._stopping:
@@ -334,25 +309,6 @@ class Loop:
             else:
                 self.conditions.end(f"captures: {name}", text, now)
 
-    # --- another configuration
-
-    def _begin_reload(self) -> None:
-        if self._reloader is None:
-            self._reload_asked = False
-            return
-        self._reload_asked = False  # before it begins: a signal may ask again at any moment
-        if self._reloader.begin():
-            self._notifier.reloading()
-        else:
-            self._reload_asked = True  # it is being read: once more when that is done
-
-    def _take_reloaded(self, _now: int, _events: int) -> None:
-        assert self._reloader is not None
-        if self._reloader.take(self.conditions.say):
-            self._stopping = True
-        else:
-            self._notifier.ready(self._status_words())
-
     # --- the service manager
 
     def _tell_manager(self, now: int) -> None:
@@ -413,8 +369,6 @@ class Loop:
     def _look_round(self, now: int) -> None:
         """What need not be done each time the loop comes round."""
         self._look_due = now + LOOK_NS
-        if self._reload_asked:
-            self._begin_reload()
         for esc in self.escs:
             esc.report(now)
         self.can.follow_conflicts(now)

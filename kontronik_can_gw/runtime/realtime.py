@@ -23,7 +23,6 @@ _begun: list[int] = []
 
 def begin(priority: int) -> None:
     """Take real-time priority for this thread, the loop's, and those beside it. RunError where this process has no right to it."""
-    end()
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
@@ -36,18 +35,7 @@ def begin(priority: int) -> None:
     for thread in threading.enumerate():
         if thread is not threading.current_thread():
             follow(thread)
-    _lock_memory(_LOCK_CURRENT | _LOCK_FUTURE | _LOCK_ON_FAULT)
-
-
-def end() -> None:
-    """Be a program as before again."""
-    if not _begun:
-        return
-    _begun.clear()
-    for thread in threading.enumerate():
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(thread.native_id or 0, os.SCHED_OTHER, os.sched_param(0))
-    _lock_memory(0)
+    _lock_memory()
 
 
 def follow(thread: threading.Thread) -> None:
@@ -79,14 +67,10 @@ def _may_lock_all() -> bool:
     return False
 
 
-def _lock_memory(how: int) -> None:
-    """Keep what is used in memory (0: no longer). A right that is missing, or an old kernel, is no reason not to run."""
+def _lock_memory() -> None:
+    """Keep what is used in memory. A right that is missing, or an old kernel, is no reason not to run."""
     if not _may_lock_all():
         return
     import ctypes  # a megabyte that others need not pay for
 
-    system = ctypes.CDLL(None, use_errno=True)
-    if how:
-        system.mlockall(how)
-    else:
-        system.munlockall()
+    ctypes.CDLL(None, use_errno=True).mlockall(_LOCK_CURRENT | _LOCK_FUTURE | _LOCK_ON_FAULT)

@@ -6,8 +6,7 @@ Nothing here raises and nothing blocks: a supervisor that does not listen must n
 import logging
 import os
 import socket
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TextIO
 
 _MOST_CHARACTERS = 800
@@ -20,13 +19,10 @@ class Notifier:
     What the socket does not take now (its queue is full) goes with the next call, but for the sign of life: ``watchdog`` is called often.
     """
 
-    def __init__(
-        self, environment: Mapping[str, str] | None = None, clock: Callable[[], int] = time.monotonic_ns
-    ) -> None:
+    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         environment = os.environ if environment is None else environment
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address if address.startswith("/") else ""
-        self._clock = clock
         self._watchdog_ns = _watchdog_ns(environment)
         self._socket: socket.socket | None = None
         self._owed: dict[str, str] = {}
@@ -43,14 +39,8 @@ class Notifier:
         return self._watchdog_ns if self._address else None
 
     def ready(self, status: str = "") -> None:
-        """Started, or done with a reload."""
-        self._forget("RELOADING", "MONOTONIC_USEC")
+        """The gateway has started."""
         self._tell({"READY": "1"} | self._news(status))
-
-    def reloading(self) -> None:
-        """The configuration is read again: ``ready`` must follow, also where it was refused."""
-        self._forget("READY")
-        self._tell({"RELOADING": "1", "MONOTONIC_USEC": str(self._clock() // 1000)})
 
     def status(self, text: str) -> None:
         """Tell a line for people, if it is another one than before."""
@@ -59,7 +49,7 @@ class Notifier:
 
     def stopping(self, status: str = "") -> None:
         """About to end."""
-        self._forget("READY", "RELOADING", "MONOTONIC_USEC")
+        self._forget("READY")
         self._tell({"STOPPING": "1"} | self._news(status))
 
     def watchdog(self) -> None:

@@ -1,6 +1,5 @@
-"""``run --record`` as its own process: captures over a reload and to the end, and a log beside them that a replay repeats to the byte."""
+"""``run --record`` as its own process: captures to the end, and a log beside them that a replay repeats to the byte."""
 
-import json
 import os
 import signal
 import subprocess
@@ -13,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.capture import Kind
 from kontronik_can_gw.offline import pty
-from kontronik_can_gw.offline.inputs import CaptureInput, open_input
+from kontronik_can_gw.offline.inputs import open_input
 from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -119,38 +117,6 @@ def test_the_log_beside_a_capture_is_what_a_replay_gives(start: Callable[..., Ru
         list(found.frames())
         assert found.damage == []
         assert "KOSMIK 120, firmware 4.17, V4 layout" in found.provenance["esc1"]
-
-
-def test_a_reload_ends_one_capture_and_begins_another(start: Callable[..., Run], tmp_path: Path) -> None:
-    config = tmp_path / "gw.toml"
-    with telemetry(EscOptions()) as ports:
-        config.write_text(configuration(ports, 'directory = "one"'))
-        run = start(config)
-        run.wait_for("esc1: telemetry ok")
-        until(lambda: size_of(tmp_path / "one") > ENOUGH, "what was recorded first")
-        config.write_text(configuration(ports, 'directory = "two"'))
-        run.process.send_signal(signal.SIGHUP)
-        until(lambda: size_of(tmp_path / "two") > ENOUGH, "a second capture")
-        threads = len(os.listdir(f"/proc/{run.process.pid}/task"))
-        config.write_text(configuration(ports))
-        run.process.send_signal(signal.SIGHUP)
-        until(lambda: len(os.listdir(f"/proc/{run.process.pid}/task")) < threads, "the recorder's thread ends")
-        assert run.end() == 0
-    for name in ("one", "two"):
-        with open_input(tmp_path / name) as found:
-            assert isinstance(found, CaptureInput)
-            kinds = [entry.kind for entry in found.entries()]
-            assert found.damage == [], name
-        assert kinds[-1] in (Kind.STOP, Kind.STATE)
-        assert kinds.count(Kind.START) == kinds.count(Kind.STOP) == 1
-        assert kinds.count(Kind.BYTES) > 20
-    with open_input(tmp_path / "one") as one, open_input(tmp_path / "two") as two:
-        assert isinstance(one, CaptureInput)
-        assert isinstance(two, CaptureInput)
-        list(one.samples())
-        state = two.header["state"]
-        assert state["started_ns"] <= one.header["monotonic_ns"] < two.header["created_ns"], "the run goes on"
-        assert json.dumps(state)
 
 
 @pytest.mark.parametrize("wait", [False, True])

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from fault_report import WITH_PYTHON
-from harness import AHEAD, Bench, Fault, Gateway, Injection, NotRecovered, PtyPort, fault
+from harness import AHEAD, Bench, Fault, Injection, NotRecovered, PtyPort, fault
 from raw_bus import RawBus
 
 LIMIT_S = 1.0
@@ -92,52 +92,6 @@ def ended(bench: Bench, fault: Fault, times: int) -> None:
             figures["s to its end"] = max(round(took, 2), figures.get("s to its end", 0))
             injection.expect(took < 0.8, f"it took {took:.2f} s to end; 0.5 s, and 0.3 s for a Python's end here")
             start_and_wait(injection)
-
-
-@fault("Process", "SIGHUP with an unchanged and with a faulty configuration", None)
-def hangup_faulty(bench: Bench, fault: Fault, times: int) -> None:
-    """Said and refused; the old one goes on undisturbed."""
-    assert bench.gateway is not None
-    text = bench.config.read_text()
-    try:
-        for i in range(times):
-            with bench.injection(fault, []) as injection:
-                said = len(bench.gateway.lines)
-                bench.config.write_text(
-                    text if i % 3 == 0 else text + ("\n[nonsense]\nx = 1\n" if i % 3 == 1 else "\n[[esc")
-                )
-                bench.gateway.process.send_signal(signal.SIGHUP)
-                gateway = bench.gateway
-                bench.wait_until(lambda gateway=gateway, said=said: len(gateway.lines) > said, 5, "a line in the log")  # type: ignore[misc]
-                injection.cleared()
-    finally:
-        bench.config.write_text(text)
-
-
-@fault("Process", "SIGHUP with another configuration", LIMIT_S)
-def hangup(bench: Bench, fault: Fault, times: int) -> None:
-    """The same process goes on with the new one."""
-    assert bench.gateway is not None
-    text = bench.config.read_text()
-    try:
-        for i in range(times):
-            with bench.injection(fault) as injection:
-                changed = (
-                    text.replace("pole_pairs = 7", "pole_pairs = 7\ntelemetry_timeout_ms = 240") if i % 2 == 0 else text
-                )
-                bench.config.write_text(changed)
-                injection.cleared()
-                bench.gateway.process.send_signal(signal.SIGHUP)
-                lines, gateway = len(bench.gateway.lines), bench.gateway
-
-                def opened(lines: int = lines, gateway: Gateway = gateway) -> bool:
-                    return any("is open" in line for line in gateway.lines[lines:])
-
-                bench.wait_until(opened, 10, "the new configuration's ports are open")
-                injection.cleared()
-                injection.wait_recovery()
-    finally:
-        bench.config.write_text(text)
 
 
 @fault("Process", "a second instance", None)

@@ -1,4 +1,4 @@
-"""The whole program under a stand-in of the service manager: ready, alive, reloaded, ended."""
+"""The whole program under a stand-in of the service manager: ready, alive, ended."""
 
 import json
 import os
@@ -146,60 +146,11 @@ def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(manage
     assert not (manager.path.parent / "status.json").exists()
 
 
-def test_a_hang_up_reads_the_configuration_again(manager: Manager, esc: PtyEsc) -> None:
-    process = manager.process
-    process.send_signal(signal.SIGHUP)
-    manager.logged("the configuration is unchanged")
-
-    manager.config.write_text(configuration(esc.path, "life", "[can_bus]\nx = 1"))
-    process.send_signal(signal.SIGHUP)
-    manager.logged("the new configuration is refused: the old one stays")
-    manager.logged("can_bus: unknown table")
-
-    manager.config.write_text(configuration(esc.path, "life").replace("[[esc]]", '[[esc]]\nname = "left"'))
-    process.send_signal(signal.SIGHUP)
-    manager.logged(f"left: {esc.path} is open")
-    esc.write(LIVE)
-    manager.logged("left: telemetry ok")
-    manager.wait(lambda: len(manager.said("RELOADING")) == 3, "RELOADING")
-    manager.wait(lambda: len(manager.said("READY")) == 4, "READY after each")
-
-    manager.config.write_text(configuration("/dev/no-such-port", "life"))
-    process.send_signal(signal.SIGHUP)
-    manager.logged("esc1: /dev/no-such-port: no such serial port")
-    manager.config.write_text(configuration(esc.path, "life"))
-    process.send_signal(signal.SIGHUP)
-    manager.logged(f"esc1: {esc.path} is open")
-    assert process.poll() is None
-
-
-def test_no_request_to_read_again_is_lost(manager: Manager, esc: PtyEsc) -> None:
-    """Whatever it comes upon: another reading, or the change to what was read."""
-    for n in range(2, 8):
-        manager.config.write_text(configuration(esc.path, "life").replace("pole_pairs = 7", f"pole_pairs = {n}"))
-        manager.process.send_signal(signal.SIGHUP)
-    manager.config.write_text(configuration(esc.path, "life").replace("[[esc]]", '[[esc]]\nname = "last"'))
+def test_a_hang_up_of_a_service_is_answered_with_what_to_do(manager: Manager, esc: PtyEsc) -> None:
     manager.process.send_signal(signal.SIGHUP)
-    manager.logged(f"last: {esc.path} is open")
-    assert manager.process.poll() is None
-
-
-def test_a_configuration_that_another_program_stands_against_is_given_up_for_the_old_one(
-    manager: Manager, esc: PtyEsc, tmp_path: Path
-) -> None:
-    with socket.socket() as busy:
-        busy.bind(("127.0.0.1", 0))
-        busy.listen()
-        number = busy.getsockname()[1]
-        more = f'[statistics]\nprometheus = "127.0.0.1:{number}"\n[canopen]\nenabled = true\nstore = "{tmp_path}"'
-        manager.config.write_text(configuration(esc.path, "life", more))
-        manager.process.send_signal(signal.SIGHUP)
-        manager.logged("going on with the old one")
-        opened = f"esc1: {esc.path} is open"
-        manager.wait(lambda: sum(opened in line for line in list(manager.lines)) == 2, "opened again")
+    manager.logged("SIGHUP is ignored: the configuration is read at the start only. Restart for another one.")
     esc.write(LIVE)
-    manager.logged("telemetry ok")
-    assert manager.process.poll() is None
+    manager.logged("esc1: telemetry ok")
 
 
 def test_a_second_gateway_on_the_same_port_is_refused_with_a_line(manager: Manager, tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Scheduler:
     monkeypatch.setattr(os, "sched_setscheduler", scheduler.set)
     monkeypatch.setattr(os, "sched_getscheduler", scheduler.policy)
     monkeypatch.setattr(os, "sched_getparam", scheduler.param)
-    monkeypatch.setattr(realtime, "_lock_memory", lambda _how: None)
+    monkeypatch.setattr(realtime, "_lock_memory", lambda: None)
     monkeypatch.setattr(realtime, "_begun", [])
     return scheduler
 
@@ -64,8 +64,6 @@ def test_the_loop_goes_before_the_threads_beside_it(kernel: Scheduler, sleeper: 
     realtime.begin(30)
     assert kernel.of[threading.get_native_id()] == (os.SCHED_FIFO, 30)
     assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 29)
-    realtime.end()
-    assert {policy for policy, _ in kernel.of.values()} == {os.SCHED_OTHER}
 
 
 def test_a_thread_that_is_started_later_follows(kernel: Scheduler, sleeper: threading.Thread) -> None:
@@ -74,31 +72,8 @@ def test_a_thread_that_is_started_later_follows(kernel: Scheduler, sleeper: thre
     assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 1)
 
 
-def test_what_somebody_else_gave_stays(kernel: Scheduler) -> None:
-    given = (os.SCHED_FIFO, 10)
-    kernel.of[threading.get_native_id()] = given
-    realtime.end()
-    assert kernel.of == {threading.get_native_id(): given}
-
-
-def test_after_a_refusal_there_is_none(kernel: Scheduler, monkeypatch: pytest.MonkeyPatch) -> None:
-    realtime.begin(10)
-    allowed = os.sched_setscheduler
-
-    def refusing(pid: int, policy: int, param: os.sched_param) -> None:
-        if param.sched_priority > 10:
-            raise PermissionError(1, "Operation not permitted")
-        allowed(pid, policy, param)
-
-    monkeypatch.setattr(os, "sched_setscheduler", refusing)
-    with pytest.raises(RunError):
-        realtime.begin(20)
-    assert kernel.of[threading.get_native_id()] == (os.SCHED_OTHER, 0)
-
-
 def test_without_it_nothing_is_changed(kernel: Scheduler, sleeper: threading.Thread) -> None:
     assert start_beside_the_loop(sleeper)
-    realtime.end()
     assert kernel.of == {}
 
 

@@ -127,17 +127,11 @@ def test_a_frozen_process_is_replaced_and_tells_where_it_was(facts: Facts) -> No
     assert any("most recent call first" in str(message) for _, message in facts["log"])
 
 
-def test_a_faulty_configuration_is_refused_at_reload_and_the_process_goes_on(facts: Facts) -> None:
-    talk(facts, "reload")
-    assert facts["after faulty reload"]["ActiveState"] == "active"
-    assert facts["same process"]
-    assert [priority for priority, message in facts["log"] if "nonsense" in str(message)] == ["3"]
-
-
 def test_a_faulty_configuration_is_not_started_by_install(facts: Facts) -> None:
     said = talk(facts, "install with faulty configuration", 1)
     assert "gateway.toml: esc[1].nonsense: unknown key." in said
     assert "kontronik-can-gw.service was not enabled and started." in said
+    assert facts["same process"]
 
 
 def test_status_is_readable(facts: Facts) -> None:

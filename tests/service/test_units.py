@@ -106,7 +106,6 @@ def test_it_never_gives_up_and_is_watched(tmp_path: Path) -> None:
     assert unit["Restart"] == ["always"]
     assert unit["StartLimitIntervalSec"] == ["0"]
     assert unit["WatchdogSec"] == ["10s"]
-    assert unit["ExecReload"] == ["/bin/kill -HUP $MAINPID"]
     assert not [
         name for name in unit if name.startswith(("ExecStartPre", "RestartPrevent", "ExecCondition", "Condition"))
     ]
