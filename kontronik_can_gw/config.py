@@ -343,6 +343,8 @@ class Config:
     statistics: StatisticsConfig = StatisticsConfig()
     record: RecordConfig = RecordConfig()
     mqtt: MqttConfig = MqttConfig()
+    warnings: tuple[str, ...] = ()
+    """One line for each key that was removed."""
 
     @cached_property
     def escs(self) -> list[EscSettings]:
@@ -401,6 +403,11 @@ _TABLES: dict[str, type[Any]] = {
     "mqtt": MqttConfig,
     "esc": EscConfig,
 }
+REMOVED_KEYS: dict[str, str] = {}
+"""Table and key of earlier versions, as "record.can_log", and what to do instead, as a sentence.
+
+For a year each is ignored with a warning: a gateway must not fall silent after an upgrade.
+"""
 
 
 def shipped(name: str) -> Path:
@@ -444,6 +451,8 @@ def parse(tables: Mapping[str, Any], file: str) -> Config:
 
 def _parsed(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[str]]:
     problems: list[str] = []
+    warnings: list[str] = []
+    tables = _without_removed_keys(tables, file, warnings)
     for name in tables:
         if name not in _TABLES:
             problems.append(f"{file}: {name}: unknown table.{_nearest(name, _TABLES)}")
@@ -469,9 +478,26 @@ def _parsed(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[s
     _check_escs(escs, file, problems)
     if not is_whole:
         return None, problems
-    config = Config(**cast(Any, made), esc=tuple(escs.values()), file=file)
+    config = Config(**cast(Any, made), esc=tuple(escs.values()), file=file, warnings=tuple(warnings))
     _check_outputs(config, problems)
     return config, problems
+
+
+def _without_removed_keys(tables: Mapping[str, Any], file: str, warnings: list[str]) -> dict[str, Any]:
+    """The tables without keys in ``REMOVED_KEYS``; each of those adds a warning."""
+
+    def kept(name: str, place: str, table: Any) -> Any:
+        if not isinstance(table, dict):
+            return table
+        removed = [key for key in table if f"{name}.{key}" in REMOVED_KEYS]
+        for key in removed:
+            warnings.append(f"{file}: {place}.{key}: was removed and is ignored. {REMOVED_KEYS[f'{name}.{key}']}")
+        return {key: value for key, value in table.items() if key not in removed}
+
+    found = {name: kept(name, name, table) for name, table in tables.items()}
+    if isinstance(found.get("esc"), list):
+        found["esc"] = [kept("esc", f"esc[{number}]", entry) for number, entry in enumerate(found["esc"], 1)]
+    return found
 
 
 def schema() -> dict[str, Any]:
@@ -479,11 +505,16 @@ def schema() -> dict[str, Any]:
     properties: dict[str, Any] = {}
     for name, kind in _TABLES.items():
         required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]
+        removed = {
+            key.removeprefix(f"{name}."): {"description": f"removed: {advice}", "deprecated": True}
+            for key, advice in REMOVED_KEYS.items()
+            if key.startswith(f"{name}.")
+        }
         table: dict[str, Any] = {
             "type": "object",
             "description": (kind.__doc__ or "").strip(),
             "additionalProperties": False,
-            "properties": {f.name: _schema_of(f) for f in fields(kind)},
+            "properties": {f.name: _schema_of(f) for f in fields(kind)} | removed,
         }
         if required:
             table["required"] = required

@@ -16,6 +16,7 @@ from importlib import import_module
 from pathlib import Path
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.cli.arguments import refuse_removed_options
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 
@@ -73,6 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(words: list[str], command: str | None) -> int:
     _prepare_streams()
     need_descriptors()
+    refuse_removed_options(command, words)
     args = make_parser([] if command is None else [command]).parse_args(words)
     with _interruptible():
         code: int = args.main(args)

@@ -1,7 +1,16 @@
 """What several commands ask of their options."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+from kontronik_can_gw.errors import UserError
+
+REMOVED_OPTIONS: dict[tuple[str, str], str] = {}
+"""Command and option of earlier versions, as ("report", "--png"), and what to type instead, as a sentence.
+
+A choice of an option that stays is written with it: ("describe", "--format html"). Each may go a year after its removal.
+"""
 
 
 def number_from(low: float, high: float, what: str = "number of seconds") -> Callable[[str], float]:
@@ -17,3 +26,13 @@ def number_from(low: float, high: float, what: str = "number of seconds") -> Cal
         return value
 
     return read
+
+
+def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
+    """UserError with what to type instead, where a command line has an option that was removed."""
+    options = words[: words.index("--")] if "--" in words else words
+    parts = [part for word in options for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    for part, value in pairwise([*parts, ""]):
+        for option in (part, f"{part} {value}"):
+            if advice := REMOVED_OPTIONS.get((command or "", option)):
+                raise UserError(f"{option}: was removed. {advice}")

@@ -158,7 +158,7 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
         warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
     damaged = () if kept is None else tuple(kept.damaged)
     mute = unreported(layout, config.dbc.on_loss == "silent")
-    said = tuple(warning for warning in (*ignored, *mute, *warnings) if warning)
+    said = tuple(warning for warning in (*config.warnings, *ignored, *mute, *warnings) if warning)
     return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc)
 
 

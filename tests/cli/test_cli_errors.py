@@ -17,7 +17,8 @@ import pytest
 from command_line import refused, run
 
 from kontronik_can_gw.cli import COMMANDS
-from kontronik_can_gw.config import load, schema, shipped
+from kontronik_can_gw.cli.arguments import REMOVED_OPTIONS
+from kontronik_can_gw.config import REMOVED_KEYS, load, schema, shipped
 from kontronik_can_gw.offline.pty import PtyEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -54,6 +55,39 @@ def test_the_help_lists_the_commands() -> None:
     assert (done.returncode, done.stderr) == (0, "")
     for name, line in COMMANDS.items():
         assert re.search(rf"^ +{name} +{re.escape(line)}", done.stdout, re.MULTILINE)
+
+
+@pytest.mark.parametrize("given", ["--tape x", "--tape=x", "--format=wax", "--format wax", "-h --tape"])
+def test_a_removed_option_is_one_line_with_what_to_type_instead(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--tape"), "Type -o x.")
+    monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--format wax"), "Type -o x.")
+    option = "--tape" if "--tape" in given else "--format wax"
+    assert refused(2, "describe", *given.split()) == f"{option}: was removed. Type -o x."
+    assert "unrecognized arguments: --tape" in refused(2, "schema", "--tape")
+
+
+def test_a_file_may_have_the_name_of_a_removed_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(REMOVED_OPTIONS, ("decode", "--tape"), "Type -o x.")
+    assert "No such file" in refused(1, "decode", "--", "--tape")
+
+
+def test_no_removed_option_is_in_use() -> None:
+    for (command, option), advice in REMOVED_OPTIONS.items():
+        name, _, choice = option.partition(" ")
+        usage = run(command, "--help").out
+        assert not re.search(rf"{name}\b" if not choice else rf"{name} {{[^}}]*\b{choice}\b", usage), option
+        assert advice.endswith("."), option
+
+
+def test_a_removed_key_is_a_warning_of_every_command_that_reads_the_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(REMOVED_KEYS, "can.queue", "Leave it out.")
+    file = configuration(tmp_path, can='interface = "virtual"\nqueue = 3')
+    line = f"{file}: can.queue: was removed and is ignored. Leave it out."
+    done = run("check", "-c", file)
+    assert (done.code, done.err) == (0, f"kontronik-can-gw: warning: {line}\n")
+    assert line in run("doctor", "-c", file, "--json").out
 
 
 # --- ports

@@ -15,7 +15,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import kontronik_can_gw
-from kontronik_can_gw.config import Config, as_toml, load, mqtt_with, parse, schema, shipped
+from kontronik_can_gw.config import REMOVED_KEYS, Config, as_toml, load, mqtt_with, parse, schema, shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.states import Device
 from kontronik_can_gw.telemetry import MS
@@ -259,6 +259,7 @@ def named(*names: str) -> dict[str, Any]:
 
 
 AMBIGUOUS = "makes signal names ambiguous. Choose another name."
+KNOWN_IN_CAN = "Known: interface, channel, bitrate, fd, data_bitrate, options."
 NEEDED = "esc: at least one [[esc]] with its port is needed. `kontronik-can-gw init` shows one."
 MISTAKES: list[tuple[dict[str, Any], str]] = [
     (tables() | {"cann": {}}, "cann: unknown table. Did you mean can?"),
@@ -315,6 +316,39 @@ def test_the_same_port_twice_is_told_with_the_numbers_in_the_file() -> None:
 def test_names_that_begin_alike_but_can_be_told_apart_are_taken(names: tuple[str, ...]) -> None:
     config = parse(named(*names), "a.toml")
     assert [esc.name for esc in config.escs] == list(names)
+
+
+# --- keys of earlier versions
+
+
+def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(REMOVED_KEYS, "can.queue", "Leave it out.")
+    monkeypatch.setitem(REMOVED_KEYS, "esc.motor", "Give pole_pairs.")
+    old = {"can": {"queue": 3, "channel": "can1"}, "esc": [{"port": "a"}, {"port": "b", "motor": [], "gear": 2}]}
+    config = parse(old, "a.toml")
+    assert config.warnings == (
+        "a.toml: can.queue: was removed and is ignored. Leave it out.",
+        "a.toml: esc[2].motor: was removed and is ignored. Give pole_pairs.",
+    )
+    assert (config.can.channel, config.esc[1].gear) == ("can1", 2)
+    assert config.can == parse({"can": {"channel": "can1"}} | escs({}), "a.toml").can
+    assert jsonschema.Draft202012Validator(schema()).is_valid(old)
+    assert "queue" not in as_toml(config)
+    assert parse(tables(), "a.toml").warnings == ()
+
+
+def test_a_removed_key_hides_no_mistake(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(REMOVED_KEYS, "can.queue", "Leave it out.")
+    assert problems(tables("can", "queues", 1)) == [f"a.toml: can.queues: unknown key. {KNOWN_IN_CAN}"]
+    assert problems(tables("dbc", "queue", 1))[0].startswith("a.toml: dbc.queue: unknown key.")
+    assert problems(tables("can", "queue", 1) | {"run": 1}) == ["a.toml: run: is a table, written [run]"]
+
+
+def test_no_removed_key_is_in_use_and_each_says_what_to_do_instead() -> None:
+    for key, advice in REMOVED_KEYS.items():
+        table, _, name = key.partition(".")
+        assert table in TABLES and name not in TABLES[table], key
+        assert advice.endswith("."), key
 
 
 # --- files
@@ -394,8 +428,8 @@ def test_the_shipped_example_has_every_key_of_every_table() -> None:
     made = tomllib.loads(uncommented())
     properties = schema()["properties"]
     for table, keys in TABLES.items():
-        entries = properties[table].get("items", properties[table])
-        assert set(entries["properties"]) == set(keys)
+        entries = properties[table].get("items", properties[table])["properties"]
+        assert {key for key, entry in entries.items() if "deprecated" not in entry} == set(keys)
         found = {key for entry in made["esc"] for key in entry} if table == "esc" else set(made[table])
         assert found == set(keys)
     assert set(properties) == set(TABLES) == set(made)
