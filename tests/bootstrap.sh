@@ -118,8 +118,7 @@ install_programs() {
 }
 
 install_small_tools() {
-    install_programs "what screens, completion, manual page and benchmarks are tried with" \
-        tmux zsh mandoc groff=groff-base openssl gcc=gcc,libc6-dev
+    install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl gcc=gcc,libc6-dev
 }
 
 install_browser() { command -v google-chrome >/dev/null || install_programs "a browser" chromium; }

@@ -38,7 +38,7 @@ COMMANDS = {
     "simulate": "simulate ESCs on pseudo terminals",
     "mqtt": "publish the ESCs' values from the bus to an MQTT broker",
     "schema": "print the JSON Schema of the configuration",
-    "describe": "what is sent and what it means: messages, objects, errors with remedies; the man page",
+    "describe": "what is sent and what it means: messages, objects, errors with remedies",
     "completion": "print the completion script of a shell",
 }
 

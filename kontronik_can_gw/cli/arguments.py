@@ -6,7 +6,13 @@ from itertools import pairwise
 
 from kontronik_can_gw.errors import UserError
 
-REMOVED_OPTIONS: dict[tuple[str, str], str] = {}
+REMOVED_OPTIONS: dict[tuple[str, str], str] = {
+    (
+        "describe",
+        "--format html",
+    ): "Type kontronik-can-gw describe -o bus.md; pandoc -s bus.md -o bus.html makes a page of it.",
+    ("describe", "--format man"): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
+}
 """Command and option of earlier versions, as ("report", "--png"), and what to type instead, as a sentence.
 
 A choice of an option that stays is written with it: ("describe", "--format html"). Each may go a year after its removal.

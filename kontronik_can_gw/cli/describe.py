@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
 
 if TYPE_CHECKING:
@@ -14,8 +13,7 @@ EPILOG = """\
 Signals and messages of the DBC in use, the CANopen nodes with their objects and emergencies, error bits and states with meaning and
 remedy. With -c as that configuration sends them: its ESCs, DBC, EDS and node-IDs. Otherwise of the shipped DBC and EDS, node-IDs from 1.
 
-md is for a repository or wiki, html one page that needs no network, json for programs (its keys only change with "version").
-man is the manual page of this program: kontronik-can-gw describe --format man > kontronik-can-gw.1
+md is for a repository or wiki, json for programs (its keys only change with "version").
 
 exit codes: 0 done, 1 the output cannot be written, 2 wrong usage, configuration, DBC or EDS
 """
@@ -30,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-c", "--config", type=Path, metavar="FILE", help="what the gateway with this TOML configuration sends"
     )
     group.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the shipped one")
-    parser.add_argument("--format", choices=("md", "html", "json", "man"), default="md", help="default: md")
+    parser.add_argument("--format", choices=("md", "json"), default="md", help="default: md")
     parser.add_argument("-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)")
 
 
@@ -43,20 +41,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _text(args: argparse.Namespace) -> str:
-    if args.format == "man":
-        if args.config is not None or args.dbc is not None:
-            raise UserError("--format man: is about the program, not about a configuration. Leave out -c and --dbc.")
-        from kontronik_can_gw.cli.man_page import man_page
-
-        return man_page()
     facts = _facts(args)
     if args.format == "json":
         return printable_json(facts.as_json(), indent=2, allow_nan=False) + "\n"
     from kontronik_can_gw.offline.describe.document import document
-    from kontronik_can_gw.offline.describe.html import html
     from kontronik_can_gw.offline.describe.markdown import markdown
 
-    return {"md": markdown, "html": html}[args.format](document(facts))
+    return markdown(document(facts))
 
 
 def _facts(args: argparse.Namespace) -> "Description":

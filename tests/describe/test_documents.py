@@ -1,6 +1,5 @@
 """The document holds everything, and whatever is in a DBC or EDS is shown as text: read back by a parser that knows nothing of us."""
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -15,9 +14,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
-from kontronik_can_gw.cli import COMMANDS, make_parser
+from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.offline.describe.document import Code, Document, Section, Table
-from kontronik_can_gw.offline.describe.html import html
 from kontronik_can_gw.offline.describe.markdown import markdown
 
 Rows = list[list[str]]
@@ -90,9 +88,8 @@ def everything(facts: dict[str, object]) -> Iterator[str]:
                 yield item
 
 
-@pytest.mark.parametrize(("kind", "read"), [("md", read_markdown), ("html", Page)])
-def test_everything_that_the_facts_hold_is_in_the_document(kind: str, read: type[Page]) -> None:
-    found = read(described("--format", kind))
+def test_everything_that_the_facts_hold_is_in_the_document() -> None:
+    found = read_markdown(described())
     facts = json.loads(described("--format", "json"))
     whole = "\n".join([*found.titles, *found.paragraphs, *sorted(found.cells)])
     del facts["sources"]  # those that only objects show are with the objects
@@ -126,28 +123,17 @@ def test_any_text_comes_back_as_it_is(title: str, paragraph: str, cell: str, nam
     table = Table(("one", "two"), ((cell, Code(name)), (paragraph, "end")))
     blocks = (f"x {paragraph}", table) if not paragraph.strip() else (paragraph, table)
     document = Document("All", ("lead",), (Section(f"T {title}", 2, "t", blocks),))
-    for found in (read_markdown(markdown(document)), Page(html(document))):
-        assert list(map(one_line, found.titles)) == ["All", one_line(f"T {title}")]
-        assert one_line(blocks[0] if isinstance(blocks[0], str) else "") in map(one_line, found.paragraphs)
-        assert [[one_line(text) for text in row] for row in found.tables[0]] == [
-            ["one", "two"],
-            [one_line(cell), one_line(name)],
-            [one_line(paragraph), "end"],
-        ]
+    found = read_markdown(markdown(document))
+    assert list(map(one_line, found.titles)) == ["All", one_line(f"T {title}")]
+    assert one_line(blocks[0] if isinstance(blocks[0], str) else "") in map(one_line, found.paragraphs)
+    assert [[one_line(text) for text in row] for row in found.tables[0]] == [
+        ["one", "two"],
+        [one_line(cell), one_line(name)],
+        [one_line(paragraph), "end"],
+    ]
 
 
-# --- the manual page and completion, of the command line's parser
-
-
-def test_the_manual_page_has_every_command_and_option() -> None:
-    page = described("--format", "man").replace("\\-", "-")
-    (commands,) = (a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
-    for name, parser in commands.choices.items():
-        assert f'.SS "{name}"' in page or f".SS {name}" in page, name
-        assert all(option in page for action in parser._actions for option in action.option_strings), name
-    if groff := shutil.which("groff"):
-        done = subprocess.run([groff, "-man", "-ww", "-Tutf8"], input=page, capture_output=True, text=True, check=True)
-        assert done.stderr == ""
+# --- completion, of the command line's parser
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +163,7 @@ ASKED = r"""
         ("des", {"describe"}),
         ("service st", {"status"}),
         ("service status --l", {"--lines"}),
-        ("describe --dbc car.dbc --format h", {"html"}),
+        ("describe --dbc car.dbc --format j", {"json"}),
         ("describe --dbc car", {"car.dbc"}),
         ("run -c car", {"car.toml"}),
         ("decode car", {"car.toml", "car.dbc", "car.bin"}),

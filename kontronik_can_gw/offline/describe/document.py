@@ -1,4 +1,4 @@
-"""A description as a document: titles, lines and tables, which ``markdown`` and ``html`` write down. Pure."""
+"""A description as a document: titles, lines and tables, which ``markdown`` writes down. Pure."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
