@@ -1,13 +1,11 @@
 """What ``make test`` makes of its steps: nothing that failed, was not run or left no report passes for good, and nothing is run twice."""
 
-import importlib.util
 import re
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
+import run as checks
 
 CASES = {
     "passed": "<testcase classname='a' name='b'/>",
@@ -18,18 +16,8 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module")
-def checks() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("run_checks", Path(__file__).parent / "run.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look there
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture
-def step(checks: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+def step(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     """A function that runs a shell command as the step "unit"; with ``cases`` it leaves a report."""
 
     def run(command: str, *cases: str, arguments: tuple[str, ...] = ()) -> Any:
@@ -69,23 +57,21 @@ def test_a_choice_that_fits_no_test_of_a_step_is_no_failure_of_it(step: Any) -> 
 
 @pytest.mark.parametrize(("command", "state"), [("true", "passed"), ("exit 1", "FAILED")])
 def test_a_step_without_tests_is_one_check(
-    checks: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, state: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, state: str
 ) -> None:
     monkeypatch.setitem(checks.STEPS, "lint", command)
     result = checks.run("lint", 60, tmp_path, tmp_path, (), False)
     assert (result.passed + result.failed, result.state) == (1, state)
 
 
-def test_a_step_that_does_not_end_is_ended_and_has_failed(
-    checks: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_step_that_does_not_end_is_ended_and_has_failed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(checks.STEPS, "lint", "sleep 600")
     result = checks.run("lint", 0.1, tmp_path, tmp_path, (), False)
     assert (result.state, result.note) == ("FAILED", "no end within 0.1 s")
 
 
 def test_what_is_missing_is_not_run_and_the_remedy_is_named(
-    checks: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(checks.NEEDS, "faults", (("no-such-program",), "sudo make one"))
     result = checks.run("faults", 60, tmp_path, tmp_path, (), False)
@@ -105,7 +91,6 @@ def test_what_is_missing_is_not_run_and_the_remedy_is_named(
     ],
 )
 def test_the_last_line_has_the_totals(
-    checks: ModuleType,
     capsys: pytest.CaptureFixture[str],
     passed: int,
     failed: int,
@@ -121,7 +106,7 @@ def test_the_last_line_has_the_totals(
     assert checks.summarize(results, strict=True) == strict_code
 
 
-def test_every_step_is_in_one_tier_and_a_test_of_each_marker_is_run_somewhere(checks: ModuleType) -> None:
+def test_every_step_is_in_one_tier_and_a_test_of_each_marker_is_run_somewhere() -> None:
     steps = [step for lanes in checks.TIERS.values() for lane in lanes for step in lane]
     assert sorted(steps) == sorted(checks.STEPS)
     for place in ("--ignore=tests/vcan", "-p no:cacheprovider tests/vcan"):

@@ -1,8 +1,7 @@
 """Starts feeder and gateways, and measures the CPU time of a gateway while telemetry flows.
 
-with programs.session(context, escs=8) as feeder:            # the pseudo terminals are there
-    with Gateway(context, "c", feeder) as gateway:            # "c", "ours" or "obvious"
-        measured = feeder.measure(gateway)
+with running(context, "c", 8) as (feeder, gateway):    # "c", "ours" or "obvious"
+    measured = feeder.measure(gateway)
 """
 
 import contextlib
@@ -11,6 +10,7 @@ import json
 import os
 import select
 import signal
+import socket
 import statistics
 import subprocess
 import sys
@@ -91,43 +91,34 @@ class Feeder:
     """The ESCs, and the other end of the bus."""
 
     def __init__(self, context: Context, escs: int, *options: str, seconds: float | None = None) -> None:
-        self.escs = escs
         self.bus = f"can:{context.vcan}" if context.vcan else f"unix:kontronik-bench-{uuid.uuid4().hex[:12]}"
         program = context.compiled("feeder.c", "-pthread")
         length = context.seconds if seconds is None else seconds
         warmup = 0.5 if context.quick else 2.0
         self._limit_s = length + warmup + 30
-        command = [
-            str(program),
-            "--bus",
-            self.bus,
-            "--escs",
-            str(escs),
-            "--seconds",
-            str(length),
-            "--warmup",
-            str(warmup),
-        ]
-        self.process = start(
-            [*command, "--priority", str(_PRIORITY), *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
+        words = ["--bus", self.bus, "--escs", escs, "--seconds", length, "--warmup", warmup, "--priority", _PRIORITY]
+        command = [str(program), *map(str, words), *options]
+        self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._heard = ""
-        told = self._line()
-        self.ports: list[str] = told["ports"]
+        self.ports: list[str] = self._line()["ports"]
 
-    def _line(self, gateway: "Gateway | None" = None) -> dict[str, Any]:
+    def _hear(self, gateway: "Gateway | None" = None) -> bool:
+        """Take in what the feeder says next; whether it goes on."""
         assert self.process.stdout is not None
         fd, deadline = self.process.stdout.fileno(), time.monotonic() + self._limit_s
+        while not select.select([fd], [], [], 0.2)[0]:
+            if gateway is not None:
+                gateway.check()
+            if time.monotonic() > deadline:
+                raise RuntimeError("the feeder says nothing more")
+        data = os.read(fd, 1 << 16)
+        self._heard += data.decode()
+        return data != b""
+
+    def _line(self, gateway: "Gateway | None" = None) -> dict[str, Any]:
         while "\n" not in self._heard:
-            if not select.select([fd], [], [], 0.2)[0]:
-                if gateway is not None:
-                    gateway.check()
-                if time.monotonic() > deadline:
-                    raise RuntimeError("the feeder says nothing more")
-                continue
-            if not (data := os.read(fd, 1 << 16)):
+            if not self._hear(gateway):
                 raise RuntimeError(f"the feeder ended: exit code {self.process.wait()}")
-            self._heard += data.decode()
         line, _, self._heard = self._heard.partition("\n")
         found: dict[str, Any] = json.loads(line)
         return found
@@ -145,17 +136,8 @@ class Feeder:
 
     def rest(self, gateway: "Gateway") -> list[str]:
         """All lines until the feeder ends."""
-        assert self.process.stdout is not None
-        fd, deadline = self.process.stdout.fileno(), time.monotonic() + self._limit_s
-        while True:
-            if not select.select([fd], [], [], 0.2)[0]:
-                gateway.check()
-                if time.monotonic() > deadline:
-                    raise RuntimeError("the feeder says nothing more")
-                continue
-            if not (data := os.read(fd, 1 << 16)):
-                break
-            self._heard += data.decode()
+        while self._hear(gateway):
+            pass
         return self._heard.splitlines()
 
     def close(self) -> None:
@@ -173,12 +155,10 @@ class Gateway:
         config: str = "",
         dbc: Path | None = FIVE,
         wrap: Callable[[list[str]], list[str]] = list,
-        environment: dict[str, str] | None = None,
     ) -> None:
         """``config``: further lines of our configuration, tables at their end. ``wrap`` makes another command of the command."""
         self._folder = tempfile.TemporaryDirectory(prefix="kontronik-bench-")
-        folder = Path(self._folder.name)
-        self.folder = folder
+        self.folder = folder = Path(self._folder.name)
         channel = context.vcan or "lo"
         if program == "c":
             command = [str(context.compiled("gateway.c")), feeder.bus, *feeder.ports]
@@ -188,10 +168,9 @@ class Gateway:
             (folder / "gateway.toml").write_text(config_text(feeder.ports, channel, dbc, folder, config))
             command = [sys.executable, str(STANDIN), feeder.bus, "ours", "run", "-c", str(folder / "gateway.toml")]
         self._errors = (folder / "errors").open("w+")
-        further = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""} | (environment or {})
-        self.process = start(
-            wrap(command), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._errors, env=further
-        )
+        same = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""}
+        nothing = subprocess.DEVNULL
+        self.process = start(wrap(command), stdin=nothing, stdout=nothing, stderr=self._errors, env=same)
         self.program = program
         self.pid = self.process.pid
 
@@ -257,3 +236,9 @@ def once(context: Context, program: str, escs: int, *options: str, **further: An
 def median(values: Sequence[float]) -> float:
     """Of a few rounds."""
     return float(statistics.median(values))
+
+
+def free_port() -> int:
+    """A TCP port that nobody has at the moment."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])

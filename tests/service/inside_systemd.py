@@ -104,7 +104,6 @@ def trial(facts: Facts) -> None:
     facts["fresh after"] = fresh()
     until(lambda: "telemetry ok" in shown()["StatusText"])  # which is told once a second
     facts["running"] = shown()
-    facts["status"] = service("status")
     pid = facts["running"]["MainPID"]
     facts["process"] = Path(f"/proc/{pid}/status").read_text()
     facts["nice"] = os.getpriority(os.PRIO_PROCESS, int(pid))
@@ -147,7 +146,6 @@ def trial(facts: Facts) -> None:
     facts["probe"] = probed()
     facts["probe with prometheus"] = service("install", "--prometheus"), probed()
     facts["log"] = [[entry.get("PRIORITY"), entry.get("MESSAGE")] for entry in entries()]
-    facts["as nobody"] = run("setpriv", "--reuid=65534", "--clear-groups", PROGRAM, "service", "uninstall")
     facts["network"] = service("install", "--network", "500000", "--channel", "vcan1"), networkd()
 
     facts["uninstall"] = service("uninstall")

@@ -134,23 +134,12 @@ def test_a_faulty_configuration_is_not_started_by_install(facts: Facts) -> None:
     assert facts["same process"]
 
 
-def test_status_is_readable(facts: Facts) -> None:
-    done = facts["status"]
-    assert (done["code"], done["talk"]) == (0, "")
-    lines = done["out"].splitlines()
-    assert lines[0].startswith("kontronik-can-gw.service: active (running) since ")
-    assert lines[0].endswith("; starts with the machine")
-    assert "esc1: telemetry ok" in lines[1]
-    assert "restarted 0 times" in lines[2]
-    assert lines[3] == "  configuration  /etc/kontronik-can-gw/gateway.toml"
-    assert lines[4].startswith("  log ")
-
-
 def test_several_gateways_run_side_by_side(facts: Facts) -> None:
     talk(facts, "install left")
     done = facts["status of both"]
     assert done["code"] == 0
     heads = [line for line in done["out"].splitlines() if not line.startswith(" ")]
+    assert "esc1: telemetry ok" in done["out"]
     assert [head.split(" (")[0] for head in heads] == [
         "kontronik-can-gw.service: active",
         "kontronik-can-gw@left.service: active",
@@ -195,11 +184,6 @@ def test_networkd_understands_the_network_file(facts: Facts) -> None:
         pytest.skip("systemd-networkd is missing: sudo apt-get install systemd (or systemd-networkd)")
     assert "60-wrong.network:4: Unknown key name 'Bitrat'" in said or "60-wrong.network:4: Unknown key 'Bitrat'" in said
     assert "50-kontronik-can-gw-vcan1.network:" not in said
-
-
-def test_only_root_removes_it(facts: Facts) -> None:
-    assert talk(facts, "as nobody", 1).count("\n") == 1
-    assert "only root may do that: sudo " in talk(facts, "as nobody", 1)
 
 
 def test_uninstall_keeps_what_people_wrote(facts: Facts) -> None:

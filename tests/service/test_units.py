@@ -100,15 +100,28 @@ def test_both_units_differ_only_in_their_names(tmp_path: Path) -> None:
     assert template["StateDirectory"] == template["RuntimeDirectory"] == ["kontronik-can-gw-%i"]
 
 
-def test_it_never_gives_up_and_is_watched(tmp_path: Path) -> None:
-    unit = settings(files(tmp_path)[NAMES[0]].text)
-    assert unit["Type"] == ["notify"]
-    assert unit["Restart"] == ["always"]
-    assert unit["StartLimitIntervalSec"] == ["0"]
-    assert unit["WatchdogSec"] == ["10s"]
-    assert not [
-        name for name in unit if name.startswith(("ExecStartPre", "RestartPrevent", "ExecCondition", "Condition"))
-    ]
+SETTINGS = {
+    "Type": ["notify"],
+    "Restart": ["always"],
+    "StartLimitIntervalSec": ["0"],
+    "WatchdogSec": ["10s"],
+    "RestrictAddressFamilies": ["AF_CAN AF_UNIX AF_NETLINK"],
+    "IPAddressDeny": ["any"],
+    "CapabilityBoundingSet": [""],
+    "AmbientCapabilities": [""],
+    "ProtectHome": ["yes"],
+}
+
+
+def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet(tmp_path: Path) -> None:
+    made = files(tmp_path)
+    unit = settings(made[NAMES[0]].text)
+    assert {name: unit[name] for name in SETTINGS} == SETTINGS
+    never = ("ExecStartPre", "RestartPrevent", "ExecCondition", "Condition")
+    assert not [name for name in unit if name.startswith(never)]
+    assert "prometheus.conf" not in made
+    loopback = settings(files(tmp_path, prometheus=True)["prometheus.conf"].text)
+    assert loopback == {"RestrictAddressFamilies": ["AF_INET AF_INET6"], "IPAddressAllow": ["localhost"]}
 
 
 def test_it_may_open_serial_ports_and_nothing_else(tmp_path: Path) -> None:
@@ -120,17 +133,6 @@ def test_it_may_open_serial_ports_and_nothing_else(tmp_path: Path) -> None:
     for module in ("usbserial", "cdc_acm"):
         assert all(f"modprobe@{module}.service" in unit[name][0].split() for name in ("Wants", "After"))
     assert "PrivateDevices" not in unit
-
-
-def test_it_speaks_can_and_nothing_of_the_internet(tmp_path: Path) -> None:
-    made = files(tmp_path)
-    unit = settings(made[NAMES[0]].text)
-    assert unit["RestrictAddressFamilies"] == ["AF_CAN AF_UNIX AF_NETLINK"]
-    assert unit["IPAddressDeny"] == ["any"]
-    assert unit["CapabilityBoundingSet"] == unit["AmbientCapabilities"] == [""]
-    assert "prometheus.conf" not in made
-    loopback = settings(files(tmp_path, prometheus=True)["prometheus.conf"].text)
-    assert loopback == {"RestrictAddressFamilies": ["AF_INET AF_INET6"], "IPAddressAllow": ["localhost"]}
 
 
 def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it(tmp_path: Path) -> None:
@@ -146,17 +148,6 @@ def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it(tmp_path: Pa
     assert "RuntimeDirectoryPreserve" in settings(made[NAMES[0]].text)
 
 
-def test_a_program_in_a_home_folder_is_seen_but_not_written(tmp_path: Path) -> None:
-    for visible, value in ((False, "yes"), (True, "read-only")):
-        assert settings(files(tmp_path, home_visible=visible)[NAMES[0]].text)["ProtectHome"] == [value]
-
-
-def test_the_group_of_serial_ports_is_the_systems(tmp_path: Path) -> None:
-    made = files(tmp_path, group="uucp")
-    assert settings(made[NAMES[0]].text)["SupplementaryGroups"] == ["uucp"]
-    assert "m kontronik-can-gw uucp\n" in made["sysusers.d"].text
-
-
 def test_nothing_is_left_to_be_filled_in(tmp_path: Path) -> None:
     for bitrate in (None, 250_000):
         for file in files(tmp_path, bitrate=bitrate, prometheus=True).values():
@@ -167,27 +158,13 @@ def test_nothing_is_left_to_be_filled_in(tmp_path: Path) -> None:
 
 
 def test_the_network_file_has_what_the_bus_needs(tmp_path: Path) -> None:
+    assert "BitRate=500000" in files(tmp_path)["50-kontronik-can-gw-can0.network.example"].text
     made = files(tmp_path, bitrate=250_000, channel="can1")
     network = settings(made["50-kontronik-can-gw-can1.network"].text)
-    assert network == {
-        "Name": ["can1"],
-        "RequiredForOnline": ["no"],
-        "BitRate": ["250000"],
-        "SamplePoint": ["87.5%"],
-        "RestartSec": ["100ms"],
-    }
+    bus = {"BitRate": ["250000"], "SamplePoint": ["87.5%"], "RestartSec": ["100ms"]}
+    assert network == {"Name": ["can1"], "RequiredForOnline": ["no"], **bus}
     link = settings(made["50-kontronik-can-gw-can1.link"].text)
     assert link == {"OriginalName": ["can1"], "TransmitQueueLength": ["128"]}
-
-
-def test_without_a_bit_rate_the_network_files_are_examples(tmp_path: Path) -> None:
-    made = files(tmp_path)
-    assert [name for name in made if "can0" in name] == [
-        "50-kontronik-can-gw-can0.network.example",
-        "50-kontronik-can-gw-can0.link.example",
-    ]
-    assert "BitRate=500000" in made["50-kontronik-can-gw-can0.network.example"].text
-    assert "then take .example off its name" in made["50-kontronik-can-gw-can0.network.example"].text
 
 
 RULE = re.compile(

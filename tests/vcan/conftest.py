@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from vcan_tools import GatewayProcess, ip
 
+from kontronik_can_gw.offline.pty import PtyEsc
+
 _numbers = itertools.count()
 
 
@@ -49,6 +51,15 @@ def module_vcan() -> Iterator[str]:
     """One for all tests of a module."""
     with fresh_vcan() as name:
         yield name
+
+
+@pytest.fixture
+def esc() -> Iterator[PtyEsc]:
+    """The port of an ESC, to which nothing may be sent."""
+    with PtyEsc() as terminal:
+        yield terminal
+        terminal.check()
+        assert terminal.received == 0, "something was transmitted to an ESC"
 
 
 @pytest.fixture

@@ -6,10 +6,11 @@ import queue
 import shutil
 import subprocess
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from types import SimpleNamespace
+from typing import Any, Self
 
 import pytest
 
@@ -118,62 +119,35 @@ def recording(interface: str, log: Path) -> Iterator[Path]:
             process.wait()
 
 
-class Decoded(NamedTuple):
-    """A frame as tshark sees it; what a frame of its kind does not have is an empty text, numbers are texts as tshark writes them."""
-
-    can_id: str
-    function: str
-    node: str
-    sdo_command: str
-    sdo_index: str
-    sdo_sub: str
-    sdo_abort: str
-    emcy_code: str
-    state: str
-    nmt_command: str
-    lss_command: str
-    pdo: str
-    malformed: str
-
-
-FIELDS = (
-    "can.id",
-    "canopen.function_code",
-    "canopen.node_id",
-    "canopen.sdo.cmd",
-    "canopen.sdo.main_idx",
-    "canopen.sdo.sub_idx",
-    "canopen.sdo.abort_code",
-    "canopen.em.err_code",
-    "canopen.nmt_guard.state",
-    "canopen.nmt_ctrl.cd",
-    "canopen.lss.cs",
-    "canopen.pdo.data.bytes",
-    "_ws.malformed",
-)
+FIELDS = {
+    "can_id": "can.id",
+    "function": "canopen.function_code",
+    "sdo_command": "canopen.sdo.cmd",
+    "sdo_index": "canopen.sdo.main_idx",
+    "sdo_sub": "canopen.sdo.sub_idx",
+    "sdo_abort": "canopen.sdo.abort_code",
+    "emcy_code": "canopen.em.err_code",
+    "state": "canopen.nmt_guard.state",
+    "nmt_command": "canopen.nmt_ctrl.cd",
+    "lss_command": "canopen.lss.cs",
+    "pdo": "canopen.pdo.data.bytes",
+    "malformed": "_ws.malformed",
+}
+"""What is asked of tshark, by our names."""
 
 
-def tshark(log: Path, show: Sequence[str] = FIELDS) -> list[Decoded]:
-    """A candump log decoded by tshark's CANopen dissector."""
-    options = [
-        "-r",
-        str(log),
-        "-d",
-        "can.subdissector,canopen",
-        "-T",
-        "fields",
-        "-E",
-        "separator=/t",
-        "-E",
-        "occurrence=f",
-    ]
-    for name in show:
-        options += ["-e", name]
+def tshark(log: Path) -> list[SimpleNamespace]:
+    """A candump log decoded by tshark: of each frame ``FIELDS`` as tshark writes them, empty where there is none."""
+    command = ["tshark", "-r", str(log), "-d", "can.subdissector,canopen", "-T", "fields"]
+    command += ["-E", "separator=/t", "-E", "occurrence=f"]
+    for name in FIELDS.values():
+        command += ["-e", name]
     # it writes its settings to HOME, which may be read-only
     run = subprocess.run(
-        ["tshark", *options], capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(log.parent)}
+        command, capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(log.parent)}
     )
-    return [Decoded(*line.split("\t")) for line in run.stdout.splitlines()]
+    lines = run.stdout.splitlines()
+    return [SimpleNamespace(**dict(zip(FIELDS, line.split("\t"), strict=True))) for line in lines]
 
 
 def has_tshark() -> bool:

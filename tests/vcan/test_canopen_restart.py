@@ -1,16 +1,14 @@
 """What CANopen nodes keep on disk over restarts, node-IDs given by LSS, and the first answer of a node. (Damage, a full or a read-only
 disk, kill -9: the fault programme and the dialogues.)"""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from canopen.lss import LssError
 from encoding import Identity
-from vcan_tools import LIMIT_S, SERIAL, Chain, GatewayProcess, Master, canopen_table, chain, configuration, wait_for
-
-from kontronik_can_gw.offline.pty import PtyEsc
+from vcan_tools import LIMIT_S, SERIAL, Chain, GatewayProcess, Master, canopen_table, chain, wait_for
 
 SAVE, LOAD = (int.from_bytes(word, "little") for word in (b"save", b"load"))
 PRODUCT, REVISION = 0x4B4F4E01, 0x00010000
@@ -113,23 +111,3 @@ def test_lss_names_nodes_and_what_it_stored_holds_after_a_restart(vcan: str, tmp
             wait_for(lambda: len(run.watch.boot_ups) == 2, "boot-ups with what LSS stored")
             assert {node for _, node in run.watch.boot_ups} == {5, 0x21}
             assert [master.number(node, 0x1018, 4) for node in (5, 0x21)] == [SERIAL, SERIAL + 1]
-
-
-CLASHING_DBC = """VERSION ""
-BU_: Gw Car
-BO_ 385 Speed: 4 Gw
- SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car
-"""
-
-
-def test_a_dbc_that_uses_a_nodes_cob_id_is_refused_at_start(
-    vcan: str, start_gateway: Callable[..., GatewayProcess], tmp_path: Path
-) -> None:
-    (tmp_path / "car.dbc").write_text(CLASHING_DBC)
-    with PtyEsc() as port:
-        gateway = start_gateway(configuration(vcan, [port.path], '[dbc]\nfile = "car.dbc"\n' + canopen_table(tmp_path)))
-        assert gateway.wait() == 2
-        assert len(gateway.lines) == 1, gateway.log
-        for word in ("car.dbc", "Speed", "181h", "TPDO 1"):
-            assert word in gateway.lines[0]
-        assert Path("/sys/class/net", vcan, "statistics/tx_packets").read_text() == "0\n"

@@ -9,13 +9,13 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
 from foreign_tools import (
     NODE_CANOPEN,
     ZENCAN,
-    Decoded,
     NodeMaster,
     Refused,
     has_tshark,
@@ -377,7 +377,7 @@ def test_node_canopen_names_nodes_by_lss(
 # --- tshark
 
 
-def is_abort(frame: Decoded) -> bool:
+def is_abort(frame: SimpleNamespace) -> bool:
     """An abort, and not the last segment of a block, which looks like one to tshark: it keeps no state."""
     return frame.sdo_abort != "" and int(frame.sdo_command, 0) == 0x80
 
@@ -417,7 +417,7 @@ def test_tshark_reads_what_was_said(vcan: str, node_master: NodeMaster, start_ga
     assert [int(f.can_id, 0) for f in frames] == told
     assert {int(f.function, 0) for f in frames} == {id_ >> 7 for id_ in told}
 
-    def of(cob_id: int) -> list[Decoded]:
+    def of(cob_id: int) -> list[SimpleNamespace]:
         return [f for f in frames if int(f.can_id, 0) == cob_id]
 
     states = [int(f.state, 0) for f in of(0x755)]

@@ -20,20 +20,19 @@ ERROR_FRAMES = {  # as a controller's driver makes them; the state that follows
 
 
 def test_a_missing_interface_and_one_without_can_fd_are_one_line_with_the_remedy(
-    vcan: str, start_gateway: Callable[..., GatewayProcess]
+    vcan: str, esc: PtyEsc, start_gateway: Callable[..., GatewayProcess]
 ) -> None:
     ip("link", "set", vcan, "down")
     ip("link", "set", vcan, "mtu", "16")
-    with PtyEsc() as port:
-        for name, options, remedy in (
-            ("nocan9", "", "ip link add nocan9 type vcan"),
-            (vcan, "fd = true", f"ip link set {vcan} mtu 72"),
-        ):
-            gateway = start_gateway(configuration(name, [port.path], options))
-            assert gateway.wait() == 1
-            assert remedy in gateway.log
-            assert name in gateway.log
-            assert name == vcan or len(gateway.lines) == 1
+    for name, options, remedy in (
+        ("nocan9", "", "ip link add nocan9 type vcan"),
+        (vcan, "fd = true", f"ip link set {vcan} mtu 72"),
+    ):
+        gateway = start_gateway(configuration(name, [esc.path], options))
+        assert gateway.wait() == 1
+        assert remedy in gateway.log
+        assert name in gateway.log
+        assert name == vcan or len(gateway.lines) == 1
 
 
 def test_an_interface_that_goes_down_and_up_or_away_and_back_is_used_again(vcan: str, tmp_path: Path) -> None:
@@ -56,10 +55,10 @@ def test_an_interface_that_goes_down_and_up_or_away_and_back_is_used_again(vcan:
 
 
 def test_commands_to_a_stopped_process_are_obeyed_when_it_goes_on(
-    vcan: str, start_gateway: Callable[..., GatewayProcess], tmp_path: Path
+    vcan: str, esc: PtyEsc, start_gateway: Callable[..., GatewayProcess], tmp_path: Path
 ) -> None:
-    with PtyEsc() as port, Candump(vcan) as dump:
-        gateway = start_gateway(configuration(vcan, [port.path]) + canopen_table(tmp_path / "store"))
+    with Candump(vcan) as dump:
+        gateway = start_gateway(configuration(vcan, [esc.path]) + canopen_table(tmp_path / "store"))
         wait_for(lambda: dump.of(0x701), "the boot-up")
         state = Path(f"/proc/{gateway.process.pid}/stat")
         gateway.process.send_signal(signal.SIGSTOP)

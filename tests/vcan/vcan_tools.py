@@ -27,8 +27,7 @@ from signals import table_of_configuration
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.offline import pty
 from kontronik_can_gw.protocol.fields import InfoData, LiveData
-from kontronik_can_gw.protocol.states import OperatingState
-from kontronik_can_gw.simulator import EscOptions, Phase, Sent, SimulatedEsc
+from kontronik_can_gw.simulator import EscOptions, Sent, SimulatedEsc
 
 LIMIT_S = 60.0
 NEVER_STALE = "telemetry_timeout_ms = 60000"
@@ -348,8 +347,6 @@ def bench(*escs: EscOptions) -> Iterator[Bench]:
 
 EDS = shipped("eds/kontronik_esc.eds")
 SERIAL = 0x00100200
-LIVELY = (Phase("up", 0.5, 90, OperatingState.Forward, 0.5), Phase("down", 0.5, 30, OperatingState.Forward, 0.5))
-"""A flight in which no two frames are alike."""
 
 
 def canopen_table(store: Path, node_id: int = 1, more: str = "") -> str:

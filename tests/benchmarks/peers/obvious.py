@@ -25,6 +25,51 @@ INFO_TIMEOUT = 10.0
 JIVEPRO = 3
 
 
+def messages(frame: bytes, supplied: bool) -> list[tuple[str, dict[str, Any]]]:
+    """The five messages of a live frame; ``supplied``: its BEC current is one."""
+    (
+        speed, voltage, current, motor_current, peak_current, charge, bec_current, bec_voltage,
+        pwm, throttle, opening, temperature, bec_temperature, errors, state, timing,
+    ) = LIVE.unpack_from(frame)  # fmt: skip
+    return [
+        (
+            "FiveSpeed",
+            {"ElectricalSpeed": speed, "BatteryVoltage": voltage / 100, "PwmInput": pwm, "Timing": timing},
+        ),
+        (
+            "FiveCurrent",
+            {
+                "BatteryCurrent": current / 10,
+                "MotorCurrent": motor_current / 10,
+                "PeakCurrent": peak_current / 10,
+                "ThrottlePercent": throttle,
+                "OutputOpeningPercent": opening,
+            },
+        ),
+        ("FiveState", {"OperatingErrors": errors, "OperatingStateRaw": state}),
+        (
+            "FiveBec",
+            {
+                "BecVoltage": bec_voltage / 1000,
+                "BecCurrent": bec_current / 1000 if supplied else "NotAvailable",
+                "PowerStageTemperature": temperature,
+                "BecTemperature": bec_temperature,
+            },
+        ),
+        ("FiveCharge", {"ConsumedCharge": charge}),
+    ]
+
+
+def can_frame(message: Any, values: dict[str, Any], index: int = 0, **further: Any) -> can.Message:
+    """A message of ESC number ``index``; what a signal has no room for is Error."""
+    for signal in message.signals:
+        value = values[signal.name]
+        if not isinstance(value, str) and not signal.minimum <= value <= signal.maximum:
+            values[signal.name] = "Error"
+    data = message.encode(values)
+    return can.Message(arbitration_id=message.frame_id + index, data=data, is_extended_id=False, **further)
+
+
 class Esc:
     """One ESC: its port, what was received and is not decoded yet, its messages."""
 
@@ -97,10 +142,7 @@ class Esc:
             self.device = self.last_device = struct.unpack_from("<H", frame, 4)[0] >> 10
             self.info_time = time.monotonic()
             return
-        (
-            speed, voltage, current, motor_current, peak_current, charge, bec_current, bec_voltage,
-            pwm, throttle, opening, temperature, bec_temperature, errors, state, timing,
-        ) = LIVE.unpack_from(frame)  # fmt: skip
+        bec_current = LIVE.unpack_from(frame)[6]
         if self.device is not None:
             supplied = self.device != JIVEPRO
         else:
@@ -108,31 +150,8 @@ class Esc:
         self.live_time = time.monotonic()
         self.is_up = True
         self.frames += 1
-        self.send(
-            "FiveSpeed",
-            {"ElectricalSpeed": speed, "BatteryVoltage": voltage / 100, "PwmInput": pwm, "Timing": timing},
-        )
-        self.send(
-            "FiveCurrent",
-            {
-                "BatteryCurrent": current / 10,
-                "MotorCurrent": motor_current / 10,
-                "PeakCurrent": peak_current / 10,
-                "ThrottlePercent": throttle,
-                "OutputOpeningPercent": opening,
-            },
-        )
-        self.send("FiveState", {"OperatingErrors": errors, "OperatingStateRaw": state})
-        self.send(
-            "FiveBec",
-            {
-                "BecVoltage": bec_voltage / 1000,
-                "BecCurrent": bec_current / 1000 if supplied else "NotAvailable",
-                "PowerStageTemperature": temperature,
-                "BecTemperature": bec_temperature,
-            },
-        )
-        self.send("FiveCharge", {"ConsumedCharge": charge})
+        for name, values in messages(frame, supplied):
+            self.send(name, values)
 
     def send_not_available(self) -> None:
         """Nothing is known."""
@@ -140,14 +159,9 @@ class Esc:
             self.send(message.name, {signal.name: "NotAvailable" for signal in message.signals})
 
     def send(self, name: str, values: dict[str, Any]) -> None:
-        """Encode and send a message; what a signal has no room for is Error."""
+        """Encode and send a message."""
         message = self.database.get_message_by_name(name)
-        for signal in message.signals:
-            value = values[signal.name]
-            if not isinstance(value, str) and not signal.minimum <= value <= signal.maximum:
-                values[signal.name] = "Error"
-        data = message.encode(values)
-        frame = can.Message(arbitration_id=message.frame_id + self.index, data=data, is_extended_id=False)
+        frame = can_frame(message, values, self.index)
         with self.lock, contextlib.suppress(can.CanOperationError):  # the bus is full: the next one is newer anyway
             self.bus.send(frame)
 

@@ -17,11 +17,9 @@ from zlib import crc32
 
 import can
 import cantools
+from obvious import JIVEPRO, LENGTHS, LIVE, can_frame, messages
 
-LIVE = struct.Struct("<4xIHhhhHHHHbBbbIBB")
-LENGTHS = {b"KODL": (38, 40), b"KODI": (41, 44)}
 PERIOD = 0.010
-JIVEPRO = 3
 
 
 class Converter:
@@ -56,53 +54,13 @@ class Converter:
         if frame[3:4] == b"I":
             self.device = struct.unpack_from("<H", frame, 4)[0] >> 10
             return
-        (
-            speed, voltage, current, motor_current, peak_current, charge, bec_current, bec_voltage,
-            pwm, throttle, opening, temperature, bec_temperature, errors, state, timing,
-        ) = LIVE.unpack_from(frame)  # fmt: skip
+        bec_current = LIVE.unpack_from(frame)[6]
         supplied = self.device != JIVEPRO and (self.device is not None or bec_current != 0)
         now = self.frames * PERIOD
         self.frames += 1
-        self.send(
-            now,
-            "FiveSpeed",
-            {"ElectricalSpeed": speed, "BatteryVoltage": voltage / 100, "PwmInput": pwm, "Timing": timing},
-        )
-        self.send(
-            now,
-            "FiveCurrent",
-            {
-                "BatteryCurrent": current / 10,
-                "MotorCurrent": motor_current / 10,
-                "PeakCurrent": peak_current / 10,
-                "ThrottlePercent": throttle,
-                "OutputOpeningPercent": opening,
-            },
-        )
-        self.send(now, "FiveState", {"OperatingErrors": errors, "OperatingStateRaw": state})
-        self.send(
-            now,
-            "FiveBec",
-            {
-                "BecVoltage": bec_voltage / 1000,
-                "BecCurrent": bec_current / 1000 if supplied else "NotAvailable",
-                "PowerStageTemperature": temperature,
-                "BecTemperature": bec_temperature,
-            },
-        )
-        self.send(now, "FiveCharge", {"ConsumedCharge": charge})
-
-    def send(self, now: float, name: str, values: dict[str, Any]) -> None:
-        """Encode and log a message; what a signal has no room for is Error."""
-        message = self.database.get_message_by_name(name)
-        for signal in message.signals:
-            value = values[signal.name]
-            if not isinstance(value, str) and not signal.minimum <= value <= signal.maximum:
-                values[signal.name] = "Error"
-        data = self.database.encode_message(name, values)
-        self.log.on_message_received(
-            can.Message(timestamp=now, arbitration_id=message.frame_id, data=data, is_extended_id=False, is_rx=False)
-        )
+        for name, values in messages(frame, supplied):
+            message = self.database.get_message_by_name(name)
+            self.log.on_message_received(can_frame(message, values, timestamp=now, is_rx=False))
 
 
 def main(arguments: list[str]) -> None:

@@ -1,0 +1,134 @@
+"""How long the gateway takes from its start to the first CAN frame, and the memory it takes: the whole command, as its own process."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from pathlib import Path
+
+from bench_programs import STANDIN, config_text, end, free_port, median, running, start
+from registry import ROOT, Benchmark, Context, Figure, judged
+
+from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.offline.pty import PtyEsc
+
+SHIPPED = ROOT / "dbc" / "kontronik_esc.dbc"
+CANOPEN = '[canopen]\nenabled = true\nnode_id = 1\nstore = "{folder}/store"\n'
+EVERYTHING = (
+    CANOPEN
+    + '[record]\ndirectory = "{folder}/captures"\n'
+    + '[statistics]\nfile = "{folder}/status.json"\nprometheus = "127.0.0.1:{port}"\n'
+)
+_PATIENCE_S = 20.0
+_EXTENDED = 0x80000000
+
+
+def first_frame_ms(escs: int, config: str) -> float:
+    """Start the gateway on a bus of its own, wait for its first frame, end it."""
+    name = f"kontronik-bench-{uuid.uuid4().hex[:12]}"
+    ports = [PtyEsc() for _ in range(escs)]
+    with (
+        tempfile.TemporaryDirectory(prefix="kontronik-bench-") as made,
+        socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener,
+    ):
+        folder = Path(made)
+        listener.bind("\0" + name)
+        listener.listen(1)
+        listener.settimeout(_PATIENCE_S)
+        file, errors = folder / "gateway.toml", folder / "errors"
+        text = config_text([port.path for port in ports], "lo", SHIPPED, folder, config.format(folder=folder))
+        file.write_text(text.replace("[dbc]", "bitrate = 1000000\n[dbc]", 1))
+        command = [sys.executable, str(STANDIN), f"unix:{name}", "ours", "run", "-c", str(file)]
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+        with errors.open("w") as log:
+            begun = time.perf_counter()
+            process = start(command, stdin=subprocess.DEVNULL, stderr=log, env=environment)
+        try:
+            bus, _ = listener.accept()
+            with bus:
+                bus.settimeout(_PATIENCE_S)
+                bus.recv(128)
+                return (time.perf_counter() - begun) * 1e3
+        except TimeoutError:
+            raise RuntimeError(f"no frame came; the gateway said: {errors.read_text()}") from None
+        finally:
+            end(process)
+            for port in ports:
+                port.close()
+
+
+def start_up(context: Context) -> list[Figure]:
+    """From exec to the first CAN frame, by turns."""
+    cases = {"1 ESC": (1, ""), "8 ESCs": (8, ""), "1 ESC, CANopen": (1, CANOPEN), "8 ESCs, CANopen": (8, CANOPEN)}
+    first_frame_ms(1, CANOPEN)  # what is compiled at the first run is there from now on
+    found: dict[str, list[float]] = {name: [] for name in cases}
+    for _ in range(2 * context.rounds - 1):
+        for name, (escs, config) in cases.items():
+            found[name].append(first_frame_ms(escs, config))
+    context.data["starts_ms"] = found
+    return [
+        judged(f"first CAN frame, {name}", median(times), "ms", "<= 500")
+        if name == "1 ESC"
+        else Figure(f"first CAN frame, {name}", median(times), "ms")
+        for name, times in found.items()
+    ]
+
+
+def memory_of(pid: int) -> dict[str, float]:
+    """Of a process now, in MB: resident, its fair share of what is shared, and what is its own."""
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    kb = {key: int(value) for key, value in re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE)}
+    return {"RSS": kb["Rss"] / 1024, "PSS": kb["Pss"] / 1024, "USS": (kb["Private_Clean"] + kb["Private_Dirty"]) / 1024}
+
+
+def many_escs_dbc(folder: Path) -> Path:
+    """The shipped DBC with 29-bit ids, so that there is room for 64 ESCs, and sent so seldom that the bus would bear it."""
+    with without_asammdf():
+        text = SHIPPED.read_text()
+    ids = "|".join(sorted(set(re.findall(r"^BO_ (\d+)", text, re.MULTILINE))))
+    text = re.sub(rf"\b({ids})\b", lambda found: str(int(found[1]) | _EXTENDED), text)
+    text = re.sub(r'(BA_ "GenMsgDelayTime" BO_ \d+) \d+', r"\1 500", text)
+    text = re.sub(r'(BA_ "GenMsgCycleTime" BO_ \d+) [1-9]\d*', r"\1 1000", text)
+    file = folder / "many_escs.dbc"
+    file.write_text(text)
+    return file
+
+
+def memory(context: Context) -> list[Figure]:
+    """After some seconds of traffic."""
+    cases = {
+        "1 ESC": (1, ""),
+        "64 ESCs": (64, ""),
+        "1 ESC, CANopen": (1, CANOPEN),
+        "8 ESCs, CANopen": (8, CANOPEN),
+        "1 ESC, CANopen, recorder, Prometheus": (1, EVERYTHING),
+    }
+    seconds = 0.5 if context.quick else 3.0
+    found: dict[str, dict[str, float]] = {}
+    with tempfile.TemporaryDirectory(prefix="kontronik-bench-") as made:
+        dbc = many_escs_dbc(Path(made))
+        for case, (escs, config) in cases.items():
+            text = config.format(folder=made, port=free_port())
+            with running(context, "ours", escs, seconds=seconds, dbc=dbc, config=text) as (feeder, gateway):
+                feeder.measure(gateway)
+                found[case] = memory_of(gateway.pid)
+            context.say(f"{case}: RSS {found[case]['RSS']:.1f} MB")
+    context.data["memory_mb"] = found
+    rss = {case: memory["RSS"] for case, memory in found.items()}
+    notes = {case: f"PSS {memory['PSS']:.1f}, USS {memory['USS']:.1f}" for case, memory in found.items()}
+    figures = [judged("RSS, 1 ESC", rss.pop("1 ESC"), "MB", "<= 40", notes["1 ESC"])]
+    figures += [Figure(f"RSS, {case}", value, "MB", note=notes[case]) for case, value in rss.items()]
+    one, nodes = found["1 ESC"]["RSS"], found["1 ESC, CANopen"]["RSS"]
+    figures.append(judged("RSS, each further ESC", (rss["64 ESCs"] - one) / 63, "MB", "<= 0.3"))
+    figures.append(Figure("RSS, each further ESC, CANopen", (rss["8 ESCs, CANopen"] - nodes) / 7, "MB"))
+    return figures
+
+
+BENCHMARKS = [
+    Benchmark("start", "from the start of the command to its first CAN frame: 1 and 8 ESCs, CANopen", start_up),
+    Benchmark("memory", "RSS, PSS and USS with 1 to 64 ESCs, CANopen, recorder, Prometheus", memory),
+]
