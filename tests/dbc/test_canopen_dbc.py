@@ -6,13 +6,12 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import cantools.database
 import pytest
-from cantools.database.can import Database
 from cantools.database.namedsignalvalue import NamedSignalValue
 from dbc_rules import ENUMS, RULES, parse
 from eds_text import SHIPPED as EDS_TEXT
 from eds_text import variable, with_object
+from packer_oracle import pascal, read
 
 from kontronik_can_gw import canopen_dbc
 from kontronik_can_gw.cia301 import eds as reader
@@ -48,22 +47,11 @@ def setup(
     return CanopenSetup(eds, tuple(NodeSettings(i, serial=i) for i in ids), tuple(stored) or (Stored(),) * len(escs))
 
 
-def read(text: str) -> Database:
-    """At cantools' strictest, and without a warning of two messages with one name or id."""
-    database = cantools.database.load_string(text, "dbc", strict=True)
-    assert isinstance(database, Database)
-    return database
-
-
 def written(of: CanopenSetup, escs: Sequence[EscSettings]) -> str:
     settings = of.esc_settings(escs)
     text = dbc_text(canopen_dbc.database(of.nodes(settings), settings))
     assert text.isascii()
     return text
-
-
-def pascal(name: str) -> str:
-    return "".join(word.capitalize() for word in name.split("_"))
 
 
 class Bench:

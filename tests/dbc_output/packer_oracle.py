@@ -13,6 +13,8 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
+import cantools.database
+from cantools.database.can import Database
 from protocol import sheet
 
 from kontronik_can_gw.protocol.codec import Layout, encode
@@ -409,6 +411,13 @@ def dbc_text(messages: Iterable[Msg], more: str = "") -> str:
         if signal.is_float
     ]
     return "\n".join(lines) + "\n"
+
+
+def read(text: str) -> Database:
+    """A DBC as cantools reads it at its strictest."""
+    database = cantools.database.load_string(text, "dbc", strict=True)
+    assert isinstance(database, Database)
+    return database
 
 
 def bindings(messages: Iterable[Msg]) -> dict[str, str | float]:

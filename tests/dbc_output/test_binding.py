@@ -6,13 +6,11 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
-import cantools.database
 import pytest
-from cantools.database.can import Database
 from e2e import p01
 from hypothesis import given
 from hypothesis import strategies as st
-from packer_oracle import STATES, Msg, Sig, dbc_text, get, pascal
+from packer_oracle import STATES, Msg, Sig, dbc_text, get, pascal, read
 
 from kontronik_can_gw.dbc_output import e2e
 from kontronik_can_gw.dbc_output.layout import Binder, DbcSettings, Layout, Role
@@ -44,10 +42,8 @@ def layout_of(
     names: Sequence[str] = ("esc1",),
     **more: Any,
 ) -> Layout:
-    database = cantools.database.load_string(dbc_text(messages), "dbc")
-    assert isinstance(database, Database)
     escs = [EscSettings(name, 7) for name in names]
-    return prepare(database, "my.dbc", escs, DbcSettings(bind or {}, **more), fd_allowed=True)[1]
+    return prepare(read(dbc_text(messages)), "my.dbc", escs, DbcSettings(bind or {}, **more), fd_allowed=True)[1]
 
 
 def frames_of(layout: Layout, lives: Sequence[LiveData | None], info: InfoData | None = None) -> list[CanFrame]:

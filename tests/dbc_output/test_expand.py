@@ -6,13 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cantools.database
 import pytest
 from cantools.database.can import Database, Message, Signal
 from dbc_rules import ENUMS, findings, parse
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text
+from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc_output import expand
@@ -24,12 +23,6 @@ from kontronik_can_gw.telemetry import EscSettings
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 EIGHT = [EscSettings(f"esc{number}") for number in range(1, 9)]
 PAIR = [EscSettings("left"), EscSettings("right")]
-
-
-def read(text: str) -> Database:
-    database = cantools.database.load_string(text, "dbc", strict=True)
-    assert isinstance(database, Database)
-    return database
 
 
 def written(database: Database) -> str:

@@ -8,7 +8,6 @@ from fractions import Fraction
 from functools import cache
 from typing import Any
 
-import cantools.database
 import pytest
 from cantools.database.can import Database
 from packer_oracle import (
@@ -23,6 +22,7 @@ from packer_oracle import (
     put,
     random_escs,
     random_gateway,
+    read,
 )
 
 from kontronik_can_gw.dbc_output.layout import DbcSettings, MessagePlan, compile_layout
@@ -39,12 +39,6 @@ FILES = int(os.environ.get("PACKER_FILES", "110"))
 MESSAGES = 30
 """Each file holds so many messages: 110 files are 3300 layouts."""
 ROUNDS = 3
-
-
-def read(text: str) -> Database:
-    database = cantools.database.load_string(text, "dbc", strict=True)
-    assert isinstance(database, Database)
-    return database
 
 
 def compiled(messages: list[Msg], database: Database, escs: tuple[EscSettings, ...] = ESCS) -> dict[str, MessagePlan]:

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-import cantools.database
 import pytest
-from cantools.database.can import Database
 from e2e import p01
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from packer_oracle import Msg, Sig, dbc_text, get
+from packer_oracle import Msg, Sig, dbc_text, get, read
 
 from kontronik_can_gw.dbc_output.layout import DbcSettings, load_database
 from kontronik_can_gw.dbc_output.prepare import prepare
@@ -52,8 +50,7 @@ class Bench:
             f'BA_ "GenMsgDelayTime" BO_ {m.dbc_id} {delay};'
             for m, kind, cycle, delay in messages
         )
-        database = cantools.database.load_string(dbc_text([m for m, *_ in messages], more), "dbc")
-        assert isinstance(database, Database)
+        database = read(dbc_text([m for m, *_ in messages], more))
         escs = [EscSettings(name, timeout_ns=TIMEOUT) for name in names]
         self.layout = prepare(database, "my.dbc", escs, DbcSettings(), fd_allowed=True)[1]
         self.gateway = Gateway(escs, self.layout, 0, silent)
