@@ -328,6 +328,13 @@ def test_a_file_that_is_no_dbc_is_said_to_be_none(tmp_path: Path, content: bytes
     assert "\n" not in caught.value.problems[0]
 
 
+def test_a_missing_file_and_a_directory_cannot_be_read(tmp_path: Path) -> None:
+    for path, reason in ((tmp_path / "none.dbc", "No such file"), (tmp_path, "directory")):
+        with pytest.raises(UserError) as caught:
+            load_database(path)
+        only(list(caught.value.problems), str(path), "cannot be read", reason)
+
+
 # --- broken versions of the shipped file -------------------------------------------------------------------------------
 
 WORDS = (

@@ -2,10 +2,13 @@
 
 import random
 import re
+import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import dialogue
 import pytest
 from e2e import p01
 from hypothesis import given, settings
@@ -507,6 +510,30 @@ def test_a_live_frame_is_followed_by_a_frame_of_the_right_kind(
         assert (frame.can_id, frame.extended, frame.fd) == (0x123, extended, fd_format > 0)
         assert frame.data == (number << at).to_bytes(size, "little")
     assert len(bench.sent) == 3
+
+
+# --- settings that a master writes --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "cycle"), [(EVENT, 0), (CYCLIC, 10), (CYCLIC_AND_EVENT, 10)])
+def test_pole_pairs_and_gear_from_a_master_hold_for_messages_from_the_next_frame_on(kind: int, cycle: int) -> None:
+    motor_speed = Sig("MotorSpeed", 0, 16, unit="1/min")
+    output_speed = Sig("OutputSpeed", 32, 32, unit="1/min", factor="0.5")
+    message = Msg("EscSpeed", 0x100, 8, [motor_speed, replace(VOLTAGE, start=16), output_speed])
+    bench = dialogue.Bench(changes=dialogue.QUIET, layout=Bench([(message, kind, cycle, 0)]).layout)
+    bench.wait(1000)
+    for writes, motor, output in (
+        ((), 21_000, 42_000),
+        (("2F 00 21 01 07 00 00 00",), 3_000, 6_000),
+        (("23 00 21 02 05 00 00 00", "23 00 21 03 02 00 00 00"), 3_000, 2_400),
+    ):
+        for request in writes:
+            bench.put(0x601, request)
+        assert [frame.data[0] for frame in bench.take() if frame.can_id == 0x581] == [0x60] * len(writes)
+        bench.uart(encode(LIVE._replace(electrical_speed=21_000), WireLayout.V4))
+        bench.wait(10)
+        data = [frame.data for frame in bench.take() if frame.can_id == 0x100][-1]
+        assert struct.unpack("<HHI", data) == (motor, 2442, output)
 
 
 # --- the gateway itself -------------------------------------------------------------------------------------------------
