@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dbc_rules import EVENT_HZ, Database, Message, Signal, parse
+from dbc_rules import Database, Message, Signal, parse
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 FRAMES_PER_MESSAGE = 100
@@ -41,9 +41,9 @@ def error(message: Message) -> dict[str, int]:
     return {s.name: 0 if s.is_flag or s.is_alive_counter else s.error for s in message.signals}
 
 
-def valid(message: Message, choice: random.Random) -> dict[str, int]:
+def valid(message: Message, choice: random.Random, file: Path = SHIPPED) -> dict[str, int]:
     """Raw values that the gateway may send: within the limits, of an enum one with a name."""
-    tables = layout().tables
+    tables = layout(file).tables
     raw = {}
     for signal in message.signals:
         low, high = int(signal.minimum / signal.factor), int(signal.maximum / signal.factor)
@@ -133,13 +133,9 @@ def matrix_of(file: Path, caplog: pytest.LogCaptureFixture) -> Any:
     return matrix
 
 
-@pytest.fixture
-def canmatrix_matrix(caplog: pytest.LogCaptureFixture) -> Any:
-    return matrix_of(SHIPPED, caplog)
-
-
-def test_canmatrix_sees_what_the_lines_say(canmatrix_matrix: Any) -> None:
-    db = layout()
+@BOTH
+def test_canmatrix_sees_what_the_lines_say(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+    canmatrix_matrix, db = matrix_of(file, caplog), layout(file)
     comments = dict(db.comments)
     assert [ecu.name for ecu in canmatrix_matrix.ecus] == db.nodes
     assert canmatrix_matrix.attributes == {"LayoutVersion": db.attribute("LayoutVersion"), "BusType": "CAN"}
@@ -158,7 +154,8 @@ def test_canmatrix_sees_what_the_lines_say(canmatrix_matrix: Any) -> None:
             assert (its.unit, its.receivers) == (signal.unit, list(signal.receivers))
             assert its.comment == comments[("SG_", *signal.key)]
             assert its.values == db.tables.get(signal.key, {})
-            assert its.initial_value == not_available(message)[signal.name] * signal.factor
+            start = int(db.attribute("GenSigStartValue", "SG_", *signal.key) or 0)
+            assert its.initial_value == start * signal.factor
 
 
 # --- opendbc --------------------------------------------------------------------------------------------------------
@@ -198,7 +195,7 @@ def test_opendbc_packs_and_parses_valid_frames() -> None:
 
     db = layout()
     packer = CANPacker(str(SHIPPED))
-    parser = CANParser(str(SHIPPED), [(message.name, EVENT_HZ) for message in db.messages], 0)
+    parser = CANParser(str(SHIPPED), [(message.name, 100) for message in db.messages], 0)
     choice = random.Random(1)
     for moment in range(20):
         sent = {message.name: valid(message, choice) for message in db.messages}
@@ -240,15 +237,17 @@ def test_all_readers_find_the_same_raw_values_in_any_bytes(file: Path, caplog: p
 
 # --- asammdf --------------------------------------------------------------------------------------------------------
 
+CODES = ("NotAvailable", "Error")
 
-def recorded(path: Path, moments: list[dict[str, dict[str, int]]]) -> Any:
-    """An MF4 of raw CAN frames, one of each message per moment and 0.1 s, decoded by asammdf with the shipped DBC."""
+
+def recorded(path: Path, file: Path, moments: list[dict[str, dict[str, int]]]) -> Any:
+    """An MF4 of raw CAN frames, one of each message per moment and 0.1 s, decoded by asammdf with the DBC."""
     import can
     from asammdf import MDF
 
     with can.MF4Writer(path) as writer:
         for number, moment in enumerate(moments):
-            for message in layout().messages:
+            for message in layout(file).messages:
                 writer.on_message_received(
                     can.Message(
                         timestamp=1_700_000_000 + number / 10,
@@ -258,46 +257,35 @@ def recorded(path: Path, moments: list[dict[str, dict[str, int]]]) -> Any:
                     )
                 )
     with MDF(path) as measurement:
-        return measurement.extract_bus_logging({"CAN": [(str(SHIPPED), 0)]})
+        return measurement.extract_bus_logging({"CAN": [(str(file), 0)]})
 
 
-def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path) -> None:
+@BOTH
+def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path, file: Path) -> None:
     import numpy as np
 
     choice = random.Random(2)
-    db = layout()
-    raw: list[dict[str, dict[str, int]]] = [{message.name: not_available(message) for message in db.messages}]
-    raw += [{message.name: error(message) for message in db.messages}]
-    raw += [{message.name: valid(message, choice) for message in db.messages} for _ in range(30)]
-    decoded = recorded(tmp_path / "raw.mf4", raw)
-    units = set()
+    db = layout(file)
+    raw: list[dict[str, dict[str, int]]] = []
+    for moment in range(30):
+        raw.append({message.name: valid(message, choice, file) for message in db.messages})
+        for (message_id, name), table in db.tables.items():
+            codes = {text: number for number, text in table.items()}
+            if moment < len(CODES) and CODES[moment] in codes:
+                (owner,) = (message.name for message in db.messages if message.id == message_id)
+                raw[moment][owner][name] = codes[CODES[moment]]
+    decoded = recorded(tmp_path / "raw.mf4", file, raw)
     for message in db.messages:
         for signal in message.signals:
             seen = decoded.get(signal.name)
             sent = [moment[message.name][signal.name] for moment in raw]
             assert list(decoded.get(signal.name, raw=True).samples) == sent, signal.name
             assert seen.unit == signal.unit
-            units.add(seen.unit)
             table = db.tables.get(signal.key, {})
-            if len(table) > 2:
+            if set(table.values()) - set(CODES):
                 assert [text.decode() for text in seen.samples] == [table[number] for number in sent]
             else:
                 expected = [float("nan") if number in table else float(number * signal.factor) for number in sent]
                 np.testing.assert_allclose(seen.samples.astype(float), expected, rtol=1e-12, err_msg=signal.name)
                 assert (seen.samples.dtype.kind == "f") == bool(table), signal.name
-    assert {"V", "A", "degC", "us", "%", "1/min"} <= units
-    decoded.close()
-
-
-@pytest.mark.filterwarnings("ignore:The inplace keyword")  # asammdf's own call of pandas
-def test_asammdf_makes_a_table_of_numbers(tmp_path: Path) -> None:
-    """What a user plots: a column of floats with gaps, never a column of texts and numbers mixed."""
-    choice = random.Random(3)
-    messages = layout().messages
-    raw: list[dict[str, dict[str, int]]] = [{message.name: not_available(message) for message in messages}]
-    raw += [{message.name: valid(message, choice) for message in messages} for _ in range(5)]
-    decoded = recorded(tmp_path / "raw.mf4", raw)
-    table = decoded.to_dataframe()
-    assert {str(table[name].dtype) for name in ("BatteryVoltage", "BatteryCurrent", "Losses", "Uptime")} == {"float64"}
-    assert list(table["BatteryVoltage"].isna()) == [True, False, False, False, False, False]
     decoded.close()

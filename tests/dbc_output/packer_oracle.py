@@ -1,7 +1,7 @@
 """An independent reckoning of what a signal must hold, and a maker of random DBC layouts and random telemetry.
 
-Nothing here uses the package's tables of fields, units or positions: they are typed again from the telemetry sheet, and bits are
-counted one by one. The package is used only to make telemetry objects out of encoded frames.
+Nothing here uses the package's tables of fields, units or positions: they are typed again from the telemetry sheet, here and in
+tests/protocol/sheet.py, and bits are counted one by one. The package is used only to make telemetry objects out of encoded frames.
 """
 
 import math
@@ -12,6 +12,10 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any
+
+import cantools.database
+from cantools.database.can import Database
+from protocol import sheet
 
 from kontronik_can_gw.protocol.codec import Layout, encode
 from kontronik_can_gw.protocol.fields import InfoData, LiveData
@@ -60,19 +64,7 @@ class Known:
     exact: bool = True
 
 
-STATES = dict(
-    zip(
-        (1, 2, 3, 7, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26),
-        [
-            "WaitForSignal", "WaitForMotorOff", "WaitForMotorOn", "Selftest", "Error_Selftest",
-            "CutOffDuringOperation", "AcousticSignal", "MotorOff", "StandBy", "Brake", "BrakeTargetBackward",
-            "BrakeTargetForward", "Programming", "Sync_Forward", "Sync_Backward", "Sync_StandBy", "Forward",
-            "Backward", "SpoolUpFromStill", "SpoolUpFromTurn", "SpoolUpQuick", "RPMControl",
-        ],
-        strict=True,
-    )
-)  # fmt: skip
-DEVICES = {1: "KOSMIK", 2: "KOLIBRI", 3: "JIVEPro", 4: "KONTROL-X", 5: "UHV"}
+STATES, DEVICES = sheet.OPERATING_STATES, sheet.DEVICES
 LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
 LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
 GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay")))
@@ -162,10 +154,10 @@ def _age(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> Fraction | Non
     return None if esc.live_ns is None else Fraction(max(0, now - esc.live_ns) // 1_000_000)
 
 
-def _plain(rows: str, reader: Callable[[str, str], Reader]) -> dict[str, Known]:
-    """Rows of fields: name, unit (- for none), and one step in that unit where it is not 1."""
-    split = [row.split() for row in rows.split(",")]
-    return {name: Known(unit.strip("-"), reader(name, *step or ["1"])) for name, unit, *step in split}
+def _plain(fields: Sequence[sheet.Field], reader: Callable[[str, str], Reader]) -> dict[str, Known]:
+    """Fields whose number is the value."""
+    spelled = str.maketrans({"µ": "u", "°": "deg"})
+    return {f.name: Known(f.unit.translate(spelled), reader(f.name, f"1/{f.steps}")) for f in fields}
 
 
 def _counters(
@@ -179,20 +171,13 @@ def _counters(
 
 
 KNOWN: dict[str, Known] = {
-    **_plain(
-        "electrical_speed 1/min, battery_voltage V 0.01, battery_current A 0.1, motor_current A 0.1, peak_current A 0.1,"
-        "consumed_charge mAh, bec_voltage V 0.001, pwm_input us, throttle %, output_opening %, power_stage_temperature degC,"
-        "bec_temperature degC, operating_errors -, timing us", _live),
+    **_plain(sheet.LIVE_FIELDS, _live),
     "bec_current": Known("A", _calculated(_bec_current)),
     "operating_state": Known("", _live("operating_state"), STATES),
     "operating_state_raw": Known("", _live("operating_state")),
     **{name: Known("", _bit("operating_errors", number)) for number, name in enumerate(ERROR_BITS)},
     **{name: Known("", _bit("selftest_errors", number)) for number, name in enumerate(TEST_BITS)},
-    **_plain(
-        "selftest_errors -, cell_count -, max_electrical_speed 1/min, min_battery_voltage V 0.01, max_battery_voltage V 0.01,"
-        "max_battery_current A 0.1, max_motor_current A 0.1, max_peak_current A 0.1, min_bec_voltage V 0.001, max_throttle %,"
-        "max_output_opening %, min_power_stage_temperature degC, max_power_stage_temperature degC, min_bec_temperature degC,"
-        "max_bec_temperature degC", _info),
+    **_plain(sheet.INFO_FIELDS[2:], _info),
     "max_bec_current": Known("A", _of_esc(_max_bec_current)),
     "device": Known("", _device_word(lambda word: word >> 10), DEVICES),
     "device_raw": Known("", _device_word(lambda word: word >> 10)),
@@ -428,6 +413,13 @@ def dbc_text(messages: Iterable[Msg], more: str = "") -> str:
     return "\n".join(lines) + "\n"
 
 
+def read(text: str) -> Database:
+    """A DBC as cantools reads it at its strictest."""
+    database = cantools.database.load_string(text, "dbc", strict=True)
+    assert isinstance(database, Database)
+    return database
+
+
 def bindings(messages: Iterable[Msg]) -> dict[str, str | float]:
     """What ``[dbc.bind]`` has to say about them."""
     return {
@@ -596,28 +588,23 @@ def random_integer(rng: random.Random, low: int, high: int) -> int:
     return rng.randint(low, high)
 
 
-LIVE_TYPES = "IHhhhHHHHbBbbIBB"
-INFO_TYPES = "HHIBIHHhhhHHbBbbbb"
-
-
 def random_fields(rng: random.Random, types: str) -> list[int]:
     values = []
     for code in types:
-        bits = 8 * struct.calcsize("<" + code)
-        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if code.islower() else (0, (1 << bits) - 1)
+        low, high = sheet.TYPE_RANGES[code]
         values.append(random_integer(rng, low, high))
     return values
 
 
 def random_live(rng: random.Random) -> LiveData:
-    values = random_fields(rng, LIVE_TYPES)
+    values = random_fields(rng, sheet.LIVE_STRUCT[1:])
     if rng.random() < 0.8:
         values[14] = rng.randint(0, 30)
     return LiveData(*values)
 
 
 def random_info(rng: random.Random) -> InfoData:
-    values = random_fields(rng, INFO_TYPES)
+    values = random_fields(rng, sheet.INFO_STRUCT[1:])
     values[0] = rng.randint(0, 7) << 10 | rng.randrange(1024)
     values[3] = rng.choice((0, 1, 3, 6, 7, 12, 255))
     return InfoData(*values)

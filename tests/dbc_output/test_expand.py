@@ -2,21 +2,18 @@
 
 import random
 import re
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cantools.database
 import pytest
 from cantools.database.can import Database, Message, Signal
-from dbc_rules import ENUMS, RULES, findings, parse
+from dbc_rules import ENUMS, findings, parse
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text
+from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.config import load
 from kontronik_can_gw.dbc_output import expand
 from kontronik_can_gw.dbc_output.layout import DbcSettings, MessagePlan, compile_layout, load_database, parse_database
 from kontronik_can_gw.dbc_output.prepare import prepare
@@ -26,12 +23,6 @@ from kontronik_can_gw.telemetry import EscSettings
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 EIGHT = [EscSettings(f"esc{number}") for number in range(1, 9)]
 PAIR = [EscSettings("left"), EscSettings("right")]
-
-
-def read(text: str) -> Database:
-    database = cantools.database.load_string(text, "dbc", strict=True)
-    assert isinstance(database, Database)
-    return database
 
 
 def written(database: Database) -> str:
@@ -56,53 +47,17 @@ def test_the_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
     assert written(load_database(SHIPPED)) == SHIPPED.read_text()
 
 
-def test_the_shipped_file_for_eight_escs_has_each_line_of_the_one_with_name_and_id_changed() -> None:
-    one = parse(SHIPPED.read_bytes())
-    per_esc = {message.id: message for message in one.messages if message.is_of_an_esc}
-    expected: Counter[str] = Counter()
-    message_id = -1
-    for line in one.lines:
-        words = line.split()
-        if not words:
-            continue
-        if words[0] == "BO_":
-            message_id = int(words[1])
-        numbers = [int(word) for word in words[1:5] if word.isdigit()]
-        about = message_id if words[0] in ("BO_", "SG_") else next((n for n in numbers if n in per_esc), -1)
-        if words[0] not in ("BO_", "SG_", "CM_", "BA_", "VAL_") or about not in per_esc:
-            expected[line] += 1
-            continue
-        message = per_esc[about]
-        for number in range(1, 9):
-            copy = re.sub(rf"\b{about}\b", str(about + number - 1), line, count=1) if words[0] != "SG_" else line
-            head, quote, tail = copy.partition('"') if words[0] != "BA_" else (copy, "", "")
-            head = re.sub(rf"\b{message.name}\b", f"Esc{number}{message.name.removeprefix('Esc')}", head)
-            for signal in message.signals:
-                head = re.sub(rf"(?<![\w\"]){signal.name}(?!\w)", f"Esc{number}{signal.name}", head)
-            expected[head + quote + tail] += 1
-    assert Counter(line for line in eight()[1].split("\n") if line) == expected
-
-
 def test_the_file_for_eight_escs_keeps_the_rules() -> None:
     text = eight()[1].encode()
     db = parse(text)
-    only_for_one = {"eight_escs_fit", "one_esc_loads_the_bus_below_ten_percent", "enums_are_closed"}
-    assert only_for_one < set(RULES)
     for line in findings(text):
-        rule = line.partition(":")[0]
-        assert rule in only_for_one or line.endswith("is longer than 28"), line
+        assert line.startswith("enums_are_closed: ") or line.endswith("is longer than 28"), line
     assert all(len(name) <= 32 for name in [m.name for m in db.messages] + [s.name for s in db.signals])
     ids = [message.id for message in db.messages]
     assert len(set(ids)) == len(ids)
-    seen = Counter[str]()
     for signal in db.signals:
-        stem = re.sub("^Esc[1-8]", "", signal.name)
         named = {n: t for n, t in db.tables.get(signal.key, {}).items() if t not in ("Error", "NotAvailable")}
-        assert named == ENUMS.get(stem, {}), signal.name
-        seen[stem] += stem in ENUMS
-    assert {stem: n for stem, n in seen.items() if n} == {
-        name: 1 if name in ("GatewayState", "CanState") else 8 for name in ENUMS
-    }
+        assert named == ENUMS.get(re.sub("^Esc[1-8]", "", signal.name), {}), signal.name
 
 
 def test_every_property_of_each_of_eight_escs_is_that_of_the_one() -> None:
@@ -270,16 +225,6 @@ def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_the
     assert 'BA_ "SystemSignalLongSymbol"' not in text
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_random_layouts_are_written_without_a_loss(seed: int) -> None:
-    maker = LayoutMaker(random.Random(seed), PAIR)
-    text = dbc_text([maker.message() for _ in range(5)])
-    before = read(text)
-    after = read(written(before))
-    assert facts_of_database(after) == facts_of_database(before)
-    assert [facts_of_message(m, "") for m in after.messages] == [facts_of_message(m, "") for m in before.messages]
-
-
 @settings(max_examples=80, deadline=None)
 @given(st.text(st.sampled_from('aB1 \n";:,_()[]|é.'), max_size=40).filter(lambda text: not text.endswith("\\")))
 def test_any_comment_and_any_text_come_through(words: str) -> None:
@@ -328,32 +273,38 @@ def test_ids_are_moved_by_the_smallest_step_without_a_clash(
     assert ids_of(after) == expected
 
 
-def compiled(text: str, escs: list[EscSettings], **more: Any) -> None:
-    database, bind = expand.expand(read(text), "Gateway", escs, "my.dbc", **more)
-    compile_layout(database, "my.dbc", escs, DbcSettings(bind))
-
-
 def refused(text: str, escs: list[EscSettings] = PAIR, **more: Any) -> str:
     with pytest.raises(UserError) as caught:
-        compiled(text, escs, **more)
+        prepare(read(text), "my.dbc", escs, DbcSettings(node="Gateway", **more))
     for line in caught.value.problems:
         assert line.startswith("my.dbc: ") and "\n" not in line
     return "\n".join(caught.value.problems)
 
 
-def test_a_step_that_makes_ids_clash_is_refused() -> None:
-    assert "moved by 1" in refused(simple(0x100, 0x101), id_step=1)
-    assert "clash" in refused(simple(0x100, gateway=(0x110,)), id_step=0x10)
-    assert "clash" in refused(simple(0x100), id_step=0)
+ONE = [EscSettings("one")]
 
 
-def test_ids_that_leave_their_range_are_refused() -> None:
-    assert "1 of 2 messages lie outside 0..7FFh, up to 800h" in refused(simple(0x7FF))
-    assert "outside 0..1FFFFFFFh" in refused(simple(0x1FFFFFFF, extended=True))
-    assert "outside 0..7FFh" in refused(simple(0x100), base_id=0x7FF, id_step=1)
-    assert "outside 0..7FFh" in refused(simple(0x100, 0x200), [EscSettings("one")], base_id=0x700)
-    assert "2 of 3 messages" in refused(simple(0x100, 0x200, 0x700), [EscSettings("one")], base_id=0x700)
-    assert "at most 1FFh" in refused(simple(0x100, 0x200, 0x700), [EscSettings("one")], base_id=0x700)
+@pytest.mark.parametrize(
+    ("text", "escs", "more", "words"),
+    [
+        (simple(0x100, 0x101), PAIR, {"id_step": 1}, "moved by 1"),
+        (simple(0x100, gateway=(0x110,)), PAIR, {"id_step": 0x10}, "clash"),
+        (simple(0x100), PAIR, {"id_step": 0}, "clash"),
+        (simple(0x7FF), PAIR, {}, "1 of 2 messages lie outside 0..7FFh, up to 800h"),
+        (simple(0x1FFFFFFF, extended=True), PAIR, {}, "outside 0..1FFFFFFFh"),
+        (simple(0x100), PAIR, {"base_id": 0x7FF, "id_step": 1}, "outside 0..7FFh"),
+        (simple(0x100, 0x200), ONE, {"base_id": 0x700}, "outside 0..7FFh"),
+        (simple(0x100, 0x200, 0x700), ONE, {"base_id": 0x700}, "2 of 3 messages"),
+        (simple(0x100, 0x200, 0x700), ONE, {"base_id": 0x700}, "at most 1FFh"),
+    ],
+)
+def test_ids_that_clash_or_leave_their_range_are_refused(
+    text: str, escs: list[EscSettings], more: dict[str, Any], words: str
+) -> None:
+    assert words in refused(text, escs, **more)
+
+
+def test_the_last_ids_are_within_their_range() -> None:
     assert ids_of(multiplied(simple(0x1FFFFFFE, extended=True), PAIR, "Gateway")[0]) == [0x1FFFFFFE, 0x1FFFFFFF]
 
 
@@ -378,15 +329,10 @@ def test_ids_that_move_among_those_of_canopen_are_named() -> None:
 
 
 def test_names_of_more_than_32_characters_are_refused() -> None:
-    name = "limit_battery_voltage_minimum"
     text = dbc_text([Msg("EscM", 1, 8, [Sig("LimitBatteryVoltageMinimum", 0, 1)])])
     assert multiplied(text, [EscSettings("abcdef"), EscSettings("b")], "Gateway")[0]
     line = refused(text, [EscSettings("abcdefg"), EscSettings("b")])
-    assert "abcdefg" in line
-    assert "longer than 32" in line
-    assert "LimitBatteryVoltageMinimum" in line
-    assert "at most 6" in line
-    assert len(name.replace("_", "")) == 26
+    assert all(words in line for words in ("abcdefg", "longer than 32", "LimitBatteryVoltageMinimum", "at most 6"))
 
 
 def test_two_messages_that_would_get_one_name_are_refused() -> None:
@@ -427,23 +373,16 @@ def test_plans_from_a_rich_file_are_those_of_the_gateway() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_plans_from_random_files_written_again_are_the_same(seed: int) -> None:
+def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: int) -> None:
     maker = LayoutMaker(random.Random(seed), PAIR)
     messages = [maker.message() for _ in range(5)]
+    before = read(dbc_text(messages))
+    after = read(written(before))
+    assert facts_of_database(after) == facts_of_database(before)
+    assert [facts_of_message(m, "") for m in after.messages] == [facts_of_message(m, "") for m in before.messages]
     bind = DbcSettings(bindings(messages))
-    database = read(dbc_text(messages))
-    by_name = [
-        {
-            (p.name, s.name, s.page): s
-            for p in compile_layout(d, "x", PAIR, bind, fd_allowed=True).messages
-            for s in p.signals
-        }
-        for d in (database, read(written(database)))
-    ]
-    assert by_name[0] == by_name[1]
-
-
-# --- the command --------------------------------------------------------------------------------------------------------
+    old, new = (compile_layout(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after))
+    assert [plain_plan(plan) for plan in new.messages] == [plain_plan(plan) for plan in old.messages]
 
 
 def test_the_command_writes_eight_escs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -454,65 +393,3 @@ def test_the_command_writes_eight_escs(tmp_path: Path, capsys: pytest.CaptureFix
     capsys.readouterr()
     assert main(["dbc", "--esc", "8"]) == 0
     assert capsys.readouterr().out == eight()[1]
-
-
-def test_the_command_takes_names_base_step_and_another_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = tmp_path / "mine.dbc"
-    source.write_text(RICH)
-    line = [
-        "dbc", "--from", str(source), "--node", "Gw", "--name", "left", "--name", "right", "--base-id", "0x20",
-        "--id-step", "4",
-    ]  # fmt: skip
-    assert main(line) == 0
-    after = read(capsys.readouterr().out)
-    assert [(m.name, m.frame_id) for m in after.messages][:5] == [
-        ("LeftPower", 0x320), ("RightPower", 0x324), ("LeftFlow", 0x20), ("RightFlow", 0x24),
-        ("GatewayHealth", 0x120),
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--esc", "0"], ["--esc", "two"], ["--esc", "2", "--name", "left"], ["--name", "left", "--name", "LEFT"],
-        ["--name", "left_1", "--name", "left1"], ["--name", "1st"], ["--base-id", "0x20000000"],
-        ["--base-id", "0x7f0"], ["--base-id", "here"], ["--esc", "2", "--id-step", "8"], ["--esc", "9"],
-        ["--node", "Nobody"], ["--from", "none.dbc"], ["-c", "none.toml"], ["-c", "none.toml", "--esc", "2"],
-        ["--esc", "2", "--name", "abcdefghijkl", "--name", "b"],
-    ],
-)  # fmt: skip
-def test_the_command_refuses_what_cannot_be(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    try:
-        code = main(["dbc", *arguments])
-    except SystemExit as end:
-        code = end.code  # type: ignore[assignment]  # argparse gives numbers
-    caught = capsys.readouterr()
-    assert code == 2 and not caught.out
-    assert "Traceback" not in caught.err
-
-
-def test_the_command_writes_what_a_configuration_sends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mine = tmp_path / "mine.dbc"
-    mine.write_text(dbc_text([Msg("EscPower", 0x100, 8, [Sig("U", 0, 16, factor="0.01", unit="V"), Sig("Id", 16, 8)])]))
-    toml = tmp_path / "gateway.toml"
-    toml.write_text(
-        '[dbc]\nfile = "mine.dbc"\nbase_id = 0x680\n[dbc.bind]\nU = "battery_voltage"\nId = 5\n'
-        '[[esc]]\nport = "/dev/ttyA"\nname = "left"\n[[esc]]\nport = "/dev/ttyB"\nname = "right"\n'
-    )
-    assert main(["dbc", "-c", str(toml)]) == 0
-    text = capsys.readouterr().out
-    config = load(toml)
-    database, layout = prepare(load_database(mine), "x", config.escs, config.dbc_settings)
-    assert text == written(database)
-    assert [(p.name, p.can_id) for p in layout.messages] == [("LeftPower", 0x680), ("RightPower", 0x681)]
-    assert [(m.name, m.frame_id) for m in read(text).messages] == [("LeftPower", 0x680), ("RightPower", 0x681)]
-
-
-def test_a_file_that_cannot_be_written_leaves_nothing_behind(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "folder").mkdir()
-    assert main(["dbc", "-o", str(tmp_path / "none" / "x.dbc")]) == 1
-    assert main(["dbc", "-o", str(tmp_path / "folder")]) == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
-    assert "cannot be written" in capsys.readouterr().err

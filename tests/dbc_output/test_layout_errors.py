@@ -175,32 +175,18 @@ def test_ids_and_names_are_each_of_one_message(tmp_path: Path) -> None:
     only(mistakes(tmp_path, file_of(POWER, FLOW)), "my_car.dbc", "Flow", "123h", "Power")
     gateway = DbcSettings(node="Gateway")
     only(mistakes(tmp_path, file_of(THEIRS, POWER), gateway), "Power", "123h", "Brake")
-    only(
-        mistakes(tmp_path, file_of(POWER, ("Power", 0x124, CURRENT))),
-        "my_car.dbc",
-        "Power",
-        "two messages have this name",
-    )
+    twice = mistakes(tmp_path, file_of(POWER, ("Power", 0x124, CURRENT)))
+    only(twice, "my_car.dbc", "Power", "two messages have this name")
     assert any("123h" in line for line in mistakes(tmp_path, file_of(POWER, ("Power", 0x123, CURRENT))))
     # among messages of others it is none of our business, and 11 and 29 bits do not meet
-    assert (
-        len(
-            load(tmp_path, file_of(THEIRS, ("Wheel", 0x123, FOO, "Other"), ("Power", 0x124, VOLTAGE)), gateway).messages
-        )
-        == 1
-    )
+    (_,) = load(tmp_path, file_of(THEIRS, ("Wheel", 0x123, FOO, "Other"), ("Power", 0x124, VOLTAGE)), gateway).messages
     assert [m.extended for m in load(tmp_path, file_of(POWER, (*FLOW, "Gateway", True))).messages] == [False, True]
 
 
 def test_an_id_that_is_taken_by_canopen_is_named_with_its_user(tmp_path: Path) -> None:
     text = file_of(("Power", 0x181, VOLTAGE), ("Flow", 0x181, CURRENT, "Gateway", True))
-    only(
-        mistakes(tmp_path, text, taken={0x181: "TPDO1 of node 1"}),
-        "my_car.dbc: Power",
-        "181h",
-        "TPDO1 of node 1",
-        "680h",
-    )
+    lines = mistakes(tmp_path, text, taken={0x181: "TPDO1 of node 1"})
+    only(lines, "my_car.dbc: Power", "181h", "TPDO1 of node 1", "680h")
 
 
 def test_can_fd_is_refused_unless_allowed_and_some_lengths_are_none(tmp_path: Path) -> None:
@@ -276,11 +262,6 @@ def test_keys_that_bind_nothing_are_named_with_the_nearest_signal(tmp_path: Path
     assert len(load(tmp_path, text, DbcSettings({"U": "battery_voltage"}, "Gateway"), names).messages) == len(names)
 
 
-def test_a_data_id_for_no_message_is_named(tmp_path: Path) -> None:
-    lines = mistakes(tmp_path, one(VOLTAGE), DbcSettings(data_ids={"Powr": 7}))
-    only(lines, "dbc.e2e_data_ids.Powr", "no such message", "my_car.dbc")
-
-
 def test_a_signal_that_does_not_say_of_which_esc_is_refused(tmp_path: Path) -> None:
     left, right = Sig("LeftBatteryVoltage", 0, 16, unit="V"), Sig("RightBatteryVoltage", 16, 16, unit="V")
     lines = mistakes(
@@ -332,16 +313,10 @@ def test_all_mistakes_come_at_once_each_naming_its_place(tmp_path: Path) -> None
     ("content", "words"),
     [
         (b"", "my_car.dbc"),
-        (b"\n\n", "my_car.dbc"),
-        (b"hello\n", "my_car.dbc"),
         (b"[can]\nchannel = 'can0'\n", "my_car.dbc"),
-        (b"<?xml version='1.0'?><NetworkDefinition/>", "my_car.dbc"),
-        (b'{"messages": []}', "my_car.dbc"),
-        (b"\x7fELF\x02\x01\x01\x00\x00\x00", "binary"),
         (b"\xff\xfe\xfa\xfb\x80\x81", "my_car.dbc"),
         ('VERSION ""'.encode("utf-16"), "binary"),
         (b'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: A\n', "no message"),
-        (b"KODL" * 20, "my_car.dbc"),
     ],
 )
 def test_a_file_that_is_no_dbc_is_said_to_be_none(tmp_path: Path, content: bytes, words: str) -> None:
@@ -360,54 +335,34 @@ def test_a_missing_file_and_a_directory_cannot_be_read(tmp_path: Path) -> None:
         only(list(caught.value.problems), str(path), "cannot be read", reason)
 
 
-def test_a_dbc_in_an_old_windows_encoding_is_read(tmp_path: Path) -> None:
-    file = tmp_path / "old.dbc"
-    file.write_bytes(one(Sig("BecTemperature", 0, 8, signed=True, unit="°C")).encode("cp1252"))
-    assert load_database(file).messages[0].signals[0].unit == "°C"
-
-
-# --- 200 broken versions of the shipped file ----------------------------------------------------------------------------
+# --- broken versions of the shipped file -------------------------------------------------------------------------------
 
 WORDS = (
-    "-1", "0", "1e400", "64", "65535", "M", "m0", "|", "@0-", '"', ";", "BO_", "SG_", "VAL_", "nan", "", "\\",
-    "9" * 30,
+    "-1", "0", "1e400", "2147483649", "M", "m0", "|", "@0-", '"', ";", "BO_", "VAL_", "nan", "", "\\", "\x80", "9" * 30,
 )  # fmt: skip
 
 
 def broken(rng: random.Random, text: str) -> str:
-    """The text with some lines, words, characters or numbers changed, lost or doubled."""
+    """The text with some lines or words changed, lost or doubled."""
     lines = text.split("\n")
     for _ in range(rng.choice((1, 1, 1, 2, 5))):
         at = rng.choice([n for n, line in enumerate(lines) if line])
-        match rng.randrange(7):
-            case 0:
-                del lines[at]
-            case 1:
-                lines.insert(rng.randrange(len(lines)), lines[at])
-            case 2:
-                words = re.split(r"([ :|@,()\[\]])", lines[at])
-                words[rng.randrange(len(words))] = rng.choice(WORDS)
-                lines[at] = "".join(words)
-            case 3:
-                numbers = list(re.finditer(r"-?\d+(\.\d+)?", lines[at]))
-                if numbers:
-                    number = rng.choice(numbers)
-                    new = rng.choice(("0", "1", "-1", "7", "63", "64", "255", "2147483649", "0.5", "1e400", "1e-400"))
-                    lines[at] = lines[at][: number.start()] + new + lines[at][number.end() :]
-            case 4:
-                place = rng.randrange(len(lines[at]))
-                lines[at] = lines[at][:place] + chr(rng.randrange(1, 256)) + lines[at][place + 1 :]
-            case 5:
-                other = rng.randrange(len(lines))
-                lines[at], lines[other] = lines[other], lines[at]
-            case _:
-                lines = lines[: rng.randrange(len(lines))] if rng.random() < 0.2 else lines
-        if not any(lines):
-            break
+        kind = rng.randrange(5)
+        if kind == 0:
+            del lines[at]
+        elif kind == 1:
+            lines.insert(rng.randrange(len(lines)), lines[at])
+        elif kind == 2:
+            other = rng.randrange(len(lines))
+            lines[at], lines[other] = lines[other], lines[at]
+        else:
+            words = re.split(r"([ :|@,()\[\]])", lines[at])
+            words[rng.randrange(len(words))] = rng.choice(WORDS)
+            lines[at] = "".join(words)
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize("batch", range(10))
+@pytest.mark.parametrize("batch", range(5))
 def test_a_broken_version_of_the_shipped_file_works_or_is_refused_in_words(tmp_path: Path, batch: int) -> None:
     text = SHIPPED.read_text()
     refusals: list[tuple[str, ...]] = []

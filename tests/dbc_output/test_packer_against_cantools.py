@@ -8,11 +8,8 @@ from fractions import Fraction
 from functools import cache
 from typing import Any
 
-import cantools.database
 import pytest
 from cantools.database.can import Database
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from packer_oracle import (
     KNOWN,
     UNITS,
@@ -20,18 +17,16 @@ from packer_oracle import (
     Msg,
     Sig,
     bindings,
-    bit_places,
     dbc_text,
     get,
     put,
     random_escs,
     random_gateway,
+    read,
 )
 
-from kontronik_can_gw.dbc_output.layout import DbcSettings, MessagePlan, Piece, _pieces, compile_layout
-from kontronik_can_gw.dbc_output.packer import compile_pack, place, take
-from kontronik_can_gw.dbc_output.packer import float_bits as bits_of_float
-from kontronik_can_gw.dbc_output.units import conversion
+from kontronik_can_gw.dbc_output.layout import DbcSettings, MessagePlan, compile_layout
+from kontronik_can_gw.dbc_output.packer import compile_pack, float_bits
 from kontronik_can_gw.sources import GatewayStatus
 from kontronik_can_gw.sources import sources as all_sources
 from kontronik_can_gw.telemetry import MS, EscSettings, EscTelemetry
@@ -44,12 +39,6 @@ FILES = int(os.environ.get("PACKER_FILES", "110"))
 MESSAGES = 30
 """Each file holds so many messages: 110 files are 3300 layouts."""
 ROUNDS = 3
-
-
-def read(text: str) -> Database:
-    database = cantools.database.load_string(text, "dbc", strict=True)
-    assert isinstance(database, Database)
-    return database
 
 
 def compiled(messages: list[Msg], database: Database, escs: tuple[EscSettings, ...] = ESCS) -> dict[str, MessagePlan]:
@@ -158,11 +147,6 @@ def test_the_oracle_knows_every_source_and_no_other() -> None:
     assert set(KNOWN) == set(all_sources(ESCS[0]))
 
 
-def test_the_oracle_says_the_same_units() -> None:
-    for name, source in all_sources(ESCS[0]).items():
-        assert conversion(source.unit, KNOWN[name].unit) == (Fraction(1), Fraction(0)), name
-
-
 # --- each source alone, each unit alone ---------------------------------------------------------------------------------
 
 
@@ -195,61 +179,11 @@ def test_every_source_is_right_in_every_unit(seed: int) -> None:
         check_frame(message, None, data, database, (escs, gateway, now))
 
 
-# --- the helpers --------------------------------------------------------------------------------------------------------
-
-
-@st.composite
-def pieces_of_a_signal(draw: st.DrawFn) -> tuple[int, int, bool]:
-    length = draw(st.integers(1, 64))
-    little = draw(st.booleans())
-    start = draw(st.integers(0, 511).filter(lambda s: all(0 <= b < 64 for b, _ in bit_places(s, length, little))))
-    return start, length, little
-
-
-@settings(max_examples=400, deadline=None)
-@given(pieces_of_a_signal(), st.data())
-def test_place_and_take_are_a_bit_by_bit_copy(position: tuple[int, int, bool], data: st.DataObject) -> None:
-    start, length, little = position
-    raw = data.draw(st.integers(-(1 << length - 1), (1 << length) - 1))
-    pieces = pieces_from_layout(start, length, little)
-    frame = bytearray(64)
-    put(frame, raw, start, length, little)
-    assert place(pieces, raw) == int.from_bytes(frame, "little")
-    noise = bytearray(data.draw(st.binary(min_size=64, max_size=64)))
-    assert take(pieces, int.from_bytes(noise, "little")) == get(bytes(noise), start, length, little)
-    assert take(pieces, place(pieces, raw)) == raw % (1 << length)
-    assert sum(piece.width for piece in pieces) == length
-
-
-@cache
-def pieces_from_layout(start: int, length: int, little: bool) -> tuple[Piece, ...]:
-    """What the compiler makes of a signal of this place."""
-    signal = Sig("Value", start, length, little)
-    loaded = cantools.database.load_string(dbc_text([Msg("M", 1, 64, [signal])]), "dbc")
-    assert isinstance(loaded, Database)
-    return _pieces(loaded.messages[0].signals[0])
-
-
-NAN_32 = 0x7FC00000
-
-
-def float_bits(value: float | None, length: int) -> int:
-    return bits_of_float(value, length, -math.inf, math.inf, NAN_32)
+# --- floats ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("value", "right"), [(None, 7), (-1.5, 7), (100.5, 7), (math.nan, 7), (100.0, 0x42C80000), (0.0, 0)]
 )
 def test_a_float_outside_its_limits_is_sent_as_error(value: float | None, right: int) -> None:
-    assert bits_of_float(value, 32, 0.0, 100.0, 7) == right
-
-
-@given(st.floats(width=32, allow_nan=False, allow_infinity=False))
-def test_float_bits_are_those_of_ieee_754(value: float) -> None:
-    assert float_of(float_bits(value, 32), 32) == value
-    assert float_of(float_bits(value, 64), 64) == value
-
-
-def test_a_value_beyond_the_range_of_32_bits_becomes_nan() -> None:
-    assert math.isnan(float_of(float_bits(1e39, 32), 32))
-    assert float_of(float_bits(1e39, 64), 64) == 1e39
+    assert float_bits(value, 32, 0.0, 100.0, 7) == right

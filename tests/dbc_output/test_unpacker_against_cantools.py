@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from packer_oracle import LayoutMaker, bindings, bit_places, dbc_text, get, put
-from test_packer_against_cantools import ESCS, MESSAGES, read
+from packer_oracle import LayoutMaker, Msg, Sig, bindings, bit_places, dbc_text, get, put, read
+from test_packer_against_cantools import ESCS, MESSAGES
 
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, compile_layout
@@ -114,22 +114,17 @@ def test_an_error_code_beside_them_does_not_hide_flags() -> None:
 
 def view_of(tmp_path: Path, *messages: tuple[str, int, str]) -> View:
     """A view of messages with one signal each: name, cycle in ms, send type."""
-    lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: G L"]
-    for number, (name, _, _) in enumerate(messages):
-        lines += [f"BO_ {100 + number} M{number}: 8 G", f' SG_ {name} : 0|16@1+ (1,0) [0|65533] "" L']
-    lines += [
-        'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 100000;',
-        'BA_DEF_ BO_ "GenMsgSendType" STRING ;',
-        'BA_DEF_DEF_ "GenMsgCycleTime" 0;',
-        'BA_DEF_DEF_ "GenMsgSendType" "";',
+    made = [
+        Msg(f"M{number}", 100 + number, 8, [Sig(name, 0, 16, maximum="65533")])
+        for number, (name, _, _) in enumerate(messages)
     ]
-    for number, (_, cycle, send) in enumerate(messages):
-        lines += [
-            f'BA_ "GenMsgCycleTime" BO_ {100 + number} {cycle};',
-            f'BA_ "GenMsgSendType" BO_ {100 + number} "{send}";',
-        ]
+    kinds = {"Cyclic": 0, "Event": 1, "OnChange": 2}
+    more = "".join(
+        f'BA_ "GenMsgCycleTime" BO_ {100 + number} {cycle};\nBA_ "GenMsgSendType" BO_ {100 + number} {kinds[send]};\n'
+        for number, (_, cycle, send) in enumerate(messages)
+    )
     path = tmp_path / "v.dbc"
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text(dbc_text(made, more))
     return View(SignalReader(layout_of_dbc(path).layout))
 
 

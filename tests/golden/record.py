@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from difflib import unified_diff
 from pathlib import Path
@@ -50,56 +50,17 @@ def differences(file: Path, old: str, new: str) -> list[str]:
     name = str(file.relative_to(HERE))
     if file.parent.name == "commands":
         return [f"{name}: {line}" for line in _in_cases(old, new)]
-    return [f"{name}: {line}" for line in [*_in_frames(old, new), *_in_lines(_others(old), _others(new))]]
-
-
-_FRAME = re.compile(r"([\d.]+) -> (\w+)(#.*)")
-
-
-def _frames(text: str) -> list[tuple[str, str, str]]:
-    return [(m[1], m[2], m[3]) for line in text.splitlines() if (m := _FRAME.match(line))]
-
-
-def _others(text: str) -> list[str]:
-    return [line for line in text.splitlines() if not _FRAME.match(line)]
+    return [f"{name}: {line}" for line in [*_in_frames(old, new), *_in_lines(old.splitlines(), new.splitlines())]]
 
 
 def _in_frames(old: str, new: str) -> Iterator[str]:
-    before, after = _frames(old), _frames(new)
-    if before == after:
-        return
-    now = defaultdict(list)
-    for at, can_id, data in after:
-        now[at, can_id].append(data)
-    differ: list[tuple[str, str]] = []
-    gone: list[tuple[str, str]] = []
-    for at, can_id, data in before:
-        if not now[at, can_id]:
-            gone.append((f"{can_id}{data}", at))
-        elif (other := now[at, can_id].pop(0)) != data:
-            differ.append((can_id, f"at {at} s: {can_id}{data} -> {can_id}{other}"))
-    added = [(f"{can_id}{data}", at) for (at, can_id), rest in now.items() for data in rest]
-    total = f"of {len(before)} frames"
-    if differ:
-        ids = ", ".join(f"{can_id} {count}x" for can_id, count in Counter(can_id for can_id, _ in differ).items())
-        yield f"{len(differ)} {total} differ ({ids}), first {differ[0][1]}"
-    moved_to = defaultdict(list)
-    for frame, at in added:
-        moved_to[frame].append(at)
-    moved = [(frame, at, moved_to[frame].pop(0)) for frame, at in gone if moved_to[frame]]
-    if moved:
-        yield f"{len(moved)} {total} come at another time, first {moved[0][0]} at {moved[0][1]} s -> {moved[0][2]} s"
-    lost = Counter(frame for frame, _ in gone) - Counter(frame for frame, _, _ in moved)
-    if lost:
-        frame, at = next((f, at) for f, at in gone if lost[f])
-        yield f"{lost.total()} {total} are gone, first {frame} at {at} s"
-    more = [(frame, at) for frame, times in moved_to.items() for at in times]
-    if more:
-        frame, at = min(more, key=lambda item: float(item[1]))
-        yield f"{len(more)} frames are new, first {frame} at {at} s"
-    if not (differ or gone or added):
-        at = next(a for a, b in zip(before, after, strict=True) if a != b)[0]
-        yield f"the order of frames is another, first at {at} s"
+    """How many frames of which ids are gone or new."""
+    before, after = (Counter(re.findall(r"^[\d.]+ -> \w+#.*", text, re.MULTILINE)) for text in (old, new))
+    for what, lines in (("gone", before - after), ("new", after - before)):
+        if lines:
+            ids = Counter(re.findall(r"-> (\w+)", " ".join(lines)))
+            counts = ", ".join(f"{can_id} {count}x" for can_id, count in ids.items())
+            yield f"{len(lines)} of {before.total()} frames are {what} ({counts})"
 
 
 def _in_lines(old: Sequence[str], new: Sequence[str]) -> Iterator[str]:

@@ -47,10 +47,14 @@ def test_a_change_is_said_in_words(tmp_path: Path) -> None:
     file = record.HERE / "flights/none.txt"
     assert record.differences(file, old, old) == []
     assert record.differences(file, old, new) == [
-        "flights/none.txt: 1 of 3 frames differ (688 1x), first at 0.200 s: 688#0304 -> 688#0305",
-        "flights/none.txt: 1 of 3 frames come at another time, first 690#00 at 0.300 s -> 0.301 s",
-        "flights/none.txt: 1 frames are new, first 701#05 at 0.350 s",
+        "flights/none.txt: 2 of 3 frames are gone (688 1x, 690 1x)",
+        "flights/none.txt: 3 of 3 frames are new (688 1x, 690 1x, 701 1x)",
+        "flights/none.txt: -0.200 -> 688#0304",
+        "flights/none.txt: -0.300 -> 690#00",
         "flights/none.txt: -0.400 - ",
+        "flights/none.txt: +0.200 -> 688#0305",
+        "flights/none.txt: +0.301 -> 690#00",
+        "flights/none.txt: +0.350 -> 701#05",
         "flights/none.txt: +0.400 -",
     ]
     case = "## one\n$ check\n! old\n=> 2\n\n## two\n$ check\n=> 0\n"
