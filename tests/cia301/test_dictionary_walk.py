@@ -12,7 +12,6 @@ from kontronik_can_gw.cia301.check import check_eds
 from kontronik_can_gw.cia301.eds import Entry, load, without
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.config import shipped
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.codec import Layout
 from kontronik_can_gw.protocol.codec import encode as uart
 from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
@@ -321,13 +320,6 @@ def test_a_changed_pdo_mapping_is_followed() -> None:
     assert bench.take()[0][:2] == (0x201, (70_000).to_bytes(4, "little") + b"\xf9")
 
 
-def test_a_default_mapping_that_cannot_be_is_refused_by_name() -> None:
-    for mapping in ("0x30000108", "0x20000108", "0x21000108"):
-        source = with_key(SHIPPED, "1A00sub1", "DefaultValue", mapping)
-        with pytest.raises(UserError, match="1A00"):
-            check_eds(load(source.encode("ascii"), "other.eds"), EscSettings())
-
-
 PLAIN = [
     (0x05, "0x12", b"\x12", b"\xff"),
     (0x06, "0x1234", b"\x34\x12", b"\xff\xff"),
@@ -369,35 +361,6 @@ def test_a_domain_is_plain_storage() -> None:
 def test_limits_of_plain_objects_hold() -> None:
     bench = bench_of(with_object(SHIPPED, 0x3000, variable(0x04, LowLimit="-5", HighLimit="5", DefaultValue="0")))
     assert [bench.write(0x3000, 0, value) for value in (-6, -5, 0, 5, 6)] == [TOO_LOW, None, None, None, TOO_HIGH]
-
-
-@pytest.mark.parametrize(
-    ("section", "data_type"),
-    [
-        ("2100sub1", 0x08),
-        ("2100sub4", 0x09),
-        ("2101sub2", 0x08),
-        ("2101sub3", 0x06),
-        ("2102sub1", 0x06),
-        ("2010sub6", 0x07),
-        ("2010sub7", 0x05),
-        ("603F", 0x05),
-        ("2000sub1", 0x08),
-        ("2000sub2", 0x09),
-        ("2020sub1", 0x01),
-    ],
-)
-def test_an_object_of_a_type_that_cannot_hold_what_it_shows_is_refused_by_name(section: str, data_type: int) -> None:
-    source = SHIPPED
-    if section == "2000sub1" or section == "2000sub2":
-        source = with_key(source, "1A00sub0", "DefaultValue", "0x0")
-    if section == "2020sub1":
-        source = with_key(source, "1A03sub0", "DefaultValue", "0x0")
-    source = with_key(source, section, "DataType", f"0x{data_type:04X}")
-    for key, value in (("LowLimit", ""), ("HighLimit", ""), ("DefaultValue", ""), ("PDOMapping", "0")):
-        source = with_key(source, section, key, value)
-    with pytest.raises(UserError, match=section[:4]):
-        check_eds(load(source.encode("ascii"), "other.eds"), EscSettings())
 
 
 @pytest.mark.parametrize("section", ["1003sub1", "1001", "1002", "603F", "2101sub1"])
