@@ -10,7 +10,7 @@ from typing import Any
 import canopen
 import canopen.lss
 import pytest
-from script import Dialogue, bytes_of, hexadecimal, ms, play_lines, read_dialogues
+from script import Dialogue, Heard, bytes_of, hexadecimal, ms, play_lines, read_dialogues
 
 from kontronik_can_gw.cia305.lss import LssSlave
 
@@ -52,14 +52,14 @@ class Node:
             self.active_node_id = self.pending_node_id
 
 
-class Talk:
+class Talk(Heard):
     """One slave as the talker of a dialogue."""
 
     def __init__(self, options: Sequence[str]) -> None:
+        super().__init__()
         self.now = 0
         self.node = Node()
         self.slave = LssSlave(self.node, self._sent)
-        self._heard: list[str] = []
         for option in options:
             match option.split():
                 case ["node-id", active, pending]:
@@ -76,16 +76,12 @@ class Talk:
                     raise AssertionError(f"what is 'with {option}'?")
 
     def _sent(self, data: bytes) -> None:
-        self._heard.append(f"{ms(self.now)} -> {hexadecimal(data)}")
+        self.hear(self.now, hexadecimal(data))
 
     def pass_time(self, until: int) -> None:
         self.now = until
 
     jump = pass_time
-
-    def heard_lines(self) -> list[str]:
-        heard, self._heard = self._heard, []
-        return heard
 
     def say(self, what: str) -> str:
         verb, _, rest = what.partition(" ")
@@ -116,41 +112,19 @@ def test_dialogue(dialogue: Dialogue) -> None:
     play_lines(Talk(dialogue.options), dialogue.lines)
 
 
-def request(text: str) -> bytes:
-    """A frame from hex text, filled up with zeros to 8 bytes."""
-    return bytes.fromhex(text).ljust(8, b"\0")
-
-
-def u32(number: int) -> str:
-    return number.to_bytes(4, "little").hex()
-
-
 class Bus:
     """Several slaves that hear the same frames."""
 
     def __init__(self, *nodes: Node) -> None:
-        self.nodes = nodes
-        self.answers: list[tuple[int, bytes]] = []
-        self.slaves = [LssSlave(node, self._sender(place)) for place, node in enumerate(nodes)]
+        self._answers: list[bytes] = []
+        self.slaves = [LssSlave(node, self._answers.append) for node in nodes]
 
-    def _sender(self, place: int) -> Callable[[bytes], None]:
-        return lambda data: self.answers.append((place, data))
-
-    def send(self, data: bytes, now: int = 0) -> list[tuple[int, bytes]]:
-        """Give a frame to all; return who answered what."""
+    def send(self, data: bytes) -> list[bytes]:
+        """Give a frame to all; return what was answered."""
+        self._answers.clear()
         for slave in self.slaves:
-            slave.receive(data, now)
-        return self.take()
-
-    def take(self) -> list[tuple[int, bytes]]:
-        taken, self.answers = self.answers, []
-        return taken
-
-    def select(self, identity: Identity) -> list[tuple[int, bytes]]:
-        answers = []
-        for service, number in zip((0x40, 0x41, 0x42, 0x43), identity, strict=True):
-            answers += self.send(request(f"{service:02x}{u32(number)}"))
-        return answers
+            slave.receive(data, 0)
+        return list(self._answers)
 
     @property
     def configuring(self) -> list[bool]:
@@ -168,22 +142,6 @@ def identities(seed: int, count: int) -> list[Identity]:
     return rng.sample(sorted(made), count)
 
 
-def test_among_several_only_the_selected_answers() -> None:
-    nodes = [
-        Node(identity=(ME[0], ME[1], ME[2], ME[3] + i), active_node_id=i + 1, pending_node_id=i + 1) for i in range(4)
-    ]
-    bus = Bus(*nodes)
-    for place, node in enumerate(nodes):
-        bus.send(request("04 00"))
-        assert bus.select(node.identity) == [(place, request("44"))]
-        for sent in ("11 20", "13 00 00", "5a", "5b", "5c", "5d", "5e"):
-            assert [who for who, _ in bus.send(request(sent))] == [place]
-        assert bus.send(request("17")) == []
-        bus.slaves[place].stored(True)
-        assert bus.take() == [(place, request("17"))]
-    assert [node.pending_node_id for node in nodes] == [0x20] * 4
-
-
 class InProcess:
     """A network for the foreign master without threads: the answers are there when its request has been sent."""
 
@@ -192,7 +150,7 @@ class InProcess:
 
     def send_message(self, can_id: int, data: bytes) -> None:
         assert can_id == 0x7E5
-        for _, answer in self._bus.send(bytes(data)):
+        for answer in self._bus.send(bytes(data)):
             self._master.on_message_received(0x7E4, bytearray(answer), 0.0)
 
 
@@ -216,7 +174,7 @@ def test_a_foreign_master_finds_each_of_several_slaves_by_fastscan_and_gives_it_
         assert ok
         assert [i for i, on in enumerate(bus.configuring) if on] == [place]
         master.configure_node_id(number)
-        assert bus.send(request("5d")) == [(place, request(f"5d {u32(nodes[place].identity[3])}"))]
+        assert master.inquire_lss_address(canopen.lss.CS_INQUIRE_SERIAL_NUMBER) == found[3]
         master.send_switch_state_global(master.WAITING_STATE)
         assert nodes[place].active_node_id == number
     assert master.fast_scan() == (False, None)
@@ -233,16 +191,7 @@ def test_a_foreign_master_configures_and_stores() -> None:
     node = nodes[1]
     assert master.send_switch_state_selective(*node.identity)
     assert bus.configuring == [False, True, False]
-    inquired = [
-        master.inquire_lss_address(service)
-        for service in (
-            canopen.lss.CS_INQUIRE_VENDOR_ID,
-            canopen.lss.CS_INQUIRE_PRODUCT_CODE,
-            canopen.lss.CS_INQUIRE_REVISION_NUMBER,
-            canopen.lss.CS_INQUIRE_SERIAL_NUMBER,
-        )
-    ]
-    assert tuple(inquired) == node.identity
+    assert tuple(map(master.inquire_lss_address, range(0x5A, 0x5E))) == node.identity
     assert master.inquire_node_id() == UNCONFIGURED
     master.configure_node_id(0x2A)
     with pytest.raises(canopen.lss.LssError, match="LSS Error: 1"):

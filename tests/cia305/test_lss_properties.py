@@ -191,18 +191,6 @@ def test_any_traffic_has_exactly_the_answers_and_the_state_that_looking_back_giv
         assert node.asked == asked
 
 
-@given(st.lists(st.binary(min_size=8, max_size=8).filter(lambda frame: frame[0] not in SERVICES), max_size=50))
-def test_unknown_services_do_nothing_in_either_state(frames: list[bytes]) -> None:
-    for configuring in (False, True):
-        node = Recorder(ME, 255, 255)
-        answers: list[bytes] = []
-        slave = LssSlave(node, answers.append)
-        slave.receive(bytes((4, configuring, 0, 0, 0, 0, 0, 0)), 0)
-        for frame in frames:
-            slave.receive(frame, 1)
-        assert (answers, node.asked, slave.configuring) == ([], [], configuring)
-
-
 @given(traffic, st.lists(st.integers(0, 100), min_size=1, max_size=3))
 @settings(max_examples=100, deadline=None)
 def test_of_several_slaves_each_answers_as_if_it_were_alone(frames: list[bytes], serials: list[int]) -> None:
