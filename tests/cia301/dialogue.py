@@ -16,6 +16,7 @@ Between the lines time passes by ``advance`` at each ``next_deadline``; what is 
 but what is written may be sent. Text behind ";" is a comment.
 """
 
+import ast
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -408,7 +409,13 @@ def _setting(text: str) -> int | Fraction:
 
 
 def _attribute(text: str) -> Any:
-    return {"none": None, "yes": True}[text] if text in ("none", "yes") else int(text, 0) if text[0].isdigit() else text
+    """A number, bytes, "yes" or "none", else a word."""
+    if text in ("yes", "none"):
+        return True if text == "yes" else None
+    try:
+        return ast.literal_eval(text)
+    except ValueError:
+        return text
 
 
 def tpdo(number: int, kind: int = 254, inhibit: int = 0, timer: int = 0, *mapped: int) -> Changes:
