@@ -232,14 +232,6 @@ class Bench:
         assert isinstance(data, bytes), f"{index:04X}h:{sub:02X}: {data:08X}h"
         return int.from_bytes(data, "little")
 
-    def store(self, part: int = 1, node: int = 1) -> Stored:
-        """What a download to 1010h asks to be stored; it is, and the download is confirmed."""
-        self.put(0x600 + node, b"\x23\x10\x10" + bytes((part,)) + _SAVE)
-        ((esc, stored),) = self.answer_saves()
-        assert esc == next(n for n, other in enumerate(self.nodes) if other.node_id == node)
-        assert self._answer(node) == b"\x60\x10\x10" + bytes((part,)) + bytes(4)
-        return stored
-
     def _ask_and_store(self, node: int, request: bytes) -> bytes:
         self.put(0x600 + node, request)
         if request[4:] in (_SAVE, _LOAD):
@@ -270,6 +262,8 @@ class Bench:
                 self.put(int(cob_id, 16), frame, **flags)
             case "uart", [esc, "rubbish"]:
                 self.uart(b"rubbish", int(esc))
+            case "uart", [esc, "wrong", "CRC"]:
+                self.uart(live()[:-1] + b"\xff", int(esc))
             case "uart", [esc, kind, *fields]:
                 values = {name: int(value, 0) for name, value in (field.split("=") for field in fields)}
                 self.uart((live if kind == "live" else info)(**values), int(esc))
@@ -356,7 +350,7 @@ def _stored(words: Sequence[str]) -> Stored:
 
 
 def bench_of(options: Sequence[str]) -> Bench:
-    """A bench with the options of a dialogue (see ``dialogues/README.txt``)."""
+    """A bench with the options of a dialogue (see ``dialogues/README.md``)."""
     changes: dict[tuple[int, int], Any] = {}
     arguments: dict[str, Any] = {}
     kept: Changes = QUIET

@@ -254,4 +254,4 @@ def test_an_eds_without_an_object_is_what_1021h_gives() -> None:
     data = without(shipped("eds/kontronik_esc.eds").read_bytes(), range(0x6000, 0x7000))
     bench = Bench(eds=load(data, "shorter.eds"))
     assert bench.read(0x606C) == NO_OBJECT
-    assert bench.read(0x1021) == data
+    assert (bench.read(0x1021), bench.number(0x1022)) == (data, 0)

@@ -135,6 +135,11 @@ def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
     check_eds(shipped_eds(), EscSettings(), range(1, 128))
 
 
+def test_a_default_cob_id_without_bit_30_is_that_of_a_pdo() -> None:
+    source = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x180")
+    check_eds(load(source.encode(), "my.eds"), EscSettings(), [5])
+
+
 def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:
     changed = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
     check_eds(load(changed.encode(), "my.eds"), EscSettings(), [1])

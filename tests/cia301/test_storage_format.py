@@ -61,17 +61,6 @@ def test_there_and_back(stored: Stored) -> None:
     assert decode(encode(stored)) == stored
 
 
-@given(stores, st.randoms())
-def test_equal_content_gives_the_same_bytes_whatever_the_order(stored: Stored, rng: Any) -> None:
-    def shuffled(mapping: Any) -> dict[int, bytes]:
-        items = list(mapping.items())
-        rng.shuffle(items)
-        return dict(items)
-
-    again = Stored(stored.node_id, shuffled(stored.communication), shuffled(stored.application))
-    assert encode(again) == encode(stored)
-
-
 def refused(data: bytes) -> str:
     with pytest.raises(ValueError) as caught:
         decode(data)
