@@ -186,25 +186,6 @@ def test_signed_limits_in_twos_complement() -> None:
     assert (entry.low, entry.high, entry.default) == (-100, 100, -100)
 
 
-@given(st.integers(-(1 << 31), (1 << 31) - 1))
-def test_every_integer_is_read_in_decimal_and_in_hexadecimal(number: int) -> None:
-    for text in (str(number), f"0x{number & 0xFFFFFFFF:X}"):
-        section = f"[2200]\n{variable(0x04, DefaultValue=text)}"
-        found = reader.load(_small(section).encode(), "mine.eds").entries[-1]
-        assert found.default == number
-
-
-def _small(more: str) -> str:
-    """A small EDS with a 2200h."""
-    vendor = variable(0x07, "ro")
-    return (
-        "[FileInfo]\n[DeviceInfo]\n[MandatoryObjects]\nSupportedObjects=3\n1=0x1000\n2=0x1001\n3=0x1018\n"
-        f"[ManufacturerObjects]\nSupportedObjects=1\n1=0x2200\n[1000]\n{variable(0x07, 'ro')}\n[1001]\n{variable(0x05, 'ro')}\n"
-        "[1018]\nParameterName=Identity\nObjectType=9\nSubNumber=2\n"
-        f"[1018sub0]\n{variable(0x05, 'ro', DefaultValue=1)}\n[1018sub1]\n{vendor}\n{more}"
-    )
-
-
 COMPACT = (
     "ParameterName=Cell\r\nObjectType=0x8\r\nDataType=0x0006\r\nAccessType=rw\r\nDefaultValue=0x10\r\nLowLimit=1\r\n"
 )
