@@ -249,8 +249,7 @@ def test_the_state_changes_only_by_nmt_commands(story: list[CanFrame]) -> None:
     for frame in story:
         if frame.can_id in (0x601, 0x602) and frame.data[1:3] == b"\x01\x21":
             continue  # 2101h: another node-ID from the next reset on
-        bench.gateway.receive_frame(frame, bench.now, bench.now)
-        bench._collect()
+        happen(bench, ("frame", frame))
         heard = bench.take()
         for model, node in zip(models, bench.nodes, strict=True):
             boot_ups = model.boot_ups
@@ -290,8 +289,7 @@ def test_a_node_says_nothing_unless_asked_but_by_its_timers(story: list[CanFrame
     for frame in story:
         listened = bench.gateway.receive_ids
         asked = {node.node_id for node in bench.nodes if frame.can_id == 0x600 + node.node_id}
-        bench.gateway.receive_frame(frame, bench.now, bench.now)
-        bench._collect()
+        happen(bench, ("frame", frame))
         heard = bench.take()
         if frame.extended or frame.remote or frame.can_id not in listened:
             assert heard == []
