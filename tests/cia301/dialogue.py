@@ -16,14 +16,16 @@ Between the lines time passes by ``advance`` at each ``next_deadline``; what is 
 but what is written may be sent. Text behind ";" is a comment.
 """
 
+import ast
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from script import MS, bytes_of, hexadecimal, ms
+from sdo_client import Refused, download, upload
 
 from kontronik_can_gw.cia301.eds import Eds, load, without
 from kontronik_can_gw.cia301.node import Node, NodeSettings
@@ -209,50 +211,19 @@ class Bench:
 
     def read(self, index: int, sub: int = 0, node: int = 1) -> bytes | int:
         """The data of an upload, or its abort code."""
-        multiplexer = index.to_bytes(2, "little") + bytes((sub,))
-        answer = self.ask(node, b"\x40" + multiplexer + bytes(4))
-        if answer[0] == 0x80:
-            assert answer[1:4] == multiplexer
-            return int.from_bytes(answer[4:], "little")
-        assert answer[1:4] == multiplexer
-        if answer[0] & 2:
-            return answer[4 : 8 - (answer[0] >> 2 & 3)]
-        assert answer[0] == 0x41
-        size = int.from_bytes(answer[4:], "little")
-        data, toggle = b"", 0
-        while True:
-            answer = self.ask(node, bytes((0x60 | toggle,)) + bytes(7))
-            assert answer[0] & 0xF0 == toggle
-            data += answer[1 : 8 - (answer[0] >> 1 & 7)]
-            toggle ^= 0x10
-            if answer[0] & 1:
-                assert len(data) == size
-                return data
+        try:
+            return upload(partial(self.ask, node), index, sub)
+        except Refused as refused:
+            return refused.code
 
     def write(self, index: int, sub: int, data: bytes | int, node: int = 1, size: int = 4) -> int | None:
         """The abort code of a download, None where it is confirmed. What is to be stored is stored at once."""
         if isinstance(data, int):
             data = data.to_bytes(size, "little", signed=data < 0)
-        multiplexer = index.to_bytes(2, "little") + bytes((sub,))
-        if 1 <= len(data) <= 4:
-            request = bytes((0x23 | 4 - len(data) << 2,)) + multiplexer + data.ljust(4, b"\0")
-            if data in (_SAVE, _LOAD) and index in (0x1010, 0x1011):
-                self.put(0x600 + node, request)
-                self.answer_saves()
-                return self._confirmed(self._answer(node), b"\x60" + multiplexer + bytes(4))
-            return self._confirmed(self.ask(node, request), b"\x60" + multiplexer + bytes(4))
-        answer = self.ask(node, b"\x21" + multiplexer + len(data).to_bytes(4, "little"))
-        if answer[0] == 0x80:
-            return self._confirmed(answer, b"")
-        toggle = 0
-        parts = [data[at : at + 7] for at in range(0, len(data), 7)] or [b""]
-        for number, part in enumerate(parts, 1):
-            command = toggle | (7 - len(part)) << 1 | (number == len(parts))
-            answer = self.ask(node, bytes((command,)) + part.ljust(7, b"\0"))
-            if answer[0] == 0x80:
-                return self._confirmed(answer, b"")
-            assert answer == bytes((0x20 | toggle,)) + bytes(7)
-            toggle ^= 0x10
+        try:
+            download(partial(self._ask_and_store, node), index, sub, data)
+        except Refused as refused:
+            return refused.code
         return None
 
     def number(self, index: int, sub: int = 0, node: int = 1) -> int:
@@ -261,13 +232,11 @@ class Bench:
         assert isinstance(data, bytes), f"{index:04X}h:{sub:02X}: {data:08X}h"
         return int.from_bytes(data, "little")
 
-    def store(self, part: int = 1, node: int = 1) -> Stored:
-        """What a download to 1010h asks to be stored; it is, and the download is confirmed."""
-        self.put(0x600 + node, b"\x23\x10\x10" + bytes((part,)) + _SAVE)
-        ((esc, stored),) = self.answer_saves()
-        assert esc == next(n for n, other in enumerate(self.nodes) if other.node_id == node)
-        assert self._answer(node) == b"\x60\x10\x10" + bytes((part,)) + bytes(4)
-        return stored
+    def _ask_and_store(self, node: int, request: bytes) -> bytes:
+        self.put(0x600 + node, request)
+        if request[4:] in (_SAVE, _LOAD):
+            self.answer_saves()
+        return self._answer(node)
 
     def _answer(self, node: int) -> bytes:
         """The one SDO answer that a node has given."""
@@ -275,13 +244,6 @@ class Bench:
         self.heard = [(t, f) for t, f in self.heard if f.can_id != 0x580 + node]
         assert len(answers) == 1, f"{len(answers)} answers of node {node}"
         return answers[0].data
-
-    @staticmethod
-    def _confirmed(answer: bytes, expected: bytes) -> int | None:
-        if answer[0] == 0x80:
-            return int.from_bytes(answer[4:], "little")
-        assert answer == expected
-        return None
 
     # --- dialogues (script.Talker)
 
@@ -300,6 +262,8 @@ class Bench:
                 self.put(int(cob_id, 16), frame, **flags)
             case "uart", [esc, "rubbish"]:
                 self.uart(b"rubbish", int(esc))
+            case "uart", [esc, "wrong", "CRC"]:
+                self.uart(live()[:-1] + b"\xff", int(esc))
             case "uart", [esc, kind, *fields]:
                 values = {name: int(value, 0) for name, value in (field.split("=") for field in fields)}
                 self.uart((live if kind == "live" else info)(**values), int(esc))
@@ -386,7 +350,7 @@ def _stored(words: Sequence[str]) -> Stored:
 
 
 def bench_of(options: Sequence[str]) -> Bench:
-    """A bench with the options of a dialogue (see ``dialogues/README.txt``)."""
+    """A bench with the options of a dialogue (see ``dialogues/README.md``)."""
     changes: dict[tuple[int, int], Any] = {}
     arguments: dict[str, Any] = {}
     kept: Changes = QUIET
@@ -439,7 +403,13 @@ def _setting(text: str) -> int | Fraction:
 
 
 def _attribute(text: str) -> Any:
-    return {"none": None, "yes": True}[text] if text in ("none", "yes") else int(text, 0) if text[0].isdigit() else text
+    """A number, bytes, "yes" or "none", else a word."""
+    if text in ("yes", "none"):
+        return True if text == "yes" else None
+    try:
+        return ast.literal_eval(text)
+    except ValueError:
+        return text
 
 
 def tpdo(number: int, kind: int = 254, inhibit: int = 0, timer: int = 0, *mapped: int) -> Changes:

@@ -30,6 +30,22 @@ class Talker(Protocol):
         """What was sent since the last call, "time -> ...": lines."""
 
 
+class Heard:
+    """What a talker has sent, as lines of a dialogue."""
+
+    def __init__(self) -> None:
+        self._lines: list[str] = []
+
+    def hear(self, now: int, frame: str) -> None:
+        """Note a frame that was sent."""
+        self._lines.append(f"{ms(now)} -> {frame}".rstrip())
+
+    def heard_lines(self) -> list[str]:
+        """What was sent since the last call."""
+        lines, self._lines = self._lines, []
+        return lines
+
+
 @dataclass
 class Dialogue:
     """One dialogue of a file: its name, options, and lines with their places."""

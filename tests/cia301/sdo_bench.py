@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from script import bytes_of, hexadecimal, ms
+from script import MS, Heard, bytes_of, hexadecimal, ms
 
 from kontronik_can_gw.cia301.abort import Abort, SdoAbort
 from kontronik_can_gw.cia301.sdo import SdoServer
-
-MS = 1_000_000
 
 
 @dataclass
@@ -86,22 +84,22 @@ class Dictionary:
         return entry.most if entry.size is None else entry.size
 
 
-class Bench:
+class Bench(Heard):
     """A server whose time is turned by hand; a talker of dialogues (see script.py)."""
 
     def __init__(self, segment_ns: int = 0) -> None:
+        super().__init__()
         self.objects = Dictionary()
         self.server = SdoServer(self.objects, self._sent, segment_ns)
         self.now = 0
         self.answers: list[bytes] = []
         """Those of the last request, and what followed it."""
-        self._heard: list[str] = []
         self._tickets: list[int] = []
 
     def _sent(self, data: bytes) -> None:
         assert len(data) == 8
         self.answers.append(data)
-        self._heard.append(f"{ms(self.now)} -> {hexadecimal(data)}")
+        self.hear(self.now, hexadecimal(data))
 
     def pass_time(self, until: int) -> None:
         """Let time pass as the runtime does: from deadline to deadline."""
@@ -123,10 +121,6 @@ class Bench:
         if self.server.waiting is not None:
             self._tickets.append(self.server.waiting)
         return self.answers
-
-    def heard_lines(self) -> list[str]:
-        heard, self._heard = self._heard, []
-        return heard
 
     def say(self, what: str) -> str:
         verb, _, rest = what.partition(" ")

@@ -2,22 +2,16 @@
 
 import struct
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
-from dialogue import QUIET, Bench, info, live, shipped_eds
-from eds_text import SHIPPED, variable, with_key, with_object
+from dialogue import QUIET, Bench, shipped_eds
 
-from kontronik_can_gw.cia301.check import check_eds
 from kontronik_can_gw.cia301.eds import Entry, load, without
-from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.config import shipped
-from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.protocol.codec import Layout
 from kontronik_can_gw.protocol.codec import encode as uart
 from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
 from kontronik_can_gw.sources import GatewayState
-from kontronik_can_gw.telemetry import EscSettings
 
 NO_OBJECT, NO_SUB, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
 TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x06070012, 0x06070013, 0x06090031, 0x06090032
@@ -193,16 +187,10 @@ def test_fresh_values_are_those_of_the_uart_frame() -> None:
     for sub, (name, data) in enumerate(wanted[4:], 1):
         assert bench.read(0x2011, sub) == data, name
     assert bench.number(0x2001, 1) == bench.number(0x606C) == 70_000
+    assert bench.read(0x2001, 3) == (-293).to_bytes(4, "little", signed=True)  # 24.42 V, -1.2 A: -29.304 W
     assert bench.number(0x2001, 5) == 4070
     assert bench.number(0x6079) == 24420
     assert bench.number(0x2020, 1) == 0x82
-
-
-def test_power_is_in_tenths_of_a_watt() -> None:
-    bench = fed()
-    data = bench.read(0x2001, 3)
-    assert isinstance(data, bytes)
-    assert int.from_bytes(data, "little", signed=True) == -293  # 24.42 V, -1.2 A: -29.304 W
 
 
 def lose(bench: Bench) -> None:
@@ -211,29 +199,16 @@ def lose(bench: Bench) -> None:
     assert bench.number(0x2020, 1) == 4
 
 
-def test_lost_values_abort() -> None:
-    bench = fed()
-    lose(bench)
-    for at in all_live():
-        assert bench.read(*at) == DEVICE_STATE, at
-
-
-def test_lost_values_by_setting_are_the_last() -> None:
-    bench = fed(behaviour=1)
+@pytest.mark.parametrize("behaviour", [0, 1, 2])
+def test_lost_values_abort_or_stay_or_are_codes_by_setting(behaviour: int) -> None:
+    bench = fed(behaviour)
     fresh = {at: bench.read(*at) for at in all_live()}
-    lose(bench)
-    for at in all_live():
-        assert bench.read(*at) == fresh[at], at
-
-
-def test_lost_values_by_setting_are_codes() -> None:
-    bench = fed(behaviour=2)
     lose(bench)
     known = entries()
     for at in all_live():
         low, high = ends(known[at])
-        code = high if low == 0 else low
-        assert bench.read(*at) == struct.pack("<" + FORMATS[known[at].data_type], code), at
+        code = struct.pack("<" + FORMATS[known[at].data_type], high if low == 0 else low)
+        assert bench.read(*at) == (DEVICE_STATE, fresh[at], code)[behaviour], at
 
 
 @pytest.mark.parametrize("behaviour", [0, 1, 2])
@@ -275,141 +250,8 @@ def test_read_only_refuses_every_download() -> None:
 # --- another EDS
 
 
-def bench_of(source: str, **settings: Any) -> Bench:
-    eds = load(source.encode("ascii"), "other.eds")
-    check_eds(eds, EscSettings())
-    return Bench(eds=eds, changes=QUIET, **settings)
-
-
 def test_an_eds_without_an_object_is_what_1021h_gives() -> None:
     data = without(shipped("eds/kontronik_esc.eds").read_bytes(), range(0x6000, 0x7000))
     bench = Bench(eds=load(data, "shorter.eds"))
     assert bench.read(0x606C) == NO_OBJECT
-    assert bench.read(0x1021) == data
-
-
-def test_changed_defaults_names_limits_and_access_are_followed() -> None:
-    source = with_key(SHIPPED, "2100sub1", "DefaultValue", "0x04")
-    source = with_key(source, "2100sub1", "HighLimit", "0x08")
-    source = with_key(source, "2100sub4", "AccessType", "ro")
-    source = with_key(source, "2100sub4", "DefaultValue", "0x1F4")
-    source = with_key(source, "1008", "DefaultValue", "My ESC")
-    source = with_key(source, "1017", "DefaultValue", "0x0064")
-    source = with_key(source, "2000sub1", "ParameterName", "Drehzahl")
-    eds = load(source.encode("ascii"), "other.eds")
-    check_eds(eds, EscSettings())
-    bench = Bench(eds=eds)
-    assert bench.number(0x2100, 1) == 4
-    assert bench.write(0x2100, 1, 9, size=1) == TOO_HIGH
-    assert bench.write(0x2100, 4, 100, size=2) == READ_ONLY
-    assert bench.gateway.escs[0].settings.timeout_ns == 500_000_000
-    assert bench.gateway.escs[0].settings.pole_pairs == 4
-    assert bench.read(0x1008) == b"My ESC"
-    bench.wait(100)
-    assert [frame.can_id for frame in bench.take()] == [0x701]
-
-
-def test_a_changed_pdo_mapping_is_followed() -> None:
-    source = with_key(SHIPPED, "1A00sub0", "DefaultValue", "0x2")
-    source = with_key(source, "1A00sub1", "DefaultValue", "0x20010120")
-    source = with_key(source, "1A00sub2", "DefaultValue", "0x20000C08")
-    source = with_key(source, "1800sub1", "DefaultValue", "$NODEID+0x40000200")
-    eds = load(source.encode("ascii"), "other.eds")
-    check_eds(eds, EscSettings())
-    bench = Bench(eds=eds).start()
-    bench.uart(uart(LIVE, Layout.V4))
-    assert bench.take()[0][:2] == (0x201, (70_000).to_bytes(4, "little") + b"\xf9")
-
-
-def test_a_default_mapping_that_cannot_be_is_refused_by_name() -> None:
-    for mapping in ("0x30000108", "0x20000108", "0x21000108"):
-        source = with_key(SHIPPED, "1A00sub1", "DefaultValue", mapping)
-        with pytest.raises(UserError, match="1A00"):
-            check_eds(load(source.encode("ascii"), "other.eds"), EscSettings())
-
-
-PLAIN = [
-    (0x05, "0x12", b"\x12", b"\xff"),
-    (0x06, "0x1234", b"\x34\x12", b"\xff\xff"),
-    (0x07, "0x12345678", b"\x78\x56\x34\x12", b"\xff\xff\xff\xff"),
-    (0x04, "-2", b"\xfe\xff\xff\xff", b"\0\0\0\x80"),
-    (0x08, "1.5", b"\0\0\xc0\x3f", b"\0\0\xc0\xbf"),
-    (0x09, "abc", b"abc", b"a longer text than one segment"),
-]
-
-
-@pytest.mark.parametrize(("data_type", "value", "data", "other"), PLAIN)
-def test_an_object_bound_to_nothing_is_plain_storage(data_type: int, value: str, data: bytes, other: bytes) -> None:
-    source = with_object(SHIPPED, 0x3000, variable(data_type, DefaultValue=value, PDOMapping="0"))
-    bench = bench_of(source)
-    assert bench.read(0x3000) == data
-    assert bench.write(0x3000, 0, other) is None
-    assert bench.read(0x3000) == other
-    stored = bench.store()
-    assert stored.application == {0x300000: other}
-    bench.put(0, "81 01")
-    assert bench.read(0x3000) == other
-    again = bench_of(source, stored=[Stored(None, {}, stored.application)])
-    assert again.read(0x3000) == other
-    assert again.write(0x1011, 1, b"load") is None
-    again.put(0, "81 01")
-    assert again.read(0x3000) == data
-
-
-def test_a_domain_is_plain_storage() -> None:
-    lines = "\n".join(("ParameterName=Plain", "ObjectType=0x2", "DataType=0x000F", "AccessType=rw"))
-    bench = bench_of(with_object(SHIPPED, 0x3000, lines))
-    assert bench.read(0x3000) == b""
-    data = bytes(range(256)) * 4
-    assert bench.write(0x3000, 0, data) is None
-    assert bench.read(0x3000) == data
-    assert bench.store().application == {0x300000: data}
-
-
-def test_limits_of_plain_objects_hold() -> None:
-    bench = bench_of(with_object(SHIPPED, 0x3000, variable(0x04, LowLimit="-5", HighLimit="5", DefaultValue="0")))
-    assert [bench.write(0x3000, 0, value) for value in (-6, -5, 0, 5, 6)] == [TOO_LOW, None, None, None, TOO_HIGH]
-
-
-@pytest.mark.parametrize(
-    ("section", "data_type"),
-    [
-        ("2100sub1", 0x08),
-        ("2100sub4", 0x09),
-        ("2101sub2", 0x08),
-        ("2101sub3", 0x06),
-        ("2102sub1", 0x06),
-        ("2010sub6", 0x07),
-        ("2010sub7", 0x05),
-        ("603F", 0x05),
-        ("2000sub1", 0x08),
-        ("2000sub2", 0x09),
-        ("2020sub1", 0x01),
-    ],
-)
-def test_an_object_of_a_type_that_cannot_hold_what_it_shows_is_refused_by_name(section: str, data_type: int) -> None:
-    source = SHIPPED
-    if section == "2000sub1" or section == "2000sub2":
-        source = with_key(source, "1A00sub0", "DefaultValue", "0x0")
-    if section == "2020sub1":
-        source = with_key(source, "1A03sub0", "DefaultValue", "0x0")
-    source = with_key(source, section, "DataType", f"0x{data_type:04X}")
-    for key, value in (("LowLimit", ""), ("HighLimit", ""), ("DefaultValue", ""), ("PDOMapping", "0")):
-        source = with_key(source, section, key, value)
-    with pytest.raises(UserError, match=section[:4]):
-        check_eds(load(source.encode("ascii"), "other.eds"), EscSettings())
-
-
-@pytest.mark.parametrize("section", ["1003sub1", "1001", "1002", "603F", "2101sub1"])
-def test_objects_of_services_that_an_eds_makes_mappable_can_be_sent(section: str) -> None:
-    bench = bench_of(with_key(SHIPPED, section, "PDOMapping", "1"))
-    index, sub = int(section[:4], 16), int(section[7:] or "0", 16)
-    size = struct.calcsize(FORMATS[entries()[index, sub].data_type])
-    assert bench.write(0x1A04, 1, index << 16 | sub << 8 | 8 * size) is None
-    assert bench.write(0x1A04, 0, b"\x01") is None
-    assert bench.write(0x1804, 1, 0x40000333) is None
-    bench.start()
-    bench.uart(live(operating_errors=1))
-    bench.uart(info())
-    bench.wait(1500)
-    assert 0x81 in {frame.can_id for frame in bench.take()}
+    assert (bench.read(0x1021), bench.number(0x1022)) == (data, 0)

@@ -118,60 +118,9 @@ def problems(data: bytes, node_ids: tuple[int, ...] = (1,)) -> list[str]:
     return list(caught.value.problems)
 
 
-def replaced(*pairs: tuple[str, str]) -> bytes:
-    data = DATA
-    for old, new in pairs:
-        assert data.count(old.encode()) == 1, old
-        data = data.replace(old.encode(), new.encode())
-    return data
-
-
-ADVICE = "Change one DefaultValue (or add $NODEID)."
-
-
-@pytest.mark.parametrize(
-    ("pairs", "node_ids", "expected"),
-    [
-        (
-            [("$NODEID+0x40000280", "$NODEID+0x40000180")],
-            (1, 2),
-            ["COB-ID 181h is that of 1800h:01 of node 1 and of 1801h:01 of node 1."],
-        ),
-        (
-            [("$NODEID+0x40000280", "$NODEID+0x180")],
-            (),
-            ["COB-ID 181h is that of 1800h:01 of node 1 and of 1801h:01 of node 1."],
-        ),
-        (
-            [("$NODEID+0x40000380", "0x40000381")],
-            (1, 2),
-            ["COB-ID 381h is that of 1802h:01 of node 1 and of 1802h:01 of node 2."],
-        ),
-        (
-            [("$NODEID+0x80\r", "0x482\r")],
-            (2,),
-            ["COB-ID 482h is that of 1014h:00 of node 2 and of 1803h:01 of node 2."],
-        ),
-        ([("$NODEID+0x40000180", "0x40000080")], (1,), ["COB-ID 080h is that of 1005h:00 and of 1800h:01 of node 1."]),
-        (
-            [("$NODEID+0x40000280", "$NODEID+0x40000380"), ("$NODEID+0x40000180", "$NODEID+0x40000480")],
-            (1,),
-            [
-                "COB-ID 381h is that of 1801h:01 of node 1 and of 1802h:01 of node 1.",
-                "COB-ID 481h is that of 1800h:01 of node 1 and of 1803h:01 of node 1.",
-            ],
-        ),
-    ],
-)
-def test_two_defaults_with_one_cob_id_are_refused_with_both_objects(
-    pairs: list[tuple[str, str]], node_ids: tuple[int, ...], expected: list[str]
-) -> None:
-    assert problems(replaced(*pairs), node_ids) == [f"my.eds: {line} {ADVICE}" for line in expected]
-
-
 def test_a_cob_id_of_emergencies_that_are_not_in_the_eds_is_taken() -> None:
-    data = without(replaced(("$NODEID+0x40000180", "$NODEID+0x40000080")), {0x1014})
-    assert problems(data) == [f"my.eds: COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1. {ADVICE}"]
+    data = without(with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080").encode(), {0x1014})
+    assert "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in problems(data)[0]
 
 
 def test_a_default_pdo_that_maps_nothing_is_named() -> None:
@@ -186,26 +135,9 @@ def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
     check_eds(shipped_eds(), EscSettings(), range(1, 128))
 
 
-@pytest.mark.parametrize(
-    ("section", "key", "value", "said"),
-    [
-        ("1200sub1", "DefaultValue", "$NODEID+0x640", "1200h:01 COB-ID client to server: must be $NODEID+0x600"),
-        ("1001", "AccessType", "rw", "1001h:00 Error register: is shown by the node, so it must be read only"),
-        ("1001", "AccessType", "wo", "must be read only"),
-        ("100A", "AccessType", "rw", "must be read only"),
-        ("1018sub1", "AccessType", "rw", "must be read only"),
-        ("2010sub6", "AccessType", "rw", "must be read only"),
-        ("2101sub1", "AccessType", "rw", "must be read only"),
-        ("1005", "DefaultValue", "0x40000080", "1005h:00 COB-ID SYNC message: DefaultValue 0x40000080"),
-        ("1014", "DefaultValue", "0x601", "1014h:00 COB-ID EMCY"),
-        ("1019", "DefaultValue", "1", "1019h:00"),
-        ("1F80", "DefaultValue", "0x1", "1F80h:00"),
-    ],
-)
-def test_defaults_that_a_download_would_be_refused_are_refused_at_start(
-    section: str, key: str, value: str, said: str
-) -> None:
-    assert said in "\n".join(problems(with_key(SHIPPED, section, key, value).encode()))
+def test_a_default_cob_id_without_bit_30_is_that_of_a_pdo() -> None:
+    source = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x180")
+    check_eds(load(source.encode(), "my.eds"), EscSettings(), [5])
 
 
 def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:

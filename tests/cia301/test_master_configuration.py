@@ -5,15 +5,11 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import canopen
-from dialogue import NO_HEARTBEAT, Bench, default, live
+from dialogue import NO_HEARTBEAT, Bench, live
+from wire import Wire
 
-from kontronik_can_gw.cia301.check import check_eds
-from kontronik_can_gw.cia301.eds import load
 from kontronik_can_gw.config import shipped
-from kontronik_can_gw.telemetry import EscSettings
 
 EDS = shipped("eds/kontronik_esc.eds")
 BUS = """
@@ -76,22 +72,14 @@ def test_each_object_of_dcfgens_concise_dcf_is_accepted_and_the_pdos_are_what_th
     assert 0x680 in {frame.can_id for frame in bench.take()}, "the event timer"
 
 
-class _Wire(canopen.Network):
-    """A master's network whose frames a bench takes and answers at once."""
-
-    def __init__(self, bench: Bench) -> None:
-        super().__init__()
-        self._bench = bench
-
-    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        self._bench.put(can_id, bytes(data), remote=remote)
-        for frame in self._bench.take():
-            self.notify(frame.can_id, bytearray(frame.data), 0.0)
-
-
 def test_the_canopen_package_saves_a_pdo_that_it_did_not_read_before() -> None:
     bench = Bench(changes=NO_HEARTBEAT)
-    node = _Wire(bench).add_node(1, str(EDS))
+
+    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
+        bench.put(cob_id, data, remote=remote)
+        return [(frame.can_id, frame.data) for frame in bench.take()]
+
+    node = Wire(exchange).add_node(1, str(EDS))
     pdo = node.tpdo[5]
     pdo.cob_id, pdo.enabled, pdo.rtr_allowed, pdo.trans_type, pdo.event_timer = 0x1F1, True, True, 254, 100
     pdo.add_variable(0x2000, 2)
@@ -100,15 +88,3 @@ def test_the_canopen_package_saves_a_pdo_that_it_did_not_read_before() -> None:
     bench.start()
     bench.uart(live(battery_voltage=2442))
     assert (0x1F1, b"\x8a\x09") in [(frame.can_id, frame.data) for frame in bench.take()]
-
-
-def test_a_default_cob_id_without_bit_30_is_that_of_a_pdo() -> None:
-    data = EDS.read_bytes().replace(b"$NODEID+0x40000180", b"$NODEID+0x180")
-    assert data != EDS.read_bytes()
-    eds = load(data, "my.eds")
-    check_eds(eds, EscSettings(), [5])
-    bench = Bench(node_ids=[5], eds=eds, changes={**NO_HEARTBEAT, **default(0x1800, 3, 0)})
-    assert bench.number(0x1800, 1, node=5) == 0x185
-    bench.start()
-    bench.uart(live(battery_voltage=2442))
-    assert (bench.take()[0].can_id, bench.nodes[0].misfits) == (0x185, [])

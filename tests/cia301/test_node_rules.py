@@ -3,63 +3,19 @@
 from pathlib import Path
 
 import pytest
-from dialogue import NO_HEARTBEAT, OFF, QUIET, SPARE, Bench, default, info, live, shipped_eds, tpdo
+from dialogue import NO_HEARTBEAT, OFF, QUIET, SPARE, Bench, default, live, shipped_eds, tpdo
 from eds_text import SHIPPED, variable, with_object
 from script import MS
-from test_dictionary_walk import bench_of
 
-from kontronik_can_gw.cia301.bindings import bindings
-from kontronik_can_gw.cia301.dictionary import Dictionary
-from kontronik_can_gw.cia301.emergency import Emergencies, GatewayError
-from kontronik_can_gw.cia301.nmt import Command, NmtState
-from kontronik_can_gw.cia301.pdo import Mapped, message_plan, restricted
+from kontronik_can_gw.cia301.eds import load
+from kontronik_can_gw.cia301.pdo import message_plan
 from kontronik_can_gw.cia301.storage import Stored, encode
 from kontronik_can_gw.cli.common import Loaded, assemble
-from kontronik_can_gw.config import parse, shipped
+from kontronik_can_gw.config import parse
 from kontronik_can_gw.dbc_output.layout import Layout
-from kontronik_can_gw.protocol.fields import device_and_variant
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number
-from kontronik_can_gw.telemetry import EscSettings
 
 VALUE, TAKEN = 0x06090030, 0x06040043
-
-
-@pytest.fixture(scope="module")
-def quiet() -> Bench:
-    """For tests that only ask and undo what they change."""
-    return Bench(changes={**QUIET, **SPARE})
-
-
-@pytest.mark.parametrize("first", Command)
-@pytest.mark.parametrize("then", Command)
-def test_each_command_leads_from_each_state_to_its_own(first: Command, then: Command) -> None:
-    bench = Bench(changes=QUIET)
-    for command in (first, then):
-        bench.put(0, bytes((command, 1)))
-    states = {Command.START: NmtState.OPERATIONAL, Command.STOP: NmtState.STOPPED}
-    assert bench.nodes[0].state == states.get(then, NmtState.PRE_OPERATIONAL)
-
-
-def test_types_2_to_240_send_with_every_nth_sync() -> None:
-    bench = Bench(changes={**QUIET, **tpdo(1, 240, 0, 0, 0x20200208)})
-    bench.start()
-    for _ in range(3):
-        for _ in range(239):
-            bench.put(0x80, "")
-        assert bench.take() == []
-        bench.put(0x80, "")
-        assert [frame.can_id for frame in bench.take()] == [0x181]
-
-
-def test_a_rate_of_crc_errors() -> None:
-    bench = Bench(changes=QUIET)
-    good, bad = live(), live()[:-1] + b"\xff"
-    heard = []
-    for number in range(350):
-        bench.wait(10)
-        bench.uart(bad if 100 <= number < 150 and number % 3 == 0 else good)
-        heard += [(frame.data[:2].hex(), frame.data[4]) for frame in bench.take()]
-    assert heard == [("1075", 2), ("0000", 0)]
 
 
 def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_it_has_ceased() -> None:
@@ -80,67 +36,22 @@ def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_i
     ]
 
 
-def test_what_only_looks_like_an_id_of_the_node_is_no_collision() -> None:
-    bench = Bench(changes=QUIET)
-    bench.take()
-    bench.put(0x701, b"", remote=True)
-    bench.put(0x701, b"", extended=True)
-    for cob_id, size in ((0x601, 8), (0x080, 0), (0x7E4, 8)):
-        bench.put(cob_id, bytes(size))
-    assert bench.gateway.status.id_conflicts == 0
-    assert bench.gateway.take_conflicts() == []
-
-
-def test_errors_that_come_and_go_in_silence_take_no_memory() -> None:
-    sent: list[bytes] = []
-
-    def send(data: bytes) -> bool:
-        sent.append(data)
-        return True
-
-    found = Emergencies(send, 8)
-    for number in range(1000):
-        found.set_word(number % 2, number)
-        found.pulse(GatewayError.RECEIVE_OVERRUN, number)
-    assert len(found._untold) <= 2
-    found.open(2000)
-    assert len(sent) == 1
-
-
-def test_reserved_and_remote_types_are_refused(quiet: Bench) -> None:
-    for kind in range(256):
-        allowed = kind <= 240 or kind >= 254
-        assert quiet.write(0x1800, 2, kind, size=1) == (None if allowed else VALUE), kind
-
-
 def test_all_pdos_that_a_uart_frame_causes_carry_that_frame() -> None:
-    mapped = {
-        **NO_HEARTBEAT,
-        **{(0x1800 + n, 3): {"default": 0} for n in range(4)},
-        **{(0x1A00 + n, 0): {"default": 1} for n in range(4)},
-        **{(0x1A00 + n, 1): {"default": 0x20000120} for n in range(4)},
-    }
-    bench = Bench(changes=mapped).start()
+    numbers, speed_only = range(1, 5), (254, 0, 0, 0x20000120)
+    tpdos = {place: change for n in numbers for place, change in tpdo(n, *speed_only).items()}
+    bench = Bench(changes={**QUIET, **tpdos}).start()
     speeds = range(1, 200)
     bench.now = 10 * MS
     bench.uart(b"".join(live(electrical_speed=s) for s in speeds[:20]))  # in one read
     for speed in speeds[20:]:
         bench.now += 10 * MS
         bench.uart(live(electrical_speed=speed))
-    frames = bench.take()
-    told = [(f.can_id, int.from_bytes(f.data, "little")) for f in frames if len(f.data) == 4]
-    assert told == [(0x181 + 0x100 * n, speed) for speed in speeds for n in range(4)]
+    sent = [(frame.can_id, int.from_bytes(frame.data, "little")) for frame in bench.take()]
+    assert sent == [(0x81 + 0x100 * number, speed) for speed in speeds for number in numbers]
 
 
-def test_a_restricted_cob_id_is_refused_and_every_other_accepted(quiet: Bench) -> None:
-    ours = {0x80, 0x81}
-    for cob_id in range(0x800):
-        wanted = VALUE if restricted(cob_id) else TAKEN if cob_id in ours else None
-        assert quiet.write(0x1804, 1, 0x40000000 | cob_id) == wanted, hex(cob_id)
-        quiet.write(0x1804, 1, OFF)
-
-
-def test_the_restricted_cob_ids_are_those_of_the_standard() -> None:
+def test_a_restricted_cob_id_is_refused_and_every_other_accepted() -> None:
+    bench = Bench(changes={**QUIET, **SPARE})
     reserved = {
         *range(0x080),
         *range(0x101, 0x181),
@@ -149,7 +60,11 @@ def test_the_restricted_cob_ids_are_those_of_the_standard() -> None:
         *range(0x6E0, 0x700),
         *range(0x701, 0x800),
     }
-    assert {cob_id for cob_id in range(0x800) if restricted(cob_id)} == reserved
+    ours = {0x80, 0x81}
+    for cob_id in range(0x800):
+        wanted = VALUE if cob_id in reserved else TAKEN if cob_id in ours else None
+        assert bench.write(0x1804, 1, 0x40000000 | cob_id) == wanted, hex(cob_id)
+        bench.write(0x1804, 1, OFF)
 
 
 def test_ids_of_other_pdos_of_all_nodes_and_of_the_dbc_are_taken() -> None:
@@ -193,60 +108,14 @@ def test_each_mappable_object_can_be_sent_and_carries_what_sdo_reads() -> None:
     assert tried > 40
 
 
-def test_settings_take_effect_at_once_in_objects_and_in_the_dbcs_messages() -> None:
-    bench = Bench(
-        changes={**QUIET, **default(0x1800, 1, 0x40000180, relative=True), **default(0x1A00, 1, 0x20010120)},
-        layout=_dbc(),
-    )
-    bench.start()
-    bench.uart(live(electrical_speed=70_000))
-    assert _speeds(bench) == {0x181: 70_000, 0x100: 70_000}
-    assert bench.write(0x2100, 1, 7, size=1) is None
-    bench.now += 20 * MS
-    bench.uart(live(electrical_speed=70_000))
-    assert _speeds(bench) == {0x181: 10_000, 0x100: 10_000}
-    assert bench.number(0x2001, 1) == bench.number(0x606C) == 10_000
-    assert bench.write(0x2100, 2, 5) is None
-    assert bench.write(0x2100, 3, 2) is None
-    assert bench.number(0x2001, 2) == 4_000
-    bench.put(0, "81 01")
-    assert bench.number(0x2001, 1) == 70_000
-
-
-def _dbc() -> Layout:
-    """A layout with one message that holds the motor speed."""
-    variable = Dictionary(shipped_eds()).find(0x2001, 1)
-    plan = message_plan("Speed", 0x100, [Mapped(variable, bindings(EscSettings())[0x2001, 1])])
-    return Layout("", "", (plan,))
-
-
-def _speeds(bench: Bench) -> dict[int, int]:
-    return {f.can_id: int.from_bytes(f.data[:4], "little") for f in bench.take()}
-
-
-def test_the_stored_eds_is_the_file_byte_for_byte() -> None:
-    bench = Bench(changes=QUIET)
-    assert bench.read(0x1021) == shipped("eds/kontronik_esc.eds").read_bytes()
-    assert bench.number(0x1022) == 0
-
-
-def test_the_bec_current_of_a_jivepro_stays_unknown_when_its_info_is_old() -> None:
-    bench = Bench()
-    bench.uart(info(device_and_variant=device_and_variant(3, 120)))
-    for _ in range(130):
-        bench.wait(100)
-        bench.uart(live(bec_current=4711))
-    assert bench.gateway.escs[0].info is None
-    assert bench.read(0x2000, 7) == 0x08000024
-
-
 def test_objects_from_a000h_on_are_stored_too() -> None:
     swapped = SHIPPED.replace("[ManufacturerObjects]", "[Kept]").replace("[OptionalObjects]", "[ManufacturerObjects]")
     changed = with_object(swapped, 0xA000, variable(0x05, DefaultValue="1"))
     changed = changed.replace("[ManufacturerObjects]", "[OptionalObjects]").replace("[Kept]", "[ManufacturerObjects]")
-    bench = bench_of(changed)
+    bench = Bench(eds=load(changed.encode("ascii"), "my.eds"), changes=QUIET)
     assert bench.write(0xA000, 0, b"\x05") is None
-    assert bench.store().application == {0xA00000: b"\x05"}
+    assert bench.write(0x1010, 1, b"save") is None
+    assert bench.on_disk[0].application == {0xA00000: b"\x05"}
 
 
 def test_serial_numbers_differ_by_number_name_and_machine(tmp_path: Path) -> None:
@@ -260,11 +129,8 @@ def test_serial_numbers_differ_by_number_name_and_machine(tmp_path: Path) -> Non
     assert machine_identity(tmp_path) == b"0123\0"
 
 
-def setup_of(tmp_path: Path, escs: int = 2, **canopen: object) -> Loaded:
-    tables = {
-        "canopen": {"enabled": True, "store": str(tmp_path), **canopen},
-        "esc": [{"port": f"p{n}"} for n in range(1, escs + 1)],
-    }
+def setup_of(tmp_path: Path) -> Loaded:
+    tables = {"canopen": {"enabled": True, "store": str(tmp_path)}, "esc": [{"port": "p1"}, {"port": "p2"}]}
     return assemble(parse(tables, "test"))
 
 

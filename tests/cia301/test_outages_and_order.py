@@ -1,6 +1,5 @@
 """What goes on a bus by itself: after an outage, from link and gateway counters, in which order; and which ids are a node's own."""
 
-import pytest
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
 from kontronik_can_gw.cia301.bindings import GATEWAY, LINK
@@ -15,11 +14,6 @@ from kontronik_can_gw.telemetry import EscSettings
 LINK_STATUS = LINK << 16 | 0x0108
 CRC_ERRORS = LINK << 16 | 0x0720
 SENT_FRAMES = GATEWAY << 16 | 0x0320
-
-
-def taken(bench: Bench) -> list[CanFrame]:
-    """Also what a call of the gateway itself has caused."""
-    return [*bench.take(), *bench.gateway.take_frames()]
 
 
 def put_out(frames: list[CanFrame]) -> list[CanFrame]:
@@ -48,45 +42,6 @@ def test_of_what_a_node_answers_nothing_is_overtaken() -> None:
     frames = bench.take()
     assert [frame.can_id for frame in frames] == [0x581] * 3 + [0x81] * 2 + [0x701, 0x581]
     assert put_out(frames) == frames
-
-
-@pytest.mark.parametrize("kind", [254, 255])
-def test_what_is_sent_on_change_only_is_said_again_after_an_outage(kind: int) -> None:
-    bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, 0, LINK_STATUS), **tpdo(2, kind, 0, 0, 0x20000210)}).start()
-    bench.uart(live())
-    bench.wait(100)
-    bench.take()
-    bench.gateway.can_returned(bench.now)
-    assert [(frame.can_id, frame.data[0] & 7) for frame in taken(bench)] == [(0x181, 2)]
-
-
-@pytest.mark.parametrize(("mapped", "first"), [(CRC_ERRORS, 1), (SENT_FRAMES, 0)])
-def test_counters_of_link_and_gateway_are_sent_each_second(mapped: int, first: int) -> None:
-    """No live frame is news to them; a second is."""
-    bench = Bench(changes={**QUIET, **tpdo(1, 255, 0, 0, mapped)}, escs={"timeout_ns": 60_000_000_000}).start()
-    bench.uart(live()[:-1] + b"\xff" + live())
-    bench.wait(10)
-    bench.take()
-    bench.uart(live())
-    assert bench.take() == []
-    for _ in range(3):
-        bench.wait(1000)
-        [frame] = bench.take()
-        assert frame.can_id == 0x181
-        assert int.from_bytes(frame.data, "little") >= first
-
-
-def test_between_lost_telemetry_and_a_lost_port_there_is_no_moment_without_error() -> None:
-    bench = Bench(changes=QUIET)
-    bench.uart(live())
-    bench.wait(1000)
-    assert [(frame.data[:2].hex(), frame.data[4]) for frame in bench.take()] == [("1075", 1)]
-    bench.gateway.port_lost(0, bench.now)
-    assert [(frame.data[:2].hex(), frame.data[4]) for frame in taken(bench)] == [("1075", 3)]
-    bench.gateway.port_opened(0, bench.now)
-    assert [(frame.data[:2].hex(), frame.data[4]) for frame in taken(bench)] == [("1075", 1)]
-    bench.uart(live())
-    assert [frame.data[:2].hex() for frame in taken(bench)] == ["0000"]
 
 
 def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> None:

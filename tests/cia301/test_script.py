@@ -20,18 +20,12 @@ def play(text: str, *options: str) -> None:
     )
 
 
-def test_what_is_as_written_passes() -> None:
-    play(RIGHT)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         ("1000 -> 701 7F", "1000 -> 701 05", "a.txt:4: expected '1000 -> 701 05', got '1000 -> 701 7F'"),
         (" 1000 -> 701 7F\n", "", "after a.txt:3: expected 'nothing', got '1000 -> 701 7F'"),
-        ("1000 -> 701 7F", "999 -> 701 7F", "a.txt:4: expected '999 -> 701 7F', got '1000 -> 701 7F'"),
         ("0 -> 581 43 .. 10 00 00*", "0 -> 581 43 .. 10 00", "a.txt:3: expected '0 -> 581 43 .. 10 00', got"),
-        ("0 -> 581 43", "0 -> 582 43", "a.txt:3: expected '0 -> 582"),
         ("1500 -", "2000 -> 701 7F\n 2001 -> 701 7F", "a.txt:6: expected '2001 -> 701 7F', got 'nothing'"),
         (
             "1500 -",
@@ -39,13 +33,13 @@ def test_what_is_as_written_passes() -> None:
             "a.txt:5: expected '1500 read 1 1017:00 = E8 04', got '1500 read 1 1017:00 = E8 03'",
         ),
         ("1500 -", "1500 write 1 1000:00 00", "got '1500 write 1 1000:00 00 ! 06010002'"),
-        ("1500 -", "1500 state 1 05", "a.txt:5: expected '1500 state 1 05', got '1500 state 1 7F'"),
         ("1500 -", "900 -", "a.txt:5: lines are not in the order of time"),
         ("1500 -", "1500 jump about", "what is 'jump about'?"),
     ],
 )
 def test_what_is_not_as_written_is_named_by_its_place(old: str, new: str, said: str) -> None:
     assert old in RIGHT
+    play(RIGHT)
     with pytest.raises(AssertionError) as caught:
         play(RIGHT.replace(old, new))
     assert said in str(caught.value)

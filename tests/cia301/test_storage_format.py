@@ -61,29 +61,11 @@ def test_there_and_back(stored: Stored) -> None:
     assert decode(encode(stored)) == stored
 
 
-@given(stores, st.randoms())
-def test_equal_content_gives_the_same_bytes_whatever_the_order(stored: Stored, rng: Any) -> None:
-    def shuffled(mapping: Any) -> dict[int, bytes]:
-        items = list(mapping.items())
-        rng.shuffle(items)
-        return dict(items)
-
-    again = Stored(stored.node_id, shuffled(stored.communication), shuffled(stored.application))
-    assert encode(again) == encode(stored)
-
-
 def refused(data: bytes) -> str:
     with pytest.raises(ValueError) as caught:
         decode(data)
     assert type(caught.value) is ValueError  # a reason of ours, not what a library happened to raise
     return str(caught.value)
-
-
-def test_every_flipped_bit_is_found() -> None:
-    data = encode(SAMPLE)
-    for place in range(len(data)):
-        for bit in range(8):
-            refused(data[:place] + bytes((data[place] ^ 1 << bit,)) + data[place + 1 :])
 
 
 def test_every_byte_in_place_of_every_byte_is_found() -> None:
@@ -110,14 +92,10 @@ def test_blocks_of_zeros_are_found(block: int) -> None:
     refused(bytes(len(data)))
 
 
-@given(st.binary(max_size=200))
-def test_rubbish_is_refused(data: bytes) -> None:
-    refused(data)
-
-
-@given(stores, st.binary(min_size=1, max_size=20))
+@given(stores, st.binary(min_size=1, max_size=200))
 @settings(max_examples=50)
-def test_anything_appended_is_refused(stored: Stored, more: bytes) -> None:
+def test_rubbish_alone_and_anything_appended_are_refused(stored: Stored, more: bytes) -> None:
+    refused(more)
     refused(encode(stored) + more)
 
 
@@ -129,6 +107,7 @@ json_values = st.recursive(
 
 
 @given(json_values)
+@settings(max_examples=30)
 def test_other_json_with_a_right_crc_is_refused(value: Any) -> None:
     refused(with_crc(json.dumps(value) + "\n"))
     if value is not None:
@@ -142,26 +121,20 @@ def test_other_json_with_a_right_crc_is_refused(value: Any) -> None:
     ("data", "reason"),
     [
         (b"", "empty"),
-        (b"\n", "first line"),
         (b"node_id = 5\n", "first line"),
         (encode(SAMPLE).split(b"\n")[1] + b"\n", "first line"),
         (encode(SAMPLE).split(b"\n")[0] + b"\n", "CRC-32"),
-        (encode(SAMPLE).split(b"\n")[0], "CRC-32"),
         (with_crc(content(), version=2), "version 2 is unknown"),
-        (with_crc(content(), version=0), "version 0 is unknown"),
         (b'{"format":"kontronik-can-gw parameters","version":12}\nsomething of the future', "version 12 is unknown"),
         (with_crc(content(), version='"1"'), "first line"),
         (with_crc(content(), version="01"), "form"),
         (with_crc(b"\xff\xfe\n"), "not JSON"),
         (with_crc("[" * 100_000), "not JSON"),
-        (with_crc("{\n"), "not JSON"),
         (with_crc("[]\n"), "consist"),
         (with_crc('{"node_id":null}\n'), "consist"),
         (with_crc(content(more=1)), "consist"),
         (with_crc(content(node_id=0)), "node_id 0"),
         (with_crc(content(node_id=128)), "node_id 128"),
-        (with_crc(content(node_id=254)), "node_id 254"),
-        (with_crc(content(node_id=-1)), "node_id -1"),
         (with_crc(content(node_id=True)), "node_id True"),
         (with_crc(content(node_id=5.0)), "node_id 5.0"),
         (with_crc(content(node_id="5")), "node_id '5'"),
@@ -171,7 +144,6 @@ def test_other_json_with_a_right_crc_is_refused(value: Any) -> None:
         (with_crc(content(communication={"1017:00\n": "00"})), "index:sub-index"),
         (with_crc(content(communication={"1a00:00": "00"})), "index:sub-index"),
         (with_crc(content(communication={"1017:00": 5})), "hexadecimal"),
-        (with_crc(content(communication={"1017:00": "0"})), "hexadecimal"),
         (with_crc(content(communication={"1017:00": "f4"})), "hexadecimal"),
         (with_crc(content(communication={"1017:00": "F4 01"})), "hexadecimal"),
         (with_crc(content(communication={"2000:00": "00"})), "2000h"),

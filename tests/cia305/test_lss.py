@@ -1,8 +1,6 @@
 """LSS slaves: dialogues from dialogues/*.txt, several slaves on one bus, and a foreign master (CiA 305)."""
 
 import random
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,103 +8,13 @@ from typing import Any
 import canopen
 import canopen.lss
 import pytest
-from script import Dialogue, bytes_of, hexadecimal, ms, play_lines, read_dialogues
+from lss_bench import ME, UNCONFIGURED, Identity, Node, Talk
+from script import Dialogue, play_lines, read_dialogues
+from wire import Wire
 
 from kontronik_can_gw.cia305.lss import LssSlave
 
-Identity = tuple[int, int, int, int]
-ME: Identity = (0x01020304, 0x11121314, 0x00020001, 0xA1B2C3D4)
-UNCONFIGURED = 255
 FILES = Path(__file__).parent.glob("dialogues/*.txt")
-
-
-@dataclass
-class Node:
-    """What LSS needs of a node, with knobs: refuse writes, refuse or delay the saving."""
-
-    identity: Identity = ME
-    active_node_id: int = UNCONFIGURED
-    pending_node_id: int = UNCONFIGURED
-    writable: bool = True
-    storable: bool = True
-    on_store: Callable[[], None] | None = None
-    stores: list[int] = field(default_factory=list)
-    left_at: list[int] = field(default_factory=list)
-
-    def configure_node_id(self, node_id: int) -> bool:
-        if self.writable:
-            self.pending_node_id = node_id
-        return self.writable
-
-    def store_configuration(self) -> bool:
-        if not self.storable:
-            return False
-        self.stores.append(self.pending_node_id)
-        if self.on_store is not None:
-            self.on_store()
-        return True
-
-    def lss_left_configuration(self, now: int) -> None:
-        self.left_at.append(now)
-        if self.active_node_id == UNCONFIGURED:
-            self.active_node_id = self.pending_node_id
-
-
-class Talk:
-    """One slave as the talker of a dialogue."""
-
-    def __init__(self, options: Sequence[str]) -> None:
-        self.now = 0
-        self.node = Node()
-        self.slave = LssSlave(self.node, self._sent)
-        self._heard: list[str] = []
-        for option in options:
-            match option.split():
-                case ["node-id", active, pending]:
-                    self.node.active_node_id, self.node.pending_node_id = int(active), int(pending)
-                case ["identity", vendor, product, revision, serial]:
-                    self.node.identity = int(vendor, 16), int(product, 16), int(revision, 16), int(serial, 16)
-                case ["read-only"]:
-                    self.node.writable = False
-                case ["refuses", "to", "store"]:
-                    self.node.storable = False
-                case ["stores", "at", "once"]:
-                    self.node.on_store = lambda: self.slave.stored(True)
-                case _:
-                    raise AssertionError(f"what is 'with {option}'?")
-
-    def _sent(self, data: bytes) -> None:
-        self._heard.append(f"{ms(self.now)} -> {hexadecimal(data)}")
-
-    def pass_time(self, until: int) -> None:
-        self.now = until
-
-    jump = pass_time
-
-    def heard_lines(self) -> list[str]:
-        heard, self._heard = self._heard, []
-        return heard
-
-    def say(self, what: str) -> str:
-        verb, _, rest = what.partition(" ")
-        match verb, rest.split():
-            case "<-", _:
-                self.slave.receive(bytes_of(rest), self.now)
-            case "disk", ["done" | "fails" as how]:
-                self.slave.stored(how == "done")
-            case "reset", []:
-                self.slave.reset()
-            case "state", _:
-                return f"state {'configuration' if self.slave.configuring else 'waiting'}"
-            case "node-id", _:
-                return f"node-id {self.node.active_node_id} {self.node.pending_node_id}"
-            case "stores", _:
-                return " ".join(["stores", *map(str, self.node.stores)])
-            case "left", _:
-                return " ".join(["left", *map(ms, self.node.left_at)])
-            case _:
-                raise AssertionError(f"what is {what!r}?")
-        return what
 
 
 @pytest.mark.parametrize(
@@ -116,41 +24,19 @@ def test_dialogue(dialogue: Dialogue) -> None:
     play_lines(Talk(dialogue.options), dialogue.lines)
 
 
-def request(text: str) -> bytes:
-    """A frame from hex text, filled up with zeros to 8 bytes."""
-    return bytes.fromhex(text).ljust(8, b"\0")
-
-
-def u32(number: int) -> str:
-    return number.to_bytes(4, "little").hex()
-
-
 class Bus:
     """Several slaves that hear the same frames."""
 
     def __init__(self, *nodes: Node) -> None:
-        self.nodes = nodes
-        self.answers: list[tuple[int, bytes]] = []
-        self.slaves = [LssSlave(node, self._sender(place)) for place, node in enumerate(nodes)]
+        self._answers: list[bytes] = []
+        self.slaves = [LssSlave(node, self._answers.append) for node in nodes]
 
-    def _sender(self, place: int) -> Callable[[bytes], None]:
-        return lambda data: self.answers.append((place, data))
-
-    def send(self, data: bytes, now: int = 0) -> list[tuple[int, bytes]]:
-        """Give a frame to all; return who answered what."""
+    def send(self, data: bytes) -> list[bytes]:
+        """Give a frame to all; return what was answered."""
+        self._answers.clear()
         for slave in self.slaves:
-            slave.receive(data, now)
-        return self.take()
-
-    def take(self) -> list[tuple[int, bytes]]:
-        taken, self.answers = self.answers, []
-        return taken
-
-    def select(self, identity: Identity) -> list[tuple[int, bytes]]:
-        answers = []
-        for service, number in zip((0x40, 0x41, 0x42, 0x43), identity, strict=True):
-            answers += self.send(request(f"{service:02x}{u32(number)}"))
-        return answers
+            slave.receive(data, 0)
+        return list(self._answers)
 
     @property
     def configuring(self) -> list[bool]:
@@ -168,32 +54,16 @@ def identities(seed: int, count: int) -> list[Identity]:
     return rng.sample(sorted(made), count)
 
 
-def test_among_several_only_the_selected_answers() -> None:
-    nodes = [
-        Node(identity=(ME[0], ME[1], ME[2], ME[3] + i), active_node_id=i + 1, pending_node_id=i + 1) for i in range(4)
-    ]
-    bus = Bus(*nodes)
-    for place, node in enumerate(nodes):
-        bus.send(request("04 00"))
-        assert bus.select(node.identity) == [(place, request("44"))]
-        for sent in ("11 20", "13 00 00", "5a", "5b", "5c", "5d", "5e"):
-            assert [who for who, _ in bus.send(request(sent))] == [place]
-        assert bus.send(request("17")) == []
-        bus.slaves[place].stored(True)
-        assert bus.take() == [(place, request("17"))]
-    assert [node.pending_node_id for node in nodes] == [0x20] * 4
+def master_of(bus: Bus) -> Any:
+    """A foreign master whose requests the slaves of a bus hear."""
 
+    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
+        assert cob_id == 0x7E5 and not remote
+        return [(0x7E4, answer) for answer in bus.send(data)]
 
-class InProcess:
-    """A network for the foreign master without threads: the answers are there when its request has been sent."""
-
-    def __init__(self, bus: Bus, master: Any) -> None:
-        self._bus, self._master = bus, master
-
-    def send_message(self, can_id: int, data: bytes) -> None:
-        assert can_id == 0x7E5
-        for _, answer in self._bus.send(bytes(data)):
-            self._master.on_message_received(0x7E4, bytearray(answer), 0.0)
+    master: Any = Wire(exchange).lss
+    master.RESPONSE_TIMEOUT = 0.0002  # what is answered is there before it waits
+    return master
 
 
 @pytest.fixture
@@ -207,16 +77,14 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_foreign_master_finds_each_of_several_slaves_by_fastscan_and_gives_it_a_node_id(seed: int) -> None:
     nodes = [Node(identity=identity) for identity in identities(seed, 6)]
     bus = Bus(*nodes, Node(identity=(0, 0, 0, 0), active_node_id=100, pending_node_id=100))
-    master: Any = canopen.lss.LssMaster()
-    master.network = InProcess(bus, master)
-    master.RESPONSE_TIMEOUT = 0.0002  # what is answered is there before it waits
+    master = master_of(bus)
     for number in range(1, len(nodes) + 1):
         ok, found = master.fast_scan()
         place = next(i for i, node in enumerate(nodes) if node.identity == tuple(found))
         assert ok
         assert [i for i, on in enumerate(bus.configuring) if on] == [place]
         master.configure_node_id(number)
-        assert bus.send(request("5d")) == [(place, request(f"5d {u32(nodes[place].identity[3])}"))]
+        assert master.inquire_lss_address(canopen.lss.CS_INQUIRE_SERIAL_NUMBER) == found[3]
         master.send_switch_state_global(master.WAITING_STATE)
         assert nodes[place].active_node_id == number
     assert master.fast_scan() == (False, None)
@@ -228,21 +96,11 @@ def test_a_foreign_master_configures_and_stores() -> None:
     bus = Bus(*nodes)
     for place, each in enumerate(nodes):
         each.on_store = lambda slave=bus.slaves[place]: slave.stored(True)
-    master: Any = canopen.lss.LssMaster()
-    master.network = InProcess(bus, master)
+    master = master_of(bus)
     node = nodes[1]
     assert master.send_switch_state_selective(*node.identity)
     assert bus.configuring == [False, True, False]
-    inquired = [
-        master.inquire_lss_address(service)
-        for service in (
-            canopen.lss.CS_INQUIRE_VENDOR_ID,
-            canopen.lss.CS_INQUIRE_PRODUCT_CODE,
-            canopen.lss.CS_INQUIRE_REVISION_NUMBER,
-            canopen.lss.CS_INQUIRE_SERIAL_NUMBER,
-        )
-    ]
-    assert tuple(inquired) == node.identity
+    assert tuple(map(master.inquire_lss_address, range(0x5A, 0x5E))) == node.identity
     assert master.inquire_node_id() == UNCONFIGURED
     master.configure_node_id(0x2A)
     with pytest.raises(canopen.lss.LssError, match="LSS Error: 1"):
@@ -251,7 +109,7 @@ def test_a_foreign_master_configures_and_stores() -> None:
         master.configure_bit_timing(2)
     master.activate_bit_timing(100)
     master.store_configuration()
-    assert node.stores == [0x2A]
+    assert node.asked == [("configure", 0x2A), ("store", 0x2A)]
     node.storable = False
     with pytest.raises(canopen.lss.LssError, match="LSS Error: 1"):
         master.store_configuration()

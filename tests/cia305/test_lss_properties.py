@@ -1,37 +1,12 @@
 """Random frames against the LSS slave: nothing raises, and only a valid sequence changes anything."""
 
-from dataclasses import dataclass, field
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lss_bench import Identity, Node
 
 from kontronik_can_gw.cia305.lss import LssSlave
 
-Identity = tuple[int, int, int, int]
 SERVICES = (0x04, 0x11, 0x13, 0x15, 0x17, *range(0x40, 0x45), *range(0x46, 0x52), *range(0x5A, 0x5F))
-
-
-@dataclass
-class Recorder:
-    """A node that writes down what is asked of it."""
-
-    identity: Identity
-    active_node_id: int
-    pending_node_id: int
-    asked: list[str] = field(default_factory=list)
-
-    def configure_node_id(self, node_id: int) -> bool:
-        assert 1 <= node_id <= 127 or node_id == 255
-        self.asked.append("configure")
-        self.pending_node_id = node_id
-        return True
-
-    def store_configuration(self) -> bool:
-        self.asked.append("store")
-        return True
-
-    def lss_left_configuration(self, now: int) -> None:
-        self.asked.append("left")
 
 
 class Oracle:
@@ -169,7 +144,7 @@ node_ids = st.sampled_from((1, 127, 255, 255, 255))
 def test_any_traffic_has_exactly_the_answers_and_the_state_that_looking_back_gives(
     frames: list[bytes], active: int, pending: int
 ) -> None:
-    node = Recorder(ME, active, pending)
+    node = Node(ME, active, pending)
     answers: list[bytes] = []
     slave = LssSlave(node, answers.append)
     oracle = Oracle(ME)
@@ -183,39 +158,9 @@ def test_any_traffic_has_exactly_the_answers_and_the_state_that_looking_back_giv
         assert slave.configuring == oracle.configuring
         asked = []
         if before and not oracle.configuring:
-            asked = ["left"]
+            asked = [("left", now)]
         elif before and expected == b"\x11\0":
-            asked = ["configure"]
+            asked = [("configure", frame[1])]
         elif before and len(frame) == 8 and frame[0] == 0x17:
-            asked = ["store"]
+            asked = [("store", node.pending_node_id)]
         assert node.asked == asked
-
-
-@given(st.lists(st.binary(min_size=8, max_size=8).filter(lambda frame: frame[0] not in SERVICES), max_size=50))
-def test_unknown_services_do_nothing_in_either_state(frames: list[bytes]) -> None:
-    for configuring in (False, True):
-        node = Recorder(ME, 255, 255)
-        answers: list[bytes] = []
-        slave = LssSlave(node, answers.append)
-        slave.receive(bytes((4, configuring, 0, 0, 0, 0, 0, 0)), 0)
-        for frame in frames:
-            slave.receive(frame, 1)
-        assert (answers, node.asked, slave.configuring) == ([], [], configuring)
-
-
-@given(traffic, st.lists(st.integers(0, 100), min_size=1, max_size=3))
-@settings(max_examples=100, deadline=None)
-def test_of_several_slaves_each_answers_as_if_it_were_alone(frames: list[bytes], serials: list[int]) -> None:
-    """Slaves share nothing: what one says is what it says alone on the bus."""
-    nodes = [Recorder((*ME[:3], serial), 255, 255) for serial in (ME[3], *serials)]
-    together: list[list[bytes]] = [[] for _ in nodes]
-    slaves = [LssSlave(node, heard.append) for node, heard in zip(nodes, together, strict=True)]
-    for frame in frames:
-        for slave in slaves:
-            slave.receive(frame, 0)
-    for node, heard in zip(nodes, together, strict=True):
-        alone: list[bytes] = []
-        slave = LssSlave(Recorder(node.identity, 255, 255), alone.append)
-        for frame in frames:
-            slave.receive(frame, 0)
-        assert heard == alone

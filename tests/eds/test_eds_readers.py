@@ -65,17 +65,9 @@ def test_dcfchk_has_no_finding_in_the_dcf(shipped: Eds, tmp_path: Path) -> None:
     assert (run.returncode, run.stderr) == (0, "")
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (b"SubNumber=0x9", b"SubNumber=0x8"),
-        (b"DefaultValue=0x00FDFFFF", b"DefaultValue=0x100FDFFFF"),
-        (b"1=0x1000", b"1=0x1004"),
-    ],
-)
-def test_dcfchk_would_have_said_so(tmp_path: Path, old: bytes, new: bytes) -> None:
+def test_dcfchk_would_have_said_so(tmp_path: Path) -> None:
     file = tmp_path / "broken.eds"
-    file.write_bytes(SHIPPED.read_bytes().replace(old, new))
+    file.write_bytes(SHIPPED.read_bytes().replace(b"SubNumber=0x9", b"SubNumber=0x8"))
     run = dcfchk(file, 1)
     assert run.returncode != 0
     assert "UserWarning" in run.stderr

@@ -3,12 +3,14 @@
 import io
 import re
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import canopen
 import pytest
+from canopen.objectdictionary import ODVariable
 
 from kontronik_can_gw.cia301 import eds as reader
 from kontronik_can_gw.cia301.eds import RECORD, VAR, Eds, Entry
@@ -178,103 +180,38 @@ def test_settings_have_the_ranges_and_defaults_of_the_configuration(
     assert entry.default == definition.default
 
 
-def test_cob_ids_follow_the_node_id(entries: dict[tuple[int, int], Entry]) -> None:
-    relative = {at: entry.default for at, entry in entries.items() if entry.relative}
-    assert relative == {
-        (0x1014, 0): 0x80,
-        (0x1200, 1): 0x600,
-        (0x1200, 2): 0x580,
-        (0x1800, 1): 0x40000180,
-        (0x1801, 1): 0x40000280,
-        (0x1802, 1): 0x40000380,
-        (0x1803, 1): 0x40000480,
-        (0x2101, 2): 0,
-    }
-    assert {entries[index, 1].default for index in (0x1804, 0x1805)} == {0xC0000000}
-
-
-PDOS: dict[int, tuple[str, ...]] = {
-    0: ("Electrical speed", "Battery voltage", "Battery current"),
-    1: ("Motor current", "Peak current", "Consumed charge", "Throttle", "Output opening"),
-    2: ("BEC voltage", "PWM input", "BEC current", "Power stage temperature", "BEC temperature"),
-    3: ("Operating errors", "Operating state", "Timing", "Link status", "Live counter"),
-    4: (),
-    5: (),
-}
-
-
-def test_default_pdos_fill_eight_bytes_in_the_order_of_the_design(entries: dict[tuple[int, int], Entry]) -> None:
-    bits_of_type = {0x02: 8, 0x03: 16, U8: 8, U16: 16, U32: 32}
-    for number, names in PDOS.items():
-        assert entries[0x1A00 + number, 0].default == len(names)
-        mapped = []
-        bits = 0
-        for sub in range(1, 9):
-            value = entries[0x1A00 + number, sub].default
-            assert isinstance(value, int)
-            if sub > len(names):
-                assert value == 0
-                continue
-            entry = entries[value >> 16, value >> 8 & 0xFF]
-            assert value & 0xFF == bits_of_type[entry.data_type]
-            bits += value & 0xFF
-            mapped.append(entry.name)
-        assert tuple(mapped) == names
-        assert bits == (64 if names else 0)
-
-
-def test_times_of_the_default_pdos(entries: dict[tuple[int, int], Entry]) -> None:
-    times = [tuple(entries[0x1800 + n, sub].default for sub in (2, 3, 5, 6)) for n in range(6)]
-    assert times == [
-        (254, 200, 0, 0),
-        (254, 500, 0, 0),
-        (254, 1000, 0, 0),
-        (254, 0, 500, 0),
-        (254, 0, 0, 0),
-        (254, 0, 0, 0),
-    ]
-
-
 # --- beside the canopen library -------------------------------------------------------------------------------------
+
+
+def variables(dictionary: canopen.ObjectDictionary) -> Iterator[ODVariable]:
+    """All entries that the library has read."""
+    for item in dictionary.values():
+        yield from [item] if isinstance(item, ODVariable) else item.values()
+
+
+def as_bytes(value: object) -> object:
+    """A text as we have it."""
+    return value.encode() if isinstance(value, str) else value
 
 
 @pytest.mark.parametrize("node_id", [1, 5, 127])
 def test_the_canopen_library_reads_every_entry_as_we_do(shipped: Eds, node_id: int) -> None:
     dictionary = canopen.import_od(str(SHIPPED), node_id=node_id)
-    theirs = {}
-    for item in dictionary.values():
-        members = [item] if isinstance(item, canopen.objectdictionary.ODVariable) else list(item.values())
-        for each in members:
-            default = each.default.encode() if isinstance(each.default, str) else each.default
-            theirs[each.index, each.subindex] = (
-                each.name,
-                each.data_type,
-                each.access_type,
-                each.pdo_mappable,
-                each.min,
-                each.max,
-                default,
-            )
+    theirs = {
+        (v.index, v.subindex): (v.name, v.data_type, v.access_type, v.pdo_mappable, v.min, v.max, as_bytes(v.default))
+        for v in variables(dictionary)
+    }
     ours = {}
     for entry in shipped.entries:
-        default = entry.default
-        if entry.relative:
-            assert isinstance(default, int)
-            default += node_id
-        ours[entry.index, entry.sub] = (
-            entry.name,
-            entry.data_type,
-            entry.access,
-            entry.mappable,
-            entry.low,
-            entry.high,
-            default,
-        )
+        default = entry.default + node_id if entry.relative and isinstance(entry.default, int) else entry.default
+        read = (entry.name, entry.data_type, entry.access, entry.mappable, entry.low, entry.high, default)
+        ours[entry.index, entry.sub] = read
     assert ours == theirs
     assert {index: dictionary[index].name for index in dictionary} == shipped.object_names
 
 
 def test_the_mirrors_can_be_dropped(shipped: Eds) -> None:
+    assert reader.without(DATA, ()) == DATA
     mirrors = (0x603F, 0x606C, 0x6079)
     shorter = reader.without(DATA, mirrors)
     rest = reader.load(shorter, "short.eds")
@@ -282,10 +219,6 @@ def test_the_mirrors_can_be_dropped(shipped: Eds) -> None:
     assert rest.device == shipped.device
     assert shorter.isascii()
     assert shorter.count(b"\r\n") == shorter.count(b"\n")
-
-
-def test_dropping_nothing_changes_nothing() -> None:
-    assert reader.without(DATA, ()) == DATA
 
 
 def test_dropping_a_pdo_counts_pdos_and_list_entries_anew(shipped: Eds) -> None:
@@ -311,13 +244,7 @@ def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
     source.name = "left.dcf"
     dictionary = canopen.import_od(source)
     assert (dictionary.node_id, dictionary.bitrate) == (5, 250_000)
-    read_back = {}
-    for item in dictionary.values():
-        members = [item] if isinstance(item, canopen.objectdictionary.ODVariable) else list(item.values())
-        for each in members:
-            if each.value is not None:
-                value = each.value.encode() if isinstance(each.value, str) else each.value
-                read_back[each.index, each.subindex] = value
+    read_back = {(v.index, v.subindex): as_bytes(v.value) for v in variables(dictionary) if v.value is not None}
     assert read_back == values
     assert "NodeName=left\r\n" in text
     assert "LSS_SerialNumber=0xDEADBEEF\r\n" in text
