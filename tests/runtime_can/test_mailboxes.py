@@ -101,6 +101,14 @@ def test_the_last_answer_is_told_for_queued_frames_too(answer: Sent) -> None:
     assert len(mailboxes) == 1
 
 
+def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
+    mailboxes, sent = Mailboxes(), list[CanFrame]()
+    for number in range(10):
+        mailboxes.put(CanFrame(1, bytes((number,)), page=number % 2))
+    mailboxes.flush(taking(sent, 9))
+    assert [(frame.page, frame.data) for frame in sent] == [(0, b"\x08"), (1, b"\x09")]
+
+
 PUTS = st.tuples(st.booleans(), st.integers(0x181, 0x184))
 STEPS = st.lists(st.one_of(PUTS, st.integers(0, 6)), max_size=80)
 
