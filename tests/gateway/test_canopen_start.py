@@ -19,16 +19,6 @@ def gateway() -> Gateway:
     return Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
 
 
-def test_the_boot_up_waits_for_an_interface_that_is_missing_at_start() -> None:
-    made = gateway()
-    made.start(0, can_open=False)
-    made.advance(5 * SECOND)
-    assert made.take_frames() == []
-    made.can_returned(6 * SECOND)
-    assert [(f.can_id, f.data) for f in made.take_frames()] == [(0x701, b"\0")]
-    assert 0x601 in made.receive_ids
-
-
 def test_an_outage_later_on_does_not_boot_the_nodes_again() -> None:
     made = gateway()
     made.start(0)

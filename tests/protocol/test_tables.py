@@ -48,17 +48,6 @@ def text_of(names: type[ErrorBit], number: int) -> str:
     return f"{bit.text} {bit.meaning}".lower()
 
 
-def test_the_second_list_is_without_gaps() -> None:
-    for fields, codes, end in (
-        (sheet.LIVE_FIELDS, sheet.LIVE_STRUCT, 34),
-        (sheet.INFO_FIELDS, sheet.INFO_STRUCT, 37),
-    ):
-        sizes = [struct.calcsize("<" + field.code) for field in fields]
-        assert [field.offset for field in fields] == [4 + sum(sizes[:index]) for index in range(len(fields))]
-        assert fields[-1].offset + sizes[-1] == end
-        assert "<" + "".join(field.code for field in fields) == codes
-
-
 @pytest.mark.parametrize(("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", ""))
 def test_a_field_has_the_type_unit_and_step_of_the_sheet(data: DataType, field: Field) -> None:
     row = row_of(data, field)

@@ -96,12 +96,6 @@ def test_after_a_refusal_there_is_none(kernel: Scheduler, monkeypatch: pytest.Mo
     assert kernel.of[threading.get_native_id()] == (os.SCHED_OTHER, 0)
 
 
-def test_without_it_nothing_is_changed(kernel: Scheduler, sleeper: threading.Thread) -> None:
-    assert start_beside_the_loop(sleeper)
-    realtime.end()
-    assert kernel.of == {}
-
-
 @pytest.mark.parametrize(("service", "remedy"), [(False, "prlimit --rtprio=20"), (True, "LimitRTPRIO=20")])
 def test_what_is_not_permitted_is_said_with_the_remedy(
     kernel: Scheduler, monkeypatch: pytest.MonkeyPatch, service: bool, remedy: str
