@@ -202,19 +202,6 @@ def test_a_configuration_that_another_program_stands_against_is_given_up_for_the
     assert manager.process.poll() is None
 
 
-def test_a_second_gateway_on_the_same_port_is_refused_with_a_line(manager: Manager, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(manager.config)],
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-    )
-    assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
-    assert "is in use by another program" in line
-
-
 def test_a_gateway_that_was_killed_leaves_nothing_in_the_way_of_the_next(tmp_path: Path, esc: PtyEsc) -> None:
     """Neither port, nor node-ID, nor store."""
     config = tmp_path / "gateway.toml"

@@ -292,62 +292,6 @@ def test_a_left_over_temporary_file_is_never_read_and_hinders_no_saving(tmp_path
 # --- disks that fail
 
 
-@pytest.mark.parametrize("step", ["open", "write", "fsync", "close", "rename", "fsync of the folder"])
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
-def test_a_failure_at_any_step_is_told_and_leaves_a_whole_file(
-    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, step: str, code: int
-) -> None:
-    folder = place(tmp_path, OLD)
-    failure = OSError(code, os.strerror(code))
-    real = {name: getattr(os, name) for name in ("open", "write", "fsync", "close")}
-    rename = Path.replace
-
-    def is_folder(fd: int) -> bool:
-        return stat.S_ISDIR(os.fstat(fd).st_mode)
-
-    def is_temporary(fd: int) -> bool:
-        return os.readlink(f"/proc/self/fd/{fd}").endswith(".tmp")
-
-    def opened(path: Any, *more: Any, **options: Any) -> int:
-        if step == "open" and str(path).endswith(".tmp"):
-            raise failure
-        fd: int = real["open"](path, *more, **options)
-        return fd
-
-    def written(fd: int, data: bytes) -> int:
-        if step == "write" and is_temporary(fd):
-            if len(data) < 40:
-                raise failure
-            return int(real["write"](fd, data[: len(data) // 2]))  # some of it goes first
-        return int(real["write"](fd, data))
-
-    def synced(fd: int) -> None:
-        if (step == "fsync of the folder" and is_folder(fd)) or (step == "fsync" and is_temporary(fd)):
-            raise failure
-        real["fsync"](fd)
-
-    def closed(fd: int) -> None:
-        fails = step == "close" and is_temporary(fd)
-        real["close"](fd)
-        if fails:
-            raise failure
-
-    def renamed(path: Path, target: Path) -> Path:
-        if step == "rename":
-            raise failure
-        return rename(path, target)
-
-    with monkeypatch.context() as patched:
-        for name, function in (("open", opened), ("write", written), ("fsync", synced), ("close", closed)):
-            patched.setattr(os, name, function)
-        patched.setattr(Path, "replace", renamed)
-        assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: {os.strerror(code)}"
-    assert [path.name for path in folder.iterdir()] == ["esc1.params"]
-    assert (folder / "esc1.params").read_bytes() == (NEW if step == "fsync of the folder" else OLD)
-    assert put(store, "esc1", NEW) is None
-    assert store.load("esc1") == (decode(NEW), None)
-
-
 def test_a_file_in_place_of_the_folder_is_told(tmp_path: Path, store: ParameterStore) -> None:
     (tmp_path / "params").write_bytes(b"")
     problem = put(store, "esc1", NEW)
@@ -474,17 +418,23 @@ Step = tuple[str, ...]
 
 
 class Recorder:
-    """Writes down, in their order, the calls that change or secure what is on disk."""
+    """Writes down, in their order, the calls that change or secure what is on disk. The one that is ``failing`` raises ``error``."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, folder: Path, failing: Step = (), error: OSError | None = None
+    ) -> None:
         self.steps: list[Step] = []
-        self._folder = folder
+        self._folder, self._failing, self._error = folder, failing, error
         self._names: dict[int, str] = {}
         self._real: dict[str, Callable[..., Any]] = {}
         names = "open write fsync close unlink replace rename mkdir truncate ftruncate"
         for name in names.split():
             self._real[name] = getattr(os, name)
             monkeypatch.setattr(os, name, getattr(self, f"_{name}", self._unexpected))
+
+    def _fail_at(self, *step: str) -> None:
+        if step == self._failing and self._error is not None:
+            raise self._error
 
     def _name(self, path: Any) -> str:
         return str(Path(path).relative_to(self._folder.parent))
@@ -493,6 +443,8 @@ class Recorder:
         raise AssertionError(f"not a call that may change a parameter file: {arguments}")
 
     def _open(self, path: Any, flags: int, *more: Any, **options: Any) -> int:
+        if Path(path).is_relative_to(self._folder):
+            self._fail_at("create", self._name(path))
         fd: int = self._real["open"](path, flags, *more, **options)
         if Path(path).is_relative_to(self._folder.parent):
             self._names[fd] = self._name(path)
@@ -502,23 +454,27 @@ class Recorder:
         return fd
 
     def _write(self, fd: int, data: bytes) -> int:
+        if any(step[0] == "write" for step in self.steps):  # some of it goes first
+            self._fail_at("write", self._names[fd])
         count: int = self._real["write"](fd, data[:50])  # a system may take only a part
         self.steps.append(("write", self._names[fd], bytes(data[:count]).decode("latin-1")))
         return count
 
     def _fsync(self, fd: int) -> None:
+        self._fail_at("fsync", self._names[fd])
         self._real["fsync"](fd)
         self.steps.append(("fsync", self._names[fd]))
 
     def _close(self, fd: int) -> None:
-        self._names.pop(fd, None)
         self._real["close"](fd)
+        self._fail_at("close", self._names.pop(fd, ""))
 
     def _unlink(self, path: Any, *more: Any, **options: Any) -> None:
         self._real["unlink"](path, *more, **options)
         self.steps.append(("unlink", self._name(path)))
 
     def _replace(self, source: Any, target: Any) -> None:
+        self._fail_at("rename", self._name(source))
         self._real["replace"](source, target)
         self.steps.append(("rename", self._name(source), self._name(target)))
 
@@ -670,6 +626,31 @@ def test_the_simulated_loss_of_power_finds_what_a_careless_writer_does(missing: 
     else:
         steps = [("unlink", FILE), ("create", FILE), ("write", FILE, new), ("fsync", FILE), *steps[4:]]
     assert faults(files, steps) != []
+
+
+@pytest.mark.parametrize(
+    "failing",
+    [
+        ("create", TEMPORARY),
+        ("write", TEMPORARY),
+        ("fsync", TEMPORARY),
+        ("close", TEMPORARY),
+        ("rename", TEMPORARY),
+        ("fsync", "params"),
+    ],
+)
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
+    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, failing: Step, code: int
+) -> None:
+    folder = place(tmp_path, OLD)
+    with monkeypatch.context() as patched:
+        Recorder(patched, folder, failing, OSError(code, os.strerror(code)))
+        assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: {os.strerror(code)}"
+    assert [path.name for path in folder.iterdir()] == ["esc1.params"]
+    assert (folder / "esc1.params").read_bytes() == (NEW if failing == ("fsync", "params") else OLD)
+    assert put(store, "esc1", NEW) is None
+    assert store.load("esc1") == (decode(NEW), None)
 
 
 # --- two gateways
