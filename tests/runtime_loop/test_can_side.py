@@ -1,11 +1,10 @@
 """The CAN interface in the loop: bus-off and its end, outages, a stalled bus. Time is passed in, port and kernel are scripted."""
 
 import logging
-import selectors
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
+from wire_world import CAN_FD, Bus, World
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse
@@ -15,7 +14,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.protocol import Layout, LiveData, encode
 from kontronik_can_gw.runtime import can_side
-from kontronik_can_gw.runtime.can_port import one_by_one, socketcan_error
+from kontronik_can_gw.runtime.can_port import socketcan_error
 from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
@@ -27,48 +26,29 @@ OFF = ACTIVE._replace(state=CanState.BUS_OFF)
 BOOT_UP = (0x701, b"\0")
 
 
-class Port:
+class Port(Bus):
     """A SocketCAN port; ``there`` False: it cannot be opened."""
 
     there = True
-    tells_busy_from_gone = True
-    gone = False
-    waits_to_be_read = False
-    drained = True
 
     def __init__(self, _config: object) -> None:
         if not Port.there:
             raise RunError("CAN interface can0: there is none.")
+        super().__init__(World())
         self.state = CanState.UNKNOWN
-        self.bus_off_count = self.overruns = 0
-        self.answer = Sent.OK
-        self.sent: list[CanFrame] = []
-
-    def fileno(self) -> None:
-        return None
 
     def set_receive_ids(self, ids: frozenset[int]) -> None:
         self.ids = ids
-
-    def receive(self) -> list[tuple[CanFrame, int | None]]:
-        return []
 
     def note_state(self, state: CanState) -> None:
         self.bus_off_count += state is CanState.BUS_OFF and self.state is not CanState.BUS_OFF
         self.state = state
 
     def send(self, frame: CanFrame) -> Sent:
-        if self.answer is Sent.OK:
-            self.sent.append(frame)
-            if self.state is CanState.UNKNOWN:
-                self.state = CanState.ERROR_ACTIVE
-        return self.answer
-
-    def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
-        return one_by_one(self.send, frames, clock, latest)
-
-    def close(self) -> None:
-        pass
+        answer = super().send(frame)
+        if answer is Sent.OK and self.state is CanState.UNKNOWN:
+            self.state = CanState.ERROR_ACTIVE
+        return answer
 
 
 class Kernel:
@@ -81,11 +61,7 @@ class Kernel:
         self._waiting: list[LinkFacts] = []
 
     def fileno(self) -> int:
-        return self._file.fileno()
-
-    def open(self, path: Path) -> "Kernel":
-        self._file = path.open("wb")
-        return self
+        return CAN_FD + 1
 
     def ask(self) -> None:
         self.asked += 1
@@ -97,19 +73,7 @@ class Kernel:
         return told
 
     def close(self) -> None:
-        self._file.close()
-
-
-class Selector(selectors.SelectSelector):
-    """Takes any file, because nothing is waited for."""
-
-    before = 0
-
-    def register(self, fileobj: object, events: int, data: object = None) -> selectors.SelectorKey:
-        return selectors.SelectorKey(fileobj, 0, events, data)  # type: ignore[arg-type]
-
-    def unregister(self, fileobj: object) -> selectors.SelectorKey:
-        return selectors.SelectorKey(fileobj, 0, 0, None)  # type: ignore[arg-type]
+        pass
 
 
 class Bench:
@@ -118,7 +82,7 @@ class Bench:
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         self.kernel, self.now, self.clock = kernel, 0, 0
-        self.can = CanSide(loaded.config.can, self.gateway, Selector(), Conditions(), clock=lambda: self.clock)
+        self.can = CanSide(loaded.config.can, self.gateway, World(), Conditions(), clock=lambda: self.clock)
 
     @property
     def port(self) -> Port:
@@ -149,18 +113,16 @@ class Bench:
         self.can._follow_reception(self.now)
 
     def take(self) -> list[tuple[int, bytes]]:
-        sent, self.port.sent = [(frame.can_id, frame.data) for frame in self.port.sent], []
-        return sent
+        return self.port.take()
 
 
 @pytest.fixture
-def kernel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Kernel]:
-    made = Kernel().open(tmp_path / "kernel")
+def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
+    made = Kernel()
     monkeypatch.setattr(can_side, "CanPort", Port)
     monkeypatch.setattr(can_side, "link_monitor", lambda _name: made)
     monkeypatch.setattr(Port, "there", True)
-    yield made
-    made.close()
+    return made
 
 
 @pytest.fixture
@@ -311,9 +273,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> None:
     loaded = assemble(parse({"can": {"interface": "slcan", "channel": "/dev/ttyUSB1"}, "esc": [{"port": "p"}]}, "test"))
     gateway = Gateway(loaded.escs, loaded.layout, 0)
-    side = CanSide(
-        loaded.config.can, gateway, Selector(), Conditions(), lambda path: "left" if "USB1" in path else None
-    )
+    side = CanSide(loaded.config.can, gateway, World(), Conditions(), lambda path: "left" if "USB1" in path else None)
     with pytest.raises(RunError, match="is the port of left: nothing may be sent to an ESC"):
         side.open(0, wait=False)
     side.close()
