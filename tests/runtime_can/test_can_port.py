@@ -1,4 +1,4 @@
-"""Reception of the CAN port: on a socket that is none, and with python-can's in-process bus, whose reader is a thread."""
+"""The CAN port: on a socket that is none, and with python-can's in-process bus, whose reader is a thread."""
 
 import errno
 import itertools
@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import CanConfig, parse
 from kontronik_can_gw.dbc_output.layout import Layout
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.frames import IMAGE, CanFrame, image_id
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.offline.pty import PtyEsc
@@ -53,6 +53,8 @@ class FakeSocket:
     def __init__(self) -> None:
         self.inbox: list[bytes | int] = []
         self.sent: list[bytes] = []
+        self.full: int | None = None
+        """After so many frames the queue takes no more."""
         self.options: dict[int, bytes | int] = {}
         self.ancillary: list[tuple[int, int, bytes]] = []
         self.drops = 0
@@ -73,6 +75,8 @@ class FakeSocket:
         return 99
 
     def send(self, data: bytes) -> None:
+        if len(self.sent) == self.full:
+            raise OSError(errno.ENOBUFS, "No buffer space available")
         self.sent.append(data)
 
     def recvmsg(self, _size: int, _ancillary_size: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, None]:
@@ -272,6 +276,35 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
     fake.inbox, fake.ancillary = [packet(1)], ancillary
     assert fake.options[64] == 1, "the kernel is asked for them"
     assert port.receive() == [(CanFrame(1, b""), came)]
+
+
+FRAMES = [CanFrame(0x100 + n, bytes((n,))) for n in range(6)]
+IMAGES = [IMAGE.pack(image_id(0x100 + n, False), 1, n) for n in range(6)]
+
+
+@pytest.mark.parametrize("proven", [True, False])
+@pytest.mark.parametrize("frames", [FRAMES, IMAGES, [*FRAMES[:3], *IMAGES[3:]]])
+@pytest.mark.parametrize("stopped_before", range(7))
+def test_what_became_late_in_the_middle_of_a_turn_stays(
+    socket_port: tuple[CanPort, FakeSocket], proven: bool, frames: list[CanFrame | bytes], stopped_before: int
+) -> None:
+    """The process is stopped in front of one of the frames: those before have gone, and nothing after."""
+    port, fake = socket_port
+    if proven:
+        assert port.send(CanFrame(0x7FF, b"")) is Sent.OK
+        fake.sent.clear()
+    steps = itertools.count()
+    answer = port.send_all(frames, lambda: 1000 if next(steps) < stopped_before else 1001, 1000)
+    assert answer == ((6, Sent.OK) if stopped_before == 6 else (stopped_before, Sent.LATE))
+    assert [data[8] for data in fake.sent] == list(range(stopped_before))[:6]
+
+
+@pytest.mark.parametrize("full", range(6))
+def test_a_queue_that_is_full_is_not_taken_for_lateness(socket_port: tuple[CanPort, FakeSocket], full: int) -> None:
+    port, fake = socket_port
+    fake.full = full
+    assert port.send_all(FRAMES, lambda: 0, 1000) == (full, Sent.BUSY)
+    assert len(fake.sent) == full
 
 
 class DatagramSocket(socket.socket):
