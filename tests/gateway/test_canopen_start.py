@@ -19,16 +19,6 @@ def gateway() -> Gateway:
     return Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
 
 
-def test_the_boot_up_waits_for_an_interface_that_is_missing_at_start() -> None:
-    made = gateway()
-    made.start(0, can_open=False)
-    made.advance(5 * SECOND)
-    assert made.take_frames() == []
-    made.can_returned(6 * SECOND)
-    assert [(f.can_id, f.data) for f in made.take_frames()] == [(0x701, b"\0")]
-    assert 0x601 in made.receive_ids
-
-
 def test_an_outage_later_on_does_not_boot_the_nodes_again() -> None:
     made = gateway()
     made.start(0)
@@ -86,16 +76,14 @@ def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(
     loaded = assemble(parse({"canopen": canopen, "dbc": {"enabled": False}, "esc": [{"port": "a"}]}, "test"))
     made = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
     made.start(0)
-    for index, sub, size, value in (
-        (0x1A04, 1, 4, 0x603F0010),
-        (0x1A04, 2, 4, 0x10010008),
-        (0x1A04, 0, 1, 2),
-        (0x1804, 1, 4, 0x400001A1),
+    for request in (
+        "23 04 1A 01 10 00 3F 60",
+        "23 04 1A 02 08 00 01 10",
+        "2F 04 1A 00 02 00 00 00",
+        "23 04 18 01 A1 01 00 40",
     ):
         made.take_frames()
-        command = {1: 0x2F, 4: 0x23}[size]
-        data = bytes((command, index & 0xFF, index >> 8, sub)) + value.to_bytes(4, "little")
-        made.receive_frame(CanFrame(0x601, data), 0, 0)
+        made.receive_frame(CanFrame(0x601, bytes.fromhex(request)), 0, 0)
         assert [f.data[0] for f in made.take_frames() if f.can_id == 0x581] == [0x60]
     live = bytes.fromhex("4B4F444C 00000000 8A09" + "0000" * 5 + "581F E903 00 00 1D 20 00000200 0C 00 39234C14")
     made.receive_bytes(0, live, SECOND, SECOND)

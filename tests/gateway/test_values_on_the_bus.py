@@ -1,43 +1,71 @@
-"""What a message holds at a known time, from bytes to bits: values that are easily taken for others."""
+"""What a gateway sends at a known time, from bytes to frames: values that are easily taken for others, or not sent at all."""
 
 import pytest
 
-from kontronik_can_gw.dbc_output.layout import DbcSettings, parse_database
+from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, parse_database
 from kontronik_can_gw.dbc_output.prepare import prepare
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode
+from kontronik_can_gw.protocol import Device, InfoData, LiveData, codec, encode
 from kontronik_can_gw.protocol.fields import device_and_variant
 from kontronik_can_gw.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
 
 HEAD = 'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: Gw Car\n\nBO_ 256 M: 8 Gw\n'
+ATTRIBUTES = """
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange";
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_DEF_DEF_ "GenMsgSendType" "Event";
+"""
+ON_CHANGE = 'BA_ "GenMsgSendType" BO_ 256 2;\n'
+EACH_CHANGE_AND_100_MS = 'BA_ "GenMsgSendType" BO_ 256 4;\nBA_ "GenMsgCycleTime" BO_ 256 100;\n'
 PERIOD = 10 * MS
+ESC = EscSettings("esc1")
+SPEED = ' SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
+
+
+def layout_of(text: str) -> Layout:
+    return prepare(parse_database(text.encode(), "t.dbc"), "t.dbc", (ESC,), DbcSettings(), fd_allowed=True)[1]
+
+
+def wire(**values: int) -> bytes:
+    return encode(LiveData(**values), codec.Layout.V4)
 
 
 class Bench:
-    """One message that follows each live frame, of a gateway that reads each frame whole."""
+    """One message, as a rule sent with each live frame, of a gateway that is awake at each deadline."""
 
-    def __init__(self, signals: str, tables: str = "") -> None:
-        esc = EscSettings("esc1")
-        text = f"{HEAD}{signals}\n{tables}"
-        layout = prepare(parse_database(text.encode(), "t.dbc"), "t.dbc", (esc,), DbcSettings(), fd_allowed=False)[1]
-        self.gateway = Gateway((esc,), layout, 0)
+    def __init__(self, signals: str, more: str = "") -> None:
+        self.gateway = Gateway((ESC,), layout_of(f"{HEAD}{signals}{ATTRIBUTES}{more}"), 0)
         self.now = 0
         self.gateway.start(0)
+        self.take()
 
     def live(self, **values: int) -> int:
         """A period later a live frame comes; what the message holds then."""
-        return self._read(encode(LiveData(**values), Layout.V4))
+        self.read(wire(**values))
+        return self.gateway.message_bits(0, self.now)
 
     def info(self, device: Device) -> None:
-        self._read(encode(InfoData(device_and_variant=device_and_variant(device, 120), cell_count=6), Layout.V4))
+        self.read(encode(InfoData(device_and_variant=device_and_variant(device, 120), cell_count=6), codec.Layout.V4))
 
-    def _read(self, data: bytes) -> int:
-        self.now += PERIOD
-        self.gateway.advance(self.now)
+    def read(self, data: bytes) -> list[bytes]:
+        """A period later bytes come; the frames sent until and with them."""
+        sent = self.wait(PERIOD)
         self.gateway.receive_bytes(0, data, self.now, self.now)
         self.gateway.advance(self.now)
-        self.gateway.take_frames()
-        return self.gateway.message_bits(0, self.now)
+        return sent + self.take()
+
+    def wait(self, ns: int) -> list[bytes]:
+        end, sent = self.now + ns, []
+        while (due := self.gateway.next_deadline()) <= end:
+            self.now = max(self.now, due)
+            self.gateway.advance(self.now)
+            sent += self.take()
+        self.now = end
+        return sent
+
+    def take(self) -> list[bytes]:
+        return [frame.data for frame in self.gateway.take_frames()]
 
 
 BEC_CURRENT = ' SG_ BecCurrent : 0|16@1+ (0.01,0) [0|655] "A" Car\n'
@@ -75,3 +103,73 @@ def test_a_value_that_equals_the_code_for_not_available_is_sent_as_the_error_cod
     )
     assert bench.gateway.message_bits(0, 0) & 0xFFFF == 100, "before the first frame"
     assert bench.live(pwm_input=throttle) & 0xFFFF == raw
+
+
+def test_after_an_outage_of_the_bus_what_has_no_cycle_is_sent_again() -> None:
+    bench = Bench(SPEED)
+    bench.live(electrical_speed=30_000)
+    bench.wait(SECOND)  # telemetry is lost, and what was sent of it did not reach the bus
+    bench.gateway.can_returned(bench.now)
+    assert [data[:4] for data in bench.take()] == [b"\xff\xff\xff\xff"]
+
+
+@pytest.mark.parametrize(("kind", "name", "per_second"), [("", "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)])
+def test_counters_in_messages_without_a_cycle_do_not_go_stale(kind: str, name: str, per_second: int) -> None:
+    unit = "s" if name == "Uptime" else ""
+    bench = Bench(f' SG_ {name} : 0|32@1+ (1,0) [0|0] "{unit}" Car\n', kind)
+    good = wire(battery_voltage=5000)
+    sent: list[bytes] = []
+    for n in range(500):  # for 5 s; each tenth frame is damaged
+        sent += bench.read(good if n % 10 else good[:20] + b"\x55" + good[21:])
+    assert 3 * per_second <= int.from_bytes(sent[-1][:4], "little") <= 5 * per_second
+
+
+def test_a_fault_of_one_frame_is_sent_although_the_next_came_in_the_same_read() -> None:
+    bench = Bench(' SG_ OperatingErrors : 0|32@1+ (1,0) [0|0] "" Car\n', ON_CHANGE)
+    assert [data[0] for data in bench.read(wire(operating_errors=1) + wire())] == [1, 0]
+
+
+def test_a_read_of_many_old_frames_is_no_flood_of_link_changes() -> None:
+    bench = Bench(SPEED)
+    sent = bench.read(b"".join(wire(electrical_speed=n) for n in range(100)))
+    esc = bench.gateway.escs[0]
+    assert bench.gateway.take_link_changes() == [0]
+    assert (esc.losses, esc.late_frames > 20, sent[-1][0]) == (0, True, 99)
+
+
+def pages(*names: str) -> str:
+    """A multiplexed message: page n has the n-th of the names."""
+    signals = (f' SG_ {name} m{n} : 8|16@1+ (0.01,0) [0|0] "V" Car\n' for n, name in enumerate(names))
+    return ' SG_ Page M : 0|4@1+ (1,0) [0|0] "" Car\n' + "".join(signals)
+
+
+def test_a_page_that_changes_often_does_not_starve_the_cycle_of_the_others() -> None:
+    bench = Bench(pages("BatteryVoltage", "BecVoltage", "MinBatteryVoltage"), EACH_CHANGE_AND_100_MS)
+    sent: list[int] = []
+    for n in range(300):
+        sent += [data[0] for data in bench.read(wire(battery_voltage=n))]
+    assert sent.count(0) >= 297
+    assert sent.count(1) >= 9 and sent.count(2) >= 9
+
+
+def test_information_that_runs_out_is_not_available_on_every_page() -> None:
+    bench = Bench(pages("MinBatteryVoltage", "MaxBatteryVoltage"))
+    sent = bench.read(encode(InfoData(min_battery_voltage=1, max_battery_voltage=2), codec.Layout.V4))
+    while bench.now < INFO_TIMEOUT_NS + SECOND:
+        sent += bench.read(wire())
+    for page, value in ((0, b"\1\0"), (1, b"\2\0")):
+        shown = [data[1:3] for data in sent if data[0] == page]
+        assert value in shown and shown[-1] == b"\xff\xff"
+
+
+def test_the_load_of_can_fd_counts_the_data_phase_at_its_own_rate() -> None:
+    messages = "".join(f"BO_ {257 + n} M{n}: 64 Gw\n{SPEED}\n" for n in range(8))
+    layout = layout_of(f"{HEAD}{SPEED}\n{messages}{ATTRIBUTES}")
+    assert 0.25 < layout.bus_load(500_000, 2_000_000) < 0.45
+    assert layout.bus_load(500_000, 500_000) > 1
+
+
+def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:
+    cycle = 'BA_ "GenMsgSendType" BO_ 256 "Cyclic";\nBA_ "GenMsgCycleTime" BO_ 256 20;\n'
+    (message,) = layout_of(f"\ufeff{HEAD}{SPEED}{ATTRIBUTES}{cycle}").messages
+    assert message.cycle_ns == 20 * MS

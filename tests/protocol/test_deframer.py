@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from kontronik_can_gw.protocol import Counters, Deframer, Frame, InfoData, Kind, Layout, LiveData, codec, encode
 
 from . import sheet
-from .reference import ambiguous, certain_at, counters_of, frames_of, random_frame, seal
+from .reference import certain_at, counters_of, frames_of, random_frame, seal
 from .sheet import FORM_ROWS, FormRow
-from .streams import Uart, overlapping_pair, random_chunks, random_stream, seeds, streams
+from .streams import Uart, random_chunks, random_stream, seeds, streams
 
 PROPERTY = settings(deadline=None, max_examples=250, database=None)
 LIVE_LEGACY, INFO_LEGACY, LIVE_V4, INFO_V4 = FORM_ROWS
@@ -86,26 +86,15 @@ def state_of(deframer: Deframer) -> tuple[dict[str, int], int]:
 # ---- against the brute force
 
 
-@PROPERTY
-@given(stream=streams)
-@example(b"")
-@example(b"KOD")
-@example(b"KODKODL")
-@example(b"KODI" + bytes(37))
-def test_a_stream_fed_whole_gives_what_brute_force_finds(stream: bytes) -> None:
-    check_against_the_reference(stream, [stream])
-
-
-@PROPERTY
-@given(stream=streams)
-def test_a_stream_fed_byte_by_byte_gives_what_brute_force_finds(stream: bytes) -> None:
-    check_against_the_reference(stream, one_by_one(stream))
-
-
-@PROPERTY
+@settings(PROPERTY, max_examples=300)
 @given(stream=streams, seed=seeds)
-def test_a_stream_cut_anywhere_gives_what_brute_force_finds(stream: bytes, seed: int) -> None:
-    check_against_the_reference(stream, random_chunks(stream, random.Random(seed)))
+@example(b"", 0)
+@example(b"KOD", 0)
+@example(b"KODKODL", 0)
+@example(b"KODI" + bytes(37), 0)
+def test_a_stream_gives_what_brute_force_finds_however_it_is_cut(stream: bytes, seed: int) -> None:
+    for chunks in (whole(stream), one_by_one(stream), random_chunks(stream, random.Random(seed))):
+        check_against_the_reference(stream, chunks)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -121,68 +110,18 @@ def test_long_damaged_streams_give_what_brute_force_finds_however_they_are_cut(s
     assert found > 250, "streams without frames would prove little"
 
 
-@form_rows
-def test_each_lost_byte_costs_no_more_than_brute_force_says(row: FormRow) -> None:
-    source = random.Random(3)
-    clean = b"".join(random_frame(row, source) for _ in range(4))
-    for at in range(len(clean)):
-        lost = clean[:at] + clean[at + 1 :]
-        check_against_the_reference(lost, [lost])
-        frames, _ = run(one_by_one(lost))
-        assert len(frames) >= 3, "only the frame that lost a byte is lost"
-
-
-@form_rows
-def test_each_flipped_bit_costs_at_most_its_own_frame(row: FormRow) -> None:
-    source = random.Random(4)
-    clean = b"".join(random_frame(row, source) for _ in range(3))
-    for at in range(row.length, 2 * row.length):
-        flipped = bytearray(clean)
-        flipped[at] ^= 1 << source.randrange(8)
-        check_against_the_reference(bytes(flipped), one_by_one(bytes(flipped)))
-        frames, _ = run([bytes(flipped)])
-        unprotected = row.covered <= at - row.length < row.crc_at
-        assert len(frames) == (3 if unprotected else 2)
-
-
-@pytest.mark.parametrize("fake", [b"K", b"KO", b"KOD", b"KODL", b"KODI", b"KODX", b"KODKO", b"KODLKODI", b"KODI" * 12])
-@form_rows
-def test_a_frame_directly_behind_rubbish_is_found(row: FormRow, fake: bytes) -> None:
-    frame = random_frame(row, random.Random(5))
-    for stream in (fake + frame, fake + frame + frame, frame + fake + frame):
-        check_against_the_reference(stream, [stream])
-        check_against_the_reference(stream, one_by_one(stream))
-    assert [found.offset for found in run([fake + frame])[0]] == [len(fake)]
+TAILS = [b"", b"K", b"KO", b"KOD", b"KKOD", b"KODX", b"KODXYZ", b"KODL", b"KODI\0", b"KODKO"]
+FRAMES = [random_frame(row, random.Random(5)) for row in FORM_ROWS]
 
 
 @pytest.mark.parametrize("fake", [b"KODL", b"KODI"])
-@pytest.mark.parametrize("gap", range(45))
-def test_a_frame_anywhere_behind_a_fake_header_is_found(fake: bytes, gap: int) -> None:
-    for row in FORM_ROWS:
-        stream = fake + bytes(gap) + random_frame(row, random.Random(gap))
-        check_against_the_reference(stream, [stream])
-        check_against_the_reference(stream, one_by_one(stream))
-        assert [found.offset for found in run([stream])[0]] == [4 + gap]
-
-
-@pytest.mark.parametrize("fake", [b"KODL", b"KODI"])
-@pytest.mark.parametrize("tail", [b"", b"K", b"KO", b"KOD", b"KKOD", b"KODX", b"KODXYZ", b"KODL", b"KODI\0", b"KODKO"])
-def test_a_stream_that_ends_anywhere_behind_a_fake_header_is_accounted_as_stated(fake: bytes, tail: bytes) -> None:
-    for gap in range(60):
+@pytest.mark.parametrize("gap", range(60))
+def test_what_comes_anywhere_behind_a_fake_header_is_accounted_as_stated(fake: bytes, gap: int) -> None:
+    for tail in (*TAILS, *FRAMES):
         stream = fake + bytes(gap) + tail
         check_against_the_reference(stream, [stream])
         check_against_the_reference(stream, one_by_one(stream))
-
-
-@form_rows
-def test_of_two_valid_frames_that_overlap_the_earlier_is_taken(row: FormRow) -> None:
-    source = random.Random(6)
-    stream = overlapping_pair(row, LIVE_LEGACY, 16, source)
-    frames, _ = run(one_by_one(stream))
-    assert [(frame.offset, frame.form.length) for frame in frames] == [(0, row.length)]
-    spoilt = stream[:4] + bytes([stream[4] ^ 1]) + stream[5:]
-    frames, _ = run(one_by_one(spoilt))
-    assert [(frame.offset, frame.form.length) for frame in frames] == [(row.length - 16, 38)]
+        assert [found.offset for found in run([stream])[0]] == ([4 + gap] if tail in FRAMES else [])
 
 
 @form_rows
@@ -200,41 +139,7 @@ def test_a_header_that_straddles_the_end_of_a_frame_does_not_count(row: FormRow)
     assert (deframer.counters.headers, deframer.counters.crc_errors) == (1, 0)
 
 
-@pytest.mark.parametrize("kind", ["live", "info"])
-@both_cuts
-def test_where_both_layouts_fit_the_shorter_wins_and_the_rest_is_noise(
-    kind: str, cut: Callable[[bytes], list[bytes]]
-) -> None:
-    stream = ambiguous(kind)
-    frames, deframer = run(cut(stream))
-    assert [(frame.kind.value, frame.layout) for frame in frames] == [(kind, Layout.LEGACY)]
-    assert deframer.counters.dropped_noise == len(stream) - frames[0].form.length == (2 if kind == "live" else 3)
-    check_against_the_reference(stream, cut(stream))
-
-
-def test_the_layout_may_change_in_mid_stream() -> None:
-    source = random.Random(9)
-    rows = [source.choice(FORM_ROWS) for _ in range(200)]
-    stream = b"".join(random_frame(row, source) for row in rows)
-    frames, deframer = run(random_chunks(stream, source))
-    assert [(frame.kind.value, frame.layout.value) for frame in frames] == [(row.kind, row.layout) for row in rows]
-    assert deframer.counters.dropped_bytes == 0
-    assert all(getattr(deframer.counters, f"{row.kind}_{row.layout}") == rows.count(row) for row in FORM_ROWS)
-
-
 # ---- when a frame comes out
-
-
-@form_rows
-def test_a_frame_is_emitted_on_its_last_byte(row: FormRow) -> None:
-    source = random.Random(10)
-    deframer = Deframer()
-    for _ in range(5):
-        frame = random_frame(row, source)
-        for byte in one_by_one(frame)[:-1]:
-            assert deframer.feed(byte) == []
-        assert [found.form.length for found in deframer.feed(frame[-1:])] == [row.length]
-        assert deframer.pending == 0
 
 
 def test_the_recorded_frames_are_emitted_on_their_last_byte() -> None:
@@ -257,16 +162,6 @@ def test_a_frame_is_emitted_as_soon_as_no_continuation_could_take_it_away(stream
     assert moments == certain_at(stream)
 
 
-def test_a_frame_behind_an_undecided_header_waits_for_that_header() -> None:
-    frame = random_frame(LIVE_LEGACY, random.Random(12))
-    deframer = Deframer()
-    assert deframer.feed(b"KODI" + frame) == []
-    assert deframer.pending == 42
-    assert deframer.feed(b"\0") == []
-    assert deframer.pending == 43
-    assert [found.offset for found in deframer.feed(b"\0")] == [4]
-
-
 @PROPERTY
 @given(stream=streams, seed=seeds)
 def test_counters_and_pending_are_the_same_at_every_moment_whatever_the_chunks(stream: bytes, seed: int) -> None:
@@ -285,27 +180,6 @@ def test_counters_and_pending_are_the_same_at_every_moment_whatever_the_chunks(s
 
 
 # ---- flush, and what may be fed
-
-
-@form_rows
-def test_flush_finds_a_frame_behind_a_header_that_never_became_one(row: FormRow) -> None:
-    frame = random_frame(row, random.Random(13))
-    deframer = Deframer()
-    early = deframer.feed(b"KODI" + frame[:-1])
-    early += deframer.feed(frame[-1:])
-    assert len(early) == (0 if row.length < 40 else 1)
-    assert [(found.offset, found.form.length) for found in early + deframer.flush()] == [(4, row.length)]
-
-
-@form_rows
-def test_flush_drops_a_frame_that_is_not_whole_as_incomplete(row: FormRow) -> None:
-    frame = random_frame(row, random.Random(14))
-    for size in range(3, row.length):
-        frames, deframer = run([frame[:size]])
-        assert frames == []
-        assert deframer.counters.dropped_incomplete == size
-        assert deframer.counters.headers == (size >= 4)
-        assert deframer.counters.crc_errors == 0
 
 
 def test_flush_of_nothing_changes_nothing() -> None:
@@ -352,39 +226,6 @@ def test_after_a_flush_that_ended_on_kod_rubbish_is_counted_at_once() -> None:
     assert deframer.counters.dropped_noise == 1
 
 
-def test_half_a_frame_before_a_flush_is_never_joined_to_the_half_behind_it() -> None:
-    deframer = Deframer()
-    frame = sheet.RECORDED_LIVE
-    assert deframer.feed(frame[:20]) + deframer.flush() + deframer.feed(frame[20:]) + deframer.flush() == []
-    assert [found.offset for found in deframer.feed(frame)] == [38]
-    assert deframer.counters.dropped_incomplete == 20
-    assert deframer.counters.dropped_noise == 18
-
-
-@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
-def test_any_buffer_of_bytes_may_be_fed_and_reused_afterwards(kind: Callable[[bytearray], bytes]) -> None:
-    """The contract is bytes; a bytearray or a memoryview is read just so, and nothing of it is kept."""
-    stream = sheet.RECORDED_LIVE + sheet.RECORDED_INFO + b"KO" + sheet.RECORDED_LIVE
-    expected = run([stream])[0]
-    for size in (1, 7, len(stream)):
-        deframer = Deframer()
-        frames: list[Frame] = []
-        for at in range(0, len(stream), size):
-            buffer = bytearray(stream[at : at + size])
-            frames += deframer.feed(kind(buffer))
-            buffer[:] = b"\xaa" * len(buffer)
-        assert frames + deframer.flush() == expected
-
-
-def test_an_empty_chunk_changes_nothing() -> None:
-    deframer = Deframer()
-    for chunk in (b"", b"KO", b"", b"DL", b"", sheet.RECORDED_LIVE[4:]):
-        before = state_of(deframer)
-        frames = deframer.feed(chunk)
-        assert chunk or (frames, state_of(deframer)) == ([], before)
-    assert deframer.counters.live_legacy == 1
-
-
 # ---- counters
 
 
@@ -402,26 +243,6 @@ def test_bytes_are_dropped_for_the_stated_reasons() -> None:
     assert counters.dropped_bytes == 13 + 3 + 40 + 9
 
 
-def test_a_failed_info_header_is_blamed_for_44_bytes_and_nested_ones_extend_it() -> None:
-    _, deframer = run([b"KODI" + bytes(60)])
-    assert (deframer.counters.dropped_crc, deframer.counters.dropped_noise) == (44, 20)
-    _, deframer = run([b"KODI" + bytes(16) + b"KODL" + bytes(60)])
-    assert (deframer.counters.dropped_crc, deframer.counters.dropped_noise) == (60, 24)
-
-
-def test_the_blame_of_a_failed_header_ends_at_the_next_frame() -> None:
-    _, deframer = run([b"KODL" + sheet.RECORDED_LIVE + b"noise" + bytes(40)])
-    assert (deframer.counters.dropped_crc, deframer.counters.dropped_noise) == (4, 45)
-
-
-def test_the_k_behind_kod_may_begin_the_next_header() -> None:
-    for stream in (b"KOD" + sheet.RECORDED_LIVE, b"KODKOD" + sheet.RECORDED_LIVE):
-        frames, deframer = run(one_by_one(stream))
-        assert len(frames) == 1
-        assert deframer.counters.unknown_kinds == (len(stream) - 38) // 3
-        assert deframer.counters.dropped_unknown_kind == len(stream) - 38
-
-
 def test_a_copy_of_the_counters_does_not_move() -> None:
     deframer = Deframer()
     deframer.feed(b"noise")
@@ -432,29 +253,9 @@ def test_a_copy_of_the_counters_does_not_move() -> None:
     assert deframer.counters.as_dict()["info"] == deframer.counters.info == 1
 
 
-def test_all_counters_and_totals_have_a_name() -> None:
-    assert set(Counters().as_dict()) == set(counters_of(b""))
-    counters = Counters(live_v4=1, live_legacy=2, info_v4=4, info_legacy=8, dropped_noise=1, dropped_crc=2)
-    counters.dropped_unknown_kind = 4
-    counters.dropped_incomplete = 8
-    assert (counters.live, counters.info, counters.dropped_bytes) == (3, 12, 15)
-    assert {name: counters.as_dict()[name] for name in ("live", "info", "dropped_bytes")} == {
-        "live": 3,
-        "info": 12,
-        "dropped_bytes": 15,
-    }
-
-
-def test_the_position_of_a_frame_is_that_in_the_whole_stream() -> None:
-    noise = b"noise!" * 1000
-    frames, _ = run(random_chunks(noise + sheet.RECORDED_LIVE + noise + sheet.RECORDED_INFO, random.Random(15)))
-    assert [frame.offset for frame in frames] == [6000, 12_038]
-    assert [type(frame.data) for frame in frames] == [LiveData, InfoData]
-
-
 # ---- hostile input
 
-MEGABYTE = 1 << 20
+SIZE = 1 << 18
 HOSTILE = {
     "KOD": b"KOD",
     "KODL": b"KODL",
@@ -465,9 +266,8 @@ HOSTILE = {
     "zeros": b"\0",
     "ones": b"\xff",
     "KODI and 39 zeros": b"KODI" + bytes(39),
-    "random": random.Random(16).randbytes(MEGABYTE),
+    "random": random.Random(16).randbytes(SIZE),
 }
-HOSTILE_BYTE_BY_BYTE = {"KOD", "KODL", "KODI", "zeros", "random"}
 
 
 class Work:
@@ -501,18 +301,15 @@ def repeated(unit: bytes, size: int) -> bytes:
 
 @pytest.mark.parametrize("name", HOSTILE)
 @both_cuts
-def test_the_work_on_a_megabyte_of_hostile_input_is_linear(
+def test_the_work_on_hostile_input_is_linear(
     name: str, cut: Callable[[bytes], list[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work = Work(monkeypatch)
-    size = MEGABYTE
-    if cut is one_by_one and name not in HOSTILE_BYTE_BY_BYTE:
-        size = MEGABYTE // 8  # to stay fast
-    calls, crc_bytes = work.of(cut(repeated(HOSTILE[name], size // 4)))
-    more_calls, more_bytes = work.of(cut(repeated(HOSTILE[name], size)))
+    calls, crc_bytes = work.of(cut(repeated(HOSTILE[name], SIZE // 4)))
+    more_calls, more_bytes = work.of(cut(repeated(HOSTILE[name], SIZE)))
     assert more_calls <= 4 * (calls + 50)
     assert more_bytes <= 4 * (crc_bytes + 50 * 40)
-    assert more_calls <= 3 * (size // 4 + 1), "at most three CRCs for a header, and a header has four bytes"
+    assert more_calls <= 3 * (SIZE // 4 + 1), "at most three CRCs for a header, and a header has four bytes"
 
 
 @pytest.mark.parametrize("unit", HOSTILE.values(), ids=HOSTILE.keys())
@@ -525,9 +322,9 @@ def test_hostile_input_gives_the_same_counters_and_bounded_pending_however_it_is
         assert deframer.counters.as_dict() == counters_of(stream)
 
 
-def test_a_frame_is_still_found_behind_a_megabyte_of_headers() -> None:
-    stream = b"KODLKODI" * (MEGABYTE // 8) + sheet.RECORDED_LIVE + bytes(2)
-    assert [found.offset for found in run([stream])[0]] == [MEGABYTE]
+def test_a_frame_is_still_found_behind_many_headers() -> None:
+    stream = b"KODLKODI" * (SIZE // 8) + sheet.RECORDED_LIVE + bytes(2)
+    assert [found.offset for found in run([stream])[0]] == [SIZE]
 
 
 # ---- diagnosis
@@ -547,59 +344,33 @@ def noise_without_kod(size: int) -> bytes:
     return random.Random(18).randbytes(size).replace(b"K", b"J")
 
 
-def test_silence_is_diagnosed_as_no_bytes() -> None:
-    assert diagnosis_of(b"").startswith(SILENCE)
-    assert "KOSMIK" in diagnosis_of(b"")
+BAD = sheet.RECORDED_LIVE[:20] + bytes((sheet.RECORDED_LIVE[20] ^ 1,)) + sheet.RECORDED_LIVE[21:]
+DIAGNOSES: list[tuple[str, list[bytes]]] = [
+    (SILENCE, [b""]),
+    (OTHER_PROTOCOL, [noise_without_kod(size) for size in (1, 63, 64, 1000)]),
+    (OTHER_PROTOCOL, [bytes(63), b"\xfe" * 899 + b"J" * 101]),
+    (SLOWER_LINE, [bytes(64), b"\xfe" * 900 + b"J" * 100]),
+    (FAILED_CRC, [BAD * 5, b"KODX" + noise_without_kod(500) + BAD * 5]),
+    (UNKNOWN_KIND, [(b"KODX" + bytes(36)) * 10]),
+    (PARTIAL, [sheet.RECORDED_LIVE[:size] for size in (4, 20, 30, 37)]),
+    (PARTIAL, [noise_without_kod(10) + sheet.RECORDED_LIVE[:4]]),
+]
 
 
-def test_while_frames_come_there_is_no_diagnosis() -> None:
-    for frame in (
-        sheet.RECORDED_LIVE,
-        sheet.RECORDED_INFO,
-        encode(LiveData(), Layout.V4),
-        encode(InfoData(), Layout.V4),
-    ):
-        deframer = Deframer()
-        deframer.feed(noise_without_kod(100) + b"KODX" + b"KODL" + bytes(50) + frame)
-        assert deframer.counters.diagnosis() is None
+@pytest.mark.parametrize(("expected", "received"), DIAGNOSES)
+def test_what_was_received_without_a_frame_has_a_diagnosis(expected: str, received: list[bytes]) -> None:
+    for stream in received:
+        assert diagnosis_of(stream).startswith(expected)
 
 
-def test_bytes_without_kod_are_diagnosed_as_parity_or_another_protocol() -> None:
-    for size in (1, 63, 64, 1000):
-        text = diagnosis_of(noise_without_kod(size))
-        assert text.startswith(OTHER_PROTOCOL)
-        assert "parity" in text and "8E1" in text
-
-
-def test_headers_without_a_valid_crc_are_diagnosed() -> None:
-    bad = bytearray(sheet.RECORDED_LIVE)
-    bad[20] ^= 1
-    assert diagnosis_of(bytes(bad) * 5).startswith(FAILED_CRC)
-    assert diagnosis_of(b"KODX" + noise_without_kod(500) + bytes(bad) * 5).startswith(FAILED_CRC)
-
-
-def test_kod_of_unknown_kind_is_diagnosed() -> None:
-    assert diagnosis_of((b"KODX" + bytes(36)) * 10).startswith(UNKNOWN_KIND)
-
-
-def test_a_header_whose_frame_never_came_whole_is_diagnosed() -> None:
+def test_a_frame_that_never_came_whole_is_diagnosed_although_nothing_is_pending() -> None:
     assert diagnosis_of(sheet.RECORDED_LIVE[:30], flush=True) == PARTIAL
 
 
-@pytest.mark.parametrize("size", [4, 20, 37])
-def test_a_frame_that_is_just_arriving_is_not_diagnosed_as_another_protocol(size: int) -> None:
-    assert diagnosis_of(sheet.RECORDED_LIVE[:size]) == PARTIAL
-    assert diagnosis_of(noise_without_kod(10) + sheet.RECORDED_LIVE[:size]) == PARTIAL
-
-
-def test_few_zeros_are_not_yet_diagnosed_as_a_slower_line() -> None:
-    assert diagnosis_of(bytes(63)).startswith(OTHER_PROTOCOL)
-    assert diagnosis_of(bytes(64)).startswith(SLOWER_LINE)
-
-
-def test_a_slower_line_needs_nine_tenths_of_long_runs() -> None:
-    assert diagnosis_of(b"\xfe" * 900 + b"J" * 100).startswith(SLOWER_LINE)
-    assert diagnosis_of(b"\xfe" * 899 + b"J" * 101).startswith(OTHER_PROTOCOL)
+def test_the_diagnoses_name_what_to_look_for() -> None:
+    assert "KOSMIK" in diagnosis_of(b"")
+    assert "parity" in diagnosis_of(b"?") and "8E1" in diagnosis_of(b"?")
+    assert "9600" in diagnosis_of(bytes(64)) and "old JIVE" in diagnosis_of(bytes(64))
 
 
 @pytest.mark.parametrize("resume_at_low_stop", [False, True])
@@ -627,9 +398,7 @@ def test_9600_baud_read_at_115200_is_diagnosed_as_a_slower_line(
         line.idle(source.randrange(500) if gaps else 0)
     received = line.received(parity=True, resume_at_low_stop=resume_at_low_stop)
     assert len(received) > 200
-    text = diagnosis_of(received)
-    assert text.startswith(SLOWER_LINE)
-    assert "9600" in text and "old JIVE" in text
+    assert diagnosis_of(received).startswith(SLOWER_LINE)
 
 
 def test_frames_read_without_parity_by_a_16550_are_diagnosed_as_wrong_parity() -> None:
@@ -638,29 +407,26 @@ def test_frames_read_without_parity_by_a_16550_are_diagnosed_as_wrong_parity() -
         line.send(sheet.RECORDED_LIVE)
         line.idle(2000)
     received = line.received(parity=False, resume_at_low_stop=True)
-    frames, deframer = run([received])
-    assert frames == []
-    text = deframer.counters.diagnosis()
-    assert text is not None
-    assert text.startswith(OTHER_PROTOCOL)
+    assert run([received])[0] == []
+    assert diagnosis_of(received).startswith(OTHER_PROTOCOL)
 
 
 def test_a_diagnosis_since_a_moment_looks_only_at_what_came_after_it() -> None:
-    bad = bytearray(sheet.RECORDED_LIVE)
-    bad[20] ^= 1
     deframer = Deframer()
     steps: list[tuple[bytes, str | None]] = [
         (sheet.RECORDED_LIVE, None),
         (b"", SILENCE),
-        (bytes(bad) + bytes(20), FAILED_CRC),
+        (BAD + bytes(20), FAILED_CRC),
         (noise_without_kod(100), OTHER_PROTOCOL),
         (b"KODX" + bytes(10), UNKNOWN_KIND),
         (bytes(100), SLOWER_LINE),
         (noise_without_kod(100), OTHER_PROTOCOL),
         (b"", SILENCE),
         (sheet.RECORDED_INFO, None),
-        (b"", SILENCE),
+        (encode(LiveData(), Layout.V4), None),
+        (encode(InfoData(), Layout.V4), None),
         (bytes(70), SLOWER_LINE),
+        (sheet.RECORDED_LIVE[:30], PARTIAL),
     ]
     for received, expected in steps:
         since = deframer.counters.copy()
@@ -668,12 +434,3 @@ def test_a_diagnosis_since_a_moment_looks_only_at_what_came_after_it() -> None:
         text = deframer.counters.diagnosis(since)
         assert text is None if expected is None else text is not None and text.startswith(expected)
     assert deframer.counters.diagnosis() is None, "over all, frames came"
-
-
-def test_a_partial_frame_since_a_moment_is_diagnosed_as_such() -> None:
-    deframer = Deframer()
-    deframer.feed(sheet.RECORDED_LIVE)
-    since = deframer.counters.copy()
-    deframer.feed(sheet.RECORDED_LIVE[:30])
-    deframer.flush()
-    assert deframer.counters.diagnosis(since) == PARTIAL

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import pairwise
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,26 +30,6 @@ def taking(sent: list[CanFrame], count: int, then: Sent = Sent.BUSY) -> Callable
         return Sent.OK
 
     return send
-
-
-def test_queued_frames_of_one_id_are_all_sent_in_order() -> None:
-    mailboxes, sent = Mailboxes(), list[CanFrame]()
-    frames = [queued(n) for n in range(127)]
-    for frame in frames:
-        mailboxes.put(frame)
-    assert mailboxes.flush(taking(sent, 1000)) == (127, Sent.OK)
-    assert sent == frames
-    assert (len(mailboxes), mailboxes.replaced, mailboxes.dropped) == (0, 0, 0)
-
-
-def test_queue_and_slots_take_turns_while_both_wait() -> None:
-    mailboxes, sent = Mailboxes(), list[CanFrame]()
-    for n in range(5):
-        mailboxes.put(queued(n))
-    for n in range(3):
-        mailboxes.put(slot(0x181 + n))
-    mailboxes.flush(taking(sent, 1000))
-    assert [frame.can_id for frame in sent] == [0x581, 0x181, 0x581, 0x182, 0x581, 0x183, 0x581, 0x581]
 
 
 def test_the_turns_go_on_where_a_full_interface_broke_them_off() -> None:
@@ -92,13 +71,12 @@ def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
     assert mailboxes.flush(taking(sent, 9)) == (0, Sent.OK)
 
 
-@pytest.mark.parametrize("answer", [Sent.BUSY, Sent.DOWN, Sent.GONE])
-def test_the_last_answer_is_told_for_queued_frames_too(answer: Sent) -> None:
+def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
     mailboxes, sent = Mailboxes(), list[CanFrame]()
-    mailboxes.put(queued(0))
-    mailboxes.put(queued(1))
-    assert mailboxes.flush(taking(sent, 1, answer)) == (1, answer)
-    assert len(mailboxes) == 1
+    for number in range(10):
+        mailboxes.put(CanFrame(1, bytes((number,)), page=number % 2))
+    mailboxes.flush(taking(sent, 9))
+    assert [(frame.page, frame.data) for frame in sent] == [(0, b"\x08"), (1, b"\x09")]
 
 
 PUTS = st.tuples(st.booleans(), st.integers(0x181, 0x184))

@@ -8,6 +8,7 @@ from wire_world import World, loop_in, run
 from kontronik_can_gw.cia301.nmt import NmtState
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import GatewayState
@@ -202,6 +203,7 @@ def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench
     bench.speed_until(50 * MS)
     old = len(bench.wire.frames)
     assert len(bench.loop.can.mailboxes) > 5
+    bench.loop.can.mailboxes.put(CanFrame(0x123, b"old"))
     bus.take()
     bus.answer = Sent.OK
     bench.world.now += HELD_UP_NS
@@ -213,6 +215,7 @@ def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench
     assert speeds == {old + 1}
     dbc = {message.can_id for message in bench.layout.messages if message.cycle_ns <= HELD_UP_NS}
     assert dbc <= {can_id for can_id, _ in sent}, "what was dropped is made anew at once"
+    assert 0x123 not in {can_id for can_id, _ in sent}, "what nothing replaces is dropped too"
 
 
 def test_in_the_middle_of_a_turn_the_rest_is_late_too_but_answers_are_not_lost(bench: Bench) -> None:

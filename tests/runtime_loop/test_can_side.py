@@ -1,11 +1,10 @@
-"""The CAN interface in the loop: bus-off and its end, outages, what is late. Time is passed in, port and kernel are scripted."""
+"""The CAN interface in the loop: bus-off and its end, outages, a stalled bus. Time is passed in, port and kernel are scripted."""
 
 import logging
-import selectors
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
+from wire_world import CAN_FD, Bus, World
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse
@@ -13,8 +12,9 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Sent
+from kontronik_can_gw.protocol import Layout, LiveData, encode
 from kontronik_can_gw.runtime import can_side
-from kontronik_can_gw.runtime.can_port import one_by_one, socketcan_error
+from kontronik_can_gw.runtime.can_port import socketcan_error
 from kontronik_can_gw.runtime.can_side import CanSide
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
@@ -26,44 +26,29 @@ OFF = ACTIVE._replace(state=CanState.BUS_OFF)
 BOOT_UP = (0x701, b"\0")
 
 
-class Port:
+class Port(Bus):
     """A SocketCAN port; ``there`` False: it cannot be opened."""
 
     there = True
-    tells_busy_from_gone = True
-    gone = False
-    waits_to_be_read = False
 
     def __init__(self, _config: object) -> None:
         if not Port.there:
             raise RunError("CAN interface can0: there is none.")
+        super().__init__(World())
         self.state = CanState.UNKNOWN
-        self.bus_off_count = self.overruns = 0
-        self.answer = Sent.OK
-        self.sent: list[CanFrame] = []
 
-    def fileno(self) -> None:
-        return None
-
-    def set_receive_ids(self, ids: object) -> None:
-        pass
+    def set_receive_ids(self, ids: frozenset[int]) -> None:
+        self.ids = ids
 
     def note_state(self, state: CanState) -> None:
         self.bus_off_count += state is CanState.BUS_OFF and self.state is not CanState.BUS_OFF
         self.state = state
 
     def send(self, frame: CanFrame) -> Sent:
-        if self.answer is Sent.OK:
-            self.sent.append(frame)
-            if self.state is CanState.UNKNOWN:
-                self.state = CanState.ERROR_ACTIVE
-        return self.answer
-
-    def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
-        return one_by_one(self.send, frames, clock, latest)
-
-    def close(self) -> None:
-        pass
+        answer = super().send(frame)
+        if answer is Sent.OK and self.state is CanState.UNKNOWN:
+            self.state = CanState.ERROR_ACTIVE
+        return answer
 
 
 class Kernel:
@@ -76,11 +61,7 @@ class Kernel:
         self._waiting: list[LinkFacts] = []
 
     def fileno(self) -> int:
-        return self._file.fileno()
-
-    def open(self, path: Path) -> "Kernel":
-        self._file = path.open("wb")
-        return self
+        return CAN_FD + 1
 
     def ask(self) -> None:
         self.asked += 1
@@ -92,19 +73,7 @@ class Kernel:
         return told
 
     def close(self) -> None:
-        self._file.close()
-
-
-class Selector(selectors.SelectSelector):
-    """Takes any file, because nothing is waited for."""
-
-    before = 0
-
-    def register(self, fileobj: object, events: int, data: object = None) -> selectors.SelectorKey:
-        return selectors.SelectorKey(fileobj, 0, events, data)  # type: ignore[arg-type]
-
-    def unregister(self, fileobj: object) -> selectors.SelectorKey:
-        return selectors.SelectorKey(fileobj, 0, 0, None)  # type: ignore[arg-type]
+        pass
 
 
 class Bench:
@@ -113,7 +82,7 @@ class Bench:
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         self.kernel, self.now, self.clock = kernel, 0, 0
-        self.can = CanSide(loaded.config.can, self.gateway, Selector(), Conditions(), clock=lambda: self.clock)
+        self.can = CanSide(loaded.config.can, self.gateway, World(), Conditions(), clock=lambda: self.clock)
 
     @property
     def port(self) -> Port:
@@ -144,18 +113,16 @@ class Bench:
         self.can._follow_reception(self.now)
 
     def take(self) -> list[tuple[int, bytes]]:
-        sent, self.port.sent = [(frame.can_id, frame.data) for frame in self.port.sent], []
-        return sent
+        return self.port.take()
 
 
 @pytest.fixture
-def kernel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Kernel]:
-    made = Kernel().open(tmp_path / "kernel")
+def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
+    made = Kernel()
     monkeypatch.setattr(can_side, "CanPort", Port)
     monkeypatch.setattr(can_side, "link_monitor", lambda _name: made)
     monkeypatch.setattr(Port, "there", True)
-    yield made
-    made.close()
+    return made
 
 
 @pytest.fixture
@@ -277,25 +244,6 @@ def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(bench: 
     assert bench.gateway.status.id_conflicts == 1
 
 
-def test_a_turn_in_which_the_process_was_stopped_sends_nothing_more(bench: Bench, kernel: Kernel) -> None:
-    kernel.facts = ACTIVE
-    bench.start()
-    bench.turn(100)
-    bench.take()
-    for can_id in range(5):
-        bench.can.mailboxes.put(CanFrame(0x100 + can_id, b"old"))
-    real = bench.port.send
-
-    def stopped_after_two(frame: CanFrame) -> Sent:
-        if frame.can_id == 0x101:
-            bench.clock += 10 * SECOND
-        return real(frame)
-
-    bench.port.send = stopped_after_two  # type: ignore[method-assign]
-    bench.can.transmit(bench.now)
-    assert [frame for frame in bench.take() if frame[1] == b"old"] == [(0x100, b"old"), (0x101, b"old")]
-
-
 def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
     bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -313,6 +261,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
     with monkeypatch.context() as patch:
         patch.setattr(can_side, "CanPort", is_down)
         bench.turn(5000)
+    assert (bench.can.is_open, bench.gateway.status.can_state) == (False, CanState.DOWN)
     kernel.facts = ACTIVE
     kernel.news = [ACTIVE]
     bench.turn(100)
@@ -324,9 +273,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> None:
     loaded = assemble(parse({"can": {"interface": "slcan", "channel": "/dev/ttyUSB1"}, "esc": [{"port": "p"}]}, "test"))
     gateway = Gateway(loaded.escs, loaded.layout, 0)
-    side = CanSide(
-        loaded.config.can, gateway, Selector(), Conditions(), lambda path: "left" if "USB1" in path else None
-    )
+    side = CanSide(loaded.config.can, gateway, World(), Conditions(), lambda path: "left" if "USB1" in path else None)
     with pytest.raises(RunError, match="is the port of left: nothing may be sent to an ESC"):
         side.open(0, wait=False)
     side.close()
@@ -347,3 +294,81 @@ def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(bench: 
     bench.can.transmit(later)
     assert not bench.can._is_proven
     assert bench.can._busy_since is None
+
+
+def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
+    bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.gateway.receive_bytes(0, encode(LiveData(battery_voltage=2400), Layout.V4), bench.now, bench.now)
+    bench.turn(100)
+    bench.take()
+    bench.port.answer = Sent.BUSY
+    bench.turn(5000)
+    assert len(bench.can.mailboxes) < 50
+    assert bench.gateway.status.dropped_frames > 4, "a heartbeat a second"
+    bench.port.answer = Sent.OK
+    bench.turn(50)
+    sent = bench.take()
+    assert [data for can_id, data in sent if can_id == 0x701] in ([], [b"\5"])
+    assert told(sent) == ["7510"], "telemetry was lost: told while nothing went, and told again"
+    said = [message for message in caplog.messages if "no frame can be sent" in message]
+    assert said == ["CAN can0: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."]
+    assert "CAN can0: frames are sent again, after 4.0 s" in caplog.messages
+
+
+def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
+    monkeypatch.setattr(Port, "tells_busy_from_gone", False)
+    bench.start()
+    port, before = bench.port, bench.can.port
+    for n in range(3000):
+        port.answer = Sent.OK if n % 3 else Sent.BUSY
+        for can_id in range(10):
+            bench.can.mailboxes.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
+        bench.turn()
+    assert bench.can.port is before
+    port.answer = Sent.BUSY
+    bench.can.mailboxes.put(CanFrame(0x100, b""))
+    bench.turn(2000)
+    assert bench.can.port is not before
+
+
+def test_bus_off_and_lost_frames_are_counted_once(bench: Bench, kernel: Kernel) -> None:
+    kernel.facts = ACTIVE
+    bench.start()
+    bench.turn(200)
+    bench.take()
+    bench.port.bus_off_count, bench.port.overruns = 2, 1
+    for _ in range(2):
+        bench.can.serve(bench.now)
+    bench.turn(200)
+    assert bench.gateway.status.bus_off_count == 2
+    assert told(bench.take()) == ["8110", "0000"]
+
+
+def test_answers_that_an_interface_that_is_down_does_not_take_are_dropped_and_counted(bench: Bench) -> None:
+    bench.start()
+    bench.turn(100)
+    bench.port.answer = Sent.DOWN
+    Port.there = False
+    for n in range(3):
+        bench.gateway.receive_frame(CanFrame(0x601, bytes((0x40, n, 0x99, 0, 0, 0, 0, 0))), bench.now, bench.now)
+    before = bench.gateway.status.dropped_frames
+    bench.can.transmit(bench.now)
+    assert bench.gateway.status.can_state is CanState.DOWN
+    assert bench.gateway.status.dropped_frames >= before + 3
+    assert len(bench.can.mailboxes) == 0
+    bench.can.serve(bench.now)  # closed in this round
+
+
+def test_the_port_is_given_the_ids_that_change_while_it_is_open(bench: Bench) -> None:
+    bench.start()
+    bench.turn(10)
+    assert 0x601 in bench.port.ids and 0x705 not in bench.port.ids
+    watch_node_5 = bytes.fromhex("23 16 10 01 2c 01 05 00")
+    bench.gateway.receive_frame(CanFrame(0x601, watch_node_5), bench.now, bench.now)
+    bench.turn(1)
+    assert {0x601, 0x705} <= bench.port.ids

@@ -32,21 +32,16 @@ def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(told: pytes
     assert conditions.reason("port") == ""
 
 
-def test_another_reason_is_said_and_the_time_runs_on(told: pytest.LogCaptureFixture) -> None:
+def test_another_reason_is_said_and_the_time_runs_on_also_after_a_quiet_beginning(
+    told: pytest.LogCaptureFixture,
+) -> None:
     conditions = Conditions()
-    conditions.begin("port", "gone", 0)
+    conditions.end("port", "over", 0)
+    conditions.begin("port", "because of another", 0, quiet=True)
+    assert told.messages == []
     conditions.begin("port", "no permission", 5 * SECOND)
     conditions.end("port", "back", 10 * SECOND)
-    assert told.messages == ["gone", "no permission", "back, after 10.0 s"]
-
-
-def test_an_end_without_a_beginning_and_a_quiet_beginning_say_nothing(told: pytest.LogCaptureFixture) -> None:
-    conditions = Conditions()
-    conditions.end("a", "over", 0)
-    conditions.begin("b", "because of a", 0, quiet=True)
-    assert told.messages == []
-    conditions.end("b", "good again", SECOND)
-    assert told.messages == ["good again, after 1.0 s"]
+    assert told.messages == ["no permission", "back, after 10.0 s"]
 
 
 def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(told: pytest.LogCaptureFixture) -> None:

