@@ -5,9 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
-from capture_bench import START, Bench, made
-from simulated_bus import capture_file
-
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.dbc_output.expand import expand
 from kontronik_can_gw.dbc_output.layout import DbcSettings, choose_node, load_database
@@ -17,7 +14,7 @@ from kontronik_can_gw.dbc_output.view import View
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.telemetry import SECOND, EscSettings
 
 Row = tuple[int, list[Value]]
 
@@ -68,29 +65,6 @@ def simulated(
         view.expire(now)
         yield now, list(view.values)
         heapq.heapreplace(due, (escs[index].next_ns, index))
-
-
-def write_capture(path: Path, seconds: float, options: Sequence[EscOptions]) -> Path:
-    """A recording as ``run --record`` makes it, of simulated ESCs e0, e1, …; its time 0 is theirs."""
-    bench = Bench(*made(len(options)))
-    gateway, now = bench.gateway, START
-    escs = [SimulatedEsc(option, seed=3 + index, start_ns=now) for index, option in enumerate(options)]
-    for index in range(len(escs)):
-        gateway.port_opened(index, now)
-    gateway.start(now)
-    bench.take(now)
-    end = now + round(seconds * SECOND)
-    while now < end:
-        now = max(now + 1, min(gateway.next_deadline(), now + 10 * MS))
-        for index, esc in enumerate(escs):
-            if data := b"".join(sent.wire for sent in esc.frames_until(now)):
-                gateway.receive_bytes(index, data, now, now)
-        gateway.advance(now)
-        bench.take(now)
-    gateway.stop(now)
-    bench.take(now)
-    path.write_bytes(capture_file(bench))
-    return path
 
 
 def column(bus: BusLayout, source: str, esc: int | None = 0) -> int:
