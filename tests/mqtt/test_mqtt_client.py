@@ -133,14 +133,6 @@ def test_two_with_one_client_id_do_not_throw_each_other_out_for_ever(
     assert 1 <= said.text.count(text) <= 2
 
 
-def test_a_take_over_that_the_broker_tells_of_is_said_once(said: pytest.LogCaptureFixture) -> None:
-    listener, port, got = served(*[b"\x20\x03\x00\x00\x00" + b"\xe0\x02\x8e\x00"] * 10)
-    with listener, connecting(to(port)) as client:
-        waits_until(client, "another program took over the client id 'test'. Give each gateway a name of its own")
-        assert len(got) == 1
-    assert said.text.count("took over") == 1
-
-
 def served(*answers: bytes, pause_s: float = 0.02) -> tuple[socket.socket, int, list[bytes]]:
     """A broker of our own making: what it answers to each connection's first bytes; then it ends it. And what it got."""
     listener = socket.create_server(("127.0.0.1", 0))

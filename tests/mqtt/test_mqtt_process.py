@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import cantools.database
 import pytest
 from command_line import refused, run
 from mqtt_bench import (
@@ -24,7 +23,6 @@ from mqtt_bench import (
 )
 from simulated_bus import flight, layout_of, write_log
 
-from kontronik_can_gw.config import shipped
 from kontronik_can_gw.protocol.states import OperatingState
 from kontronik_can_gw.simulator import EscOptions, Phase
 
@@ -65,36 +63,6 @@ def put(port: int, messages: Mapping[str, bytes]) -> None:
         subprocess.run(command, input=payload, check=True)
 
 
-# --- the whole way
-
-
-def test_what_is_on_the_bus_is_published_and_nothing_is_sent(adapter: Slcan, broker: Mosquitto) -> None:
-    frames = flight(layout_of(["esc1"]), 30, [FLIES])
-    with live(adapter, broker, "way", "--rate", 5) as program, Subscriber(broker.port, "kontronik/way/#") as heard:
-        wait_for(lambda: adapter.is_open, lambda: program.log)
-        with Traffic(adapter, frames) as traffic:
-            heard.wait("kontronik/way/esc1/state", count=9)
-        assert program.end() == 0
-    assert "Traceback" not in program.log
-    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-    assert isinstance(database, cantools.database.Database)
-    signals = {
-        "electrical_speed": "ElectricalSpeed",
-        "battery_voltage": "BatteryVoltage",
-        "throttle": "ThrottlePercent",
-    }
-    speed = database.get_message_by_name("EscSpeed")
-    decoded = iter([speed.decode(frame.data) for frame in traffic.put if frame.can_id == speed.frame_id])
-    for state in heard.of("kontronik/way/esc1/state")[2:]:  # each is of a frame that came after that of the one before
-        assert any(
-            all(found[signal] == pytest.approx(state.json[source]) for source, signal in signals.items())  # type: ignore[call-overload]
-            for found in decoded
-        ), state
-    assert heard.of("kontronik/way/online")[-1].payload == b"offline"
-    assert heard.of("kontronik/way/esc1/available")[0].payload == b"online"
-    assert adapter.sent == []
-
-
 def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(adapter: Slcan, broker: Mosquitto) -> None:
     with live(adapter, broker, "term") as program:
         program.wait_for_line("connected as kontronik-can-gw-term")
@@ -111,30 +79,6 @@ def test_the_last_will_says_offline_where_it_was_killed(adapter: Slcan, broker: 
         program.end(signal.SIGKILL)
         heard.wait("kontronik/killed/online", b"offline")
     assert kept(broker.port, "kontronik/killed/online") == {"kontronik/killed/online": b"offline"}
-
-
-def test_a_bus_without_frames_is_told_while_the_publisher_stays_online(adapter: Slcan, broker: Mosquitto) -> None:
-    frames = flight(layout_of(["esc1"]), 1, [QUIET])
-    with live(adapter, broker, "quiet") as program, Subscriber(broker.port, "kontronik/quiet/#") as heard:
-        wait_for(lambda: adapter.is_open, lambda: program.log)
-        with Traffic(adapter, frames):
-            heard.wait("kontronik/quiet/available", b"online")
-            heard.wait("kontronik/quiet/esc1/available", b"offline")
-            heard.wait("kontronik/quiet/available", b"offline")
-            wait_for(lambda: not heard.of("kontronik/quiet/state")[-1].json["available"], "its state")
-        last = heard.of("kontronik/quiet/state")[-1].json
-        assert (last["available"], last["gateway_state"]) == (False, None)
-        assert last["age"] >= 3000
-        assert heard.of("kontronik/quiet/online")[-1].payload == b"online"
-
-
-def test_a_recording_that_nobody_takes_fails(tmp_path: Path) -> None:
-    file = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 1))
-    code, said = talk(file, "--broker", f"127.0.0.1:{free_port()}", "--gateway", "nobody")
-    assert code == 1
-    last = said.splitlines()[-1]
-    assert last.startswith("kontronik-can-gw mqtt: the end of the recording was not published. MQTT broker 127.0.0.1:")
-    assert last.endswith(": connection refused. Does it run, and is the port right?")
 
 
 def test_several_escs_come_by_their_names_from_a_configuration(tmp_path: Path, broker: Mosquitto) -> None:
@@ -215,6 +159,7 @@ def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path, adapter: 
             finally:
                 made.stop()
     assert "Traceback" not in program.log
+    assert adapter.sent == [], "nothing is sent to the bus"
 
 
 def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(tmp_path: Path, adapter: Slcan) -> None:
@@ -268,27 +213,3 @@ def test_the_service_manager_is_told_and_the_watchdog_fed(tmp_path: Path, adapte
             while "STOPPING=1" not in told[-1]:
                 told.append(manager.recv(4096).decode())
     assert "READY=1" in told[0]
-
-
-def test_as_a_service_it_waits_for_the_interface(tmp_path: Path, broker: Mosquitto) -> None:
-    path = str(tmp_path / "notify")
-    with (
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
-        Subscriber(broker.port, "kontronik/wait/#") as heard,
-    ):
-        manager.bind(path)
-        words = (
-            "--interface",
-            "slcan",
-            "--channel",
-            tmp_path / "none",
-            "--broker",
-            broker.address,
-            "--gateway",
-            "wait",
-        )
-        with Process(*words, environment={"NOTIFY_SOCKET": path}) as program:
-            heard.wait("kontronik/wait/online", b"online")
-            heard.wait("kontronik/wait/available", b"offline")
-            assert program.log.count(f"CAN slcan {tmp_path}/none") == 1
-            assert program.end() == 0
