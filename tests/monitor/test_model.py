@@ -120,17 +120,6 @@ def test_nothing_old_is_shown_when_frames_stay_away() -> None:
     assert esc.spreads["battery_voltage"].high is not None, "extremes stay"
 
 
-def test_a_lost_telemetry_line_leaves_the_link_and_no_values() -> None:
-    """The gateway still sends: NotAvailable."""
-    monitor = watched(ONE, flight(ONE, 3, [with_errors(OperatingError.BEC_OVERCURRENT)], until=1.5))
-    esc = monitor.escs[0]
-    assert esc.link == "Lost"
-    assert not esc.is_link_ok
-    assert esc.number("battery_voltage") is None
-    assert esc.active == []
-    assert not esc.is_fresh
-
-
 def gapped() -> Timed:
     """What the gateway sends of an ESC whose telemetry stays away from 2 s to 5 s."""
     esc = SimulatedEsc(EscOptions(), seed=1)
@@ -252,21 +241,6 @@ def test_a_users_dbc_with_other_names_and_units_shows_the_same(users: BusLayout)
     assert esc.link is None
     assert esc.is_link_ok
     assert monitor.document()["units"]["battery_voltage"] == "V"
-
-
-def test_all_cyclic_messages_make_it_complete() -> None:
-    frames = flight(ONE, 3)
-    monitor = Monitor(ONE)
-    when = None
-    seen = set()
-    cyclic = {plan.can_id for plan in ONE.layout.messages if plan.cycle_ns}
-    for now, frame in frames:
-        monitor.take(frame, now)
-        seen.add(frame.can_id)
-        assert monitor.is_complete == (cyclic <= seen)
-        when = when or (now if monitor.is_complete else None)
-    assert when is not None
-    assert when <= 1.1 * SECOND_NS
 
 
 def test_the_document_names_sources_and_has_null_for_what_is_not_available() -> None:

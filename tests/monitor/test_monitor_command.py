@@ -109,26 +109,6 @@ def test_once_takes_what_there_is_at_the_timeout(on_bus: type[FakeBus], clock: C
     assert values["battery_current"] is found["escs"][0]["state"] is found["gateway"]["state"] is None
 
 
-def test_without_any_frame_it_is_one_line_with_the_channel_of_configuration_or_option(
-    on_bus: type[FakeBus], tmp_path: Path
-) -> None:
-    toml = written(tmp_path / "g.toml", '[can]\nchannel = "can3"\n[[esc]]\nport = "/dev/ttyX"\n')
-    for words, channel in (([], "can3"), (["--channel", "can4"], "can4")):
-        done = run("monitor", "-c", toml, "--once", "--timeout", 0.2, *words)
-        assert (done.code, done.out, done.err.count("\n")) == (1, "", 1)
-        assert f"no frame of kontronik_esc.dbc on {channel} for 0.2 s. Is the gateway running" in done.err
-
-
-def test_lines_are_written_where_there_is_no_terminal(on_bus: type[FakeBus]) -> None:
-    on_bus.frames = flight(ONE, 5)
-    done = run("monitor", "--interval", 1)
-    lines = done.out.splitlines()
-    assert done.code == 0
-    assert len(lines) == 5 and all("  esc1  link " in line for line in lines)
-    assert "\x1b" not in done.out
-    assert "none sent" in done.err
-
-
 def test_nothing_in_the_monitor_can_send() -> None:
     """The way to the bus has no method to send with, and its sources call none."""
     assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
@@ -166,16 +146,6 @@ def test_once_of_a_log_tells_what_holds_at_its_end(log: Path) -> None:
     assert values["battery_voltage"] == pytest.approx(last["BatteryVoltage"])
     assert values["consumed_charge"] == last["ConsumedCharge"]
     assert found["time"].startswith("2026-09-21T")
-
-
-def test_a_log_is_played_in_lines(log: Path, clock: Clock) -> None:
-    done = run("monitor", log, "--speed", 10, "--interval", 0.25)
-    assert done.code == 0
-    assert clock.now - 100 == pytest.approx(1.2, abs=0.1)
-    lines = done.out.splitlines()
-    assert len(lines) == 5
-    assert lines[-1].lstrip().startswith("12.0 s")
-    assert f"{len(flight(ONE, 12))} frames of kontronik_esc.dbc seen on flight.log, none sent" in done.err
 
 
 def test_a_log_without_our_frames_is_told_so(tmp_path: Path, clock: Clock) -> None:
@@ -225,19 +195,3 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
 
 
 # --- mistakes
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        (["--interface", "sockcan"], 2, "Did you mean socketcan?"),
-        (["--interface", "socketcan", "--channel", "nocan7"], 1, "CAN interface nocan7: "),
-    ],
-)
-def test_a_mistake_is_one_line_with_the_remedy(
-    words: list[str], code: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = run("monitor", *words)
-    assert (done.code, done.out) == (code, "")
-    assert said in done.err.splitlines()[-1]
