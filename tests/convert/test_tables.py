@@ -358,11 +358,3 @@ def test_any_values_read_back_equal(tmp_path: Path, form: str, rows: list[Any], 
             text = "" if wall_ns is None else f"{datetime.fromtimestamp(wall_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%S}"
             assert cells["Utc"] == (f"{text}.{wall_ns % 10**9 // 1000:06d}Z" if text else None)
         assert tuple(cells[field.name] for field in FIELDS) == values
-
-
-def test_what_json_does_not_know_is_null(tmp_path: Path) -> None:
-    path = tmp_path / "odd.jsonl"
-    with path.open("wb") as file, open_table(file, "jsonl", Table(FIELDS[2:3], False)) as writer:
-        for value in (math.inf, -math.inf, 1.5):
-            writer.write(Row(0, None, (value,)))
-    assert [row["Float"] for row in read_jsonl(path, {})] == [None, None, 1.5]
