@@ -100,26 +100,6 @@ def test_rows_of_a_capture_are_the_esc_s_frames_at_their_times(tmp_path: Path) -
         assert found.damage == []
 
 
-def test_rows_agree_with_what_was_on_the_bus(tmp_path: Path) -> None:
-    """The row at the time of a frame holds what cantools reads in that frame."""
-    bench, _ = plain_run(8)
-    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
-        at = columns(found)
-        by_time = {row.time_ns: row for row in found.samples()}
-        compared = 0
-        for frame in found.frames():
-            row = by_time.get(frame.time_ns)
-            message = SHIPPED.get_message_by_frame_id(frame.frame.can_id)
-            if row is None or message.name not in ("EscSpeed", "EscCurrent"):
-                continue
-            for name, value in message.decode_simple(frame.frame.data).items():
-                if name in at:
-                    expected = None if str(value) in ("NotAvailable", "Error") else value
-                    assert row.values[at[name]] == (expected if expected is None else pytest.approx(expected)), name
-                    compared += 1
-        assert compared > 3000
-
-
 def test_a_loss_is_a_row_without_values_and_so_is_everything_until_the_next_frame(tmp_path: Path) -> None:
     bench, _ = plain_run(12, faults=Faults(dropout=Dropout(2 * SECOND, 6 * SECOND)))
     with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:

@@ -353,23 +353,6 @@ def test_the_wall_clock_that_is_set_is_followed(tmp_path: Path, monkeypatch: pyt
     assert second - first == 3612 * SECOND
 
 
-def test_a_folder_that_goes_comes_again(tmp_path: Path) -> None:
-    now = 10 * SECOND
-    folder = tmp_path / "stick" / "captures"
-    it = begun(folder, clock=lambda: now, part_bytes=1)
-    put(it, entries(3))
-    until(lambda: it.facts.bytes > 0 and it._file is None)
-    for file in folder.iterdir():
-        file.unlink()
-    folder.rmdir()
-    folder.parent.rmdir()
-    now += 6 * SECOND
-    put(it, entries(3, 3))
-    until(folder.exists)
-    it.close()
-    assert [e for e in recorded(folder) if e.kind == Kind.BYTES] == entries(3, 3)
-
-
 def test_a_folder_that_is_not_there_yet_is_waited_for_where_devices_are(tmp_path: Path) -> None:
     now = 10 * SECOND
     place = tmp_path / "place"

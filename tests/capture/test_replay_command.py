@@ -1,13 +1,9 @@
 """``replay`` as a person uses it."""
 
-import contextlib
-import os
-import select
 import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import can
@@ -52,20 +48,6 @@ def test_a_log_of_each_kind_holds_what_was_sent(suffix: str, bench: Bench, recor
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_log_on_standard_output_has_the_times_of_the_wall_clock(bench: Bench, recording: Path) -> None:
-    code, out, talk = replay(recording, "--to", "log")
-    assert code == 0
-    lines = out.splitlines()
-    assert len(lines) == len(bench.sent)
-    for line, sent in zip(lines, bench.sent, strict=True):
-        us = (1_700_000_000 * SECOND + sent.time_ns - START + 500) // 1000
-        assert (
-            line
-            == f"({us // 1_000_000}.{us % 1_000_000:06d}) can0 {sent.frame.can_id:03X}#{sent.frame.data.hex().upper()} T"
-        )
-    assert talk.endswith(f"{len(bench.sent)} frames\n")
-
-
 def test_a_log_of_a_log_is_the_same_log(recording: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "1.log", tmp_path / "2.log"
     assert replay(recording, "--to", "log", "-o", first)[0] == 0
@@ -77,46 +59,6 @@ def test_a_log_is_not_written_over_itself_and_has_no_bytes_of_escs(tmp_path: Pat
     log = written(tmp_path / "a.log", "(1.000000) can0 688#0000000000000000\n")
     assert "is the recording itself" in refused(2, "replay", log, "--to", "log", "-o", log, "--force")
     assert "log of CAN frames, which has no bytes of ESCs" in refused(2, "replay", log, "--to", "pty")
-
-
-def test_frames_on_a_bus_are_marked_unless_told_otherwise(bench: Bench, recording: Path) -> None:
-    channel = f"replay-{os.getpid()}"
-    for words, same in ((["--unmarked"], True), ([], False)):
-        with can.Bus(interface="virtual", channel=channel) as bus:
-            code, _, talk = replay(
-                recording, "--to", "can", "--interface", "virtual", "--channel", channel, "--speed", "max", *words
-            )
-            assert code == 0, talk
-            got = []
-            while (message := bus.recv(0)) is not None:
-                got.append((message.arbitration_id, bytes(message.data)))
-        sent = [(f.frame.can_id, f.frame.data) for f in bench.sent]
-        assert (got == sent) is same
-        assert [can_id for can_id, _ in got] == [can_id for can_id, _ in sent]
-        assert {a[0] for a, b in zip(got, sent, strict=True) if a != b} == (set() if same else {1752})
-
-
-def test_the_bytes_come_out_of_the_pseudo_terminals(bench: Bench, recording: Path, tmp_path: Path) -> None:
-    link = tmp_path / "esc{n}"
-    words = ["replay", str(recording), "--to", "pty", "--link", str(link), "--speed", "5", "--delay", "1.5"]
-    with subprocess.Popen([*PROGRAM, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as player:
-        assert player.stdout
-        assert player.stderr
-        names = [player.stdout.readline().split() for _ in range(2)]
-        assert [name for name, _ in names] == ["e0", "e1"]
-        fds = [os.open(tmp_path / f"esc{n}", os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK) for n in (1, 2)]
-        got = [b"", b""]
-        end = time.monotonic() + 120
-        while player.poll() is None and time.monotonic() < end:
-            for fd in select.select(fds, [], [], 0.05)[0]:
-                with contextlib.suppress(OSError):
-                    got[fds.index(fd)] += os.read(fd, 4096)
-        for fd in fds:
-            os.close(fd)
-        assert player.wait(120) == 0, player.stderr.read()
-        assert "dropped" not in player.stderr.read()
-    for index in range(2):
-        assert got[index] == b"".join(e.data for e in bench.entries if e.kind == 1 and e.esc == index)
 
 
 def test_it_stops_at_once_when_it_is_told_to(tmp_path: Path) -> None:

@@ -3,14 +3,12 @@
 import contextlib
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import cantools.database
 import jsonschema
 import pytest
 from command_line import refused, run
@@ -132,18 +130,6 @@ def test_schema_is_the_json_schema_of_the_configuration() -> None:
 
 
 # --- dbc
-
-
-def test_the_dbc_of_a_configuration_is_what_its_gateway_sends(tmp_path: Path) -> None:
-    file = configuration(tmp_path, dbc="base_id = 0x100\nid_step = 128")
-    file.write_text(file.read_text() + 'name = "left"\n[[esc]]\nport = "y"\nname = "right"\n')
-    done = run("dbc", "-c", file)
-    assert (done.code, done.err) == (0, "")
-    database = cantools.database.load_string(done.out, "dbc", strict=True)
-    assert isinstance(database, cantools.database.can.Database)
-    checked = dict(re.findall(r"^(\w+) +([0-9A-F]{3})h ", run("check", "-c", file).out, re.MULTILINE))
-    assert checked == {message.name: f"{message.frame_id:03X}" for message in database.messages}
-    assert database.get_message_by_name("LeftStatus").frame_id == 0x100
 
 
 def test_a_dbc_goes_into_a_pipe_and_through_a_link_without_replacing_them(tmp_path: Path) -> None:

@@ -159,17 +159,6 @@ def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
         assert variable.encode_raw(text) == node.dictionary.upload(index, sub, 0), f"{index:04X}h:{sub:02X}"
 
 
-def test_nodes_of_one_configuration_differ_in_what_is_their_own_only(tmp_path: Path) -> None:
-    file = configuration(tmp_path, "enabled = true\nserial = 7", left="pole_pairs = 3")
-    left = dcf_values("-c", file, "--node-id", 1)
-    right = dcf_values("-c", file, "--node-id", 2)
-    assert set(left) == set(right)
-    assert {key for key in left if left[key] != right[key]} == {
-        *((0x1014, 0), (0x1018, 4), (0x1200, 1), (0x1200, 2), (0x2100, 1), (0x2101, 1), (0x2101, 2)),
-        *((0x1800 + n, 1) for n in range(4)),
-    }
-
-
 @pytest.mark.parametrize(
     ("lines", "right", "expected"),
     [

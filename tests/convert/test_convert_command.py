@@ -110,16 +110,6 @@ def test_a_missing_library_is_named_with_its_extra(
     assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
 
 
-@pytest.mark.parametrize("form", ["csv", "blf"])
-def test_nothing_heavy_is_imported_where_it_is_not_needed(dump: Path, tmp_path: Path, form: str) -> None:
-    code = (
-        f"import sys; from kontronik_can_gw.cli import main; main(['convert', {str(dump)!r}, {str(tmp_path / 'out')!r}, "
-        f"'--to', {form!r}, '-q']); print([m for m in ('numpy', 'pyarrow', 'asammdf', 'pandas', 'rich') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout == "[]\n"
-
-
 # --- when it cannot go on
 
 

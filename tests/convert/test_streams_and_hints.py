@@ -4,21 +4,18 @@ import os
 import random
 import subprocess
 import sys
-import tempfile
-import threading
 from pathlib import Path
 
 import pytest
-from command_line import refused
+from command_line import refused, run
 from log_files import SUFFIX, some_frames, write_log
 from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_candump
+from simulated_bus import flight, layout_of
+from simulated_bus import write_log as write_bus_log
 
 from kontronik_can_gw.capture import Block, Scanner, block, json_payload, read_json
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.config import shipped
 from kontronik_can_gw.offline.can_logs import NAMES, CanLog
-from kontronik_can_gw.offline.inputs import open_input
-from kontronik_can_gw.offline.layouts import layout_of_dbc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 
@@ -66,35 +63,6 @@ def test_a_pipe_gives_what_the_file_gives(tmp_path: Path, kind: str, way: str) -
     assert (tmp_path / "o.csv").read_bytes() == (tmp_path / "file.csv").read_bytes()
 
 
-def test_what_a_pipe_brings_is_named_by_the_pipe_and_nothing_is_left(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    content = capture_bytes()
-    before = sorted(os.listdir(tempfile.gettempdir()))
-    process = subprocess.Popen(["bash", "-c", f"cat > '{pipe}'"], stdin=subprocess.PIPE)
-    assert process.stdin is not None
-    reached: list[int] = []
-
-    def write() -> None:
-        assert process.stdin is not None
-        process.stdin.write(content[: len(content) // 2])
-        process.stdin.close()
-
-    writer = threading.Thread(target=write)
-    writer.start()
-    with open_input(pipe, reached=reached.append) as found:
-        writer.join()
-        process.wait(60)
-        assert (found.name, found.size) == (str(pipe), len(content) // 2)
-        rows = len(list(found.samples()))
-        assert rows == len(list(found.samples())) > 100  # as often as wanted
-        assert any(line.startswith("pipe: ") for line in found.damage)
-    assert reached[-1] == found.size
-    assert reached == sorted(reached)
-    new = set(os.listdir(tempfile.gettempdir())) - set(before)
-    assert not any(name.startswith("tmp") for name in new)
-
-
 @pytest.mark.parametrize(
     ("command", "said"),
     [
@@ -112,41 +80,10 @@ def test_a_stream_without_a_recording_is_one_line(tmp_path: Path, command: str, 
     assert list(tmp_path.iterdir()) == []
 
 
-# --- more ESCs than the DBC has
-
-
-def _log_of(path: Path, escs: int, frames: int = 900, foreign: int = 0) -> Path:
-    """A log of so many ESCs by ``dbc --esc``, made by cantools' ids alone; and of foreign ids."""
-    import cantools.database
-
-    dbc = path.with_suffix(".dbc")
-    assert main(["dbc", "--esc", str(escs), "-o", str(dbc)]) == 0
-    database = cantools.database.load_file(dbc)
-    assert isinstance(database, cantools.database.can.Database)
-    ids = [(message.frame_id, message.length) for message in database.messages]
-    chance = random.Random(escs)
-    lines = [(1_700_000_000_000_000 + n * 1000, *ids[n % len(ids)]) for n in range(frames)]
-    lines += [(1_700_000_000_000_500 + n * 1000, chance.randrange(0x600), 8) for n in range(foreign)]
-    return write_candump(path, [(us, can_id, bytes(size)) for us, can_id, size in sorted(lines)])
-
-
-@pytest.mark.parametrize("escs", [2, 5, 8])
-def test_a_log_of_several_escs_by_the_dbc_of_one_is_told(
-    tmp_path: Path, escs: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = _log_of(tmp_path / "bus.log", escs, foreign=escs % 2 * 500)
-    ours = {message.can_id for message in layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout.messages}
-    others = sum(int(line.split()[2].partition("#")[0], 16) not in ours for line in log.read_text().splitlines())
-    capsys.readouterr()
-    assert convert(log, tmp_path / "o.csv") == 0
-    summary, hint = capsys.readouterr().err.splitlines()
-    assert "other frames" not in summary
-    assert f"{log}: {others - escs % 2 * 500} frames are not in kontronik_esc.dbc" in hint
-    assert f"those of {escs} ESCs. Give -c, or make their DBC (kontronik-can-gw dbc --esc {escs} -o escs.dbc)" in hint
-    assert convert(log, tmp_path / "o.csv", "--force", "--dbc", log.with_suffix(".dbc")) == 0
-    assert "look like" not in capsys.readouterr().err
-    assert convert(log, tmp_path / "o.blf") == 0  # which holds all of them
-    assert "look like" not in capsys.readouterr().err
+def test_a_log_of_several_escs_by_the_dbc_of_one_is_told(tmp_path: Path) -> None:
+    log = write_bus_log(tmp_path / "bus.log", flight(layout_of(["a", "b", "c"]), 2))
+    assert "those of 3 ESCs" in run("convert", log, tmp_path / "o.csv").err
+    assert "look like" not in run("convert", log, tmp_path / "o.blf").err, "which holds all of them"
 
 
 # --- content before names

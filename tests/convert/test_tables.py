@@ -266,19 +266,6 @@ def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_p
             assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
 
 
-@pytest.mark.parametrize("form", sorted(READ))
-def test_the_same_input_gives_the_same_bytes(tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    import time
-
-    source = tmp_path / "two.kcap"
-    source.write_bytes(capture_bytes())
-    assert convert(source, tmp_path / f"a.{form}") == 0
-    now = time.time()
-    monkeypatch.setattr(time, "time", lambda: now + 5000)
-    assert convert(source, tmp_path / f"b.{form}") == 0
-    assert (tmp_path / f"a.{form}").read_bytes() == (tmp_path / f"b.{form}").read_bytes()
-
-
 # --- what is wanted of it
 
 

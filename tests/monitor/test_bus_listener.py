@@ -1,6 +1,5 @@
 """The listener on python-can's in-process bus, and on a port that is none where an interface is to go away."""
 
-import errno
 import itertools
 
 import pytest
@@ -53,26 +52,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     monkeypatch.setattr(bus_listener, "fault_of", lambda _name: FakePort.fault)
     monkeypatch.setattr(bus_listener, "time", made)
     return made
-
-
-def test_it_comes_back_after_the_interface_was_removed(clock: Clock) -> None:
-    listener = BusListener(CanConfig(), frozenset({0x123}))
-    (first,) = FakePort.opened
-    first.inbox.append(FRAME)
-    assert listener.receive(1) == [FRAME]
-    first.gone, FakePort.fault = True, errno.ENODEV
-    assert listener.receive(0.1) == []
-    assert listener.problem.startswith("CAN interface can0: there is none.")
-    assert first.closed
-    assert listener.receive(60) == []
-    assert FakePort.opened == [first], "it was not to be opened while it is not there"
-    FakePort.fault = 0
-    assert listener.receive(0.6) == []
-    assert listener.problem == ""
-    second = FakePort.opened[-1]
-    assert second is not first and second.ids == frozenset({0x123})
-    second.inbox.append(FRAME)
-    assert listener.receive(1) == [FRAME]
 
 
 def test_it_is_tried_at_most_each_half_second(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -99,16 +99,6 @@ def test_once_ends_when_all_cyclic_messages_have_come(on_bus: type[FakeBus], clo
     assert 20 < esc["values"]["battery_voltage"] < 26
 
 
-def test_once_takes_what_there_is_at_the_timeout(on_bus: type[FakeBus], clock: Clock) -> None:
-    speed = next(plan.can_id for plan in ONE.layout.messages if plan.name == "EscSpeed")
-    on_bus.frames = [(now, frame) for now, frame in flight(ONE, 10) if frame.can_id == speed]
-    found = document(run("monitor", "--dbc", DBC, "--once", "--timeout", 0.5))
-    assert clock.now == pytest.approx(100.5)
-    values = found["escs"][0]["values"]
-    assert values["battery_voltage"] is not None
-    assert values["battery_current"] is found["escs"][0]["state"] is found["gateway"]["state"] is None
-
-
 def test_nothing_in_the_monitor_can_send() -> None:
     """The way to the bus has no method to send with, and its sources call none."""
     assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
@@ -146,16 +136,6 @@ def test_once_of_a_log_tells_what_holds_at_its_end(log: Path) -> None:
     assert values["battery_voltage"] == pytest.approx(last["BatteryVoltage"])
     assert values["consumed_charge"] == last["ConsumedCharge"]
     assert found["time"].startswith("2026-09-21T")
-
-
-def test_a_log_without_our_frames_is_told_so(tmp_path: Path, clock: Clock) -> None:
-    file = write_log(tmp_path / "x.log", [(n * SECOND_NS, CanFrame(0x123, b"\0")) for n in range(3)])
-    done = run("monitor", file, "--once")
-    assert (done.code, done.out) == (1, "")
-    assert "x.log: holds no frame of kontronik_esc.dbc. Give its DBC (--dbc)." in done.err
-    done = run("monitor", file)
-    assert done.code == 0
-    assert "x.log holds no frame of kontronik_esc.dbc" in done.err
 
 
 def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) -> None:

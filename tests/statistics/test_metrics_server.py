@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import os
-import random
 import selectors
 import socket
 import time
@@ -279,17 +278,6 @@ def test_a_flood_of_connections_is_held_to_fifty_in_a_second(served: Served) -> 
     served.now += 1
     served.until(late.look)
     assert status_of(late.answer) == 200
-
-
-def test_garbage_of_all_kinds_does_no_harm(served: Served) -> None:
-    dice = random.Random(1)
-    for number in range(40):
-        client = served.connect()
-        with contextlib.suppress(ConnectionError):
-            client.send(dice.randbytes(dice.choice((1, 10, 300, 5000))) + b"\r\n\r\n" * (number % 2))
-        served.turn()
-        client.close()
-    assert status_of(served.get()) == 200
 
 
 def test_without_descriptors_it_waits_a_second_and_goes_on(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
