@@ -154,11 +154,12 @@ def test_a_file_of_nothing_but_damage_is_summed_up(header: dict[str, Any], tmp_p
 def test_a_name_from_the_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "a.kcap"
     entries = block(b"D", 1, data_payload(bench.entries))
-    forged = changed(header, ("configuration",), '[can]\nchannel = "can0 123#11\\n(1.0) can0"\n')
-    path.write_bytes(block(b"H", 0, json_payload(forged)) + entries)
-    with open_input(path) as found:
-        assert isinstance(found, CaptureInput)
-        assert found.channel == "can0"
+    for given, shown in (("t1", "t1"), ("can0 123#11\\n(1.0) can0", "can0")):
+        forged = changed(header, ("configuration",), f'[can]\nchannel = "{given}"\n')
+        path.write_bytes(block(b"H", 0, json_payload(forged)) + entries)
+        with open_input(path) as found:
+            assert isinstance(found, CaptureInput)
+            assert found.channel == shown
     path.write_bytes(block(b"H", 0, json_payload(changed(header, ("escs", 0, "name"), "a\nb"))) + entries)
     with pytest.raises(UserError, match="header cannot be used"):
         open_input(path)

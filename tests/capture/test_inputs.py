@@ -211,25 +211,6 @@ def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
         list(found.samples())
 
 
-def test_a_damaged_capture_gives_all_that_is_intact(tmp_path: Path) -> None:
-    bench, _ = plain_run(6)
-    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
-    whole = path.read_bytes()
-    middle = len(whole) // 2
-    path.write_bytes(whole[:middle] + b"\0" * 20 + whole[middle + 20 :])
-    with open_input(path) as found:
-        at = columns(found)
-        rows = list(found.samples())
-        assert len(found.damage) == 2
-        assert "are damaged" in found.damage[0]
-        assert "1 blocks" in found.damage[1]
-    assert 400 < len([r for r in rows if r.values[at["BatteryVoltage"]] is not None]) < 600
-    path.write_bytes(whole[:-30])
-    with open_input(path) as found:
-        assert len(list(found.samples())) > 500
-        assert "was not closed" in found.damage[-1]
-
-
 def test_pole_pairs_and_gear_are_those_of_the_capture_whatever_dbc_shows_it(tmp_path: Path) -> None:
     setup, layout = made(2)
     escs = (replace(setup.escs[0], pole_pairs=7), replace(setup.escs[1], pole_pairs=5))

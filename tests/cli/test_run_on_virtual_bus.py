@@ -11,7 +11,7 @@ import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -31,7 +31,6 @@ from kontronik_can_gw.runtime import can_port
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import LinkState
 
 SECOND_NS = 1_000_000_000
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -126,35 +125,6 @@ def test_a_terminal_that_echoes_gets_no_echo_from_the_gateway() -> None:
     finally:
         os.close(slave)
         os.close(master)
-
-
-def test_a_port_that_hangs_up_is_opened_again(tmp_path: Path) -> None:
-    link = tmp_path / "esc"
-    first = PtyEsc(link)
-    with bench(str(link)) as running:
-        first.write(encode(LIVE, Layout.V4))
-        running.speed(12_345)
-        assert first.check() == 0
-        first.close()
-        lost = {"LinkState": int(LinkState.PORT_ERROR), "ElectricalSpeed": 0xFFFFFF, "BatteryVoltage": 655.35}
-        seen: dict[str, Any] = {}
-
-        def all_lost(_name: str, signals: dict[str, Any]) -> bool:
-            seen.update(signals)
-            return all(seen.get(name) == pytest.approx(value) for name, value in lost.items())
-
-        running.until(all_lost, "port error and values not available")
-        with PtyEsc(link) as second:
-            new = encode(LIVE._replace(electrical_speed=777), Layout.LEGACY)
-            end = time.monotonic() + 60
-            is_seen = False
-            while not is_seen and time.monotonic() < end:
-                second.write(new)
-                with suppress(AssertionError):
-                    running.speed(777, 0.02)
-                    is_seen = True
-            assert is_seen
-            assert second.check() == 0
 
 
 def test_file_descriptors_do_not_grow_with_a_port_that_comes_and_goes(tmp_path: Path) -> None:

@@ -12,8 +12,6 @@ from command_line import refused, run
 from log_files import SUFFIX
 from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_candump
 
-from kontronik_can_gw.offline.inputs import open_input
-
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 
 
@@ -53,18 +51,6 @@ def test_a_log_goes_through_every_format_and_comes_back_the_same(tmp_path: Path,
         before = out
     plain = [line.removesuffix(" T") for line in before.read_text().splitlines()]
     assert plain == log.read_text().splitlines()
-
-
-def test_bytes_of_an_esc_come_out_as_they_went_in(
-    tmp_path: Path, dump: Path, capture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert convert(dump, tmp_path / "out.bin") == 0
-    assert (tmp_path / "out.bin").read_bytes() == dump_bytes()
-    assert convert(capture, tmp_path / "two.bin", "--esc", "e1") == 0
-    with open_input(capture) as opened:
-        assert (tmp_path / "two.bin").read_bytes() == b"".join(opened.esc_bytes(1)) != b""
-    said = refused(2, "convert", capture, tmp_path / "three.bin")
-    assert said.endswith("bin holds the bytes of one ESC. Give --esc: e0, e1")
 
 
 # --- standard output and talk

@@ -13,8 +13,6 @@ from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_
 from simulated_bus import flight, layout_of
 from simulated_bus import write_log as write_bus_log
 
-from kontronik_can_gw.capture import Block, Scanner, block, json_payload, read_json
-from kontronik_can_gw.cli import main
 from kontronik_can_gw.offline.can_logs import NAMES, CanLog
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -133,21 +131,3 @@ def test_a_table_in_mf4_is_told_from_a_log(tmp_path: Path) -> None:
 
 
 # --- options, channel, signals
-
-
-def test_a_capture_gives_its_own_channel(tmp_path: Path) -> None:
-    content = capture_bytes()
-    parts = []
-    for found in Scanner().feed(content):
-        assert isinstance(found, Block)
-        payload = found.payload
-        if found.kind == b"H":
-            header = read_json(payload) | {"configuration": '[can]\nchannel = "t1"\n'}
-            payload = json_payload(header)
-        parts.append(block(found.kind, found.number, payload))
-    path = tmp_path / "t1.kcap"
-    path.write_bytes(b"".join(parts))
-    assert convert(path, tmp_path / "a.log") == 0
-    assert main(["replay", str(path), "--to", "log", "-o", str(tmp_path / "b.log")]) == 0
-    first, second = ((tmp_path / name).read_text().splitlines() for name in ("a.log", "b.log"))
-    assert {line.split()[1] for line in first} == {line.split()[1] for line in second} == {"t1"}

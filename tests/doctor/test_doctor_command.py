@@ -3,37 +3,11 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import jsonschema
 import pytest
 from command_line import run, written
 
-from kontronik_can_gw import __version__
 from kontronik_can_gw.offline.pty import PtyEsc
-
-TEXT, NUMBER = {"type": "string"}, {"type": "integer"}
-FINDING = {
-    "group": {"type": "string", "minLength": 1},
-    "check": {"type": "string", "pattern": "^(config|port|can|machine)(\\.[a-z_]+)?$"},
-    "severity": {"enum": ["ok", "note", "warning", "error"]},
-    "text": {"type": "string", "minLength": 1},
-    "remedy": TEXT,
-    "command": TEXT,
-}
-
-
-def exactly(properties: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "object", "additionalProperties": False, "required": list(properties), "properties": properties}
-
-
-SCHEMA = exactly(
-    {
-        "format": {"const": 1}, "version": {"const": __version__}, "config": TEXT, "exit_code": {"enum": [0, 1, 2]},
-        "errors": NUMBER, "warnings": NUMBER,
-        "findings": {"type": "array", "minItems": 1, "items": exactly(FINDING)},
-    }
-)  # fmt: skip
 
 
 @pytest.fixture
@@ -54,8 +28,9 @@ def document(file: Path, code: int) -> tuple[list[dict[str, str]], list[dict[str
     done = run("doctor", "-c", file, "--json")
     assert (done.code, done.err) == (code, "")
     found = json.loads(done.out)
-    jsonschema.validate(found, SCHEMA)
-    assert found["exit_code"] == code
+    assert set(found) == {"format", "version", "config", "exit_code", "errors", "warnings", "findings"}
+    assert all(set(f) == {"group", "check", "severity", "text", "remedy", "command"} for f in found["findings"])
+    assert (found["format"], found["exit_code"]) == (1, code)
     for severity in ("error", "warning"):
         assert found[f"{severity}s"] == sum(f["severity"] == severity for f in found["findings"])
     return found["findings"], [f for f in found["findings"] if f["severity"] == "error"]

@@ -2,25 +2,22 @@
 
 import ast
 import inspect
-import itertools
 import json
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 from capture_bench import Bench, made
 from command_line import Done, run, written
-from simulated_bus import Clock, Timed, capture_file, flight, layout_of, with_errors, write_log
+from simulated_bus import Clock, capture_file, flight, layout_of, write_log
 
 from kontronik_can_gw.cli import monitor, monitor_screen
 from kontronik_can_gw.cli.monitor import Recording
-from kontronik_can_gw.config import CanConfig, shipped
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.config import shipped
 from kontronik_can_gw.offline import monitor as model
 from kontronik_can_gw.offline.inputs import open_input
-from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.runtime import bus_listener
 from kontronik_can_gw.simulator import SECOND_NS, EscOptions, SimulatedEsc
 
@@ -28,45 +25,11 @@ DBC = shipped("dbc/kontronik_esc.dbc")
 ONE = layout_of(["esc1"])
 
 
-class FakeBus:
-    """In place of the listener: frames at their times of a clock; Ctrl-C is pressed when all have come."""
-
-    frames: ClassVar[Timed] = []
-    clock: ClassVar[Clock]
-
-    def __init__(self, config: CanConfig, keys: frozenset[int]) -> None:
-        self.problem = ""
-        self.config = config
-        self._begin = FakeBus.clock.monotonic_ns()
-        self._rest = list(FakeBus.frames)
-
-    def receive(self, seconds: float) -> list[CanFrame]:
-        if seconds > 0:
-            FakeBus.clock.sleep(seconds)
-        now = FakeBus.clock.monotonic_ns() - self._begin
-        due = list(itertools.takewhile(lambda timed: timed[0] <= now, self._rest))
-        del self._rest[: len(due)]
-        if FakeBus.frames and not self._rest:
-            signal.raise_signal(signal.SIGINT)
-        return [frame for _, frame in due]
-
-    def close(self) -> None:
-        pass
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
     monkeypatch.setattr(monitor, "time", clock)
     return clock
-
-
-@pytest.fixture
-def on_bus(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> type[FakeBus]:
-    monkeypatch.setattr(bus_listener, "BusListener", FakeBus)
-    monkeypatch.setattr(FakeBus, "frames", [])
-    FakeBus.clock = clock
-    return FakeBus
 
 
 @pytest.fixture(autouse=True)
@@ -86,17 +49,6 @@ def document(done: Done) -> dict[str, Any]:
 
 
 # --- from the bus
-
-
-def test_once_ends_when_all_cyclic_messages_have_come(on_bus: type[FakeBus], clock: Clock) -> None:
-    on_bus.frames = flight(ONE, 20, [with_errors(OperatingError.UNDERVOLTAGE)])
-    found = document(run("monitor", "--dbc", DBC, "--channel", "can7", "--once", "--timeout", 15))
-    assert clock.now - 100 < 2
-    assert (found["interface"], found["dbc"]) == ("can7", "kontronik_esc.dbc")
-    assert found["gateway"]["state"] == "Running"
-    (esc,) = found["escs"]
-    assert (esc["name"], esc["link"], esc["errors"]) == ("esc1", "Ok", ["undervoltage"])
-    assert 20 < esc["values"]["battery_voltage"] < 26
 
 
 def test_nothing_in_the_monitor_can_send() -> None:

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mqtt_bench import PATIENCE, Mosquitto, Subscriber, free_port, wait_for
+from mqtt_bench import PATIENCE, Mosquitto, Subscriber, wait_for
 
 from kontronik_can_gw.runtime import mqtt_client
 from kontronik_can_gw.runtime.mqtt_client import Broker, MqttClient, check
-from kontronik_can_gw.telemetry import SECOND
 
 pytestmark = pytest.mark.extended
 
@@ -183,21 +182,6 @@ def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(monkeypatch
         waits_until(client, "does not answer. Is this the port of an MQTT broker?")
         client.stop(0.3)
         wait_for(lambda: not client.alive, "the end of the thread")
-
-
-def test_pauses_grow_and_are_not_all_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fleet that lost its broker does not come back all at once."""
-    client = MqttClient(to(free_port()), ONLINE)
-    pauses = []
-    monkeypatch.setattr("kontronik_can_gw.runtime.mqtt_client.time.monotonic_ns", lambda: 0)
-    for _ in range(14):
-        client._failed("x")
-        assert client._retry.due is not None
-        pauses.append(client._retry.due)
-    assert pauses[0] < 0.13 * SECOND
-    assert max(pauses) <= 1.25 * mqtt_client.LONGEST_PAUSE_NS
-    assert min(pauses[-4:]) > 0.7 * mqtt_client.LONGEST_PAUSE_NS
-    assert len({round(pause / SECOND, 2) for pause in pauses[-4:]}) > 1
 
 
 # --- TLS

@@ -41,7 +41,7 @@ def analysed(bus: BusLayout, rows: list[Row], points: int = 2000, **more: tuple[
 
 @pytest.fixture(scope="module")
 def bus() -> BusLayout:
-    return shipped_bus(("left", "right"))
+    return shipped_bus("left", "right")
 
 
 @pytest.fixture(scope="module")

@@ -38,8 +38,8 @@ COUNT = """((key, colour) => {
 })"""
 
 
-def flown(names: tuple[str, ...]) -> Flight:
-    bus = shipped_bus(names)
+def flown(*names: str) -> Flight:
+    bus = shipped_bus(*names)
     analysis = Analysis(bus, 2000)
     for time_ns, values in simulated(bus, 60, [EscOptions(faults=FAULTS), EscOptions(max_current=80)]):
         analysis.take(time_ns, values)
@@ -48,14 +48,14 @@ def flown(names: tuple[str, ...]) -> Flight:
 
 @pytest.fixture(scope="module")
 def one() -> Flight:
-    return flown(("esc1",))
+    return flown("esc1")
 
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory, one: Flight) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     written = {}
-    for name, flight, title in (("one", one, "One"), ("two", flown(("left", "right")), EVIL)):
+    for name, flight, title in (("one", one, "One"), ("two", flown("left", "right"), EVIL)):
         written[name] = folder / f"{name}.html"
         html = render(flight, title=title, source="flight.kcap", provenance={EVIL: EVIL}, wall_ns=1_763_751_137 * S)
         written[name].write_text(html, encoding="utf-8")

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from report_flights import dbc_bus, shipped_bus, simulated
+from report_flights import shipped_bus, simulated
 
 from kontronik_can_gw.config import shipped
+from kontronik_can_gw.offline.layouts import layout_of_dbc
 from kontronik_can_gw.offline.report.analysis import Analysis
 from kontronik_can_gw.offline.report.decimate import Number
 from kontronik_can_gw.offline.report.flight import Flight
@@ -144,7 +145,7 @@ def test_what_the_dbc_does_not_have_is_left_out_and_told(tmp_path: Path) -> None
     text = re.sub(r"^(CM_ SG_|VAL_|BA_ \"\w+\" SG_) \d+ Bec(Current|Voltage) [^;]*;\n", "", text, flags=re.MULTILINE)
     file = tmp_path / "lean.dbc"
     file.write_text(text, encoding="utf-8")
-    bus = dbc_bus(str(file))
+    bus = layout_of_dbc(file)
     analysis = Analysis(bus, 500)
     for time_ns, values in simulated(bus, 12):
         analysis.take(time_ns, values)
