@@ -32,7 +32,6 @@ from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.sources import CanState
 
-SECOND_NS = 1_000_000_000
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 LIVE = LiveData(electrical_speed=12_345, battery_voltage=2442, battery_current=-17, operating_state=21)
 

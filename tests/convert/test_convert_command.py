@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from command_line import refused, run
 from log_files import SUFFIX
-from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_candump
+from recordings import candump_lines, convert, dump_bytes, write_candump
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 
@@ -31,13 +31,6 @@ def dump(tmp_path: Path) -> Path:
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     return write_candump(tmp_path / "bus.log", candump_lines(300))
-
-
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    path = tmp_path / "two.kcap"
-    path.write_bytes(capture_bytes())
-    return path
 
 
 # --- CAN logs and bytes

@@ -15,8 +15,6 @@ from simulated_bus import write_log as write_bus_log
 
 from kontronik_can_gw.offline.can_logs import NAMES, CanLog
 
-PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
-
 
 def program(command: str, data: bytes | None = None, cwd: Path | None = None) -> "subprocess.CompletedProcess[bytes]":
     """A line of bash; ``gw`` is the program."""

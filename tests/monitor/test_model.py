@@ -41,7 +41,7 @@ def watched(bus: BusLayout, frames: Timed, until: float | None = None) -> Monito
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(0, 65533), st.integers(-200, 200)), min_size=1, max_size=30))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_extremes_and_availability_hold_for_any_values(values: list[int | None]) -> None:
     """Frames packed by cantools; None is sent as NotAvailable."""
     message = ONE.database.get_message_by_name("EscCurrent")
@@ -66,7 +66,7 @@ def test_extremes_and_availability_hold_for_any_values(values: list[int | None])
 
 
 @given(st.lists(st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans()), max_size=40), st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_any_frames_are_borne(frames: Sequence[tuple[int, bytes, bool]], data: st.DataObject) -> None:
     """Foreign ids, short data, any bits; times that jump."""
     monitor = Monitor(ONE)

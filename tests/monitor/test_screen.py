@@ -53,7 +53,7 @@ def texts(monitor: Monitor, size: tuple[int, int], where: Where = LIVE, choice: 
     st.tuples(st.integers(1, 150), st.integers(1, 60)), st.sampled_from([1, 2, 8]), st.sampled_from(KINDS),
     st.integers(-3, 9), st.none() | st.integers(0, 9),
 )  # fmt: skip
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_any_size_page_and_choice_is_borne(
     size: tuple[int, int], count: int, kind: str, page: int, esc: int | None
 ) -> None:

@@ -60,10 +60,6 @@ def states(published: Published, esc: str | None = "esc1") -> list[tuple[int, di
     return [(now, json.loads(m.payload)) for now, m in published if m.topic == TOPICS.state(esc)]
 
 
-def payloads(published: Published, topic: str) -> list[bytes]:
-    return [message.payload for _, message in published if message.topic == topic]
-
-
 def snake(signal: str, prefix: str) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", signal.removeprefix(prefix).removesuffix("Percent")).lower()
 

@@ -20,13 +20,7 @@ from mqtt_bench import (
 )
 from simulated_bus import flight, layout_of, write_log
 
-from kontronik_can_gw.protocol.states import OperatingState
-from kontronik_can_gw.simulator import EscOptions, Phase
-
 pytestmark = pytest.mark.extended
-
-QUIET = EscOptions(profile=(Phase("off", 1000, 0, OperatingState.MotorOff, 0),))
-FLIES = EscOptions(profile=(Phase("go", 1000, 60, OperatingState.Forward, 1),))
 
 
 @pytest.fixture(scope="module")
