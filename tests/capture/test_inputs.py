@@ -16,11 +16,9 @@ from kontronik_can_gw.capture_setup import CaptureSetup
 from kontronik_can_gw.config import shipped
 from kontronik_can_gw.dbc_output.unpacker import SignalReader
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.offline.decode import Decoder
 from kontronik_can_gw.offline.inputs import CanLogInput, CaptureInput, DumpInput, Input, open_input
 from kontronik_can_gw.offline.layouts import layout_of_dbc
-from kontronik_can_gw.offline.samples import Sample
 from kontronik_can_gw.protocol import Device
 from kontronik_can_gw.simulator import Dropout, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.telemetry import MS, SECOND
@@ -102,26 +100,6 @@ def test_rows_of_a_capture_are_the_esc_s_frames_at_their_times(tmp_path: Path) -
         assert found.damage == []
 
 
-def test_rows_agree_with_what_was_on_the_bus(tmp_path: Path) -> None:
-    """The row at the time of a frame holds what cantools reads in that frame."""
-    bench, _ = plain_run(8)
-    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
-        at = columns(found)
-        by_time = {row.time_ns: row for row in found.samples()}
-        compared = 0
-        for frame in found.frames():
-            row = by_time.get(frame.time_ns)
-            message = SHIPPED.get_message_by_frame_id(frame.frame.can_id)
-            if row is None or message.name not in ("EscSpeed", "EscCurrent"):
-                continue
-            for name, value in message.decode_simple(frame.frame.data).items():
-                if name in at:
-                    expected = None if str(value) in ("NotAvailable", "Error") else value
-                    assert row.values[at[name]] == (expected if expected is None else pytest.approx(expected)), name
-                    compared += 1
-        assert compared > 3000
-
-
 def test_a_loss_is_a_row_without_values_and_so_is_everything_until_the_next_frame(tmp_path: Path) -> None:
     bench, _ = plain_run(12, faults=Faults(dropout=Dropout(2 * SECOND, 6 * SECOND)))
     with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
@@ -135,32 +113,6 @@ def test_a_loss_is_a_row_without_values_and_so_is_everything_until_the_next_fram
             assert back.values[at["BatteryVoltage"]] is not None
             before = rows[rows.index(lost) - 1]
             assert 250 * MS <= lost.time_ns - before.time_ns < 300 * MS
-
-
-def test_rows_of_several_escs_stand_together(tmp_path: Path) -> None:
-    bench, meant = plain_run(6, escs=3)
-    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
-        rows = list(found.samples())
-        at = columns(found)
-        names = [esc.name for esc in found.bus.escs]
-        assert names == ["e0", "e1", "e2"]
-        lives = max(sum(hasattr(data, "battery_voltage") for _, data in m) for m in meant)
-        assert lives <= len(rows) <= 2.2 * lives
-        assert all(a.time_ns < b.time_ns for a, b in pairwise(rows))
-        row = rows[-1]
-        for index in range(3):
-            assert row.values[at[f"E{index}BatteryVoltage"]] == pytest.approx(
-                bench.gateway.escs[index].last_live.battery_voltage / 100  # type: ignore[union-attr]
-            )
-
-
-def test_a_list_that_was_given_is_not_changed_any_more(tmp_path: Path) -> None:
-    bench, _ = plain_run(2)
-    with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
-        kept: list[tuple[Sample, list[Any]]] = [(row, list(row.values)) for row in found.samples()]
-        assert all(row.values == copy for row, copy in kept)
-        assert found.position == found.size
-        assert list(found.samples())[-1].values == kept[-1][1]  # and once more from the beginning
 
 
 def test_the_bytes_of_an_esc_come_out_as_they_went_in(tmp_path: Path) -> None:
@@ -187,17 +139,6 @@ def test_the_bytes_of_an_esc_come_out_as_they_went_in(tmp_path: Path) -> None:
             assert len(list(plain.frames())) > len(lives)
 
 
-def test_a_dump_at_another_rate(tmp_path: Path) -> None:
-    dump = tmp_path / "a.bin"
-    esc = SimulatedEsc(EscOptions())
-    dump.write_bytes(b"".join(s.wire for s in esc.frames_until(3 * SECOND)))
-    with open_input(dump, live_rate=2) as found:
-        at = columns(found)
-        rows = list(found.samples())
-        assert rows[1].time_ns - rows[0].time_ns == SECOND // 2
-        assert all(row.values[at["BatteryVoltage"]] is not None for row in rows)  # not taken for stale
-
-
 def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> None:
     bench, _ = plain_run(6)
     stop, resume = START + 2 * SECOND, START + 5 * SECOND
@@ -222,14 +163,6 @@ def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> N
         assert sum(v is not None for v in voltages) > 250
         assert any(2.0 < (row.time_ns - start) / SECOND < 4.9 for row in rows), "the loss has a row of its own"
         assert found.wall_ns(rows[0].time_ns) == pytest.approx(1_700_000_000 * SECOND, abs=2 * MS)
-
-
-def test_frames_of_others_and_short_ones_are_passed_over() -> None:
-    reader = SignalReader(layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout)
-    assert reader.read(0x123, b"12345678") is None
-    assert reader.read(1672, b"1234567") is None
-    assert reader.read(1672 | 0x80000000, b"12345678") is None
-    assert reader.read(1672, b"123456789") is not None
 
 
 def test_every_value_of_the_shipped_dbc_reads_as_cantools_reads_it() -> None:
@@ -260,26 +193,6 @@ def test_every_value_of_the_shipped_dbc_reads_as_cantools_reads_it() -> None:
                         assert value == str(other)
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"", "is empty"),
-        (b"hello world\n" * 50, "is no capture"),
-        (block(b"D", 0, data_payload([])), "has no header"),
-        (block(b"H", 0, b"[]"), "has no header"),
-        (block(b"H", 0, b'{"format": "kontronik-can-gw capture", "version": 3}'), "version 3 is unknown"),
-    ],
-)
-def test_what_is_no_recording_is_said_in_one_line(content: bytes, words: str, tmp_path: Path) -> None:
-    path = tmp_path / "x"
-    path.write_bytes(content)
-    with pytest.raises(UserError) as caught:
-        open_input(path)
-    [line] = caught.value.problems
-    assert words in line
-    assert line.startswith(str(path))
-
-
 def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
     bench, _ = plain_run(1)
     with pytest.raises(UserError, match="has no captures"):
@@ -298,37 +211,6 @@ def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
         list(found.samples())
 
 
-def test_a_damaged_capture_gives_all_that_is_intact(tmp_path: Path) -> None:
-    bench, _ = plain_run(6)
-    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
-    whole = path.read_bytes()
-    middle = len(whole) // 2
-    path.write_bytes(whole[:middle] + b"\0" * 20 + whole[middle + 20 :])
-    with open_input(path) as found:
-        at = columns(found)
-        rows = list(found.samples())
-        assert len(found.damage) == 2
-        assert "are damaged" in found.damage[0]
-        assert "1 blocks" in found.damage[1]
-    assert 400 < len([r for r in rows if r.values[at["BatteryVoltage"]] is not None]) < 600
-    path.write_bytes(whole[:-30])
-    with open_input(path) as found:
-        assert len(list(found.samples())) > 500
-        assert "was not closed" in found.damage[-1]
-
-
-def test_another_dbc_shows_a_capture_in_its_own_way(tmp_path: Path) -> None:
-    bench, _ = plain_run(2)
-    text = (shipped("dbc/kontronik_esc.dbc")).read_text().replace("BatteryVoltage", "battery_voltage")
-    other = tmp_path / "other.dbc"
-    other.write_text(text)
-    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
-    with open_input(path, layout_of_dbc(other)) as found:
-        assert "battery_voltage" in columns(found)
-        assert list(found.samples())[-1].values[columns(found)["battery_voltage"]] is not None
-    assert CanFrame(1, b"").key == 1
-
-
 def test_pole_pairs_and_gear_are_those_of_the_capture_whatever_dbc_shows_it(tmp_path: Path) -> None:
     setup, layout = made(2)
     escs = (replace(setup.escs[0], pole_pairs=7), replace(setup.escs[1], pole_pairs=5))
@@ -345,17 +227,6 @@ def test_pole_pairs_and_gear_are_those_of_the_capture_whatever_dbc_shows_it(tmp_
                 electrical, motor = row[at[f"E{index}ElectricalSpeed"]], row[at[f"E{index}MotorSpeed"]]
                 assert isinstance(electrical, int)
                 assert motor == (2 * electrical + poles) // (2 * poles)
-
-
-def test_a_dbc_of_other_escs_is_refused(tmp_path: Path) -> None:
-    bench, _ = plain_run(1, escs=2)
-    path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
-    from kontronik_can_gw.cli import main
-
-    three = tmp_path / "three.dbc"
-    assert main(["dbc", "--esc", "3", "-o", str(three)]) == 0
-    with pytest.raises(UserError, match="describes 3 ESCs, the recording has 2"):
-        open_input(path, layout_of_dbc(three))
 
 
 def test_a_part_without_a_header_is_told_and_the_others_are_read(tmp_path: Path) -> None:

@@ -1,11 +1,19 @@
 """What a replay gives is what the live gateway sent: every frame, every byte, every time."""
 
-import json
-
 import pytest
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw.capture import Block, Entry, Scanner, block, data_payload, json_payload, read_entries, read_json
+from kontronik_can_gw.capture import (
+    Block,
+    Entry,
+    Kind,
+    Scanner,
+    block,
+    data_payload,
+    json_payload,
+    read_entries,
+    read_json,
+)
 from kontronik_can_gw.capture_setup import CaptureSetup
 from kontronik_can_gw.offline.marking import Marker
 from kontronik_can_gw.offline.replay import Replay, TimedFrame
@@ -32,18 +40,18 @@ def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:
     return frames
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize(("escs", "canopen"), [(1, False), (1, True), (3, True)])
-def test_frames_and_times_are_those_of_the_live_run(seed: int, escs: int, canopen: bool) -> None:
-    bench = Bench(*made(escs, canopen)).live(seed, 8)
-    frames = [frame for frame in replayed(bench) if not frame.received]
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("escs", "canopen", "on_loss"), [(2, False, "silent"), (1, True, "not_available"), (3, True, "not_available")]
+)
+def test_frames_and_times_are_those_of_the_live_run(seed: int, escs: int, canopen: bool, on_loss: str) -> None:
+    bench = Bench(*made(escs, canopen, on_loss=on_loss)).live(seed, 8)
+    frames = replayed(bench)
     assert len(bench.sent) > 500
-    assert frames == bench.sent
-
-
-def test_the_silent_gateway_too() -> None:
-    bench = Bench(*made(2, on_loss="silent")).live(5, 6)
-    assert [frame for frame in replayed(bench) if not frame.received] == bench.sent
+    assert [frame for frame in frames if not frame.received] == bench.sent
+    received = sum(entry.kind == Kind.FRAME for entry in bench.entries)
+    assert sum(frame.received for frame in frames) == received
+    assert received > 3
 
 
 def test_frames_that_were_thrown_away_are_not_replayed() -> None:
@@ -62,12 +70,6 @@ def test_frames_that_were_thrown_away_are_not_replayed() -> None:
     times = {frame.time_ns for frame in replayed(bench)}
     assert times == {frame.time_ns for frame in bench.sent}
     assert not [at for at in times if START + 450 * 10**6 < at < START + 1000 * 10**6]
-
-
-def test_what_was_received_is_told_as_received() -> None:
-    bench = Bench(*made(1, True)).live(7, 6)
-    received = [frame for frame in replayed(bench) if frame.received]
-    assert len(received) == sum(entry.kind == 2 for entry in bench.entries) > 3
 
 
 def test_a_marked_replay_differs_in_the_state_and_nowhere_else() -> None:
@@ -114,38 +116,6 @@ def test_the_beginning_of_a_run_may_be_missing() -> None:
     assert speeds(frames) == speeds(bench.sent)
     assert speeds(frames)
     assert replay.gateway.escs[0].losses >= 9
-
-
-def test_rubbish_entries_are_counted_and_passed_over() -> None:
-    bench = Bench(*made(1)).live(1, 1, wild=False)
-    found = bench.setup.database()
-    assert found is not None
-    replay = Replay(bench.setup.gateway(found[1], START))
-    bad = [
-        Entry(START, 1, 9, b"x"),
-        Entry(START, 2, 0, b""),
-        Entry(START, 99),
-        Entry(START, 14, 0, b"1"),
-        Entry(START, 10, flags=200),
-    ]
-    for entry in bad:
-        assert replay.play(entry) == []
-    assert replay.passed_over == len(bad)
-
-
-def test_a_header_of_another_kind_is_refused_with_the_reason() -> None:
-    header = Bench(*made(1, True)).setup.header()
-    json.dumps(header)
-    changes: list[dict[str, object]] = [
-        {"format": "x"},
-        {"version": 99},
-        {"escs": None},
-        {"dbc": {}},
-        {"canopen": {"eds": 1}},
-    ]
-    for change in changes:
-        with pytest.raises(ValueError, match=r"header|version"):
-            CaptureSetup.of(header | change)
 
 
 def test_a_setup_comes_back_from_its_header() -> None:

@@ -4,10 +4,11 @@ import io
 import json
 import logging
 import re
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
+from command_line import run
 from rich.console import Console
 
 from kontronik_can_gw.cli import main, say, show
@@ -41,14 +42,6 @@ class Terminal(io.TextIOWrapper):
 
 def is_clean(text: str) -> bool:
     return all(c.isprintable() or c in "\n\t" for c in text)
-
-
-def program(*words: object) -> tuple[int, str, str]:
-    """Both streams of a command within this process; without an exception."""
-    out, talk = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(talk):
-        code = main([str(word) for word in words])
-    return code, out.getvalue(), talk.getvalue()
 
 
 def test_what_a_terminal_obeys_is_shown_as_a_question_mark() -> None:
@@ -148,10 +141,10 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("words", [["check"], ["describe"], ["describe", "--format", "json"]])
 def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> None:
-    code, out, talk = program(*words, "-c", folder / "gateway.toml")
-    assert code == 0, talk
-    assert "?EVIL?" in out or "\\u001bEVIL\\u0007" in out
-    assert is_clean(out + talk)
+    done = run(*words, "-c", folder / "gateway.toml")
+    assert done.code == 0, done.err
+    assert "?EVIL?" in done.out or "\\u001bEVIL\\u0007" in done.out
+    assert is_clean(done.out + done.err)
 
 
 @pytest.mark.parametrize(
@@ -169,10 +162,6 @@ def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> N
 def test_what_is_wrong_with_hostile_files(name: str, content: str, words: list[str], tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_text(content)
-    out, talk = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(talk):
-        try:
-            main([*words, str(path), *(["-"] if words[0] == "convert" else [])])
-        except SystemExit as end:
-            pytest.fail(f"usage: {end.code} {talk.getvalue()}")
-    assert is_clean(out.getvalue() + talk.getvalue())
+    done = run(*words, path, *(["-"] if words[0] == "convert" else []))
+    assert "usage:" not in done.err
+    assert is_clean(done.out + done.err)

@@ -6,7 +6,7 @@ import can
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from log_files import READERS, SUFFIX, WALL_NS, Item, at_wall, read_by_library, read_log, some_frames, write_log
+from log_files import READERS, SUFFIX, Item, at_wall, read_by_library, read_log, some_frames, write_log
 
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
@@ -14,24 +14,6 @@ from kontronik_can_gw.offline.can_logs import CanLog, CanLogWriter, log_format
 
 FORMATS = sorted(READERS)
 WITH_FD = sorted(set(FORMATS) - {"trc"})
-
-
-@pytest.mark.parametrize("format_", FORMATS)
-@pytest.mark.parametrize("wall", [WALL_NS, None])
-def test_what_is_written_is_read_again(tmp_path: Path, format_: str, wall: int | None) -> None:
-    items = some_frames(500, fd=format_ in WITH_FD)
-    path = tmp_path / f"log{SUFFIX[format_]}"
-    write_log(path, format_, items, wall)
-    found, damage = read_log(path)
-    assert found == (at_wall(items) if wall is not None else items)
-    assert damage == []
-    with CanLog(path) as log:
-        assert log.format == format_
-        assert (log.wall_start_ns is None) == (wall is None)
-        assert log.wall == (format_ == "candump" and wall is not None)
-        for _ in log.frames():
-            assert 0 <= log.position <= log.size
-        assert log.position == log.size == path.stat().st_size
 
 
 @pytest.mark.parametrize("format_", FORMATS)

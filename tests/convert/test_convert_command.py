@@ -1,8 +1,5 @@
 """``kontronik-can-gw convert`` as people use it: what it makes, what it says, what it leaves behind when it cannot go on."""
 
-import contextlib
-import os
-import pty
 import resource
 import signal
 import subprocess
@@ -12,10 +9,8 @@ from pathlib import Path
 
 import pytest
 from command_line import refused, run
-from log_files import SUFFIX, read_by_library
-from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_candump
-
-from kontronik_can_gw.offline.inputs import open_input
+from log_files import SUFFIX
+from recordings import candump_lines, convert, dump_bytes, write_candump
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 
@@ -38,33 +33,7 @@ def log(tmp_path: Path) -> Path:
     return write_candump(tmp_path / "bus.log", candump_lines(300))
 
 
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    path = tmp_path / "two.kcap"
-    path.write_bytes(capture_bytes())
-    return path
-
-
 # --- CAN logs and bytes
-
-
-@pytest.mark.parametrize("form", ["candump", "asc", "blf", "trc", "mf4-log"])
-@pytest.mark.parametrize("source", ["capture", "log"])
-def test_can_logs_hold_the_frames_of_the_recording(
-    tmp_path: Path, source: str, form: str, request: pytest.FixtureRequest
-) -> None:
-    path = request.getfixturevalue(source)
-    format_ = form.removesuffix("-log")
-    out = tmp_path / f"out{SUFFIX[format_]}"
-    assert convert(path, out, "--to", form) == 0
-    with open_input(path) as opened:
-        expected = [((opened.wall_ns(t) or 0), frame, received) for t, frame, received in opened.frames()]
-    found = read_by_library(out, format_)
-    assert len(found) == len(expected) > 250
-    for (time_ns, frame, received), (wanted_ns, wanted, wanted_received) in zip(found, expected, strict=True):
-        assert abs(time_ns - wanted_ns) <= 1000
-        same = (frame.can_id, frame.data, frame.extended, received)
-        assert same == (wanted.can_id, wanted.data, wanted.extended, wanted_received)
 
 
 def test_a_log_goes_through_every_format_and_comes_back_the_same(tmp_path: Path, log: Path) -> None:
@@ -77,27 +46,6 @@ def test_a_log_goes_through_every_format_and_comes_back_the_same(tmp_path: Path,
     assert plain == log.read_text().splitlines()
 
 
-def test_a_part_of_a_log_keeps_its_times(tmp_path: Path, log: Path) -> None:
-    assert convert(log, tmp_path / "out.log", "--from", "0.5", "--until", "1") == 0
-    lines = log.read_text().splitlines()
-    start = float(lines[0][1:18])
-    wanted = [line for line in lines if 0.5 <= float(line[1:18]) - start <= 1]
-    assert [line[:-2] for line in (tmp_path / "out.log").read_text().splitlines()] == wanted
-    assert 0 < len(wanted) < len(lines)
-
-
-def test_bytes_of_an_esc_come_out_as_they_went_in(
-    tmp_path: Path, dump: Path, capture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert convert(dump, tmp_path / "out.bin") == 0
-    assert (tmp_path / "out.bin").read_bytes() == dump_bytes()
-    assert convert(capture, tmp_path / "two.bin", "--esc", "e1") == 0
-    with open_input(capture) as opened:
-        assert (tmp_path / "two.bin").read_bytes() == b"".join(opened.esc_bytes(1)) != b""
-    said = refused(2, "convert", capture, tmp_path / "three.bin")
-    assert said.endswith("bin holds the bytes of one ESC. Give --esc: e0, e1")
-
-
 # --- standard output and talk
 
 
@@ -107,55 +55,6 @@ def test_text_on_standard_output_is_that_of_a_file_and_talk_goes_to_standard_err
     assert (done.code, done.data) == (0, (tmp_path / "out.csv").read_bytes())
     assert [line.partition(",")[0] for line in done.out.splitlines()[1:4]] == ["0.000000", "0.020000", "0.040000"]
     assert "times are assumed: 50 live frames a second" in done.err
-
-
-# --- damage
-
-
-def _on_terminal(*words: object, data_too: bool = False) -> bytes:
-    """What a person sees on standard error (and output), a terminal."""
-    master, slave = pty.openpty()
-    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
-    process = subprocess.Popen(
-        [*PROGRAM, *map(str, words)], stderr=slave, stdout=slave if data_too else subprocess.DEVNULL, env=environment
-    )
-    os.close(slave)
-    seen = b""
-    with contextlib.suppress(OSError):  # EIO: the program has gone
-        while data := os.read(master, 65536):
-            seen += data
-    os.close(master)
-    assert process.wait(60) == 0
-    return seen
-
-
-def test_no_bar_where_the_data_goes_to_the_same_terminal(dump: Path) -> None:
-    assert "━" not in _on_terminal(dump, "-", "--to", "csv", data_too=True).decode()
-    assert "━" in _on_terminal(dump, "-", "--to", "csv").decode()
-
-
-def test_of_damaged_input_all_that_is_intact_is_converted_and_the_rest_told(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lines = log.read_text().splitlines(keepends=True)
-    lines[100] = lines[100][:30] + "\n"
-    lines[200] = "rubbish\n"
-    log.write_text("".join(lines))
-    assert convert(log, tmp_path / "out.log") == 0
-    said = capsys.readouterr().err.splitlines()
-    assert said[0].startswith(f"kontronik-can-gw convert: {tmp_path / 'out.log'}: 298 CAN frames, up to ")
-    assert said[1:] == [f"kontronik-can-gw convert: {log}: damaged: 2 damaged lines: 101, 201"]
-
-
-def test_a_damaged_capture_is_converted_as_far_as_it_goes(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    content = bytearray(capture_bytes())
-    content[len(content) // 2] ^= 1
-    capture.write_bytes(content)
-    assert convert(capture, tmp_path / "out.csv") == 0
-    assert "two.kcap: damaged: two.kcap: " in capsys.readouterr().err
-    assert len((tmp_path / "out.csv").read_text().splitlines()) > 200
 
 
 @pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "mf4", "candump", "blf", "mf4-log"])
@@ -188,16 +87,6 @@ def test_a_missing_library_is_named_with_its_extra(
     said = refused(1, "convert", dump, tmp_path / "out", "--to", form)
     assert said.endswith(f"needs {module}: pip install 'kontronik-can-gw[{extra}]'")
     assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
-
-
-@pytest.mark.parametrize("form", ["csv", "blf"])
-def test_nothing_heavy_is_imported_where_it_is_not_needed(dump: Path, tmp_path: Path, form: str) -> None:
-    code = (
-        f"import sys; from kontronik_can_gw.cli import main; main(['convert', {str(dump)!r}, {str(tmp_path / 'out')!r}, "
-        f"'--to', {form!r}, '-q']); print([m for m in ('numpy', 'pyarrow', 'asammdf', 'pandas', 'rich') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout == "[]\n"
 
 
 # --- when it cannot go on

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from log_files import SUFFIX, Item, at_wall, read_log, some_frames, write_log
 
-from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.offline.can_logs import CanLog
+from kontronik_can_gw.errors import UserError
 
 OWN = ["candump", "asc", "trc", "blf"]
 TEXT = ["candump", "asc", "trc"]
@@ -54,22 +53,6 @@ def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(tmp_path: Path
 
 
 @pytest.mark.parametrize("format_", TEXT)
-def test_a_flipped_bit_costs_one_line_at_most(tmp_path: Path, format_: str) -> None:
-    path, items, content = _log(tmp_path, format_, 30)
-    start = content.index(b"\n", len(content) // 2) + 1
-    for place in range(start, start + 60):
-        for bit in range(8):
-            damaged = bytearray(content)
-            damaged[place] ^= 1 << bit
-            path.write_bytes(damaged)
-            found, _ = read_log(path)
-            same = sum(item in items for item in found)
-            # a line end that goes takes two lines with it
-            assert same >= len(items) - (2 if content[place] == 10 else 1)
-            assert len(found) <= len(items)
-
-
-@pytest.mark.parametrize("format_", TEXT)
 @pytest.mark.parametrize("rubbish", [b"\0" * 10_000, b"hello\n", bytes(range(256)) * 3 + b"\n", b"\n\n", b"(1.5) \n"])
 def test_rubbish_between_lines_costs_no_frame(tmp_path: Path, format_: str, rubbish: bytes) -> None:
     path, items, content = _log(tmp_path, format_, 40)
@@ -108,19 +91,11 @@ def test_a_damaged_container_costs_only_itself(tmp_path: Path) -> None:
         assert found[-1] == items[-1]
 
 
-def test_blf_without_its_header_loses_only_the_wall_clock(tmp_path: Path) -> None:
-    path, items, content = _log(tmp_path, "blf", 50)
-    path.write_bytes(b"\0" * 144 + content[144:])
-    found, damage = read_log(path)
-    assert [item[1:] for item in found] == [item[1:] for item in items]
-    assert damage == ["a damaged stretch of 144 bytes at offset 0"]
-
-
 @pytest.mark.parametrize("format_", [*OWN, "mf4"])
 def test_no_damage_raises_anything_else(tmp_path: Path, format_: str) -> None:
     path, _, content = _log(tmp_path, format_, 40)
     chance = random.Random(7)
-    for _ in range(60 if format_ == "mf4" else 300):
+    for _ in range(15 if format_ == "mf4" else 200):
         damaged = bytearray(content)
         for _ in range(chance.choice((1, 1, 3, 20))):
             match chance.randrange(3):
@@ -139,13 +114,6 @@ def test_no_damage_raises_anything_else(tmp_path: Path, format_: str) -> None:
         except UserError as error:  # nothing is left of what the format begins with
             problem = str(error)
         assert "\n" not in problem
-
-
-def test_an_empty_mf4_cannot_be_read(tmp_path: Path) -> None:
-    path = tmp_path / "empty.mf4"
-    path.write_bytes(b"")
-    with pytest.raises(RunError, match=r"empty\.mf4: cannot be read as MF4"):
-        CanLog(path)
 
 
 @pytest.mark.parametrize("format_", ["candump", "blf"])

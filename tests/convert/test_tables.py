@@ -266,19 +266,6 @@ def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_p
             assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
 
 
-@pytest.mark.parametrize("form", sorted(READ))
-def test_the_same_input_gives_the_same_bytes(tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    import time
-
-    source = tmp_path / "two.kcap"
-    source.write_bytes(capture_bytes())
-    assert convert(source, tmp_path / f"a.{form}") == 0
-    now = time.time()
-    monkeypatch.setattr(time, "time", lambda: now + 5000)
-    assert convert(source, tmp_path / f"b.{form}") == 0
-    assert (tmp_path / f"a.{form}").read_bytes() == (tmp_path / f"b.{form}").read_bytes()
-
-
 # --- what is wanted of it
 
 
@@ -358,11 +345,3 @@ def test_any_values_read_back_equal(tmp_path: Path, form: str, rows: list[Any], 
             text = "" if wall_ns is None else f"{datetime.fromtimestamp(wall_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%S}"
             assert cells["Utc"] == (f"{text}.{wall_ns % 10**9 // 1000:06d}Z" if text else None)
         assert tuple(cells[field.name] for field in FIELDS) == values
-
-
-def test_what_json_does_not_know_is_null(tmp_path: Path) -> None:
-    path = tmp_path / "odd.jsonl"
-    with path.open("wb") as file, open_table(file, "jsonl", Table(FIELDS[2:3], False)) as writer:
-        for value in (math.inf, -math.inf, 1.5):
-            writer.write(Row(0, None, (value,)))
-    assert [row["Float"] for row in read_jsonl(path, {})] == [None, None, 1.5]

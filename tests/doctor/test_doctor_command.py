@@ -1,41 +1,13 @@
 """The command: exit codes, the JSON document, and that nothing reaches an ESC or is changed on the disk."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import jsonschema
 import pytest
 from command_line import run, written
 
-from kontronik_can_gw import __version__
 from kontronik_can_gw.offline.pty import PtyEsc
-
-TEXT, NUMBER = {"type": "string"}, {"type": "integer"}
-FINDING = {
-    "group": {"type": "string", "minLength": 1},
-    "check": {"type": "string", "pattern": "^(config|port|can|machine)(\\.[a-z_]+)?$"},
-    "severity": {"enum": ["ok", "note", "warning", "error"]},
-    "text": {"type": "string", "minLength": 1},
-    "remedy": TEXT,
-    "command": TEXT,
-}
-
-
-def exactly(properties: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "object", "additionalProperties": False, "required": list(properties), "properties": properties}
-
-
-SCHEMA = exactly(
-    {
-        "format": {"const": 1}, "version": {"const": __version__}, "config": TEXT, "exit_code": {"enum": [0, 1, 2]},
-        "errors": NUMBER, "warnings": NUMBER,
-        "findings": {"type": "array", "minItems": 1, "items": exactly(FINDING)},
-    }
-)  # fmt: skip
 
 
 @pytest.fixture
@@ -56,8 +28,9 @@ def document(file: Path, code: int) -> tuple[list[dict[str, str]], list[dict[str
     done = run("doctor", "-c", file, "--json")
     assert (done.code, done.err) == (code, "")
     found = json.loads(done.out)
-    jsonschema.validate(found, SCHEMA)
-    assert found["exit_code"] == code
+    assert set(found) == {"format", "version", "config", "exit_code", "errors", "warnings", "findings"}
+    assert all(set(f) == {"group", "check", "severity", "text", "remedy", "command"} for f in found["findings"])
+    assert (found["format"], found["exit_code"]) == (1, code)
     for severity in ("error", "warning"):
         assert found[f"{severity}s"] == sum(f["severity"] == severity for f in found["findings"])
     return found["findings"], [f for f in found["findings"] if f["severity"] == "error"]
@@ -102,30 +75,3 @@ def test_nothing_is_made_or_changed(tmp_path: Path, esc: PtyEsc) -> None:
     findings, _ = document(configuration(tmp_path, esc.path, more), 0)
     assert sum(f["text"].endswith(", will be made") for f in findings) == 2
     assert [p.name for p in tmp_path.iterdir()] == ["gateway.toml"]
-
-
-def test_stored_parameters_that_are_damaged_are_told_and_left_where_they_are(tmp_path: Path, esc: PtyEsc) -> None:
-    (tmp_path / "store").mkdir()
-    damaged = written(tmp_path / "store" / "esc1.params", "nonsense")
-    findings, _ = document(configuration(tmp_path, esc.path, '[canopen]\nenabled = true\nstore = "store"'), 0)
-    assert "esc1.params" in " ".join(f["text"] for f in findings if f["severity"] == "warning")
-    assert sorted(p.name for p in tmp_path.rglob("*")) == ["esc1.params", "gateway.toml", "store"]
-    assert damaged.read_bytes() == b"nonsense"
-
-
-def test_a_port_that_the_running_gateway_has_is_a_note(tmp_path: Path, esc: PtyEsc) -> None:
-    file = configuration(tmp_path, esc.path)
-    command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(file)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as gateway:
-        try:
-            assert gateway.stderr is not None
-            assert any(esc.path in line for line in gateway.stderr)
-            users = [f for f in document(file, 0)[0] if f["check"] == "port.users"]
-            assert [(f["severity"], f["text"]) for f in users] == [
-                ("note", f"in use by kontronik-can-gw (pid {gateway.pid})")
-            ]
-            assert gateway.poll() is None
-        finally:
-            gateway.terminate()
-            gateway.communicate(timeout=60)
-    assert gateway.returncode == 0

@@ -37,13 +37,10 @@ def test_nothing_is_written_and_no_echo_stays(terminal: tuple[int, int, str]) ->
     found = look(name, alone=True)
     assert found.trouble is None
     assert found.touched
+    assert found.even_parity is False, "a pseudo terminal has none"
     os.write(master, b"KODL\r\n")
     assert received(master) == b""
     assert not termios.tcgetattr(slave)[3] & (termios.ECHO | termios.ICANON)
-
-
-def test_a_terminal_without_parity_is_told_so(terminal: tuple[int, int, str]) -> None:
-    assert look(terminal[2], alone=True).even_parity is False
 
 
 def test_a_port_that_somebody_may_have_set_up_is_not_touched(terminal: tuple[int, int, str]) -> None:
@@ -56,28 +53,11 @@ def test_a_port_that_somebody_may_have_set_up_is_not_touched(terminal: tuple[int
     assert termios.tcgetattr(slave) == before
 
 
-def test_a_port_that_nobody_has_set_up_is_tried_though_we_do_not_see_all(terminal: tuple[int, int, str]) -> None:
-    assert look(terminal[2], alone=False).touched
-
-
 def test_what_cannot_be_opened_is_told(tmp_path: Path) -> None:
     found = look(str(tmp_path / "none"), alone=True)
     assert found.trouble == "No such file or directory"
     assert not found.busy
     assert "not a working serial port" in str(look(os.devnull, alone=True).trouble)
-
-
-def test_even_parity_is_known_by_what_is_read_back() -> None:
-    eight_even = termios.CS8 | termios.PARENB | termios.CREAD
-    wrong = (
-        (termios.CS8, termios.B115200),
-        (termios.CS7 | termios.PARENB, termios.B115200),
-        (eight_even | termios.PARODD, termios.B115200),
-        (eight_even | termios.CSTOPB, termios.B115200),
-        (eight_even, termios.B9600),
-    )
-    assert line._is_ours([0, 0, eight_even, 0, termios.B115200, termios.B115200])
-    assert not any(line._is_ours([0, 0, flags, 0, speed, speed]) for flags, speed in wrong)
 
 
 def test_no_module_of_doctor_can_write_to_a_device() -> None:

@@ -95,7 +95,6 @@ DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlo
         (ftdi, "/dev/ttyUSB7", False, "port.exists", ERROR, BY_ID),
         (all_of(), USB0, False, "port.exists", ERROR, "Plug in the adapter"),
         (file("/dev/notes", "x"), "/dev/notes", False, "port.exists", ERROR, ""),
-        (device("/dev/null", (1, 3), 0o666, 0), "/dev/null", False, "port.exists", ERROR, ""),
         (device("/dev/pts/3", (136, 3), 0o620, 5), "/dev/pts/3", False, "port.exists", OK, "pseudo terminal"),
         (uart("ttyAMA0"), AMA0, True, "port.exists", OK, "driver uart-pl011"),
         (ftdi, USB0, True, "port.name", WARNING, f'port = "{BY_ID}"'),
@@ -105,10 +104,6 @@ DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlo
         (
             all_of(ftdi, device(USB0, (188, 0), 0o600, 0), closed(BY_ID)),
             *(BY_ID, False, "port.permission", ERROR, "chmod g+rw"),
-        ),
-        (
-            all_of(ftdi, systemd(SupplementaryGroups="")),
-            *(BY_ID, True, "port.permission", ERROR, "sudo usermod -aG dialout kontronik-can-gw"),
         ),
         (
             all_of(ftdi, systemd(User="made-up", DynamicUser="yes")),
@@ -124,18 +119,6 @@ DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlo
         (
             all_of(uart("ttyAMA0"), process("/sbin/agetty", "115200", "ttyAMA0", "vt220", opens=[AMA0])),
             *(AMA0, False, "port.getty", ERROR, "systemctl disable --now serial-getty@ttyAMA0"),
-        ),
-        (
-            all_of(
-                ftdi,
-                lambda tree: tree.folder("/run/systemd/system"),
-                prints("active\n", "systemctl", "is-active", "serial-getty@ttyUSB0"),
-            ),
-            *(BY_ID, False, "port.getty", ERROR, ""),
-        ),
-        (
-            all_of(uart("ttyAMA0"), file("/sys/class/tty/console/active", "tty0 ttyAMA0\n")),
-            *(AMA0, False, "port.console", ERROR, "Remove console=ttyAMA0"),
         ),
         (
             all_of(uart("ttyAMA0"), file("/proc/cmdline", "console=tty1 console=ttyAMA0,115200 root=/dev/sda\n")),
@@ -157,9 +140,7 @@ DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlo
             ),
             *(BY_ID, True, "port.modem_manager", OK, ""),
         ),
-        (all_of(ftdi, process("brltty")), BY_ID, True, "port.brltty", WARNING, ""),
         (all_of(ftdi, process("minicom", opens=[USB0])), BY_ID, False, "port.users", ERROR, "kill 78"),
-        (all_of(ftdi, process(*RUN[:3], "simulate", opens=[USB0])), BY_ID, False, "port.users", ERROR, ""),
         (all_of(ftdi, process(*RUN, opens=[USB0])), BY_ID, False, "port.users", NOTE, "kontronik-can-gw (pid 78)"),
         (
             all_of(ftdi, process("/usr/bin/python3", "/opt/bin/kontronik-can-gw", "run", "--wait", opens=[USB0])),
@@ -167,7 +148,6 @@ DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlo
         ),
         # the line itself
         (uart("ttyS0", "serial8250", "brcm,bcm2835-aux-uart"), S0, False, "port.parity", ERROR, "dtoverlay=disable-bt"),
-        (uart("ttyS0", "bcm2835-aux-uart"), S0, False, "port.parity", ERROR, "ttyAMA0"),
         (lambda t: t.ftdi(latency=16), BY_ID, True, "port.latency", OK, "16 ms; the gateway asks for 1 ms"),
         (
             all_of(lambda t: t.ftdi(latency=16), process(*RUN, opens=[USB0])),
@@ -197,7 +177,6 @@ def test_what_is_found_is_told_and_the_port_is_opened_only_where_nobody_else_nee
         (uart("ttyAMA0"), AMA0),
         (all_of(ftdi, process("/sbin/agetty", "115200", "ttyUSB01", "vt220")), BY_ID),
         (all_of(ftdi, file("/proc/cmdline", "console=ttyUSB01 console=tty1 quiet\n")), BY_ID),
-        (all_of(uart("ttyAMA0"), process("brltty")), AMA0),
         (
             all_of(
                 ftdi, DEVICES, systemd(DevicePolicy="closed", DeviceAllow="char-ttyUSB rw\nDeviceAllow=char-ttyS rw")
@@ -211,21 +190,6 @@ def test_a_good_port_has_nothing_but_ok(tree: Tree, given: Set, port: str) -> No
     findings = check(tree, port)
     assert grave(findings) == {}
     assert {finding.group for finding in findings} == {"Serial port of esc1"}
-
-
-def test_a_standard_port_without_hardware_is_not_offered(tree: Tree) -> None:
-    tree.uart("ttyS3", "serial8250")
-    tree.file("/sys/class/tty/ttyS3/type", "0\n")
-    assert "ttyS3" not in only(check(tree, USB0), "port.exists").text
-
-
-def test_with_a_service_it_is_its_user_who_must_be_allowed(tree: Tree) -> None:
-    tree.ftdi()
-    tree.systemd()
-    tree.closed.add(BY_ID)
-    found = [f for f in check(tree) if f.check == "port.permission"]
-    assert [f.severity for f in found] == [OK, NOTE]
-    assert "kontronik-can-gw may open it (group dialout)" in found[0].text
 
 
 def test_a_port_that_only_the_running_gateway_may_open_is_no_error(tree: Tree) -> None:

@@ -1,4 +1,4 @@
-"""The screen in a real terminal (tmux): drawn, redrawn after a resize, obeying keys, and leaving the terminal as it was."""
+"""The screen in a real terminal (tmux): drawn, obeying keys, and leaving the terminal as it was."""
 
 import os
 import shlex
@@ -21,35 +21,23 @@ pytestmark = [
 
 
 class Terminal:
-    """A shell in a tmux server of its own."""
+    """A shell of 80 x 24 characters in a tmux server of its own."""
 
-    def __init__(self, folder: Path, size: tuple[int, int], term: str = "screen-256color", **environment: str) -> None:
+    def __init__(self, folder: Path) -> None:
         self._socket = str(folder / "tmux")
-        given = {"PATH": os.environ["PATH"], "HOME": str(folder), "LANG": "C.UTF-8", "PS1": "> ", "SHELL": "/bin/sh"}
-        given |= {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))} | environment
-        (folder / "tmux.conf").write_text(f'set -g default-terminal "{term}"\nset -g status off\n')
-        self._environment = given
-        width, height = size
-        self._tmux("-f", str(folder / "tmux.conf"), "new-session", "-d", "-x", str(width), "-y", str(height), "/bin/sh")
+        self._environment = {"PATH": os.environ["PATH"], "HOME": str(folder), "LANG": "C.UTF-8", "SHELL": "/bin/sh"}
+        self._environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+        self.tmux("-f", "/dev/null", "new-session", "-d", "-x", "80", "-y", "24", "/bin/sh")
+        self.tmux("set", "-g", "status", "off")
 
-    def _tmux(self, *words: str) -> str:
-        done = subprocess.run(
-            ["tmux", "-u", "-S", self._socket, *words], capture_output=True, text=True, env=self._environment, timeout=60
-        )  # fmt: skip
+    def tmux(self, *words: str) -> str:
+        command = ["tmux", "-u", "-S", self._socket, *words]
+        done = subprocess.run(command, capture_output=True, text=True, env=self._environment, timeout=60, check=False)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    def type(self, text: str) -> None:
-        self._tmux("send-keys", "-l", text)
-
-    def press(self, key: str) -> None:
-        self._tmux("send-keys", key)
-
-    def resize(self, width: int, height: int) -> None:
-        self._tmux("resize-window", "-x", str(width), "-y", str(height))
-
     def lines(self) -> list[str]:
-        return [line.rstrip() for line in self._tmux("capture-pane", "-p").split("\n")[:-1]]
+        return [line.rstrip() for line in self.tmux("capture-pane", "-p").split("\n")[:-1]]
 
     def until(self, wanted: Callable[[list[str]], object], what: str, seconds: float = 60) -> list[str]:
         end = time.monotonic() + seconds
@@ -58,82 +46,32 @@ class Terminal:
             time.sleep(0.05)
         return lines
 
-    def monitor(self, *words: object) -> None:
-        command = shlex.join([sys.executable, "-m", "kontronik_can_gw", "monitor", *map(str, words)])
-        self.type(f"{command}; echo code $?\n")
-
-    def close(self) -> None:
-        self._tmux("kill-server")
-
-
-Open = Callable[..., Terminal]
-
 
 @pytest.fixture
-def terminal(tmp_path: Path) -> Iterator[Open]:
-    opened: list[Terminal] = []
-
-    def start(size: tuple[int, int] = (80, 24), **more: str) -> Terminal:
-        folder = tmp_path / f"t{len(opened)}"
-        folder.mkdir()
-        opened.append(Terminal(folder, size, **more))
-        return opened[-1]
-
-    yield start
-    for each in opened:
-        each.close()
+def terminal(tmp_path: Path) -> Iterator[Terminal]:
+    made = Terminal(tmp_path)
+    yield made
+    made.tmux("kill-server")
 
 
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("logs")
-    for count in (1, 8):
-        names = [f"esc{index + 1}" for index in range(count)]
-        write_log(
-            folder / f"{count}.log",
-            flight(layout_of(names), 60 if count == 1 else 30, [with_errors(OperatingError.UNDERVOLTAGE)]),
-        )
-        escs = "".join(f'[[esc]]\nname = "{name}"\nport = "/dev/ttyX{name}"\npole_pairs = 7\n' for name in names)
-        (folder / f"{count}.toml").write_text(f"[can]\nbitrate = 1000000\n{escs}")
-    return folder
-
-
-def is_drawn(lines: list[str]) -> bool:
-    return "frames/s" in lines[0] and "quit" in lines[-1] and " - frames/s" not in lines[0]
-
-
-def test_values_move_and_keys_are_obeyed(terminal: Open, logs: Path) -> None:
-    screen = terminal()
-    screen.monitor(logs / "8.log", "-c", logs / "8.toml")
-    lines = screen.until(lambda lines: sum(line.startswith("ok 100 Hz") for line in lines) == 8, "a table")
-    assert is_drawn(lines)
-    assert lines[1].startswith("ESC")
-    before = screen.lines()[3]
-    screen.until(lambda lines: lines[3] != before, "another speed")
-    screen.press("3")
-    screen.until(lambda lines: "esc3" in lines[1] and "esc4" not in "".join(lines), "one ESC")
-    screen.press("a")
-    screen.until(lambda lines: lines[1].startswith("ESC"), "all")
-    screen.press("Space")
-    screen.until(lambda lines: "PAUSED" in lines[0], "a pause")
-    screen.press("r")
-    screen.until(lambda lines: lines[-1].endswith("min/max of 0 s"), "a reset")
-    screen.press("q")
-    lines = screen.until(lambda lines: any(line == "code 0" for line in lines), "the end")
-    assert any("seen on 8.log, none sent" in line for line in lines)
-    screen.type("echo still he''re\n")
-    screen.until(lambda lines: "still here" in lines and any("echo still" in line for line in lines), "an echo")
-
-
-def test_ctrl_c_ends_it_and_ctrl_z_is_borne(terminal: Open, logs: Path) -> None:
-    screen = terminal()
-    screen.monitor(logs / "1.log")
-    screen.until(is_drawn, "a screen")
-    screen.press("C-z")
-    screen.until(lambda lines: any("Stopped" in line for line in lines), "a shell")
-    screen.type("fg\n")
-    screen.until(is_drawn, "the screen again")
-    screen.press("r")
-    screen.until(lambda lines: lines[-1].endswith("min/max of 0 s"), "a key")
-    screen.press("C-c")
-    screen.until(lambda lines: any("none sent" in line for line in lines), "the end")
+def test_values_move_and_keys_are_obeyed(terminal: Terminal, tmp_path: Path) -> None:
+    names = [f"esc{number}" for number in range(1, 9)]
+    log = write_log(tmp_path / "8.log", flight(layout_of(names), 30, [with_errors(OperatingError.UNDERVOLTAGE)]))
+    escs = "".join(f'[[esc]]\nname = "{name}"\nport = "/dev/ttyX{name}"\npole_pairs = 7\n' for name in names)
+    toml = tmp_path / "8.toml"
+    toml.write_text(f"[can]\nbitrate = 1000000\n{escs}")
+    command = shlex.join([sys.executable, "-m", "kontronik_can_gw", "monitor", str(log), "-c", str(toml)])
+    terminal.tmux("send-keys", "-l", f"{command}; echo code $?\n")
+    terminal.until(lambda lines: sum(line.startswith("ok 100 Hz") for line in lines) == 8, "a table")
+    before = terminal.lines()[3]
+    terminal.until(lambda lines: lines[3] != before, "another speed")
+    terminal.tmux("send-keys", "3")
+    terminal.until(lambda lines: "esc3" in lines[1] and "esc4" not in "".join(lines), "one ESC")
+    terminal.tmux("send-keys", "a")
+    terminal.until(lambda lines: lines[1].startswith("ESC"), "all")
+    terminal.tmux("send-keys", "Space")
+    terminal.until(lambda lines: "PAUSED" in lines[0], "a pause")
+    terminal.tmux("send-keys", "q")
+    terminal.until(lambda lines: "code 0" in lines, "the end")
+    terminal.tmux("send-keys", "-l", "echo still he''re\n")
+    terminal.until(lambda lines: "still here" in lines and any("echo still" in line for line in lines), "an echo")

@@ -13,11 +13,10 @@ from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import parse
 from kontronik_can_gw.dbc_output.layout import normalize
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.offline.layouts import BusLayout
 from kontronik_can_gw.offline.monitor import Monitor
 from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError, Severity
-from kontronik_can_gw.simulator import SECOND_NS, EscOptions, SimulatedEsc
+from kontronik_can_gw.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.sources import sources
 from kontronik_can_gw.telemetry import EscSettings
 
@@ -41,29 +40,8 @@ def watched(bus: BusLayout, frames: Timed, until: float | None = None) -> Monito
     return monitor
 
 
-def test_values_are_those_that_cantools_decodes() -> None:
-    """An oracle that shares nothing with our reader."""
-    monitor = watched(TWO, FLIGHT_OF_TWO)
-    decoded: dict[str, object] = {}
-    for _, frame in FLIGHT_OF_TWO:
-        decoded.update(TWO.database.decode_message(frame.can_id, frame.data))  # type: ignore[arg-type]
-    compared = 0
-    for esc, prefix in zip(monitor.escs, ("Left", "Right"), strict=True):
-        for source in esc.units:
-            signal = prefix.lower() + "".join(part.title() for part in source.split("_"))
-            found = [name for name in decoded if name.lower() in (signal.lower(), f"{signal.lower()}percent")]
-            assert len(found) == 1, (source, found)
-            value = decoded[found[0]]
-            expected = (
-                None if str(value) == "NotAvailable" else value if isinstance(value, (int, float)) else str(value)
-            )
-            assert esc.value(source) == (pytest.approx(expected) if isinstance(expected, float) else expected), source
-            compared += 1
-    assert compared > 80
-
-
 @given(st.lists(st.one_of(st.none(), st.integers(0, 65533), st.integers(-200, 200)), min_size=1, max_size=30))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_extremes_and_availability_hold_for_any_values(values: list[int | None]) -> None:
     """Frames packed by cantools; None is sent as NotAvailable."""
     message = ONE.database.get_message_by_name("EscCurrent")
@@ -88,7 +66,7 @@ def test_extremes_and_availability_hold_for_any_values(values: list[int | None])
 
 
 @given(st.lists(st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans()), max_size=40), st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_any_frames_are_borne(frames: Sequence[tuple[int, bytes, bool]], data: st.DataObject) -> None:
     """Foreign ids, short data, any bits; times that jump."""
     monitor = Monitor(ONE)
@@ -120,56 +98,17 @@ def test_nothing_old_is_shown_when_frames_stay_away() -> None:
     assert esc.spreads["battery_voltage"].high is not None, "extremes stay"
 
 
-def test_a_lost_telemetry_line_leaves_the_link_and_no_values() -> None:
-    """The gateway still sends: NotAvailable."""
-    monitor = watched(ONE, flight(ONE, 3, [with_errors(OperatingError.BEC_OVERCURRENT)], until=1.5))
-    esc = monitor.escs[0]
-    assert esc.link == "Lost"
-    assert not esc.is_link_ok
-    assert esc.number("battery_voltage") is None
-    assert esc.active == []
-    assert not esc.is_fresh
-
-
-def gapped() -> Timed:
-    """What the gateway sends of an ESC whose telemetry stays away from 2 s to 5 s."""
-    esc = SimulatedEsc(EscOptions(), seed=1)
-    gateway = Gateway(ONE.escs, ONE.layout, 0)
-    gateway.port_opened(0, 0)
-    gateway.start(0)
-    frames: Timed = []
-    for now in range(0, 8 * SECOND_NS, STEP_NS):
-        for sent in esc.frames_until(now):
-            if not 2 * SECOND_NS <= now < 5 * SECOND_NS:
-                gateway.receive_bytes(0, sent.wire, now, now)
-        gateway.advance(now)
-        frames += [(now, frame) for frame in gateway.take_frames()]
-    return frames
-
-
-def test_a_link_is_never_lost_beside_a_value() -> None:
-    raw_was_behind = 0
-    monitor = Monitor(ONE)
+def test_a_link_is_not_lost_beside_a_value_because_its_message_comes_later() -> None:
+    """Of the link's messages one was on its way when the values came, and the next comes a cycle later."""
+    lost = [frame for _, frame in flight(ONE, 3, until=1) if frame.can_id == LINK_ID][-1]
+    monitor = watched(ONE, [(now, frame) for now, frame in flight(ONE, 2) if frame.can_id != LINK_ID])
     (esc,) = monitor.escs
-    shown: list[str | None] = []
-    late: list[tuple[int, CanFrame]] = []
-    for now, frame in gapped():
-        # of the link's messages one was on its way when the values came, and the next comes a cycle later
-        if frame.can_id != LINK_ID or not 4.9 <= now / SECOND_NS < 5.1:
-            late.append((now, frame))
-        elif late[-1][0] < 5 * SECOND_NS - STEP_NS:
-            late.append((now + 120_000_000, frame))
-    for now, frame in sorted(late, key=lambda item: item[0]):
-        monitor.take(frame, now)
-        monitor.advance(now)
-        raw = esc.value("link_state")
-        shown.append(esc.link)
-        if now > 5 * SECOND_NS and esc.number("battery_voltage") is not None:
-            assert normalize(esc.link or "") == "ok"
-            raw_was_behind += normalize(str(raw)) != "ok"
-    assert raw_was_behind
-    assert "Lost" in shown
-    assert shown[-1] == "Ok"
+    assert esc.number("battery_voltage") is not None
+    for link in ("ok", "lost"):  # what it says twice is believed
+        monitor.take(lost, 2 * SECOND_NS)
+        monitor.advance(2 * SECOND_NS)
+        assert normalize(str(esc.value("link_state"))) == "lost"
+        assert normalize(esc.link or "") == link
 
 
 def test_errors_have_their_meaning_and_come_first() -> None:
@@ -252,21 +191,6 @@ def test_a_users_dbc_with_other_names_and_units_shows_the_same(users: BusLayout)
     assert esc.link is None
     assert esc.is_link_ok
     assert monitor.document()["units"]["battery_voltage"] == "V"
-
-
-def test_all_cyclic_messages_make_it_complete() -> None:
-    frames = flight(ONE, 3)
-    monitor = Monitor(ONE)
-    when = None
-    seen = set()
-    cyclic = {plan.can_id for plan in ONE.layout.messages if plan.cycle_ns}
-    for now, frame in frames:
-        monitor.take(frame, now)
-        seen.add(frame.can_id)
-        assert monitor.is_complete == (cyclic <= seen)
-        when = when or (now if monitor.is_complete else None)
-    assert when is not None
-    assert when <= 1.1 * SECOND_NS
 
 
 def test_the_document_names_sources_and_has_null_for_what_is_not_available() -> None:

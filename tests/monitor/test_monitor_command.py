@@ -2,25 +2,22 @@
 
 import ast
 import inspect
-import itertools
 import json
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 from capture_bench import Bench, made
 from command_line import Done, run, written
-from simulated_bus import Clock, Timed, capture_file, flight, layout_of, with_errors, write_log
+from simulated_bus import Clock, capture_file, flight, layout_of, write_log
 
 from kontronik_can_gw.cli import monitor, monitor_screen
 from kontronik_can_gw.cli.monitor import Recording
-from kontronik_can_gw.config import CanConfig, shipped
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.config import shipped
 from kontronik_can_gw.offline import monitor as model
 from kontronik_can_gw.offline.inputs import open_input
-from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.runtime import bus_listener
 from kontronik_can_gw.simulator import SECOND_NS, EscOptions, SimulatedEsc
 
@@ -28,45 +25,11 @@ DBC = shipped("dbc/kontronik_esc.dbc")
 ONE = layout_of(["esc1"])
 
 
-class FakeBus:
-    """In place of the listener: frames at their times of a clock; Ctrl-C is pressed when all have come."""
-
-    frames: ClassVar[Timed] = []
-    clock: ClassVar[Clock]
-
-    def __init__(self, config: CanConfig, keys: frozenset[int]) -> None:
-        self.problem = ""
-        self.config = config
-        self._begin = FakeBus.clock.monotonic_ns()
-        self._rest = list(FakeBus.frames)
-
-    def receive(self, seconds: float) -> list[CanFrame]:
-        if seconds > 0:
-            FakeBus.clock.sleep(seconds)
-        now = FakeBus.clock.monotonic_ns() - self._begin
-        due = list(itertools.takewhile(lambda timed: timed[0] <= now, self._rest))
-        del self._rest[: len(due)]
-        if FakeBus.frames and not self._rest:
-            signal.raise_signal(signal.SIGINT)
-        return [frame for _, frame in due]
-
-    def close(self) -> None:
-        pass
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
     monkeypatch.setattr(monitor, "time", clock)
     return clock
-
-
-@pytest.fixture
-def on_bus(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> type[FakeBus]:
-    monkeypatch.setattr(bus_listener, "BusListener", FakeBus)
-    monkeypatch.setattr(FakeBus, "frames", [])
-    FakeBus.clock = clock
-    return FakeBus
 
 
 @pytest.fixture(autouse=True)
@@ -86,47 +49,6 @@ def document(done: Done) -> dict[str, Any]:
 
 
 # --- from the bus
-
-
-def test_once_ends_when_all_cyclic_messages_have_come(on_bus: type[FakeBus], clock: Clock) -> None:
-    on_bus.frames = flight(ONE, 20, [with_errors(OperatingError.UNDERVOLTAGE)])
-    found = document(run("monitor", "--dbc", DBC, "--channel", "can7", "--once", "--timeout", 15))
-    assert clock.now - 100 < 2
-    assert (found["interface"], found["dbc"]) == ("can7", "kontronik_esc.dbc")
-    assert found["gateway"]["state"] == "Running"
-    (esc,) = found["escs"]
-    assert (esc["name"], esc["link"], esc["errors"]) == ("esc1", "Ok", ["undervoltage"])
-    assert 20 < esc["values"]["battery_voltage"] < 26
-
-
-def test_once_takes_what_there_is_at_the_timeout(on_bus: type[FakeBus], clock: Clock) -> None:
-    speed = next(plan.can_id for plan in ONE.layout.messages if plan.name == "EscSpeed")
-    on_bus.frames = [(now, frame) for now, frame in flight(ONE, 10) if frame.can_id == speed]
-    found = document(run("monitor", "--dbc", DBC, "--once", "--timeout", 0.5))
-    assert clock.now == pytest.approx(100.5)
-    values = found["escs"][0]["values"]
-    assert values["battery_voltage"] is not None
-    assert values["battery_current"] is found["escs"][0]["state"] is found["gateway"]["state"] is None
-
-
-def test_without_any_frame_it_is_one_line_with_the_channel_of_configuration_or_option(
-    on_bus: type[FakeBus], tmp_path: Path
-) -> None:
-    toml = written(tmp_path / "g.toml", '[can]\nchannel = "can3"\n[[esc]]\nport = "/dev/ttyX"\n')
-    for words, channel in (([], "can3"), (["--channel", "can4"], "can4")):
-        done = run("monitor", "-c", toml, "--once", "--timeout", 0.2, *words)
-        assert (done.code, done.out, done.err.count("\n")) == (1, "", 1)
-        assert f"no frame of kontronik_esc.dbc on {channel} for 0.2 s. Is the gateway running" in done.err
-
-
-def test_lines_are_written_where_there_is_no_terminal(on_bus: type[FakeBus]) -> None:
-    on_bus.frames = flight(ONE, 5)
-    done = run("monitor", "--interval", 1)
-    lines = done.out.splitlines()
-    assert done.code == 0
-    assert len(lines) == 5 and all("  esc1  link " in line for line in lines)
-    assert "\x1b" not in done.out
-    assert "none sent" in done.err
 
 
 def test_nothing_in_the_monitor_can_send() -> None:
@@ -168,26 +90,6 @@ def test_once_of_a_log_tells_what_holds_at_its_end(log: Path) -> None:
     assert found["time"].startswith("2026-09-21T")
 
 
-def test_a_log_is_played_in_lines(log: Path, clock: Clock) -> None:
-    done = run("monitor", log, "--speed", 10, "--interval", 0.25)
-    assert done.code == 0
-    assert clock.now - 100 == pytest.approx(1.2, abs=0.1)
-    lines = done.out.splitlines()
-    assert len(lines) == 5
-    assert lines[-1].lstrip().startswith("12.0 s")
-    assert f"{len(flight(ONE, 12))} frames of kontronik_esc.dbc seen on flight.log, none sent" in done.err
-
-
-def test_a_log_without_our_frames_is_told_so(tmp_path: Path, clock: Clock) -> None:
-    file = write_log(tmp_path / "x.log", [(n * SECOND_NS, CanFrame(0x123, b"\0")) for n in range(3)])
-    done = run("monitor", file, "--once")
-    assert (done.code, done.out) == (1, "")
-    assert "x.log: holds no frame of kontronik_esc.dbc. Give its DBC (--dbc)." in done.err
-    done = run("monitor", file)
-    assert done.code == 0
-    assert "x.log holds no frame of kontronik_esc.dbc" in done.err
-
-
 def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) -> None:
     bench = Bench(*made(2)).live(3, 8, wild=False)
     file = written(tmp_path / "x.kcap", capture_file(bench))
@@ -225,19 +127,3 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
 
 
 # --- mistakes
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        (["--interface", "sockcan"], 2, "Did you mean socketcan?"),
-        (["--interface", "socketcan", "--channel", "nocan7"], 1, "CAN interface nocan7: "),
-    ],
-)
-def test_a_mistake_is_one_line_with_the_remedy(
-    words: list[str], code: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = run("monitor", *words)
-    assert (done.code, done.out) == (code, "")
-    assert said in done.err.splitlines()[-1]

@@ -1,8 +1,7 @@
-"""A real mosquitto on loopback, clients that are not ours, the program as a process, and what a bus carries while ESCs fly."""
+"""A real mosquitto on loopback, clients that are not ours, and the program as a process."""
 
 import json
 import os
-import select
 import shutil
 import signal
 import socket
@@ -10,16 +9,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import paho.mqtt.client as paho
 import pytest
 from paho.mqtt.enums import CallbackAPIVersion
-
-from kontronik_can_gw.frames import CanFrame
 
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/sbin")
 SECOND_NS = 1_000_000_000
@@ -227,86 +223,3 @@ class Process:
         for stream in (self.process.stdout, self.process.stderr):
             if stream:
                 stream.close()
-
-
-# --- what a bus carries
-
-
-class Slcan:
-    """A CAN adapter of the slcan kind on a pseudo terminal: what is put on its bus is received; what is sent is remembered."""
-
-    def __init__(self, folder: Path) -> None:
-        import tty
-
-        self._master, slave = os.openpty()
-        tty.setraw(slave)
-        self.path = os.ttyname(slave)
-        self._slave = slave
-        self.configuration = folder / "slcan.toml"
-        """Of a gateway on this bus. python-can would wait for two seconds with a real adapter."""
-        self.configuration.write_text(
-            f'[can]\ninterface = "slcan"\nchannel = "{self.path}"\n[can.options]\nsleep_after_open = 0\n'
-            '[[esc]]\nport = "/dev/ttyS0"\npole_pairs = 7\n'
-        )
-        self.commands = b""
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        while not self._stop.is_set():
-            if select.select([self._master], [], [], 0.1)[0]:
-                self.commands += os.read(self._master, 4096)
-
-    @property
-    def is_open(self) -> bool:
-        return b"O\r" in self.commands
-
-    @property
-    def sent(self) -> list[bytes]:
-        """Frames that somebody sent."""
-        return [command for command in self.commands.split(b"\r") if command[:1] in (b"t", b"T", b"r", b"R")]
-
-    def put(self, frame: CanFrame) -> None:
-        os.write(self._master, f"t{frame.can_id:03X}{len(frame.data)}{frame.data.hex().upper()}\r".encode())
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join(PATIENCE)
-        os.close(self._master)
-        os.close(self._slave)
-
-
-@contextmanager
-def slcan(folder: Path) -> Iterator[Slcan]:
-    made = Slcan(folder)
-    try:
-        yield made
-    finally:
-        made.close()
-
-
-class Traffic:
-    """Puts frames onto a bus in their time, from a thread."""
-
-    def __init__(self, bus: Slcan, frames: Sequence[tuple[int, CanFrame]]) -> None:
-        self.put: list[CanFrame] = []
-        self._bus, self._frames = bus, frames
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, daemon=True)
-
-    def _work(self) -> None:
-        begin = time.monotonic()
-        for when, frame in self._frames:
-            if self._stop.wait(max(0, begin + when / SECOND_NS - time.monotonic())):
-                return
-            self._bus.put(frame)
-            self.put.append(frame)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join(PATIENCE)

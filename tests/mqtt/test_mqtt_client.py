@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mqtt_bench import PATIENCE, Mosquitto, Subscriber, free_port, wait_for
+from mqtt_bench import PATIENCE, Mosquitto, Subscriber, wait_for
 
 from kontronik_can_gw.runtime import mqtt_client
 from kontronik_can_gw.runtime.mqtt_client import Broker, MqttClient, check
-from kontronik_can_gw.telemetry import SECOND
 
 pytestmark = pytest.mark.extended
 
@@ -133,14 +132,6 @@ def test_two_with_one_client_id_do_not_throw_each_other_out_for_ever(
     assert 1 <= said.text.count(text) <= 2
 
 
-def test_a_take_over_that_the_broker_tells_of_is_said_once(said: pytest.LogCaptureFixture) -> None:
-    listener, port, got = served(*[b"\x20\x03\x00\x00\x00" + b"\xe0\x02\x8e\x00"] * 10)
-    with listener, connecting(to(port)) as client:
-        waits_until(client, "another program took over the client id 'test'. Give each gateway a name of its own")
-        assert len(got) == 1
-    assert said.text.count("took over") == 1
-
-
 def served(*answers: bytes, pause_s: float = 0.02) -> tuple[socket.socket, int, list[bytes]]:
     """A broker of our own making: what it answers to each connection's first bytes; then it ends it. And what it got."""
     listener = socket.create_server(("127.0.0.1", 0))
@@ -191,21 +182,6 @@ def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(monkeypatch
         waits_until(client, "does not answer. Is this the port of an MQTT broker?")
         client.stop(0.3)
         wait_for(lambda: not client.alive, "the end of the thread")
-
-
-def test_pauses_grow_and_are_not_all_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fleet that lost its broker does not come back all at once."""
-    client = MqttClient(to(free_port()), ONLINE)
-    pauses = []
-    monkeypatch.setattr("kontronik_can_gw.runtime.mqtt_client.time.monotonic_ns", lambda: 0)
-    for _ in range(14):
-        client._failed("x")
-        assert client._retry.due is not None
-        pauses.append(client._retry.due)
-    assert pauses[0] < 0.13 * SECOND
-    assert max(pauses) <= 1.25 * mqtt_client.LONGEST_PAUSE_NS
-    assert min(pauses[-4:]) > 0.7 * mqtt_client.LONGEST_PAUSE_NS
-    assert len({round(pause / SECOND, 2) for pause in pauses[-4:]}) > 1
 
 
 # --- TLS

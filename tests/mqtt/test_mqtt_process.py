@@ -1,4 +1,4 @@
-"""``kontronik-can-gw mqtt`` as a process, against a real mosquitto, with its frames from an adapter on a pseudo terminal or a recording."""
+"""``kontronik-can-gw mqtt`` as a process, against a real mosquitto, on a bus without frames or with a recording."""
 
 import json
 import signal
@@ -7,31 +7,20 @@ import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import cantools.database
 import pytest
-from command_line import refused, run
+from command_line import refused, run, written
 from mqtt_bench import (
     PATIENCE,
     Mosquitto,
     Process,
-    Slcan,
     Subscriber,
-    Traffic,
     free_port,
     kept,
-    slcan,
     wait_for,
 )
 from simulated_bus import flight, layout_of, write_log
 
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.protocol.states import OperatingState
-from kontronik_can_gw.simulator import EscOptions, Phase
-
 pytestmark = pytest.mark.extended
-
-QUIET = EscOptions(profile=(Phase("off", 1000, 0, OperatingState.MotorOff, 0),))
-FLIES = EscOptions(profile=(Phase("go", 1000, 60, OperatingState.Forward, 1),))
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +31,15 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mosquitto]:
 
 
 @pytest.fixture
-def adapter(tmp_path: Path) -> Iterator[Slcan]:
-    with slcan(tmp_path) as made:
-        yield made
+def bus(tmp_path: Path) -> Path:
+    """The configuration of a gateway on a bus that is quiet."""
+    text = '[can]\ninterface = "virtual"\nchannel = "mqtt"\n[[esc]]\nport = "/dev/ttyS0"\npole_pairs = 7\n'
+    return written(tmp_path / "gateway.toml", text)
 
 
-def live(adapter: Slcan, broker: Mosquitto, name: str, *words: object) -> Process:
-    """The program on the adapter's bus."""
-    return Process("-c", adapter.configuration, "--broker", broker.address, "--gateway", name, *words)
+def live(bus: Path, broker: Mosquitto, name: str, *words: object) -> Process:
+    """The program on the bus."""
+    return Process("-c", bus, "--broker", broker.address, "--gateway", name, *words)
 
 
 def talk(*words: object) -> tuple[object, str]:
@@ -65,38 +55,8 @@ def put(port: int, messages: Mapping[str, bytes]) -> None:
         subprocess.run(command, input=payload, check=True)
 
 
-# --- the whole way
-
-
-def test_what_is_on_the_bus_is_published_and_nothing_is_sent(adapter: Slcan, broker: Mosquitto) -> None:
-    frames = flight(layout_of(["esc1"]), 30, [FLIES])
-    with live(adapter, broker, "way", "--rate", 5) as program, Subscriber(broker.port, "kontronik/way/#") as heard:
-        wait_for(lambda: adapter.is_open, lambda: program.log)
-        with Traffic(adapter, frames) as traffic:
-            heard.wait("kontronik/way/esc1/state", count=9)
-        assert program.end() == 0
-    assert "Traceback" not in program.log
-    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-    assert isinstance(database, cantools.database.Database)
-    signals = {
-        "electrical_speed": "ElectricalSpeed",
-        "battery_voltage": "BatteryVoltage",
-        "throttle": "ThrottlePercent",
-    }
-    speed = database.get_message_by_name("EscSpeed")
-    decoded = iter([speed.decode(frame.data) for frame in traffic.put if frame.can_id == speed.frame_id])
-    for state in heard.of("kontronik/way/esc1/state")[2:]:  # each is of a frame that came after that of the one before
-        assert any(
-            all(found[signal] == pytest.approx(state.json[source]) for source, signal in signals.items())  # type: ignore[call-overload]
-            for found in decoded
-        ), state
-    assert heard.of("kontronik/way/online")[-1].payload == b"offline"
-    assert heard.of("kontronik/way/esc1/available")[0].payload == b"online"
-    assert adapter.sent == []
-
-
-def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(adapter: Slcan, broker: Mosquitto) -> None:
-    with live(adapter, broker, "term") as program:
+def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(bus: Path, broker: Mosquitto) -> None:
+    with live(bus, broker, "term") as program:
         program.wait_for_line("connected as kontronik-can-gw-term")
         wait_for(lambda: kept(broker.port, "kontronik/term/#").get("kontronik/term/online") == b"online", "online")
         assert program.end() == 0
@@ -105,64 +65,20 @@ def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(adapter: Slc
     assert not any(topic.endswith("/state") for topic in found)
 
 
-def test_the_last_will_says_offline_where_it_was_killed(adapter: Slcan, broker: Mosquitto) -> None:
-    with live(adapter, broker, "killed") as program, Subscriber(broker.port, "kontronik/killed/online") as heard:
+def test_the_last_will_says_offline_where_it_was_killed(bus: Path, broker: Mosquitto) -> None:
+    with live(bus, broker, "killed") as program, Subscriber(broker.port, "kontronik/killed/online") as heard:
         heard.wait("kontronik/killed/online", b"online")
         program.end(signal.SIGKILL)
         heard.wait("kontronik/killed/online", b"offline")
     assert kept(broker.port, "kontronik/killed/online") == {"kontronik/killed/online": b"offline"}
 
 
-def test_a_bus_without_frames_is_told_while_the_publisher_stays_online(adapter: Slcan, broker: Mosquitto) -> None:
-    frames = flight(layout_of(["esc1"]), 1, [QUIET])
-    with live(adapter, broker, "quiet") as program, Subscriber(broker.port, "kontronik/quiet/#") as heard:
-        wait_for(lambda: adapter.is_open, lambda: program.log)
-        with Traffic(adapter, frames):
-            heard.wait("kontronik/quiet/available", b"online")
-            heard.wait("kontronik/quiet/esc1/available", b"offline")
-            heard.wait("kontronik/quiet/available", b"offline")
-            wait_for(lambda: not heard.of("kontronik/quiet/state")[-1].json["available"], "its state")
-        last = heard.of("kontronik/quiet/state")[-1].json
-        assert (last["available"], last["gateway_state"]) == (False, None)
-        assert last["age"] >= 3000
-        assert heard.of("kontronik/quiet/online")[-1].payload == b"online"
-
-
-def test_a_recording_that_nobody_takes_fails(tmp_path: Path) -> None:
-    file = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 1))
-    code, said = talk(file, "--broker", f"127.0.0.1:{free_port()}", "--gateway", "nobody")
-    assert code == 1
-    last = said.splitlines()[-1]
-    assert last.startswith("kontronik-can-gw mqtt: the end of the recording was not published. MQTT broker 127.0.0.1:")
-    assert last.endswith(": connection refused. Does it run, and is the port right?")
-
-
-def test_several_escs_come_by_their_names_from_a_configuration(tmp_path: Path, broker: Mosquitto) -> None:
-    toml = tmp_path / "gateway.toml"
-    toml.write_text(
-        f'[mqtt]\nbroker = "{broker.address}"\ngateway = "two"\ntopic = "fleet"\nrate = 5\n'
-        + "".join(f'[[esc]]\nport = "/dev/{name}"\nname = "{name}"\npole_pairs = 7\n' for name in ("left", "right"))
-    )
-    file = write_log(tmp_path / "a.log", flight(layout_of(["left", "right"]), 3, [QUIET, FLIES]))
-    with Subscriber(broker.port, "fleet/#") as heard, Process(file, "-c", toml, "--gateway", "three") as program:
-        assert program.process.wait(PATIENCE) == 0
-    left, right = (heard.of(f"fleet/three/{name}/state")[-1].json for name in ("left", "right"))
-    assert (left["motor"], right["motor"]) == ("idle", "run")
-    assert (left["electrical_speed"], right["electrical_speed"] > 1000) == (0, True)
-    assert left["time"].startswith("2026-09-21T14:13:2")
-    assert left["replay"] is True
-    assert len(heard.of("fleet/three/left/state")) >= 2
-
-
 # --- Home Assistant
 
 
 def test_discovery_is_kept_and_can_be_removed_again(tmp_path: Path, broker: Mosquitto) -> None:
-    bus = layout_of(["esc1"])
-    frames = flight(bus, 2)
-    with Process(
-        write_log(tmp_path / "a.log", frames), "--broker", broker.address, "--gateway", "ha", "--discovery"
-    ) as program:
+    log = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 2))
+    with Process(log, "--broker", broker.address, "--gateway", "ha", "--discovery") as program:
         assert program.process.wait(PATIENCE) == 0
     found = {topic: json.loads(text) for topic, text in kept(broker.port, "homeassistant/#").items()}
     mine = {"homeassistant/device/kontronik_ha/config", "homeassistant/device/kontronik_ha_esc1/config"}
@@ -192,32 +108,30 @@ def test_discovery_is_kept_and_can_be_removed_again(tmp_path: Path, broker: Mosq
 # --- brokers that are missing, go away, do not want us
 
 
-def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path, adapter: Slcan) -> None:
+def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path, bus: Path) -> None:
     port = free_port()
-    words = ("-c", adapter.configuration, "--gateway", "late", "--rate", 20)
+    words = ("-c", bus, "--gateway", "late", "--rate", 20)
     with Process(*words, "--broker", f"127.0.0.1:{port}") as program:
         program.wait_for_line(f"MQTT broker 127.0.0.1:{port}: connection refused. Does it run, and is the port right?")
-        wait_for(lambda: adapter.is_open, lambda: program.log)
-        with Traffic(adapter, flight(layout_of(["esc1"]), 120, [QUIET])):
-            made = Mosquitto(tmp_path, port=port)
-            try:
-                program.wait_for_line("connected as kontronik-can-gw-late")
-                made.stop()
-                program.wait_for_line("the connection was lost")
-                made.start()
-                with Subscriber(port, "kontronik/late/#") as heard:
-                    heard.wait("kontronik/late/online", b"online")
-                    heard.wait("kontronik/late/esc1/available", b"online")  # the broker had lost it
-                    heard.wait("kontronik/late/esc1/state")
-                program.wait_for_line(": connected, after")
-                assert program.log.count("connection refused") <= 3  # not one line an attempt
-                assert program.end() == 0
-            finally:
-                made.stop()
+        made = Mosquitto(tmp_path, port=port)
+        try:
+            program.wait_for_line("connected as kontronik-can-gw-late")
+            made.stop()
+            program.wait_for_line("the connection was lost")
+            made.start()
+            with Subscriber(port, "kontronik/late/#") as heard:
+                heard.wait("kontronik/late/online", b"online")
+                heard.wait("kontronik/late/esc1/available", b"offline")  # the broker had lost it
+                heard.wait("kontronik/late/esc1/state")
+            program.wait_for_line(": connected, after")
+            assert program.log.count("connection refused") <= 3  # not one line an attempt
+            assert program.end() == 0
+        finally:
+            made.stop()
     assert "Traceback" not in program.log
 
 
-def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(tmp_path: Path, adapter: Slcan) -> None:
+def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(tmp_path: Path, bus: Path) -> None:
     users = tmp_path / "users"
     subprocess.run(["mosquitto_passwd", "-b", "-c", str(users), "boat", "right horse"], check=True, capture_output=True)
     made = Mosquitto(tmp_path, f"allow_anonymous false\npassword_file {users}\n")
@@ -225,7 +139,7 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
     secret.write_text("wrong donkey\nmore\n")
     secret.chmod(0o644)
     try:
-        with live(adapter, made, "pw", "--username", "boat", "--password-file", secret) as program:
+        with live(bus, made, "pw", "--username", "boat", "--password-file", secret) as program:
             program.wait_for_line("refuses user 'boat': not authorized. Check user name and password.")
             assert f"{secret}: can be read by everybody on this machine. Run: chmod o= {secret}" in program.log
             secret.write_text("right horse\n")
@@ -236,7 +150,7 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
         for text in ("donkey", "horse"):
             assert text not in program.log
             assert text.encode() not in command
-        with live(adapter, made, "nobody") as program:
+        with live(bus, made, "nobody") as program:
             program.wait_for_line("refuses us without a user name: not authorized. Check --username, --password-file.")
     finally:
         made.stop()
@@ -245,22 +159,22 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
 # --- systemd
 
 
-def test_the_same_gateway_twice_on_a_machine_is_refused(adapter: Slcan, broker: Mosquitto, tmp_path: Path) -> None:
+def test_the_same_gateway_twice_on_a_machine_is_refused(bus: Path, broker: Mosquitto, tmp_path: Path) -> None:
     file = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 1))
-    with live(adapter, broker, "twice") as program:
+    with live(bus, broker, "twice") as program:
         program.wait_for_line("connected as")
         said = refused(1, "mqtt", file, "--broker", broker.address, "--gateway", "twice")
         assert f"another process on this machine publishes as twice to MQTT broker {broker.address}" in said
         assert program.process.poll() is None
 
 
-def test_the_service_manager_is_told_and_the_watchdog_fed(tmp_path: Path, adapter: Slcan, broker: Mosquitto) -> None:
+def test_the_service_manager_is_told_and_the_watchdog_fed(tmp_path: Path, bus: Path, broker: Mosquitto) -> None:
     told: list[str] = []
     path = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(path)
         manager.settimeout(PATIENCE)
-        words = ("-c", adapter.configuration, "--broker", broker.address, "--gateway", "sd")
+        words = ("-c", bus, "--broker", broker.address, "--gateway", "sd")
         with Process(*words, environment={"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "1000000"}) as program:
             while not any("STATUS=connected" in text for text in told) or sum("WATCHDOG=1" in t for t in told) < 5:
                 told.append(manager.recv(4096).decode())
@@ -268,27 +182,3 @@ def test_the_service_manager_is_told_and_the_watchdog_fed(tmp_path: Path, adapte
             while "STOPPING=1" not in told[-1]:
                 told.append(manager.recv(4096).decode())
     assert "READY=1" in told[0]
-
-
-def test_as_a_service_it_waits_for_the_interface(tmp_path: Path, broker: Mosquitto) -> None:
-    path = str(tmp_path / "notify")
-    with (
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
-        Subscriber(broker.port, "kontronik/wait/#") as heard,
-    ):
-        manager.bind(path)
-        words = (
-            "--interface",
-            "slcan",
-            "--channel",
-            tmp_path / "none",
-            "--broker",
-            broker.address,
-            "--gateway",
-            "wait",
-        )
-        with Process(*words, environment={"NOTIFY_SOCKET": path}) as program:
-            heard.wait("kontronik/wait/online", b"online")
-            heard.wait("kontronik/wait/available", b"offline")
-            assert program.log.count(f"CAN slcan {tmp_path}/none") == 1
-            assert program.end() == 0

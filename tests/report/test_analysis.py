@@ -14,7 +14,7 @@ from kontronik_can_gw.offline.report.fit import ResistanceFit
 from kontronik_can_gw.offline.report.flight import Event, Flight
 from kontronik_can_gw.offline.report.quantities import PLOTS
 from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError
-from kontronik_can_gw.simulator import FLIGHT, Dropout, ErrorWindow, EscOptions, Faults, Swap
+from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
 from kontronik_can_gw.telemetry import SECOND as S
 
 GAP_NS = 500_000_000
@@ -41,7 +41,7 @@ def analysed(bus: BusLayout, rows: list[Row], points: int = 2000, **more: tuple[
 
 @pytest.fixture(scope="module")
 def bus() -> BusLayout:
-    return shipped_bus(("left", "right"))
+    return shipped_bus("left", "right")
 
 
 @pytest.fixture(scope="module")
@@ -108,15 +108,6 @@ def test_extremes_are_those_of_pandas_with_their_time(
         values = data[source].to_numpy(float)
         at = values.argmax() if which == "max" else values.argmin()
         assert (extreme.value, extreme.time_ns) == (values[at], data.time_ns.iloc[at]), key
-
-
-def test_extremes_survive_in_the_lines(flight: Flight) -> None:
-    assert flight.rows_in_bucket > 1
-    for plot in flight.plots:
-        for line in plot.lines:
-            found = flight.summaries[line.esc].extremes.get(f"max {line.source}")
-            if found is not None:
-                assert max(v for v in line.values if v is not None) == found.value
 
 
 def test_sag_and_resistance(bus: BusLayout, rows: list[Row], flight: Flight) -> None:
@@ -191,23 +182,6 @@ def test_losses_are_gaps_in_lines_and_events(bus: BusLayout, rows: list[Row], fl
         assert all(v is None for v in inside[5:-5])
 
 
-def test_a_device_that_changes_is_told(flight: Flight) -> None:
-    (event,) = [e for e in flight.events if e.kind == "device"]
-    assert event.text == "Device changed from Kosmik 120 firmware 4.17 to Kolibri 120 firmware 4.17"
-    assert 70 < (event.begin_ns - flight.origin_ns) / S < 72
-    assert (flight.facts[0].device, flight.facts[0].firmware, flight.facts[0].layout) == ("Kolibri", "4.17", "V4")
-    assert (flight.facts[1].device, flight.facts[1].layout) == ("JivePro", "Legacy")
-
-
-def test_the_band_holds_the_states_that_were_flown(flight: Flight) -> None:
-    names = [int(s.state) for s in flight.segments[1]]
-    profile = [int(phase.state) for phase in FLIGHT]
-    flown = [state for state, before in zip(profile, [0, *profile], strict=False) if state != before]
-    assert names[3 : 3 + len(flown)] == flown  # behind self-test, waiting and beep
-    assert all(a.end_ns == b.begin_ns for a, b in pairwise(flight.segments[1]))
-    assert flight.segments[1][-1].end_ns == flight.end_ns
-
-
 def test_a_window_is_cut_out_with_the_times_of_the_whole(bus: BusLayout, rows: list[Row]) -> None:
     part = analysed(bus, rows, window=(10.0, 20.0))
     assert part.origin_ns == rows[0][0]
@@ -240,13 +214,13 @@ def test_many_events_and_states_stay_bounded() -> None:
     state, flag, live = (column(bus, s) for s in ("operating_state", "undervoltage", "battery_voltage"))
     blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
     analysis = Analysis(bus, 1000)
-    for number in range(60_000):
+    for number in range(30_000):
         values = list(blank)
         values[live], values[flag] = 24.0, number & 1
         values[state] = ("Forward", "Brake")[number & 1]
         analysis.take(number * 10_000_000, values)
     flight = analysis.finish()
-    assert flight.left_out == {"error": 25_000, "state": 55_000}
+    assert flight.left_out == {"error": 10_000, "state": 25_000}
     assert len(flight.events) == 10_000
     assert len(flight.segments[0]) <= 4000
     assert len(flight.times) <= 1000
