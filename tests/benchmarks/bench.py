@@ -1,6 +1,6 @@
 """Measures the gateway beside a small C program and beside the obvious Python program, and says which targets are reached.
 
-    .venv/bin/python tests/benchmarks/bench.py [--only NAME ...] [--list] [--seconds N] [--json FILE] [--plots FOLDER]
+    .venv/bin/python tests/benchmarks/bench.py [--only NAME ...] [--list] [--seconds N] [--json FILE]
 
 Standard output has the table, standard error what is going on. Exit code 1 where two programs do not agree or one fails; a missed target
 is told and is no error.
@@ -49,12 +49,9 @@ def parser() -> argparse.ArgumentParser:
         "--seconds", type=seconds, default=5.0, metavar="N", help="length of one measurement (default: 5)"
     )
     made.add_argument("--rounds", type=rounds, default=3, metavar="N", help="turns of what is compared (default: 3)")
-    made.add_argument(
-        "--long", action="store_true", help="files of up to 1 GB too, which takes minutes and as much disk"
-    )
+    made.add_argument("--long", action="store_true", help="files of up to 100 MB too, which takes minutes")
     made.add_argument("--quick", action="store_true", help="as short as it can be: tries the benchmarks themselves")
     made.add_argument("--json", type=Path, default=registry.ROOT / "build" / "bench.json", metavar="FILE")
-    made.add_argument("--plots", type=Path, metavar="FOLDER", help="draw PNG pictures into this folder")
     made.add_argument(
         "--realtime", type=int, default=0, choices=range(1, 100), metavar="1..99", help="real-time priority to measure"
     )
@@ -79,8 +76,6 @@ def main(arguments: list[str] | None = None) -> int:
     folder = registry.ROOT / "build" / "bench"
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        if args.plots is not None:
-            args.plots.mkdir(parents=True, exist_ok=True)
         if not args.json.parent.is_dir():
             raise NotADirectoryError(2, "there is no such folder")
         args.json.open("a").close()  # before half an hour of measuring, not behind it
@@ -90,7 +85,7 @@ def main(arguments: list[str] | None = None) -> int:
     results, interrupted = [], False
     try:
         for each in chosen:
-            context = Context(folder, lasts, turns, args.quick, args.plots, args.realtime, args.vcan, args.long)
+            context = Context(folder, lasts, turns, args.quick, args.realtime, args.vcan, args.long)
             results.append(run_one(each, context))
     except KeyboardInterrupt:
         interrupted = True

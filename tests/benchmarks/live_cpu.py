@@ -2,7 +2,6 @@
 
 from dataclasses import asdict
 from itertools import pairwise
-from pathlib import Path
 
 from bench_programs import Measured, median, once
 from registry import Benchmark, Context, Figure, LeftOut
@@ -133,8 +132,6 @@ def growth(context: Context) -> list[Figure]:
             figures.append(Figure(f"{program}, {escs} ESC", cpu_of(runs), "us/frame", note=losses(runs)))
         all_kept_up &= keeps_up(found["ours"])
     context.data["escs"], context.data["cpu_us"] = numbers, series
-    if context.plots is not None:
-        draw(context.plots / "cpu_growth.png", numbers, series)
     ours = series["ours"]
     worst = max(after / before for before, after in pairwise(ours))
     figures.append(
@@ -143,32 +140,10 @@ def growth(context: Context) -> list[Figure]:
     return figures
 
 
-def draw(file: Path, numbers: list[int], series: dict[str, list[float]]) -> None:
-    """CPU time a frame over the number of ESCs."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(8, 5))
-    for program, values in series.items():
-        axes.plot(numbers, values, marker="o", label={"c": "C", "ours": "kontronik-can-gw"}[program])
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(numbers, [str(number) for number in numbers])
-    axes.set_ylim(bottom=0)
-    axes.set_xlabel("ESCs at 100 frames a second each")
-    axes.set_ylabel("CPU time for each live frame, µs")
-    axes.set_title("Five CAN frames for each live frame")
-    axes.grid(alpha=0.3)
-    axes.legend()
-    figure.savefig(file, dpi=120, bbox_inches="tight")
-    plt.close(figure)
-
-
 BENCHMARKS = [
     Benchmark("cpu", "CPU time a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program", cpu),
     Benchmark("cpu-canopen", "CPU time with CANopen nodes and default PDOs beside the DBC's messages", canopen),
     Benchmark("cpu-shipped", "CPU time with the shipped DBC", shipped),
     Benchmark("cpu-bytewise", "CPU time where the bytes come one by one", bytewise),
-    Benchmark("cpu-growth", "CPU time a live frame over 1 to 128 ESCs, and a plot", growth),
+    Benchmark("cpu-growth", "CPU time a live frame over 1 to 128 ESCs", growth),
 ]

@@ -1,12 +1,12 @@
 """What a benchmark is, and what it gives: the modules live_*.py, run_*.py and offline_*.py beside this one have ``BENCHMARKS``.
 
-    BENCHMARKS = [Benchmark("scan", "MB/s of the offline scanner, beside C", scan)]
+    BENCHMARKS = [Benchmark("cpu", "CPU time a live frame, beside C", cpu)]
 
-    def scan(context: Context) -> list[Figure]:
-        program = context.compiled("scan.c")   # raises LeftOut where there is no gcc
+    def cpu(context: Context) -> list[Figure]:
+        program = context.compiled("gateway.c")   # raises LeftOut where there is no gcc
         if ours != theirs:
-            raise NotEqual("scan: row 12: 3 is not 4")
-        return [Figure("scan, ours / C", ratio, "x", "<= 8", ratio <= 8)]
+            raise NotEqual("cpu: frame 12: 3 is not 4")
+        return [Figure("cpu, ours / C", ratio, "x", "<= 8", ratio <= 8)]
 
 A missed target is a Figure whose ``reached`` is False, never an error. What is not equal, and what fails, is an exception.
 """
@@ -61,8 +61,6 @@ class Context:
     """How often measurements that are compared are taken by turns."""
     quick: bool = False
     """As short as it can be: for trying the benchmarks themselves. Figures mean little."""
-    plots: Path | None = None
-    """Where PNG pictures go; None: none are drawn."""
     realtime: int = 0
     """Real-time priority of the gateway, where it is measured with one; 0: the benchmark's own choice."""
     vcan: str = ""
