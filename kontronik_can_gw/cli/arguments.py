@@ -6,7 +6,9 @@ from itertools import pairwise
 
 from kontronik_can_gw.errors import UserError
 
-REMOVED_OPTIONS: dict[tuple[str, str], str] = {}
+REMOVED_OPTIONS: dict[tuple[str, str], str] = {
+    ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
+}
 """Command and option of earlier versions, as ("report", "--png"), and what to type instead, as a sentence.
 
 A choice of an option that stays is written with it: ("describe", "--format html"). Each may go a year after its removal.
