@@ -329,7 +329,7 @@ def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(monkey
         "a.toml: can.queue: was removed and is ignored. Leave it out.",
         "a.toml: esc[2].motor: was removed and is ignored. Give pole_pairs.",
     )
-    assert (config.can.channel, config.esc[1].gear) == ("can1", 2)
+    assert (config.can.channel, config.esc[1].gear) == ("can1", Fraction(2))
     assert config.can == parse({"can": {"channel": "can1"}} | escs({}), "a.toml").can
     assert jsonschema.Draft202012Validator(schema()).is_valid(old)
     assert "queue" not in as_toml(config)

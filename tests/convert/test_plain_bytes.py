@@ -2,6 +2,7 @@
 
 import random
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ BO_ 256 Live: 8 Gateway
 """
 """Every value that a frame can hold, so that none is out of range."""
 PERIOD_NS = 20_000_000
-STREAMS = {
+STREAMS: dict[str, Callable[[random.Random], bytes]] = {
     "frames and pieces of frames": lambda source: random_stream(source, 60),
     "long rubbish": lambda source: b"".join(random_stream(source, 8) + source.randbytes(3000) for _ in range(4)),
     "headers without end": lambda source: random_stream(source, 20) + b"KODL" * 900 + random_stream(source, 20),

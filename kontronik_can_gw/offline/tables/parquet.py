@@ -87,7 +87,7 @@ class ParquetTable:
         for one, codes, column in zip(self._table.fields, self._codes, columns, strict=True):
             if one.kind is Kind.TEXT:
                 indices = pa.array([codes.get(value) for value in column], pa.int32())
-                arrays.append(pa.DictionaryArray.from_arrays(indices, pa.array(codes, pa.string())))
+                arrays.append(pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string())))
             else:
                 arrays.append(pa.array(column, self._type(one)))
         self._rows = []
