@@ -322,12 +322,6 @@ class RecordConfig:
     min_free_mb: int = _key(
         "record nothing while fewer megabytes are free on the file system", "integer", 100, low=0, high=10_000_000
     )
-    can_log: str = _key(
-        "beside it a log of the CAN frames sent and received (MF4: by `convert`, from the capture)",
-        "string",
-        "none",
-        choices=("none", "candump", "asc", "blf", "trc"),
-    )
 
 
 @dataclass(frozen=True)
@@ -403,7 +397,9 @@ _TABLES: dict[str, type[Any]] = {
     "mqtt": MqttConfig,
     "esc": EscConfig,
 }
-REMOVED_KEYS: dict[str, str] = {}
+REMOVED_KEYS: dict[str, str] = {
+    "record.can_log": "`kontronik-can-gw convert CAPTURE flight.log` makes the log from a capture.",
+}
 """Table and key of earlier versions, as "record.can_log", and what to do instead, as a sentence.
 
 For a year each is ignored with a warning: a gateway must not fall silent after an upgrade.
@@ -731,8 +727,6 @@ def _check_outputs(config: Config, problems: list[str]) -> None:
         for what, other in read.items():
             if normpath(path) == normpath(other):
                 problems.append(f"{file}: statistics.file: {str(path)!r} is {what}, which would be overwritten")
-    if config.record.can_log == "trc" and config.can.fd:
-        problems.append(f"{file}: record.can_log: a TRC log knows no CAN FD frames. Take candump, asc or blf.")
     if not config.dbc.enabled and not canopen.enabled:
         problems.append(f"{file}: dbc.enabled, canopen.enabled: both are false, so nothing would be sent. Enable one.")
     if not canopen.enabled:

@@ -50,7 +50,6 @@ ONLY_IN = {
     "numpy": ("offline",),
     "pyarrow": ("offline",),
     "asammdf": ("offline",),
-    "matplotlib": ("offline",),
     "paho": ("runtime",),
     "shtab": ("cli",),
     "canopen": ("cia301/eds.py", "cia301/dictionary.py"),

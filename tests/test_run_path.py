@@ -38,7 +38,6 @@ NEVER = (
         "numpy",
         "pandas",
         "pyarrow",
-        "matplotlib",
         "rich",
         "pygments",
         "jsonschema",
@@ -68,7 +67,6 @@ CONFIGURATIONS = {
     ),
     "DBC and CANopen": ('[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\n', CANTOOLS | CANOPEN),
     "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS),
-    "recorder with a CAN log": ('[record]\ndirectory = "captures"\ncan_log = "candump"\n', CANTOOLS | PYTHON_CAN),
     "status and Prometheus": ('[statistics]\nfile = "status.json"\nprometheus = "127.0.0.1:{port}"\n', CANTOOLS),
 }
 

@@ -32,7 +32,7 @@ COMMANDS = {
     "eds": "write the EDS, or the DCF of a CANopen node",
     "monitor": "a live screen of the ESCs, from the CAN bus or a recording",
     "convert": "convert recordings and CAN logs to tables and to CAN logs of other formats",
-    "report": "a recorded flight as a page for a browser: summary, plots, events; or as pictures",
+    "report": "a recorded flight as a page for a browser: summary, plots, events",
     "decode": "decode recorded UART bytes to JSON lines or CSV",
     "replay": "play a recording on a CAN bus, on pseudo terminals, or as a log",
     "simulate": "simulate ESCs on pseudo terminals",

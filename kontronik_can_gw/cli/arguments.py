@@ -12,6 +12,7 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "--format html",
     ): "Type kontronik-can-gw describe -o bus.md; pandoc -s bus.md -o bus.html makes a page of it.",
     ("describe", "--format man"): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
+    ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
 }
 """Command and option of earlier versions, as ("report", "--png"), and what to type instead, as a sentence.
 

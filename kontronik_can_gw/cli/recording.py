@@ -27,7 +27,7 @@ def in_words(config: Config, folder: Path) -> str:
     record = config.record
     words = f"{folder}, parts of {record.part_mb} MB or {record.part_minutes} min"
     words += f", {record.keep_mb} MB in all" if record.keep_mb else ""
-    return words if record.can_log == "none" else f"{words}, a CAN log ({record.can_log}) beside"
+    return words
 
 
 def recorder_of(config: Config, given: Path | None) -> Recorder | None:
@@ -43,8 +43,6 @@ def recorder_of(config: Config, given: Path | None) -> Recorder | None:
             record.part_minutes * 60 * SECOND,
             record.keep_mb * _MB,
             record.min_free_mb * _MB,
-            record.can_log,
-            config.can.channel,
         )
     )
 

@@ -1,4 +1,4 @@
-"""``kontronik-can-gw report``: a recorded flight as one page for a browser, and its plots as pictures."""
+"""``kontronik-can-gw report``: a recorded flight as one page for a browser."""
 
 import argparse
 from pathlib import Path
@@ -22,7 +22,7 @@ The same recording gives the same page, byte for byte. A file that exists is onl
 examples:
   kontronik-can-gw report flight.kcap -o flight.html
   kontronik-can-gw report bus.log -c gateway.toml -o climb.html --title "Climb with 6S"
-  kontronik-can-gw report flight.kcap --png pictures --from 60 --to 90
+  kontronik-can-gw report flight.kcap -o part.html --from 60 --to 90
 
 exit codes: 0 done, 1 something cannot be read or written, or has no values; 2 wrong usage, or a file that is no recording
 """
@@ -33,9 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
     parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes")
-    parser.add_argument("-o", "--output", metavar="FILE", help="page to write, or - for standard output")
-    parser.add_argument("--png", metavar="FOLDER", help="write each plot as a PNG into FOLDER")
-    parser.add_argument("--force", action="store_true", help="replace files that exist")
+    parser.add_argument("-o", "--output", metavar="FILE", required=True, help="page to write, or - for standard output")
+    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
     add_layout_arguments(parser)
     parser.add_argument(
         "--points", type=_points, default=20_000, metavar="N", help="points of a line, 100 to 1000000 (default 20000)"
@@ -55,13 +54,12 @@ def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.errors import RunError, UserError
     from kontronik_can_gw.offline.inputs import open_input
     from kontronik_can_gw.offline.report.analysis import Analysis
+    from kontronik_can_gw.offline.report.page import render
 
-    if args.output is None and args.png is None:
-        raise UserError("give -o FILE for the page, --png FOLDER for pictures, or both")
     if args.start is not None and args.end is not None and args.end <= args.start:
         raise UserError(f"--to {args.end:g}: must be greater than --from {args.start:g}")
     source = Path(args.input)
-    _check_targets(source, args.output, args.png, force=args.force)
+    _check_target(source, args.output, force=args.force)
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     with open_input(source, layout) as recording:
         analysis = Analysis(recording.bus, args.points, (args.start, args.end))
@@ -77,23 +75,15 @@ def main(args: argparse.Namespace) -> int:
             )
         title = args.title if args.title is not None else source.name
         damage = list(recording.damage)
-        if args.output is not None:
-            from kontronik_can_gw.offline.report.page import render
-
-            page = render(
-                flight,
-                title=title,
-                source=source.name,
-                provenance=recording.provenance,
-                wall_ns=recording.wall_ns(flight.origin_ns),
-                damage=damage,
-            )
-            write_output(args.output, page, "utf-8")
-        if args.png is not None:
-            from kontronik_can_gw.offline.report.plots_png import write_pngs
-
-            written = write_pngs(flight, Path(args.png), title)
-            say(f"{args.png}: {', '.join(file.name for file in written)} written")
+        page = render(
+            flight,
+            title=title,
+            source=source.name,
+            provenance=recording.provenance,
+            wall_ns=recording.wall_ns(flight.origin_ns),
+            damage=damage,
+        )
+        write_output(args.output, page, "utf-8")
     for line in recording.notes:
         say(f"{args.input}: {line}", "report")
     for line in damage:
@@ -101,31 +91,22 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_targets(source: Path, output: str | None, png: str | None, *, force: bool) -> None:
-    """UserError where something cannot be written, or is there."""
+def _check_target(source: Path, output: str, *, force: bool) -> None:
+    """UserError where the page cannot be written, or is there."""
     from kontronik_can_gw.errors import UserError
 
     if output == "":
         raise UserError("-o: is empty. Give a file, or - for standard output.")
-    if png == "":
-        raise UserError("--png: is empty. Give a folder.")
     try:
-        if output is not None and output != "-" and (target := Path(output)).exists():
+        if output != "-" and (target := Path(output)).exists():
             if source.exists() and target.samefile(source):
                 raise UserError(f"-o {output}: is the input. Give another file.")
             if target.is_dir():
                 raise UserError(f"-o {output}: is a folder. Give a file.")
             if target.is_file() and not force:
                 raise UserError(f"{output}: exists. Give another -o, or --force.")
-        if png is not None:
-            from kontronik_can_gw.offline.report.plots_png import check_matplotlib, names_of_pngs
-
-            check_matplotlib()
-            for file in (Path(png) / name for name in names_of_pngs()):
-                if file.exists() and not force:
-                    raise UserError(f"{file}: exists. Give another --png, or --force.")
     except (OSError, ValueError) as error:  # a name too long, or with a null byte
-        raise UserError(f"{output or png}: cannot be written: {getattr(error, 'strerror', None) or error}.") from None
+        raise UserError(f"{output}: cannot be written: {getattr(error, 'strerror', None) or error}.") from None
 
 
 def _read(recording: "Input", analysis: "Analysis", name: str, data_on_screen: bool) -> bool:

@@ -13,8 +13,7 @@ from typing import IO, TYPE_CHECKING, Protocol, Self
 from kontronik_can_gw.offline.part_file import PartFile
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.offline.bulk.frames import Found
-    from kontronik_can_gw.offline.inputs import DumpInput, Input
+    from kontronik_can_gw.offline.inputs import Input
     from kontronik_can_gw.offline.replay import TimedFrame
     from kontronik_can_gw.offline.tables import Choice
 
@@ -80,7 +79,7 @@ class TableConversion:
     units_line: bool = False
 
     def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
-        from kontronik_can_gw.offline.tables import Block, Rows, open_table
+        from kontronik_can_gw.offline.tables import Rows, open_table
 
         rows = Rows(recording, self.choice, self.by_frame)
         table = rows.table
@@ -89,16 +88,10 @@ class TableConversion:
         count, last_ns = 0, 0
         with open_table(out.open(), self.form, table, self.units_line) as writer:
             write = writer.write
-            for item in rows:
-                if isinstance(item, Block):
-                    writer.write_block(item)
-                    count += len(item)
-                    last_ns = item.last_ns
-                    reached(recording.position)
-                    continue
-                write(item)
+            for row in rows:
+                write(row)
                 count += 1
-                last_ns = item.time_ns
+                last_ns = row.time_ns
                 if not count % _TURN:
                     reached(recording.position)
             reached(recording.position)
@@ -117,13 +110,9 @@ class LogConversion:
 
     def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
         from kontronik_can_gw.offline.can_logs import CanLogWriter
-        from kontronik_can_gw.offline.inputs import LEAST_FOR_NUMPY, CaptureInput, DumpInput
+        from kontronik_can_gw.offline.inputs import CaptureInput
         from kontronik_can_gw.offline.tables import first_of
 
-        if self.format == "candump" and isinstance(recording, DumpInput) and recording.size >= LEAST_FOR_NUMPY:
-            blocks = recording.bulk_frames()
-            if blocks is not None:
-                return self._in_bulk(recording, blocks, out, reached)
         first, frames = first_of(recording.frames())
         if first is None:
             return None
@@ -156,20 +145,6 @@ class LogConversion:
         if abs(moved) > _CLOCK_SET_NS:
             told += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
         return told
-
-    def _in_bulk(
-        self, recording: "DumpInput", blocks: "Iterator[Found]", out: Output, reached: Callable[[int], None]
-    ) -> str | None:
-        """The same log, by blocks."""
-        from kontronik_can_gw.offline.bulk.candump import write
-
-        plans = recording.bus.layout.messages
-        found = write(blocks, plans, out.open, self.start_ns, self.end_ns, lambda: reached(recording.position))
-        if found is None:
-            return None
-        out.is_whole = True
-        count, lasted = found
-        return f"{_many(count, 'CAN frame')}, up to {lasted / 1e9:.3f} s"
 
     def _cut(self, frames: "Iterator[TimedFrame]", origin_ns: int) -> "Iterator[TimedFrame]":
         from kontronik_can_gw.offline.tables import DISORDER_NS

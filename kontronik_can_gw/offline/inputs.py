@@ -7,12 +7,12 @@ come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol, Self
+from typing import IO, Any, Protocol, Self
 
 from kontronik_can_gw.capture import (
     MAGIC,
@@ -41,11 +41,6 @@ from kontronik_can_gw.protocol.codec import Kind as FrameKind
 from kontronik_can_gw.protocol.deframer import Deframer
 from kontronik_can_gw.telemetry import SECOND
 
-if TYPE_CHECKING:
-    from kontronik_can_gw.gateway import Gateway
-    from kontronik_can_gw.offline.bulk.frames import Found
-    from kontronik_can_gw.offline.tables.blocks import Block as RowBlock
-
 CHUNK = 1 << 18
 LIVE_RATE = 100.0
 """Live frames a second that plain bytes are taken to have come at."""
@@ -53,8 +48,6 @@ _LOOK = 1 << 16
 _LOOK_FOR_HEADER = 1 << 25
 _MOST_DAMAGE = 50
 _LATEST_NS = 1 << 62
-LEAST_FOR_NUMPY = 1 << 17
-"""Of fewer bytes all is done before numpy is imported."""
 _MOST_WAITING = 1 << 16
 _LONGEST_FRAME = 64
 _MOST_IDS = 4096
@@ -86,9 +79,6 @@ class Input(Protocol):
 
     def samples(self) -> Iterator[Sample]:
         """Rows of all values."""
-
-    def blocks(self, chosen: Sequence[int]) -> "Iterator[Sample | RowBlock] | None":
-        """The same rows, many at once where that can be, with these columns only; None where they can only be had one by one."""
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         """The UART bytes of one ESC. UserError where the recording has none."""
@@ -123,9 +113,6 @@ class _Base:
     @cached_property
     def reader(self) -> SignalReader:
         return SignalReader(self.bus.layout)
-
-    def blocks(self, chosen: Sequence[int]) -> "Iterator[Sample | RowBlock] | None":  # noqa: ARG002
-        return None
 
     def close(self) -> None:
         pass
@@ -246,14 +233,7 @@ class CaptureInput(_Base):
         self._tell(replay)
 
     def samples(self) -> Iterator[Sample]:
-        yield from self._samples(frames_count=True)
-
-    def blocks(self, chosen: Sequence[int]) -> "Iterator[Sample | RowBlock] | None":
-        """Single rows; the frames that were sent are made only where the number of them is wanted."""
-        return self._samples(any(self.reader.columns[index].source == "sent_frames" for index in chosen))
-
-    def _samples(self, frames_count: bool) -> Iterator[Sample]:
-        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, self._created_ns, frames_count)
+        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, self._created_ns)
         replay = Replay(gateway, self.header.get("state"))
         for entry in self.entries():
             replay.play(entry)
@@ -420,83 +400,12 @@ class DumpInput(_Base):
     def frames(self) -> Iterator[TimedFrame]:
         yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self.chunks())
 
-    def bulk_frames(self) -> "Iterator[Found] | None":
-        """Those of ``frames``, in blocks; None where they can only be had one by one: numpy is missing, or a message is of a rare kind."""
-        try:
-            from kontronik_can_gw.offline.bulk.frames import can_follow
-        except ModuleNotFoundError as error:
-            if error.name != "numpy":
-                raise
-            return None
-        gateway = self.setup.gateway(self.bus.layout, 0)
-        if not can_follow(gateway, self.bus.layout, self._period_ns, self.size):
-            return None
-        return self._bulk_frames(gateway)
-
-    def _bulk_frames(self, gateway: "Gateway") -> "Iterator[Found]":
-        from kontronik_can_gw.offline.bulk.feed import Feed
-        from kontronik_can_gw.offline.bulk.frames import follow
-
-        self.damage = []
-        self.position = 0
-        feed = Feed(self.size, self._period_ns)
-        try:
-            with self._path.open("rb") as file:
-
-                def read(size: int) -> bytes:
-                    data = file.read(size)
-                    self.position += len(data)
-                    return data
-
-                yield from follow(gateway, self.bus.layout, read, feed, self._period_ns)
-        except OSError as error:
-            raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
-        self.damage = feed.damage
-
     def samples(self) -> Iterator[Sample]:
         gateway = SampledGateway(self.setup, self.bus.layout, self.reader, 0, frames_count=False)
         for now, data in self.chunks():
             gateway.play(now, data)
             yield from gateway.take_rows()
         yield from gateway.finish()
-
-    def blocks(self, chosen: Sequence[int]) -> "Iterator[Sample | RowBlock] | None":
-        if self.size < LEAST_FOR_NUMPY:
-            return None
-        try:
-            from kontronik_can_gw.offline.bulk.rows import can_read
-        except ModuleNotFoundError as error:
-            if error.name != "numpy":
-                raise
-            return None
-        return self._blocks(chosen) if can_read(self._period_ns, self.size) else None
-
-    def _blocks(self, chosen: Sequence[int]) -> "Iterator[Sample | RowBlock]":
-        from kontronik_can_gw.offline.bulk.feed import Feed
-        from kontronik_can_gw.offline.bulk.rows import read_rows
-
-        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, 0, frames_count=False)
-        feed = Feed(self.size, self._period_ns)
-        with self._opened() as read:
-            yield from read_rows(gateway, self.reader, chosen, read, feed, self._period_ns)
-        self.damage = feed.damage
-
-    @contextmanager
-    def _opened(self) -> Iterator[Callable[[int], bytes]]:
-        """A function that reads on."""
-        self.damage = []
-        self.position = 0
-        try:
-            with self._path.open("rb") as file:
-
-                def read(size: int) -> bytes:
-                    data = file.read(size)
-                    self.position += len(data)
-                    return data
-
-                yield read
-        except OSError as error:
-            raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         if esc:

@@ -172,34 +172,21 @@ def in_order(frames: list[CanFrame], waiting: Mailboxes) -> list[CanFrame]:
     return sent
 
 
-class BytesFollower:
-    """What a gateway sends that is given bytes of its first ESC at their times, starts with them, and is never late."""
-
-    def __init__(self, gateway: Gateway) -> None:
-        self.gateway = gateway
-        self._started = False
-        self._waiting = Mailboxes()
-
-    def follow(self, now: int, data: bytes) -> list[TimedFrame]:
-        """Give it bytes; the frames up to then."""
-        gateway, waiting = self.gateway, self._waiting
-        if not self._started:
-            self._started = True
+def follow_bytes(gateway: Gateway, chunks: Iterable[tuple[int, bytes]]) -> Iterator[TimedFrame]:
+    """What a gateway sends that is given (time, bytes) of its first ESC, starts with them, and is never late."""
+    waiting = Mailboxes()
+    started = False
+    for now, data in chunks:
+        if not started:
+            started = True
             gateway.port_opened(0, now)
             gateway.start(now)
-        found: list[TimedFrame] = []
         while (due := gateway.next_deadline()) < now:
             gateway.advance(due)
-            found += [TimedFrame(due, frame) for frame in in_order(gateway.take_frames(), waiting)]
+            for frame in in_order(gateway.take_frames(), waiting):
+                yield TimedFrame(due, frame)
         gateway.receive_bytes(0, data, now, now)
         gateway.advance(now)
-        found += [TimedFrame(now, frame) for frame in in_order(gateway.take_frames(), waiting)]
+        for frame in in_order(gateway.take_frames(), waiting):
+            yield TimedFrame(now, frame)
         gateway.take_link_changes()
-        return found
-
-
-def follow_bytes(gateway: Gateway, chunks: Iterable[tuple[int, bytes]]) -> Iterator[TimedFrame]:
-    """The frames of a BytesFollower that is given (time, bytes)."""
-    follower = BytesFollower(gateway)
-    for now, data in chunks:
-        yield from follower.follow(now, data)

@@ -72,8 +72,6 @@ class SampledGateway(Gateway):
         self._last_ns = 0
         self._in_row: set[int] = set()
         self._gateway_ns = now - GATEWAY_NS
-        self._all_read_ns = now
-        """When the messages of an ESC were read that do not come with live frames."""
         indices = {plan.name: index for index, plan in enumerate(layout.messages)}
 
         def taken(parts: Iterable[Part]) -> list[_Taken]:
@@ -131,7 +129,6 @@ class SampledGateway(Gateway):
             if again or when - self._row_ns > SAME_ROW_NS:
                 self._close_row()
         if events & (Event.LINK | Event.INFO):
-            self._all_read_ns = when
             self._read(self._by_esc[esc], when)
         else:
             self._read(self._with_live[esc], when)

@@ -15,7 +15,6 @@ from kontronik_can_gw.protocol.codec import FORMS, FORMS_BY_KIND_BYTE, Form, Kin
 from kontronik_can_gw.protocol.fields import Data, LiveData, body_format
 from kontronik_can_gw.protocol.states import LARGEST_STATE
 
-LONGEST = max(form.length for form in FORMS)
 _LIVE_LEGACY, _LIVE_V4 = (form for form in FORMS if form.kind is Kind.LIVE)
 _LIVE, _V4_LENGTH = _LIVE_V4.header, _LIVE_V4.length
 _COVERED, _LEGACY_CRC_AT = _LIVE_LEGACY.covered, _LIVE_LEGACY.crc_at

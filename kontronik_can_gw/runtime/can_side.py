@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.frames import CanFrame, frame_of
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Conflict, Gateway
 from kontronik_can_gw.mailboxes import Mailboxes, Sent, are_images, stand_alone
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
@@ -55,8 +55,6 @@ class CanSide:
         self.mailboxes = Mailboxes()
         self.facts: LinkFacts | None = None
         """What the kernel told last; None where it tells nothing of this interface."""
-        self.tap: Callable[[CanFrame, int, bool], None] | None = None
-        """Is told each frame that was sent, or received (True), with its time."""
         self._gateway = gateway
         self._selector = selector
         self._conditions = conditions
@@ -330,8 +328,6 @@ class CanSide:
             for frame, at in frames:
                 # a wall clock that was set moves no frame out of the time in which it must have come
                 self._gateway.receive_frame(frame, now, now if at is None else min(max(at, since), now))
-                if self.tap is not None:
-                    self.tap(frame, now, True)
             self._follow_reception(now)
 
     def is_stuck(self) -> bool:
@@ -367,8 +363,6 @@ class CanSide:
         if self._is_proven and self._busy_until is None and not waiting and are_images(frames):
             # as nearly always
             count, answer = self.port.send_all(frames, self._clock, now + self.longest_turn_ns)
-            if self.tap is not None:
-                self._tell_tap(frames[:count])
             if answer is _OK and not self._stalled:
                 self._busy_since = None
                 status.sent_frames += count
@@ -421,15 +415,7 @@ class CanSide:
     def _send_all(self, frames: Sequence[CanFrame | bytes]) -> tuple[int, Sent]:
         assert self.port is not None
         # LATE where the process was stopped in the middle of its turn
-        count, answer = self.port.send_all(frames, self._clock, self._turn_ns + self.longest_turn_ns)
-        if self.tap is not None:
-            self._tell_tap(frames[:count])
-        return count, answer
-
-    def _tell_tap(self, frames: Sequence[CanFrame | bytes]) -> None:
-        assert self.tap is not None
-        for frame in frames:
-            self.tap(frame_of(frame), self._turn_ns, False)
+        return self.port.send_all(frames, self._clock, self._turn_ns + self.longest_turn_ns)
 
     def _send(self, frame: CanFrame) -> Sent:
         return self._send_all((frame,))[1]

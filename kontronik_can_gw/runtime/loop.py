@@ -90,8 +90,6 @@ class Loop:
             EscInput(i, path, gateway, self._poller, self.conditions, self._lost, clock) for i, path in enumerate(ports)
         ]
         self.can = CanSide(can_config, gateway, self._poller, self.conditions, self._esc_at, clock)
-        if recorder is not None and recorder.wants_frames:
-            self.can.tap = recorder.put_frame
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._poller.register(self._wake_read, selectors.EVENT_READ, self._woken)
         if store is not None:

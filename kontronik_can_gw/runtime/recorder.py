@@ -1,6 +1,6 @@
-"""Captures of a running gateway: a folder of .kcap files (capture.py) and, if wanted, of CAN logs, written by a thread.
+"""Captures of a running gateway: a folder of .kcap files (capture.py), written by a thread.
 
-What may touch what: ``put``, ``put_frame``, ``note`` and ``reports`` are called by the loop's thread and never wait; only ``_work`` and
+What may touch what: ``put``, ``note`` and ``reports`` are called by the loop's thread and never wait; only ``_work`` and
 what it calls touch the disk. Entries go from one to the other by a deque with a bound: what finds no room is counted, and the count is
 recorded when there is room again. Each half second what has come is one block, forced to the disk: a loss of power costs that and no more.
 Whatever goes wrong with the disk is told once, tried again each five seconds, and never ends the gateway nor the recorder.
@@ -20,10 +20,8 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture import SUFFIX, Kind, block, data_payload, json_payload, number_data
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.protocol.states import device_text
-from kontronik_can_gw.runtime.can_log import SUFFIXES, CanLog
 from kontronik_can_gw.runtime.threads import start_beside_the_loop
 from kontronik_can_gw.telemetry import MS, SECOND
 
@@ -38,14 +36,14 @@ _LOOK_AT_SPACE_NS = 5 * SECOND
 _CLOCK_NS = 10 * SECOND
 _STATE_NS = 2 * SECOND
 _STEP_NS = MS
-_JUMP_NS = SECOND // 10
 _SLOW_NS = 5 * SECOND
 _MB = 1_000_000
 
-Item = tuple[int, int, int, Any, int, int | None]
+_LOGS_OF_0_5_0 = (".log", ".asc", ".blf", ".trc")
+"""Logs of CAN frames beside captures, which 0.5.0 wrote: they are removed as captures are."""
+
+Item = tuple[int, int, int, bytes, int, int | None]
 """(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
-_SENT, _RECEIVED = 100, 101
-"""Kinds of items for the CAN log only; their data is the frame."""
 
 
 class Report(NamedTuple):
@@ -67,10 +65,6 @@ class RecordSettings:
     """The oldest captures of the folder are removed when all together are larger."""
     least_free_bytes: int = 100 * _MB
     """With less than this free nothing is written."""
-    can_log: str = "none"
-    """none, candump, asc, blf or trc."""
-    channel: str = "can0"
-    """The interface's name in a candump log."""
 
 
 @dataclass
@@ -103,8 +97,6 @@ class Recorder:
         self._unwritten = 0
         """Entries that could not be written: the thread's count."""
         self._told_overflow = 0
-        self._frames_lost = self._told_frames = 0
-        """For the CAN log only; they are no entries."""
         self._reports: deque[Report] = deque()
         self._state_ns = 0
         self._devices: list[Any] = []
@@ -113,7 +105,7 @@ class Recorder:
         self._thread: threading.Thread | None = None
         self._busy_since: int | None = None
         self._told_slow = False
-        self._file: _Files | None = None
+        self._file: _Part | None = None
         self._run = os.urandom(8).hex()
         self._stamp = ""
         self._part = 0
@@ -149,18 +141,6 @@ class Recorder:
         else:
             self._entries.append((time_ns, kind, esc, data, flags, came_ns))
 
-    @property
-    def wants_frames(self) -> bool:
-        """True where there is a CAN log to write."""
-        return self.settings.can_log != "none"
-
-    def put_frame(self, frame: CanFrame, time_ns: int, received: bool) -> None:
-        """Record a frame that was sent or received, for the CAN log."""
-        if len(self._entries) >= CAPACITY:
-            self._frames_lost += 1
-        else:
-            self._entries.append((time_ns, _RECEIVED if received else _SENT, 0, frame, 0, None))
-
     def note(self, gateway: Gateway, now: int) -> None:
         """How the gateway is now: what a replay of a later part begins with, and what is known of the devices."""
         self._devices = devices_of(gateway)
@@ -176,10 +156,6 @@ class Recorder:
         if self._overflowed >= max(1, 2 * self._told_overflow):
             self._told_overflow = self._overflowed
             text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
-            taken.append(Report("losses", True, text))
-        if self._frames_lost >= max(1, 2 * self._told_frames):
-            self._told_frames = self._frames_lost
-            text = f"captures: {self._frames_lost} CAN frames are missing in the log so far: the disk is too slow"
             taken.append(Report("losses", True, text))
         since, folder = self._busy_since, self.settings.folder
         if since is not None and now - since > _SLOW_NS and not self._told_slow:
@@ -219,7 +195,7 @@ class Recorder:
             now = self._clock()
             try:
                 self._write(items, now)
-            except Exception as error:  # a mistake of ours, or of python-can's writers, is no reason to end either
+            except Exception as error:  # a mistake of ours is no reason to end either
                 self._fail(error, now, items)
             if not entries or self._file is None:
                 break
@@ -236,10 +212,9 @@ class Recorder:
         if self._devices != self._told_devices:
             self._told_devices = self._devices
             file.write(b"I", json_payload({"devices": self._told_devices}))
-        before = self._offset
         if items:
             self._remark(file, items, now)
-        file.take(items, before)
+            file.take(items)
         self.facts.bytes += file.sync()
         self.facts.file = str(file.path)
         if self._failed:
@@ -247,14 +222,12 @@ class Recorder:
             self.facts.problem = ""
             self._reports.append(Report("folder", False, f"captures: {file.path} is written"))
         settings = self.settings
-        over = [settings.part_bytes and file.size >= settings.part_bytes]
-        over.append(settings.part_ns and now - file.begun >= settings.part_ns)
-        # a log whose clock goes back, or leaps, is read by nobody
-        over.append(self.wants_frames and abs(self._offset - before) > _JUMP_NS)
-        if any(over):
+        is_large = settings.part_bytes and file.size >= settings.part_bytes
+        is_old = settings.part_ns and now - file.begun >= settings.part_ns
+        if is_large or is_old:
             self._end_part()
 
-    def _remark(self, file: "_Files", items: list[Item], now: int) -> None:
+    def _remark(self, file: "_Part", items: list[Item], now: int) -> None:
         """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
         last = items[-1][0]
         if (lost := self._overflowed + self._unwritten - file.lost) > 0:
@@ -284,7 +257,7 @@ class Recorder:
         return not self._full
 
     def _lose(self, items: list[Item]) -> None:
-        self._unwritten += sum(item[1] < _SENT for item in items)
+        self._unwritten += len(items)
 
     def _fail(self, error: Exception, now: int, items: list[Item]) -> None:
         self._lose(items)
@@ -321,7 +294,7 @@ class Recorder:
             "devices": self._told_devices,
         }
         base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{part:05d}"
-        self._file = _Files(base, json_payload(header), now, self.settings)
+        self._file = _Part(base.with_name(base.name + SUFFIX), json_payload(header), now)
         self._file.lost = self._recorded_losses
         self._remove_oldest()
 
@@ -353,12 +326,12 @@ class Recorder:
 
 
 def is_ours(name: str) -> bool:
-    """True for the name of a capture, or of a CAN log beside one."""
+    """True for the name of a capture, or of a log beside one."""
     stem, _, suffix = name.partition(".")
     stamp, _, rest = stem.partition("-")
     run, _, part = rest.partition("-")
     made = len(stamp) == 16 and stamp.endswith("Z") and len(run) == 6 and part.isdecimal()
-    return made and f".{suffix}" in (SUFFIX, *SUFFIXES.values())
+    return made and f".{suffix}" in (SUFFIX, *_LOGS_OF_0_5_0)
 
 
 def state_of(gateway: Gateway) -> dict[str, Any]:
@@ -385,28 +358,23 @@ def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
     ]
 
 
-class _Files:
-    """One part: the capture, locked while it is written, and the CAN log beside it."""
+class _Part:
+    """One file of a capture, locked while it is written."""
 
-    def __init__(self, base: Path, header: bytes, now: int, settings: RecordSettings) -> None:
-        self.path = base.with_name(base.name + SUFFIX)
+    def __init__(self, path: Path, header: bytes, now: int) -> None:
+        self.path = path
         self.begun = now
         self.size = 0
         self.lost = 0
         self._number = 0
         self._new = 0
-        self._log: CanLog | None = None
         self._header: bytes | None = header
         self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
         try:
             with contextlib.suppress(OSError):  # a file system without locks
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self.write(b"H", header)
-            _sync_folder(base.parent)
-            if settings.can_log != "none":
-                self._log = CanLog(
-                    base.with_name(base.name + SUFFIXES[settings.can_log]), settings.can_log, settings.channel
-                )
+            _sync_folder(path.parent)
         except BaseException:  # nothing is in there yet
             os.close(self._fd)
             with contextlib.suppress(OSError):
@@ -422,25 +390,17 @@ class _Files:
         while data:
             data = data[os.write(self._fd, data) :]
 
-    def take(self, items: list[Item], offset: int) -> None:
-        """Append what came; ``offset``: wall clock less monotonic clock."""
-        entries = [item for item in items if item[1] < _SENT]
-        if entries:
-            self.write(b"D", data_payload(entries))
-            if self._header is not None:  # once more, elsewhere: without it nothing can be made of the rest
-                self.write(b"H", self._header)
-                self._header = None
-        if self._log is not None:
-            for time_ns, kind, _, frame, _, _ in items:
-                if kind >= _SENT:
-                    self._log.add(frame, time_ns + offset, kind == _RECEIVED)
+    def take(self, items: list[Item]) -> None:
+        """Append what came."""
+        self.write(b"D", data_payload(items))
+        if self._header is not None:  # once more, elsewhere: without it nothing can be made of the rest
+            self.write(b"H", self._header)
+            self._header = None
 
     def sync(self) -> int:
         """Force to the disk what was written; how many bytes since the last call. OSError where somebody removed a file."""
-        if os.fstat(self._fd).st_nlink == 0 or (self._log is not None and not self._log.exists):
+        if os.fstat(self._fd).st_nlink == 0:
             raise OSError(errno.ENOENT, "what was being written was removed")
-        if self._log is not None:
-            self._log.flush()
         if self._new:
             os.fdatasync(self._fd)
         new, self._new = self._new, 0
@@ -449,22 +409,16 @@ class _Files:
     def close(self) -> int:
         """Close in good order; how many bytes since the last ``sync``."""
         try:
-            try:
-                self.write(b"E", b"")
-                os.fdatasync(self._fd)
-            finally:
-                os.close(self._fd)
+            self.write(b"E", b"")
+            os.fdatasync(self._fd)
         finally:
-            if self._log is not None:
-                self._log.close()
+            os.close(self._fd)
         return self._new
 
     def abandon(self) -> None:
         """Close without writing any more."""
         with contextlib.suppress(OSError):
             os.close(self._fd)
-        if self._log is not None:
-            self._log.abandon()
 
 
 def _make_folder(folder: Path) -> None:

@@ -41,11 +41,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--seconds", type=seconds, default=5.0, metavar="N", help="length of one measurement (default: 5)"
     )
-    made.add_argument(
-        "--long", action="store_true", help="files of up to 1 GB too, which takes minutes and as much disk"
-    )
+    made.add_argument("--long", action="store_true", help="files of up to 100 MB too, which takes minutes")
     made.add_argument("--quick", action="store_true", help="as short as it can be: tries the benchmarks themselves")
-    made.add_argument("--plots", type=Path, metavar="FOLDER", help="draw PNG pictures into this folder")
     made.add_argument("--vcan", default="", metavar="NAME", help="a vcan interface in place of the local socket")
     return made
 
@@ -63,9 +60,8 @@ def main(arguments: list[str] | None = None) -> int:
             return 2
     lasts, turns = (min(args.seconds, 0.5), 1) if args.quick else (args.seconds, 3)
     folder = registry.ROOT / "build" / "bench"
-    for needed in (folder, args.plots or folder):
-        needed.mkdir(parents=True, exist_ok=True)
-    common = Context(folder, lasts, turns, args.quick, args.plots, args.vcan, args.long)
+    folder.mkdir(parents=True, exist_ok=True)
+    common = Context(folder, lasts, turns, args.quick, args.vcan, args.long)
     results, interrupted = [], False
     try:
         for each in known:

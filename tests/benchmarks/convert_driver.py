@@ -1,8 +1,8 @@
 """One conversion in a process of its own: prints its CPU and wall time, its peak memory and what was said of it, as JSON.
 
-    python convert_driver.py FORM IN OUT [--dbc FILE] [--streaming]
+    python convert_driver.py FORM IN OUT [--dbc FILE]
 
-The libraries are loaded before the clock starts. ``--streaming``: one frame after the other, as where numpy is missing.
+The libraries are loaded before the clock starts.
 """
 
 import argparse
@@ -30,19 +30,13 @@ def main() -> None:
     parser.add_argument("source", type=Path)
     parser.add_argument("target", type=Path)
     parser.add_argument("--dbc", type=Path)
-    parser.add_argument("--streaming", action="store_true")
     args = parser.parse_args()
-    import kontronik_can_gw.offline.bulk.candump
-    import kontronik_can_gw.offline.bulk.rows
-    import kontronik_can_gw.offline.tables.parquet  # noqa: F401
-
     if args.form == "parquet":
-        import pyarrow.parquet  # type: ignore[import-untyped]  # noqa: F401
+        import pyarrow.parquet  # type: ignore[import-untyped]
+
+        pyarrow.array([0])  # imports pandas where it is installed
     layout = None if args.dbc is None else layout_of_dbc(args.dbc)
     with DumpInput(args.source, layout) as recording:
-        if args.streaming:
-            recording.bulk_frames = lambda: None  # type: ignore[method-assign]
-            recording.blocks = lambda chosen: None  # type: ignore[method-assign]
         conversion: Conversion = LogConversion(args.form)
         if args.form in TABLES:
             conversion = TableConversion(args.form, Choice.of(recording.reader.columns))

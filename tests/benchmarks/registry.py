@@ -1,9 +1,9 @@
 """What a benchmark is, and what it gives: each of ``MODULES`` has a list ``BENCHMARKS``.
 
-    BENCHMARKS = [Benchmark("scan", "MB/s of the offline scanner, beside C", scan)]
+    BENCHMARKS = [Benchmark("cpu", "CPU time a live frame, beside C", cpu)]
 
-    def scan(context: Context) -> list[Figure]:
-        program = context.compiled("scan.c")   # raises LeftOut where there is no gcc
+    def cpu(context: Context) -> list[Figure]:
+        program = context.compiled("gateway.c")   # raises LeftOut where there is no gcc
         if ours != theirs:
             raise NotEqual("scan: row 12: 3 is not 4")
         return [Figure("scan, ours / C", ratio, "x", "<= 8")]
@@ -68,8 +68,6 @@ class Context:
     """How often measurements that are compared are taken by turns."""
     quick: bool = False
     """As short as it can be: for trying the benchmarks themselves. Figures mean little."""
-    plots: Path | None = None
-    """Where PNG pictures go; None: none are drawn."""
     vcan: str = ""
     """A vcan interface to use in place of the local socket that stands for the bus."""
     long: bool = False

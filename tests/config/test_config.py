@@ -29,7 +29,7 @@ DEFAULTS: dict[str, dict[str, object]] = {
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
     "run": {"wait_for_devices": False, "realtime_priority": None},
     "statistics": {"file": None, "prometheus": None},
-    "record": {"directory": None, "part_mb": 64, "part_minutes": 60, "keep_mb": 0, "min_free_mb": 100, "can_log": "none"},
+    "record": {"directory": None, "part_mb": 64, "part_minutes": 60, "keep_mb": 0, "min_free_mb": 100},
     "mqtt": dict.fromkeys(("broker", "ca_file", "cert_file", "key_file", "username", "password_file"), None)
     | {"tls": False, "gateway": None, "topic": "kontronik", "rate": 1.0, "retain": False, "discovery": None},
     "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250}
@@ -280,7 +280,6 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"canopen": {"enabled": True, "node_id": 127}} | escs({}, {}), "its node-ID would be 128"),
     ({"canopen": {"enabled": True, "read_only": True, "node_id": 255}} | escs({}), "waits for a node-ID by LSS"),
     ({"dbc": {"enabled": False}} | escs({}), "nothing would be sent"),
-    ({"can": {"fd": True}, "record": {"can_log": "trc"}} | escs({}), "a TRC log knows no CAN FD frames"),
     *((tables("statistics", "file", name) | {"dbc": {"file": "my.dbc"}}, f"is the {what}, which would be overwritten")
       for name, what in (("a.toml", "configuration"), ("./a.toml", "configuration"), ("my.dbc", "DBC"))),
 ]  # fmt: skip
@@ -325,7 +324,7 @@ def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(monkey
         "a.toml: can.queue: was removed and is ignored. Leave it out.",
         "a.toml: esc[2].motor: was removed and is ignored. Give pole_pairs.",
     )
-    assert (config.can.channel, config.esc[1].gear) == ("can1", 2)
+    assert (config.can.channel, config.esc[1].gear) == ("can1", Fraction(2))
     assert config.can == parse({"can": {"channel": "can1"}} | escs({}), "a.toml").can
     assert jsonschema.Draft202012Validator(schema()).is_valid(old)
     assert "queue" not in as_toml(config)
@@ -512,7 +511,6 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     **{place: st.integers(*ends) for place, ends in RANGES.items()},
     **dict.fromkeys(STRINGS, st.text(min_size=1, max_size=8).map(lambda text: text.strip() or "x")),
     **dict.fromkeys(BOOLEANS, st.booleans()),
-    ("record", "can_log"): st.sampled_from(["none", "candump", "asc", "blf"]),
     ("dbc", "on_loss"): st.sampled_from(["not_available", "silent"]),
     ("esc", "device"): st.sampled_from([device.text for device in Device]),
     ("can", "options"): st.dictionaries(

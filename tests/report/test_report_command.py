@@ -1,4 +1,4 @@
-"""``kontronik-can-gw report`` from a file to the page and the pictures."""
+"""``kontronik-can-gw report`` from a file to the page."""
 
 import re
 from pathlib import Path
@@ -47,15 +47,10 @@ def test_the_page_can_go_to_standard_output_and_be_of_a_part(dump: Path) -> None
     assert "battery voltage too low" not in out
 
 
-def test_pictures_are_made_and_nothing_is_written_over_without_force(dump: Path, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="pip install 'kontronik-can-gw[plot]'")
-    page, folder = tmp_path / "flight.html", tmp_path / "pictures"
+def test_no_page_is_written_over_without_force(dump: Path, tmp_path: Path) -> None:
+    page = tmp_path / "flight.html"
     page.write_text("mine")
-    folder.mkdir()
-    (folder / "power.png").write_text("mine")
     assert refused(2, "report", dump, "-o", page) == f"{page}: exists. Give another -o, or --force."
-    assert refused(2, "report", dump, "--png", folder) == f"{folder}/power.png: exists. Give another --png, or --force."
-    assert (page.read_text(), (folder / "power.png").read_text()) == ("mine", "mine")
-    assert report(dump, "-o", page, "--png", folder, "--force")[0] == 0
+    assert page.read_text() == "mine"
+    assert report(dump, "-o", page, "--force")[0] == 0
     assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
-    assert all(file.read_bytes().startswith(b"\x89PNG") for file in folder.iterdir())

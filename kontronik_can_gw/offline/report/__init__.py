@@ -1,1 +1,1 @@
-"""A recorded flight as one page for people. analysis (with decimate, ledger, fit) makes a flight of rows; page and plots_png show it."""
+"""A recorded flight as one page for people. analysis (with decimate, ledger, fit) makes a flight of rows; page shows it."""

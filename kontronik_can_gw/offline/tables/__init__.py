@@ -1,6 +1,5 @@
 """Tables of ESC values, a row at each time: CSV, JSON lines, Parquet, MF4."""
 
-from kontronik_can_gw.offline.tables.blocks import Block, BlockColumn
 from kontronik_can_gw.offline.tables.fields import Field, Table
 from kontronik_can_gw.offline.tables.rows import DISORDER_NS, Choice, Row, Rows, first_of
 from kontronik_can_gw.offline.tables.writers import FORMATS, TableWriter, open_table
@@ -8,8 +7,6 @@ from kontronik_can_gw.offline.tables.writers import FORMATS, TableWriter, open_t
 __all__ = [
     "DISORDER_NS",
     "FORMATS",
-    "Block",
-    "BlockColumn",
     "Choice",
     "Field",
     "Row",

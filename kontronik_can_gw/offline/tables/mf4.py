@@ -10,7 +10,6 @@ from typing import Any
 
 from kontronik_can_gw.dbc_output.unpacker import Value
 from kontronik_can_gw.offline.can_logs.mf4 import asammdf_module, quiet, save_mf4, set_start
-from kontronik_can_gw.offline.tables.blocks import Block
 from kontronik_can_gw.offline.tables.fields import Field, Kind, Table
 from kontronik_can_gw.offline.tables.rows import SECOND_NS, Row
 
@@ -25,7 +24,6 @@ class Mf4Table:
         module = asammdf_module()
         self._path = path
         self._provenance = table.provenance
-        self._texts = [[text for _, text in one.texts] for one in table.fields]
         with quiet():
             self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
             set_start(self._mdf, table.start_wall_ns or 0)
@@ -42,11 +40,6 @@ class Mf4Table:
     def write(self, row: Row) -> None:
         """Add a row."""
         (self._groups[row.values[1]] if self._groups else self._group).write(row)
-
-    def write_block(self, block: Block) -> None:
-        """Add many rows."""
-        for row in block.rows(self._texts):
-            self.write(Row(*row))
 
     def close(self) -> None:
         """Write the file."""

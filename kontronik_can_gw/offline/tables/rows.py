@@ -13,7 +13,6 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.offline.replay import TimedFrame
 from kontronik_can_gw.offline.samples import Sample
-from kontronik_can_gw.offline.tables.blocks import Block
 from kontronik_can_gw.offline.tables.fields import Table, fields_of, frame_fields
 
 SECOND_NS = 1_000_000_000
@@ -39,7 +38,6 @@ class Recording(Protocol):
     def reader(self) -> SignalReader: ...
     def frames(self) -> Iterator[TimedFrame]: ...
     def samples(self) -> Iterator[Sample]: ...
-    def blocks(self, chosen: Sequence[int]) -> Iterator[Sample | Block] | None: ...
     def wall_ns(self, time_ns: int) -> int | None: ...
 
 
@@ -81,7 +79,7 @@ def first_of(items: Iterator[T]) -> tuple[T | None, Iterator[T]]:
 
 
 class Rows:
-    """The rows of a recording, single ones and blocks of them: iterate once.
+    """The rows of a recording: iterate once.
 
     ``table`` describes them; None where the recording has nothing.
     """
@@ -92,17 +90,16 @@ class Rows:
         self._names = _frame_names(recording.reader, choice)
         columns = recording.reader.columns
         fields = fields_of([columns[index] for index in choice.columns])
-        items: Iterator[Row | Block]
+        items: Iterator[Row]
         self.table: Table | None = None
-        self._rows: Iterator[Row | Block] = iter(())
-        blocks = None if by_frame or choice.rate is not None else recording.blocks(choice.columns)
+        self._rows: Iterator[Row] = iter(())
         if by_frame:
             first_frame, frames = first_of(recording.frames())
             origin_ns = None if first_frame is None else first_frame.time_ns
             items = self._of_frames(frames, origin_ns or 0)
             fields = [*frame_fields(self._names.values()), *fields]
         else:
-            first, samples = first_of(recording.samples() if blocks is None else blocks)
+            first, samples = first_of(recording.samples())
             origin_ns = None if first is None else first.time_ns
             items = self._of_samples(samples, origin_ns or 0)
         if origin_ns is None:
@@ -110,27 +107,21 @@ class Rows:
         if choice.start_ns is not None or choice.end_ns is not None:
             items = _cut(items, choice.start_ns, choice.end_ns)
         if choice.rate is not None:
-            singly = (item for item in items if isinstance(item, Row))  # there are no blocks
-            items = thinned(singly, choice.rate, (lambda row: row.values[1]) if by_frame else None)
+            items = thinned(items, choice.rate, (lambda row: row.values[1]) if by_frame else None)
         first_row, self._rows = first_of(items)
         if first_row is None:
             return
         wall_ns = recording.wall_ns(origin_ns)
         self.table = Table(fields, wall_ns is not None, by_frame, wall_ns, recording.provenance)
 
-    def __iter__(self) -> Iterator[Row | Block]:
+    def __iter__(self) -> Iterator[Row]:
         return self._rows
 
-    def _of_samples(
-        self, samples: Iterator[Sample | Block] | Iterator[Sample], origin_ns: int
-    ) -> Iterator[Row | Block]:
+    def _of_samples(self, samples: Iterator[Sample], origin_ns: int) -> Iterator[Row]:
         pick = _picker(self._choice.columns)
         wall_ns = self._recording.wall_ns
-        for item in samples:
-            if isinstance(item, Block):
-                yield item.since(origin_ns)
-            else:
-                yield Row(item.time_ns - origin_ns, wall_ns(item.time_ns), pick(item.values))
+        for time_ns, values in samples:
+            yield Row(time_ns - origin_ns, wall_ns(time_ns), pick(values))
 
     def _of_frames(self, frames: Iterator[TimedFrame], origin_ns: int) -> Iterator[Row]:
         reader, names = self._recording.reader, self._names
@@ -157,16 +148,8 @@ def _frame_names(reader: SignalReader, choice: Choice) -> dict[int, tuple[str, s
     return found
 
 
-def _cut(rows: Iterator[Row | Block], start_ns: int | None, end_ns: int | None) -> Iterator[Row | Block]:
+def _cut(rows: Iterator[Row], start_ns: int | None, end_ns: int | None) -> Iterator[Row]:
     for row in rows:
-        if isinstance(row, Block):
-            first = 0 if start_ns is None else row.rows_before(start_ns)
-            behind = len(row) if end_ns is None else row.rows_before(end_ns + 1)
-            if first < behind:
-                yield row.of(first, behind)
-            if end_ns is not None and row.last_ns > end_ns + DISORDER_NS:
-                return
-            continue
         if start_ns is not None and row.time_ns < start_ns:
             continue
         if end_ns is not None and row.time_ns > end_ns:

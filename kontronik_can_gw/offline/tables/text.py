@@ -3,15 +3,47 @@
 import json
 import math
 from collections.abc import Callable, Sequence
+from datetime import UTC as UTC_ZONE
+from datetime import datetime
 from typing import IO
 
 from kontronik_can_gw.dbc_output.unpacker import Value
-from kontronik_can_gw.offline.tables.block_text import BlockText, UtcText, csv_text, seconds_text
-from kontronik_can_gw.offline.tables.blocks import Block
 from kontronik_can_gw.offline.tables.fields import TIME, UTC, Field, Kind, Table
-from kontronik_can_gw.offline.tables.rows import Row
+from kontronik_can_gw.offline.tables.rows import SECOND_NS, Row
 
 _Line = Callable[[str, str, Sequence[Value]], str]
+
+
+def seconds_text(time_ns: int) -> str:
+    """Exact decimal seconds: 6 digits where that is exact, else 9."""
+    sign = "-" if time_ns < 0 else ""
+    seconds, rest = divmod(abs(time_ns), SECOND_NS)
+    return f"{sign}{seconds}.{rest:09d}" if rest % 1000 else f"{sign}{seconds}.{rest // 1000:06d}"
+
+
+class UtcText:
+    """Unix times as ISO 8601 with microseconds: ``2023-11-14T22:13:20.123456Z``; empty where it is no date."""
+
+    def __init__(self) -> None:
+        self._second = -1
+        self._text = ""
+
+    def __call__(self, wall_ns: int | None) -> str:
+        if wall_ns is None:
+            return ""
+        second, rest = divmod(wall_ns, SECOND_NS)
+        if second != self._second:
+            self._second = second
+            try:
+                self._text = datetime.fromtimestamp(second, UTC_ZONE).strftime("%Y-%m-%dT%H:%M:%S")
+            except (ValueError, OverflowError, OSError):
+                self._text = ""
+        return f"{self._text}.{rest // 1000:06d}Z" if self._text else ""
+
+
+def csv_text(text: str) -> str:
+    """Quoted where it has to be."""
+    return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text
 
 
 class CsvTable:
@@ -20,7 +52,6 @@ class CsvTable:
     def __init__(self, file: IO[bytes], table: Table) -> None:
         self._write = file.write
         self._utc = UtcText()
-        self._text = BlockText(table.fields, True, table.has_utc)
         self._line = _compiled(table.fields, "csv", table.has_utc)
         heads = [f"{TIME} [s]", *([UTC] if table.has_utc else []), *(one.header for one in table.fields)]
         file.write((",".join(map(csv_text, heads)) + "\n").encode())
@@ -29,11 +60,6 @@ class CsvTable:
         """Add a row."""
         time_ns, wall_ns, values = row
         self._write(self._line(seconds_text(time_ns), self._utc(wall_ns), values).encode())
-
-    def write_block(self, block: Block) -> None:
-        """Add many rows."""
-        for lines in self._text.lines(block):
-            self._write(lines)
 
     def close(self) -> None:
         """Nothing is held back."""
@@ -48,7 +74,6 @@ class JsonTable:
     def __init__(self, file: IO[bytes], table: Table, units: bool = False) -> None:
         self._write = file.write
         self._utc = UtcText()
-        self._text = BlockText(table.fields, False, table.has_utc)
         self._by_message: dict[Value, _Line] = {}
         fields = table.fields
         if table.by_frame:
@@ -66,11 +91,6 @@ class JsonTable:
         time_ns, wall_ns, values = row
         line = self._by_message[values[1]] if self._by_message else self._line
         self._write(line(seconds_text(time_ns), self._utc(wall_ns), values).encode())
-
-    def write_block(self, block: Block) -> None:
-        """Add many rows."""
-        for lines in self._text.lines(block):
-            self._write(lines)
 
     def close(self) -> None:
         """Nothing is held back."""

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Protocol
 
-from kontronik_can_gw.offline.tables.blocks import Block
 from kontronik_can_gw.offline.tables.fields import Table
 from kontronik_can_gw.offline.tables.rows import Row
 from kontronik_can_gw.offline.tables.text import CsvTable, JsonTable
@@ -18,9 +17,6 @@ class TableWriter(Protocol):
 
     def write(self, row: Row) -> None:
         """Add a row."""
-
-    def write_block(self, block: Block) -> None:
-        """Add many rows."""
 
     def close(self) -> None:
         """Write what is held back, and the end."""

@@ -1,0 +1,107 @@
+"""Plain bytes of one ESC: every frame that brute force finds is a row at its assumed time, whatever stands between the frames."""
+
+import random
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from protocol.reference import Found, certain_at, frames_of
+from protocol.sheet import LIVE_STRUCT
+from protocol.streams import random_stream
+from recordings import convert, dump_bytes
+
+from kontronik_can_gw.offline import inputs
+from kontronik_can_gw.offline.inputs import DumpInput
+from kontronik_can_gw.offline.layouts import layout_of_dbc
+
+DBC = """VERSION ""
+BS_:
+BU_: Gateway
+BO_ 256 Live: 8 Gateway
+ SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|4294967295] "rpm" Vector__XXX
+ SG_ BatteryVoltage : 32|16@1+ (0.01,0) [0|655.35] "V" Vector__XXX
+ SG_ BatteryCurrent : 48|16@1- (0.1,0) [-3276.8|3276.7] "A" Vector__XXX
+"""
+"""Every value that a frame can hold, so that none is out of range."""
+PERIOD_NS = 20_000_000
+STREAMS: dict[str, Callable[[random.Random], bytes]] = {
+    "frames and pieces of frames": lambda source: random_stream(source, 60),
+    "long rubbish": lambda source: b"".join(random_stream(source, 8) + source.randbytes(3000) for _ in range(4)),
+    "headers without end": lambda source: random_stream(source, 20) + b"KODL" * 900 + random_stream(source, 20),
+    "nothing": lambda _: b"",
+}
+
+
+def recording(tmp_path: Path, stream: bytes, live_rate: float) -> DumpInput:
+    dbc, path = tmp_path / "all.dbc", tmp_path / "esc.bin"
+    dbc.write_text(DBC)
+    path.write_bytes(stream)
+    return DumpInput(path, layout_of_dbc(dbc), live_rate)
+
+
+def assumed_times(found: list[Found]) -> list[int]:
+    """A live frame each period, an info frame half a period before the next live frame, never back in time."""
+    times: list[int] = []
+    lives = 0
+    for frame in found:
+        if frame.kind == "live":
+            times.append(lives * PERIOD_NS)
+            lives += 1
+        else:
+            times.append(max(times[-1] if times else 0, lives * PERIOD_NS - PERIOD_NS // 2))
+    return times
+
+
+@pytest.mark.parametrize("kind", list(STREAMS))
+@pytest.mark.parametrize("seed", range(6))
+def test_rows_are_the_frames_that_brute_force_finds(
+    tmp_path: Path, kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However the file is read: small reads put every limit of a read anywhere in a frame and in rubbish."""
+    source = random.Random(f"{kind} {seed}")
+    monkeypatch.setattr(inputs, "CHUNK", source.choice([1, 7, 44, 100, 5000, inputs.CHUNK]))
+    monkeypatch.setattr(inputs, "_MOST_WAITING", source.choice([64, 300, inputs._MOST_WAITING]))
+    stream = STREAMS[kind](source)
+    dump = recording(tmp_path, stream, live_rate=1e9 / PERIOD_NS)
+    found = frames_of(stream)
+    times = assumed_times(found)
+
+    at, ends = 0, {}
+    for time_ns, data in dump.chunks():
+        assert data
+        at += len(data)
+        ends[at] = time_ns
+    assert at == len(stream)
+    assert [ends[frame.end] for frame in found] == times
+
+    lives = [
+        (time_ns, certain == frame.end, struct.unpack_from(LIVE_STRUCT, frame.raw, 4))
+        for frame, time_ns, certain in zip(found, times, certain_at(stream), strict=True)
+        if frame.kind == "live"
+    ]
+    rows = list(dump.samples())
+    assert [row.values for row in rows] == [[data[0], data[1] / 100, data[2] / 10] for _, _, data in lives]
+    for row, (time_ns, at_once, _) in zip(rows, lives, strict=True):
+        # a frame behind a header that may still become one comes with the bytes after it
+        assert row.time_ns == time_ns if at_once else time_ns <= row.time_ns <= time_ns + PERIOD_NS
+    dropped = len(stream) - sum(len(frame.raw) for frame in found)
+    told = [line.split()[0] for line in dump.damage if "belong to no frame" in line]
+    assert told == ([str(dropped)] if dropped else [])
+    assert dump.position == len(stream)
+
+
+@pytest.mark.parametrize(("start", "end"), [("3.3", "9"), ("0", "0"), (None, "7.7"), ("12", None), ("8", "8.001")])
+def test_a_part_of_the_frames_of_plain_bytes_is_cut_out_of_all(
+    tmp_path: Path, start: str | None, end: str | None
+) -> None:
+    source = tmp_path / "esc.bin"
+    source.write_bytes(dump_bytes(15, faults=True))
+    options = [*(["--from", start] if start else []), *(["--until", end] if end else [])]
+    assert convert("-q", source, tmp_path / "all.log") == 0
+    assert convert("-q", source, tmp_path / "part.log", *options) == 0
+    lines = (tmp_path / "all.log").read_text().splitlines()
+    low, high = float(start or 0), float(end or 1e9)
+    wanted = [line for line in lines if low <= float(line[1:].partition(")")[0]) <= high]
+    assert len(lines) > len(wanted) > 0
+    assert (tmp_path / "part.log").read_text().splitlines() == wanted
