@@ -7,7 +7,9 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from harness import Bench, Identity, PtyPort, Report
+from encoding import Identity
+from fault_report import Report
+from harness import Bench, PtyPort
 from signals import Table, table_of_shipped
 from slcan_adapters import Bus
 
@@ -108,7 +110,8 @@ def adapters(report: Report) -> Iterator[Bench]:
         bus.close()
 
 
-BENCHES: dict[str, Callable[[Report], contextlib.AbstractContextManager[Bench]]] = {
+MakesBench = Callable[[Report], contextlib.AbstractContextManager[Bench]]
+BENCHES: dict[str, MakesBench] = {
     "two": two,
     "cycles": two,
     "adapters": adapters,

@@ -28,10 +28,9 @@ KEPT = 100
 
 _SO_TIMESTAMPNS = 35
 _SO_RCVBUFFORCE = 33
-_ERR_FILTER = 2
 _FRAME = struct.Struct("=IB3x8s")
 _STAMP = struct.Struct("=qq")
-_EXTENDED, _ERROR, _ID = 0x80000000, 0x20000000, 0x1FFFFFFF
+_EXTENDED = 0x80000000
 _FOLLOWS = {"Speed": SPEED, "Current": CURRENT}
 
 
@@ -65,24 +64,41 @@ class Emergency(NamedTuple):
     data: bytes
 
 
+class Said(NamedTuple):
+    """A frame with an ESC's values: the time, the message, and what is not marked as not available."""
+
+    at_ns: int
+    message: Message
+    esc: int
+    data: bytes
+    present: list[tuple[str, float, float]]
+    """Name, value and half a step."""
+    flags: int | None
+    """The error bits, where the message has any and they hold."""
+
+    @property
+    def name(self) -> str:
+        return f"Esc{self.esc + 1}{self.message.stem}"
+
+    @property
+    def text(self) -> str:
+        return ", ".join(f"{name} {value:g}" for name, value, _ in self.present)
+
+    def wrong(self, why: str) -> Wrong:
+        return Wrong(self.at_ns, self.name, self.data.hex(), why)
+
+    def is_of(self, values: dict[str, float]) -> bool:
+        same = all(abs(values[name] - value) <= half for name, value, half in self.present)
+        return same and (self.flags is None or self.flags == values["flags"])
+
+
 class Judge:
-    """What was sent, what came, and whether it is right.
+    """What was sent, what came, and whether it is right. ``slack_ns``: what the machine is given on top of the time-out."""
 
-    ``timeout_ns``: how old a live value may be by the configuration; ``slack_ns``: what the machine is given on top.
-    """
-
-    def __init__(
-        self,
-        table: Table,
-        escs: Sequence[FedEsc],
-        slack_ns: int = 60 * MS,
-        timeout_ns: int = TIMEOUT_NS,
-        node_ids: Sequence[int] = (),
-    ) -> None:
+    def __init__(self, table: Table, escs: Sequence[FedEsc], slack_ns: int = 60 * MS) -> None:
         self.table = table
         self.escs = escs
         self.slack_ns = slack_ns
-        self.timeout_ns = timeout_ns
         self.wrong: list[Wrong] = []
         """The newest ones, settled."""
         self.wrong_count = 0
@@ -91,92 +107,70 @@ class Judge:
         """Of them those that were right, but late."""
         self.late_count = 0
         """Values that were old only because the machine stood still."""
-        self.frames = 0
         self.values = 0
         """Frames with values that were compared and right."""
         self.marked = 0
         """Frames in which all values were marked not available."""
-        self.unknown = 0
         self.boot_ups: list[tuple[int, int]] = []
         """(time, node)"""
-        self.heartbeats: deque[tuple[int, int, int]] = deque(maxlen=1000)
-        """(time, node, state)"""
         self.emergencies: list[Emergency] = []
-        self.errors: deque[tuple[int, int, bytes]] = deque(maxlen=1000)
-        """Error frames of the watched interface: (time, class, data)."""
         self.fresh: list[deque[Fresh]] = [deque(maxlen=5_000) for _ in escs]
         """The EscSpeed frames that were right."""
-        self.marks: list[int] = [0 for _ in escs]
-        """When an EscSpeed frame marked as not available came last."""
         self.longest_silence_ns = [0 for _ in escs]
         self.last_ns = 0
         self._last_fresh_ns = [0 for _ in escs]
         self._suspects: list[Wrong] = []
         self._newest: dict[int, int] = {}  # CAN id -> number of the newest live frame that it has carried
-        self._bits: dict[str, tuple[int, Message, int]] = {}  # message name -> time, message, content
-        self._nodes = set(node_ids) or set(range(1, len(escs) + 1))
+        self._bits: dict[str, tuple[Message, int]] = {}  # message name -> message, content
+        self._nodes = set(range(1, len(escs) + 1))
         self._live: list[dict[int, dict[str, float]]] = [{} for _ in escs]
         self._info: list[dict[int, dict[str, float]]] = [{} for _ in escs]
         self._devices: list[int | None] = [None for _ in escs]
 
     def take(self, can_id: int, data: bytes, at_ns: int) -> None:
         """A classic frame with an 11-bit identifier that the gateway has sent."""
-        self.frames += 1
         self.last_ns = at_ns
         if can_id > 0x700 and can_id - 0x700 in self._nodes and len(data) == 1:
             if data[0] == 0:
                 self.boot_ups.append((at_ns, can_id - 0x700))
-            self.heartbeats.append((at_ns, can_id - 0x700, data[0]))
             return
         if 0x80 < can_id <= 0xFF and can_id - 0x80 in self._nodes and len(data) == 8:
             self.emergencies.append(Emergency(at_ns, can_id - 0x80, int.from_bytes(data[:2], "little"), data))
             return
         message = self.table.get(can_id)
         if message is None:
-            self.unknown += 1
             return
         bits = int.from_bytes(data, "little")
         if message.kind == "other":
             name = message.stem if message.esc is None else f"Esc{message.esc + 1}{message.stem}"
-            self._bits[name] = (at_ns, message, bits)
+            self._bits[name] = (message, bits)
             if message.stem == "Link":
                 self._judge_age(message, bits, at_ns)
             return
         present = []
         for place in message.places:
-            raw = bits >> place.start & place.mask
-            if raw & place.sign:
-                raw -= place.mask + 1
+            raw = place.raw(bits)
             if raw != place.not_available:
                 present.append((place.name, raw * place.scale, place.scale / 2 + 1e-9))
-        assert message.esc is not None
         if not present:
             self.marked += 1
-            if message.stem == "Speed":
-                self.marks[message.esc] = at_ns
             return
         start, mask = message.flags
         has_state = mask and any(name in ("operating_state", "device") for name, _, _ in present)
-        flags = (bits >> start & mask) if has_state else None
-        if message.kind == "info":
-            self._judge_info(message, data, present, flags, at_ns)
-        else:
-            self._judge_live(message, data, present, flags, at_ns)
+        assert message.esc is not None
+        said = Said(at_ns, message, message.esc, data, present, (bits >> start & mask) if has_state else None)
+        (self._judge_info if message.kind == "info" else self._judge_live)(said)
 
     def value(self, message: str, signal: str) -> int | None:
         """The newest raw value of a signal of the gateway's own messages or of ``EscNLink``; None before the first."""
         found = self._bits.get(message)
         if found is None:
             return None
-        return next(place.raw(found[2]) for place in found[1].places if place.name == signal)
+        return next(place.raw(found[1]) for place in found[0].places if place.name == signal)
 
     def info_device(self, esc: int) -> int | None:
         """The device number that an ESC's newest right EscInfo told."""
         return self._devices[esc]
-
-    def time_of(self, message: str) -> int:
-        """When that message came last, 0 if never."""
-        return self._bits[message][0] if message in self._bits else 0
 
     def first_fresh(self, esc: int, after_ns: int, sent_after_ns: int = 0) -> Fresh | None:
         """The first right value frame of an ESC after a time, of a live frame that was sent after another."""
@@ -228,84 +222,65 @@ class Judge:
 
     # --- judging
 
-    def _judge_live(
-        self, message: Message, data: bytes, present: list[tuple[str, float, float]], flags: int | None, at_ns: int
-    ) -> None:
-        assert message.esc is not None
-        esc = self.escs[message.esc]
-        newest = esc.newest(at_ns + MS)
-        n = newest
-        while n >= 0 and at_ns - esc.left(n) <= self.timeout_ns + self.slack_ns:
-            if self._is_live(message.esc, n, present, flags):
+    def _judge_live(self, said: Said) -> None:
+        esc, at_ns = self.escs[said.esc], said.at_ns
+        n = newest = esc.newest(at_ns + MS)
+        while n >= 0 and at_ns - esc.left(n) <= TIMEOUT_NS + self.slack_ns:
+            if self._is_live(said, said.esc, n):
                 break
             n -= 1
         else:
-            self._suspects.append(self._origin(message, data, n, newest, present, flags, at_ns))
+            self._suspects.append(self._origin(said, n, newest))
             return
-        if n < self._newest.get(message.can_id, -1):
-            newer = self._newest[message.can_id]
-            self._say_wrong(message, data, at_ns, f"values of frame {n} after those of frame {newer}")
+        newer = self._newest.get(said.message.can_id, -1)
+        if n < newer:
+            self._suspects.append(said.wrong(f"values of frame {n} after those of frame {newer}"))
             return
-        self._newest[message.can_id] = n
+        self._newest[said.message.can_id] = n
         self.values += 1
-        if follows := _FOLLOWS.get(message.stem):
+        if follows := _FOLLOWS.get(said.message.stem):
             esc.seen[n] |= follows
             if follows == SPEED:
-                self.fresh[message.esc].append(Fresh(at_ns, n))
-                if (last := self._last_fresh_ns[message.esc]) and at_ns - last > self.longest_silence_ns[message.esc]:
-                    self.longest_silence_ns[message.esc] = at_ns - last
-                self._last_fresh_ns[message.esc] = at_ns
+                self.fresh[said.esc].append(Fresh(at_ns, n))
+                if last := self._last_fresh_ns[said.esc]:
+                    self.longest_silence_ns[said.esc] = max(self.longest_silence_ns[said.esc], at_ns - last)
+                self._last_fresh_ns[said.esc] = at_ns
 
-    def _origin(
-        self,
-        message: Message,
-        data: bytes,
-        n: int,
-        newest: int,
-        present: list[tuple[str, float, float]],
-        flags: int | None,
-        at_ns: int,
-    ) -> Wrong:
+    def _origin(self, said: Said, older: int, newest: int) -> Wrong:
         """Where values come from that none of the newest frames had."""
-        assert message.esc is not None
-        fed = self.escs[message.esc]
-        name = f"Esc{message.esc + 1}{message.stem}"
-        oldest = max(0, newest - LOOKED_BACK)
-        while n >= oldest:
-            if self._is_live(message.esc, n, present, flags, keep=False):
-                age = at_ns - fed.left(n)
-                why = f"old: frame {n}, sent {age / SECOND:.3f} s before"
-                excess = age - self.timeout_ns - self.slack_ns
-                follows = _FOLLOWS.get(message.stem, 0)
-                return Wrong(at_ns, name, data.hex(), why, fed.sent[n], excess, message.esc, n, follows)
-            n -= 1
-        for other in range(len(self.escs)):
-            if other != message.esc and (m := self.escs[other].newest(at_ns)) >= 0:
-                for k in range(m, max(-1, m - 20), -1):
-                    if self._is_live(other, k, present, flags, keep=False):
-                        return Wrong(at_ns, name, data.hex(), f"of another ESC: frame {k} of esc{other + 1}")
-        text = ", ".join(f"{value_name} {value:g}" for value_name, value, _ in present)
-        return Wrong(at_ns, name, data.hex(), f"never sent: {text}; newest frame {newest}")
+        fed = self.escs[said.esc]
+        for n in range(older, max(0, newest - LOOKED_BACK) - 1, -1):
+            if self._is_live(said, said.esc, n, keep=False):
+                age = said.at_ns - fed.left(n)
+                return said.wrong(f"old: frame {n}, sent {age / SECOND:.3f} s before")._replace(
+                    since_ns=fed.sent[n],
+                    excess_ns=age - TIMEOUT_NS - self.slack_ns,
+                    esc=said.esc,
+                    n=n,
+                    follows=_FOLLOWS.get(said.message.stem, 0),
+                )
+        for other, another in enumerate(self.escs):
+            last = another.newest(said.at_ns) if other != said.esc else -1
+            for n in range(last, max(-1, last - 20), -1):
+                if self._is_live(said, other, n, keep=False):
+                    return said.wrong(f"of another ESC: frame {n} of esc{other + 1}")
+        return said.wrong(f"never sent: {said.text}; newest frame {newest}")
 
-    def _judge_info(
-        self, message: Message, data: bytes, present: list[tuple[str, float, float]], flags: int | None, at_ns: int
-    ) -> None:
-        assert message.esc is not None
-        esc = self.escs[message.esc]
-        m = newest = esc.newest_info(at_ns + MS)
-        while m >= 0 and at_ns - esc.info_sent[m] <= INFO_TIMEOUT_NS + self.slack_ns:
-            values = self._info[message.esc].get(m)
+    def _judge_info(self, said: Said) -> None:
+        esc = self.escs[said.esc]
+        m = newest = esc.newest_info(said.at_ns + MS)
+        while m >= 0 and said.at_ns - esc.info_sent[m] <= INFO_TIMEOUT_NS + self.slack_ns:
+            values = self._info[said.esc].get(m)
             if values is None:
-                values = info_values(esc.info(m))
-                self._keep(self._info[message.esc], m, values)
-            if not flags and _same(values, present):
+                values = info_values(esc.info(m)) | {"flags": 0}
+                self._keep(self._info[said.esc], m, values)
+            if said.is_of(values):
                 self.values += 1
-                if "device" in values and message.stem == "Info":
-                    self._devices[message.esc] = int(values["device"])
+                if said.message.stem == "Info":
+                    self._devices[said.esc] = int(values["device"])
                 return
             m -= 1
-        text = ", ".join(f"{name} {value:g}" for name, value, _ in present)
-        self._say_wrong(message, data, at_ns, f"no info of the last 10 s: {text}; newest {newest}")
+        self._suspects.append(said.wrong(f"no info of the last 10 s: {said.text}; newest {newest}"))
 
     def _judge_age(self, message: Message, bits: int, at_ns: int) -> None:
         """The age of the data must not be told younger than what was sent last."""
@@ -314,18 +289,18 @@ class Judge:
         age = place.raw(bits)
         if age == place.not_available or age >= 65_000:
             return
-        newest = self.escs[message.esc].newest(at_ns + MS)
-        true_age = (at_ns - self.escs[message.esc].left(newest)) / MS if newest >= 0 else 1e9
+        fed = self.escs[message.esc]
+        newest = fed.newest(at_ns + MS)
+        true_age = (at_ns - fed.left(newest)) / MS if newest >= 0 else 1e9
         if age < true_age - self.slack_ns / MS - 5:
-            sent = self.escs[message.esc].sent[newest] if newest >= 0 else None
+            sent = fed.sent[newest] if newest >= 0 else None
             why = f"an age of {age} ms; the newest is {true_age:.0f} ms old"
             excess = int((true_age - age) * MS) - self.slack_ns
             name = f"Esc{message.esc + 1}{message.stem}"
             self._suspects.append(Wrong(at_ns, name, f"{bits:016x}", why, sent, excess))
 
-    def _is_live(
-        self, esc: int, n: int, present: list[tuple[str, float, float]], flags: int | None, keep: bool = True
-    ) -> bool:
+    def _is_live(self, said: Said, esc: int, n: int, keep: bool = True) -> bool:
+        """Whether an ESC's live frame has these values."""
         values = self._live[esc].get(n)
         if values is None:
             fed = self.escs[esc]
@@ -334,21 +309,13 @@ class Judge:
             values["flags"] = data.operating_errors & 0xFFFFFF
             if keep:
                 self._keep(self._live[esc], n, values)
-        return _same(values, present) and (flags is None or flags == values["flags"])
+        return said.is_of(values)
 
     @staticmethod
     def _keep(cache: dict[int, dict[str, float]], n: int, values: dict[str, float]) -> None:
         cache[n] = values
         if len(cache) > 80:
             del cache[next(iter(cache))]
-
-    def _say_wrong(self, message: Message, data: bytes, at_ns: int, why: str) -> None:
-        name = message.stem if message.esc is None else f"Esc{message.esc + 1}{message.stem}"
-        self._suspects.append(Wrong(at_ns, name, data.hex(), why))
-
-
-def _same(values: dict[str, float], present: list[tuple[str, float, float]]) -> bool:
-    return all(abs(values[name] - value) <= half for name, value, half in present)
 
 
 def _both_clocks() -> tuple[int, int]:
@@ -374,14 +341,11 @@ class BusWatch(Judge):
         escs: Sequence[FedEsc],
         *,
         slack_ns: int = 60 * MS,
-        timeout_ns: int = TIMEOUT_NS,
         ignore_local: bool = True,
-        node_ids: Sequence[int] = (),
     ) -> None:
-        super().__init__(table, escs, slack_ns, timeout_ns, node_ids)
+        super().__init__(table, escs, slack_ns)
         self.interface = interface
         self.foreign = 0
-        self.extended = 0
         self.failure: BaseException | None = None
         self._ignore_local = ignore_local
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
@@ -390,7 +354,6 @@ class BusWatch(Judge):
                 self._socket.setsockopt(socket.SOL_SOCKET, option, 48 << 20)
                 break
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        self._socket.setsockopt(socket.SOL_CAN_RAW, _ERR_FILTER, 0x1FFFFFFF)
         self._socket.bind(("",))
         self._socket.settimeout(0.1)
         now, wall = _both_clocks()
@@ -430,13 +393,9 @@ class BusWatch(Judge):
                 at_ns = self._monotonic(seconds * SECOND + rest, now)
         self._latest_ns = at_ns
         can_id, size, content = _FRAME.unpack(data)
-        if can_id & _ERROR:
-            self.errors.append((at_ns, can_id & _ID, content))
-        elif self._ignore_local and flags & socket.MSG_DONTROUTE:
+        if self._ignore_local and flags & socket.MSG_DONTROUTE:
             self.foreign += 1
-        elif can_id & _EXTENDED:
-            self.extended += 1
-        else:
+        elif not can_id & _EXTENDED:
             self.take(can_id & 0x7FF, content[:size], at_ns)
 
     def catch_up(self, seconds: float = 90) -> None:

@@ -4,23 +4,26 @@ import subprocess
 import time
 
 import benches
-from harness import SECOND, Bench, Fault, Injection, fault
+from bus_watch import SECOND
+from fault_report import Fault, fault
+from harness import Bench, Injection
 from raw_bus import ERROR_FLAG, RawBus
 from slcan_adapters import Adapter, Bus
 
 LIMIT_S = 1.0
-BUS_OFF, DOWN, PASSIVE = 4, 5, 3
+ACTIVE, PASSIVE = 1, 3
 BUS_OFF_LEFT = 0x8140
 MOST_IN_CONTROLLER = 6
 """Frames that the kernel has taken and that nobody can take back: as many as the smallest send buffer that it grants holds."""
 
 
-def can_state(bench: Bench) -> int | None:
-    return bench.watch.value("GatewayStatus", "can_state")
-
-
 def ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True)
+    benches.run("ip", *words)
+
+
+def wait_can_state(bench: Bench, state: int) -> None:
+    """Wait until GatewayStatus says so."""
+    bench.wait_until(lambda: bench.watch.value("GatewayStatus", "can_state") == state, 2, f"CanState {state}")
 
 
 def boot_ups(injection: Injection) -> None:
@@ -31,22 +34,10 @@ def boot_ups(injection: Injection) -> None:
 
 @fault("CAN", "interface down and up", LIMIT_S)
 def down(bench: Bench, fault: Fault, times: int) -> None:
-    for i in range(times * 2):
+    for pause in [0.05, 0.5, 1.2] * times + [24 if times > 10 else 4]:
         with bench.injection(fault) as injection:
             ip("link", "set", bench.interface, "down")
-            time.sleep((0.05, 0.5, 1.2)[i % 3])
-            injection.cleared()
-            ip("link", "set", bench.interface, "up")
-            injection.wait_recovery()
-            boot_ups(injection)
-
-
-@fault("CAN", "interface down for long", LIMIT_S)
-def down_long(bench: Bench, fault: Fault, times: int) -> None:
-    for i in range(max(1, times // 3)):
-        with bench.injection(fault) as injection:
-            ip("link", "set", bench.interface, "down")
-            time.sleep(4 + 20 * i)
+            time.sleep(pause)
             injection.cleared()
             ip("link", "set", bench.interface, "up")
             injection.wait_recovery()
@@ -72,8 +63,8 @@ def missing(bench: Bench, fault: Fault, times: int) -> None:
         with bench.injection(fault) as injection:
             injection.expect(bench.stop() == 0, "the gateway did not end well")
             ip("link", "del", bench.interface)
-            gateway = bench.start(wait=False)
-            bench.wait_until(lambda gateway=gateway: "Trying again" in gateway.log, 20, "the log says so")  # type: ignore[misc]
+            bench.start(wait=False)
+            bench.wait_log("Trying again", seconds=20)
             time.sleep(0.7)
             benches.make_pair(bench.interface, bench.watched, up=False)
             injection.cleared()
@@ -92,7 +83,7 @@ def bus_off(bench: Bench, fault: Fault, times: int) -> None:
             far.send(ERROR_FLAG | 0x100, bytes(8))
             injection.wait_recovery()
             boot_ups(injection)
-            injection.expect(BUS_OFF_LEFT in injection.emergency_codes(1), "no EMCY 8140h")
+            injection.wait_emergency(1, BUS_OFF_LEFT)
 
 
 def limit(interface: str, rate: str) -> None:
@@ -110,7 +101,7 @@ FREE = "1gbit"
 
 def unlimit(interface: str) -> None:
     """To be called when nothing waits: what waits is thrown away."""
-    subprocess.run(["tc", "qdisc", "del", "dev", interface, "root"], check=True)
+    benches.run("tc", "qdisc", "del", "dev", interface, "root")
 
 
 @fault("CAN", "ENOBUFS: a bus that takes less than there is to send", LIMIT_S)
@@ -173,7 +164,7 @@ def controller_bus_off(bench: Bench, fault: Fault, times: int) -> None:
             restart(near)
             injection.wait_recovery()
             boot_ups(injection)
-            injection.expect(BUS_OFF_LEFT in injection.emergency_codes(1), "no EMCY 8140h")
+            injection.wait_emergency(1, BUS_OFF_LEFT)
 
 
 @fault("CAN", "controller error passive", None, bench="adapters")
@@ -183,10 +174,10 @@ def passive(bench: Bench, fault: Fault, times: int) -> None:
         with bench.injection(fault, []) as injection:
             near.tell_errors("f")
             near.tell_state("p", 10, 130)
-            bench.wait_until(lambda: can_state(bench) == PASSIVE, 2, "GatewayStatus says ErrorPassive")
+            wait_can_state(bench, PASSIVE)
             injection.cleared()
             near.tell_state("a", 0, 0)
-            bench.wait_until(lambda: can_state(bench) == 1, 2, "GatewayStatus says ErrorActive")
+            wait_can_state(bench, ACTIVE)
 
 
 @fault("CAN", "no other node acknowledges", LIMIT_S, bench="adapters")

@@ -2,14 +2,17 @@
 
 import contextlib
 import os
-import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 
 import benches
-from harness import SECOND, Bench, Fault, Gateway, PtyPort, Report, fault
+from bus_watch import SECOND
+from fault_report import Fault, Report, fault
+from harness import Bench, PtyPort
 from process_faults import RESTART_LIMIT_S, start_and_wait
 from raw_bus import RawBus
 
@@ -31,7 +34,7 @@ write to the disk at all, which the watch on its system calls would show as sile
 
 def mount_small(folder: Path) -> None:
     folder.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k,mode=0700", "tmpfs", str(folder)], check=True)
+    benches.run("mount", "-t", "tmpfs", "-o", "size=64k,mode=0700", "tmpfs", str(folder))
 
 
 def fill(folder: Path) -> Path:
@@ -69,35 +72,37 @@ def stores_again(bench: Bench, master: RawBus) -> None:
         raise AssertionError(f"parameters cannot be stored though the disk is good again: {code}")
 
 
-@fault("Disk", "full", None, bench="disk")
-def full(bench: Bench, fault: Fault, times: int) -> None:
-    """A master's "save" is refused, and is possible again when there is room; telemetry goes on."""
+@contextlib.contextmanager
+def full(folder: Path) -> Iterator[None]:
+    filler = fill(folder)
+    yield
+    filler.unlink()
+
+
+@contextlib.contextmanager
+def read_only(folder: Path) -> Iterator[None]:
+    """On top of the one that the gateway has its lock open on, which would be busy."""
+    benches.run("mount", "--bind", str(folder), str(folder))
+    benches.run("mount", "-o", "remount,bind,ro", str(folder))
+    yield
+    benches.run("umount", str(folder))
+
+
+def refused(bench: Bench, fault: Fault, times: int, bad: Callable[[Path], AbstractContextManager[None]]) -> None:
+    """A master's "save" is refused, and is possible again when the disk is good; telemetry goes on."""
     with RawBus(bench.watched) as master:
         for _ in range(times):
             with bench.injection(fault, []) as injection:
-                filler = fill(bench.store)
-                master.write(1, *TIMEOUT_OBJECT, 251, 2)
-                code = master.store(1)
-                injection.expect(code not in (0, None), f"saving on a full disk was answered with {code}")
-                filler.unlink()
+                with bad(bench.store):
+                    master.write(1, *TIMEOUT_OBJECT, 251, 2)
+                    code = master.store(1)
+                    injection.expect(code not in (0, None), f"saving was answered with {code}")
                 injection.cleared()
                 stores_again(bench, master)
 
 
-@fault("Disk", "read-only", None, bench="disk")
-def read_only(bench: Bench, fault: Fault, times: int) -> None:
-    with RawBus(bench.watched) as master:
-        for _ in range(times):
-            with bench.injection(fault, []) as injection:
-                # on top of the one that the gateway has its lock open on, which would be busy
-                subprocess.run(["mount", "--bind", str(bench.store), str(bench.store)], check=True)
-                subprocess.run(["mount", "-o", "remount,bind,ro", str(bench.store)], check=True)
-                master.write(1, *TIMEOUT_OBJECT, 252, 2)
-                code = master.store(1)
-                injection.expect(code not in (0, None), f"saving on a read-only disk was answered with {code}")
-                subprocess.run(["umount", str(bench.store)], check=True)
-                injection.cleared()
-                stores_again(bench, master)
+fault("Disk", "full", None, bench="disk")(partial(refused, bad=full))
+fault("Disk", "read-only", None, bench="disk")(partial(refused, bad=read_only))
 
 
 @fault("Disk", "a write that takes 5 s", None, bench="disk")
@@ -108,23 +113,17 @@ def slow(bench: Bench, fault: Fault, times: int) -> None:
         for _ in range(max(1, times // 3)):
             with bench.injection(fault, []) as injection:
                 assert bench.gateway is not None
-                gateway, saved = bench.gateway, bench.gateway.log.count("parameters stored")
+                said = len(bench.gateway.lines)
                 bench.watch.reset_silence()
                 switch.touch()
                 master.write(1, *TIMEOUT_OBJECT, 253, 2)
                 begin = time.monotonic()
                 master.store(1, 1)
-
-                def stored(gateway: Gateway = gateway, saved: int = saved) -> bool:
-                    return gateway.log.count("parameters stored") > saved
-
-                bench.wait_until(stored, 40, "the saving's end")
+                bench.wait_log("parameters stored", said, 40)
                 took = time.monotonic() - begin
                 silence = max(bench.watch.longest_silence_ns) / SECOND
-                bench.report.row(fault).figures |= {
-                    "s to save": round(took, 1),
-                    "longest silence in s": round(silence, 3),
-                }
+                bench.report.row(fault).peak("s to save", round(took, 1))
+                bench.report.row(fault).peak("longest silence in s", round(silence, 3))
                 switch.unlink()
                 injection.expect(took > SLOW_S, f"the disk was not slow: {took:.1f} s")
                 injection.cleared()
@@ -144,10 +143,8 @@ def damaged(bench: Bench, fault: Fault, times: int) -> None:
                 file.write_bytes((b"", content[: len(content) // 2], bytes(x ^ 0x20 for x in content))[i % 3])
                 start_and_wait(injection)
                 assert bench.gateway is not None
-                injection.expect(
-                    "Running on defaults" in bench.gateway.log, "the log does not say that the file is bad"
-                )
-                injection.expect(0x6300 in injection.emergency_codes(1), "no EMCY 6300h")
+                bench.wait_log("Running on defaults")
+                injection.wait_emergency(1, 0x6300)
                 stores_again(bench, master)
 
 

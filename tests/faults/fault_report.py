@@ -20,6 +20,9 @@ class Fault:
     bench: str
     """Which bench it needs; those that need the same one share it."""
 
+    def __str__(self) -> str:
+        return f"{self.area}: {self.name}"
+
 
 FAULTS: list[Fault] = []
 """Every fault; filled by importing the modules that define them."""
@@ -77,6 +80,17 @@ class Row:
     """What went wrong, for people."""
     figures: dict[str, float] = field(default_factory=dict)
 
+    def __str__(self) -> str:
+        return f"{self.area}: {self.name}"
+
+    def peak(self, name: str, value: float) -> None:
+        """The largest of a figure."""
+        self.figures[name] = max(value, self.figures.get(name, 0))
+
+    def count(self, name: str, value: float) -> None:
+        """The sum of a figure."""
+        self.figures[name] = value + self.figures.get(name, 0)
+
     @property
     def good(self) -> bool:
         healed = self.injected > 0 and self.recovered == self.injected
@@ -114,7 +128,7 @@ class Report:
         """Each row as a test; one that was not judged as skipped."""
         suite = ET.Element("testsuite")
         for row in self.rows:
-            case = ET.SubElement(suite, "testcase", classname=f"faults.{row.machine}", name=f"{row.area}: {row.name}")
+            case = ET.SubElement(suite, "testcase", classname=f"faults.{row.machine}", name=str(row))
             if row.state == FAILED:
                 ET.SubElement(case, "failure", message=line(row))
             elif row.state == NOT_JUDGED:
@@ -135,7 +149,7 @@ class Report:
 def line(row: Row) -> str:
     """One row for the terminal."""
     recovery = "undisturbed" if row.limit_s is None else f"worst {row.worst_s:.2f} s of {row.limit_s:g} s"
-    text = f"{row.state:10} {row.machine} {row.area}: {row.name}: {row.recovered} of {row.injected}, "
+    text = f"{row.state:10} {row.machine} {row}: {row.recovered} of {row.injected}, "
     text += f"{recovery}, wrong {row.wrong}, lost {row.lost}"
     if row.excused:
         text += f", {row.excused} not sent while the machine stood still"
@@ -144,4 +158,4 @@ def line(row: Row) -> str:
     if row.taken > MAX_TAKEN:
         text += f", {row.taken:.0%} of the processor time was taken"
     figures = ", ".join(f"{name} {value:g}" for name, value in row.figures.items())
-    return text + (f"; {figures}" if figures else "") + "".join(f"\n       {note}" for note in row.notes)
+    return text + (f"; {figures}" if figures else "") + "".join(f"\n       {note}" for note in row.notes[:8])

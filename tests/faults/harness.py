@@ -21,36 +21,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol, Self
 
-from bus_watch import MS, SECOND, BusWatch, Judge
+from bus_watch import MS, SECOND, BusWatch, Fresh
 from encoding import GEAR, POLE_PAIRS, Identity
-from fault_report import FAULTS, Fault, Report, Row, fault, line
+from fault_report import Fault, Report, Row
 from feeder import CURRENT, SPEED, FedEsc, Feeder
 from signals import Table, table_of_configuration
 
 from kontronik_can_gw.offline.pty import PtyEsc
-
-__all__ = [
-    "FAULTS",
-    "MS",
-    "SECOND",
-    "Bench",
-    "BusWatch",
-    "Fault",
-    "FedEsc",
-    "Feeder",
-    "Gateway",
-    "Identity",
-    "Injection",
-    "Judge",
-    "Metronome",
-    "NotRecovered",
-    "Port",
-    "PtyPort",
-    "Report",
-    "Row",
-    "fault",
-    "line",
-]
 
 IN_FLIGHT_NS = 60 * MS
 """A frame that was handed over so shortly before a fault may be its victim."""
@@ -60,12 +37,12 @@ AHEAD = ("chrt", "-f", "10")
 """The gateway goes before the bench's own processes, with which it shares a processor here."""
 _METRONOME = """
 import sys, time
-last = time.monotonic_ns()
+step, last = float(sys.argv[1]), time.monotonic_ns()
 while True:
-    time.sleep(0.004)
+    time.sleep(step)
     now = time.monotonic_ns()
-    if now - last > 12_000_000:
-        print(last + 4_000_000, now, flush=True)
+    if now - last > 3e9 * step:
+        print(last + int(1e9 * step), now, flush=True)
     last = now
 """
 
@@ -80,21 +57,15 @@ class Gateway:
     (Like GatewayProcess of the vcan tests, without the libraries that those import: emulated, they cost seconds.)
     """
 
-    def __init__(
-        self,
-        config: Path,
-        *options: str,
-        prefix: Sequence[str] = (),
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
-        command = [*AHEAD, *prefix, sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)]
+    def __init__(self, config: Path, prefix: Sequence[str], environment: Mapping[str, str]) -> None:
+        command = [*AHEAD, *prefix, sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), "--wait"]
         self.started_ns = time.monotonic_ns()
         self.process = subprocess.Popen(
-            [*command, *options],
+            command,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
-            env={**os.environ, **(environment or {})},
+            env={**os.environ, **environment},
         )
         self.lines: list[str] = []
         """What it has logged so far."""
@@ -109,14 +80,6 @@ class Gateway:
     @property
     def log(self) -> str:
         return "\n".join(self.lines)
-
-    def end(self, number: int = 15, seconds: float = 5) -> int:
-        """Send a signal and wait for the exit code."""
-        self.process.send_signal(number)
-        try:
-            return self.process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            raise NotRecovered(f"it did not end within {seconds:g} s of signal {number}") from None
 
     def kill(self) -> None:
         if self.process.poll() is None:
@@ -140,9 +103,14 @@ class Gateway:
             "threads": int(status["Threads"]),
         }
 
-    def processor_seconds(self) -> float:
-        fields = Path("/proc", str(self.process.pid), "stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+def growth(row: Row, before: dict[str, int], after: dict[str, int], rss_kib: int) -> list[str]:
+    """Note in a row what a gateway has more of than before, memory above so much; the names of what has grown."""
+    row.figures |= {f"{name} before": before[name] for name in before}
+    row.figures |= {f"{name} after": after[name] for name in after}
+    grown = [name for name in before if after[name] > before[name] + (rss_kib if name == "rss" else 0)]
+    row.notes += [f"the gateway has more {name} than before" for name in grown]
+    return grown
 
 
 class Port(Protocol):
@@ -169,14 +137,13 @@ class PtyPort:
 
     echoed = 0  # a pseudo terminal is made without echo
 
-    def __init__(self, link: Path, identity: Identity, rate_hz: float = 50, plugged: bool = True) -> None:
+    def __init__(self, link: Path, identity: Identity, rate_hz: float = 50) -> None:
         self.link = link
         self.fed = FedEsc(self.write, identity, rate_hz)
         self._lock = threading.Lock()
         self._received = 0
         self._pty: PtyEsc | None = None
-        if plugged:
-            self.plug()
+        self.plug()
 
     @property
     def path(self) -> str:
@@ -224,9 +191,9 @@ class PtyPort:
 class Metronome:
     """A process that only wakes up, and notes when it could not: then nothing could run, the gateway neither."""
 
-    def __init__(self) -> None:
+    def __init__(self, step_s: float) -> None:
         self.stalls: list[tuple[int, int]] = []
-        command = ["chrt", "-f", "20", sys.executable, "-S", "-E", "-c", _METRONOME]
+        command = ["chrt", "-f", "20", sys.executable, "-S", "-E", "-c", _METRONOME, str(step_s)]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -258,8 +225,10 @@ class Bench:
     """Everything that runs around one gateway.
 
     ``interface`` is the gateway's, ``watched`` where the judge listens: the far end of it, where there is one. ``options``
-    is further text of the configuration's tables; ``esc_options`` of each ESC's.
+    is further text of the configuration's tables.
     """
+
+    metronome_step_s = 0.004
 
     def __init__(
         self,
@@ -271,10 +240,8 @@ class Bench:
         slack_ns: int = 60 * MS,
         canopen: str | None = "self_start = true",
         options: str = "",
-        esc_options: str = "",
         table: Table | None = None,
         store: Path | None = None,
-        run_options: Sequence[str] = ("--wait",),
         prefix: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
         start_limit_s: float = 20,
@@ -287,16 +254,15 @@ class Bench:
         self.folder = Path(tempfile.mkdtemp(prefix="faults."))
         self.store = store or self.folder / "store"
         self.config = self.folder / "gateway.toml"
-        self.run_options = tuple(run_options)
         self.prefix = tuple(prefix)
         self.environment = dict(environment or {})
         self.start_limit_s = start_limit_s
         self._canopen = canopen
-        self.write_configuration(options, esc_options)
+        self.config.write_text(self.configuration(options))
         if table is None:
             table = table_of_configuration(self.config, canopen is not None, len(ports))
         self.watch = BusWatch(watched, table, self.fed, slack_ns=slack_ns, ignore_local=watched != interface).start()
-        self.metronome = Metronome()
+        self.metronome = Metronome(self.metronome_step_s)
         self.feeder = Feeder(self.fed).start()
         self.gateway: Gateway | None = None
         self.losses: list[tuple[int, str]] = []
@@ -305,10 +271,7 @@ class Bench:
         self._received = self._echoed = 0
         self._excluded: list[list[tuple[int, int]]] = [[] for _ in ports]
 
-    def write_configuration(self, options: str = "", esc_options: str = "") -> None:
-        self.config.write_text(self.configuration(options, esc_options))
-
-    def configuration(self, options: str = "", esc_options: str = "") -> str:
+    def configuration(self, options: str = "") -> str:
         text = f'[can]\ninterface = "socketcan"\nchannel = "{self.interface}"\nbitrate = 1000000\n'
         if self._canopen is not None:
             text += (
@@ -317,7 +280,6 @@ class Bench:
         text += f"{options}\n"
         for i, port in enumerate(self.ports):
             text += f'[[esc]]\nname = "esc{i + 1}"\nport = "{port.path}"\npole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n'
-            text += f"{esc_options}\n"
         return text
 
     # --- the gateway
@@ -326,52 +288,53 @@ class Bench:
         """Start the gateway; ``wait``: until every ESC that is on has its values on the bus. NotRecovered if they do not come."""
         assert self.gateway is None
         begin = time.monotonic_ns()
-        self.gateway = Gateway(self.config, *self.run_options, prefix=self.prefix, environment=self.environment)
+        self.gateway = Gateway(self.config, self.prefix, self.environment)
         if wait:
             on = [i for i, fed in enumerate(self.fed) if fed.on]
             self.wait_fresh(on, begin, self.start_limit_s)
             self.leave_out(range(len(self.ports)), begin - IN_FLIGHT_NS, time.monotonic_ns())
         return self.gateway
 
-    def stop(self, number: int = 15) -> int:
-        """End the gateway by a signal; its exit code."""
+    def stop(self) -> int:
+        """End the gateway by SIGTERM; its exit code."""
         assert self.gateway is not None
         gateway, self.gateway = self.gateway, None
         try:
-            return gateway.end(number, 10)
+            gateway.process.terminate()
+            return gateway.process.wait(10)
+        except subprocess.TimeoutExpired:
+            raise NotRecovered("it did not end within 10 s of SIGTERM") from None
         finally:
             gateway.kill()
 
     def wait_fresh(self, escs: Sequence[int], after_ns: int, seconds: float, sent_after_ns: int = 0) -> int:
         """Wait until each of these ESCs has had a right value on the bus after a time; when the last of them came first."""
-        deadline, judged_ns = time.monotonic_ns() + int(seconds * SECOND), 0
-        while True:
-            found = [self.watch.first_fresh(esc, after_ns, sent_after_ns) for esc in escs]
-            if all(found):
-                return max([fresh.at_ns for fresh in found if fresh] or [time.monotonic_ns()])
-            if judged_ns:
-                silent = [f"esc{esc + 1}" for esc, fresh in zip(escs, found, strict=True) if fresh is None]
-                raise NotRecovered(f"no right value of {', '.join(silent)} within {seconds:g} s; {self.last_words()}")
-            self.check_alive()
-            if time.monotonic_ns() > deadline:
-                self.watch.catch_up()  # and look once more
-                judged_ns = time.monotonic_ns()
-            else:
-                time.sleep(0.01)
 
-    def wait_until(self, condition: Callable[[], bool], seconds: float, what: str) -> float:
-        """Wait until something holds; the seconds it took. NotRecovered when it does not come."""
+        def found() -> list[Fresh | None]:
+            return [self.watch.first_fresh(esc, after_ns, sent_after_ns) for esc in escs]
+
+        names = ", ".join(f"esc{esc + 1}" for esc in escs)
+        self.wait_until(lambda: all(found()), seconds, f"right values of {names}")
+        return max([fresh.at_ns for fresh in found() if fresh], default=time.monotonic_ns())
+
+    def wait_until(self, condition: Callable[[], bool], seconds: float, what: str) -> None:
+        """Wait until something holds. NotRecovered when it does not come."""
         begin, last = time.monotonic(), False
         while not condition():
             if last:
                 raise NotRecovered(f"{what}: not within {seconds:g} s; {self.last_words()}")
             self.check_alive()
             if time.monotonic() - begin > seconds:
-                self.watch.catch_up()
+                self.watch.catch_up()  # and look once more
                 last = True
             else:
                 time.sleep(0.01)
-        return time.monotonic() - begin
+
+    def wait_log(self, text: str, since: int = 0, seconds: float = 10) -> None:
+        """Wait for a line with this text in the gateway's log, from that line on."""
+        assert self.gateway is not None
+        lines = self.gateway.lines
+        self.wait_until(lambda: any(text in line for line in lines[since:]), seconds, f"the log says {text!r}")
 
     def check_alive(self) -> None:
         if self.gateway is not None and not self.gateway.alive:
@@ -417,14 +380,8 @@ class Bench:
                     excused += 1
                 else:
                     lost += 1
-                    missing = (
-                        "EscSpeed, EscCurrent"
-                        if not fed.seen[n]
-                        else "EscCurrent"
-                        if fed.seen[n] & SPEED
-                        else "EscSpeed"
-                    )
-                    self.losses.append((at, f"esc{index + 1} frame {n} of {len(fed.sent)}: no {missing}"))
+                    seen = "only EscSpeed" if fed.seen[n] == SPEED else "only EscCurrent" if fed.seen[n] else "nothing"
+                    self.losses.append((at, f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came"))
             self._accounted[index] = max(self._accounted[index], last + 1)
             self._excluded[index] = [x for x in self._excluded[index] if x[1] > until_ns]
         return lost, excused
@@ -460,20 +417,16 @@ class Bench:
             row.excused += excused
             if injection.in_the_controller:
                 most, end_ns = injection.in_the_controller
-                forgiven = self.watch.forgive(most, injection.begin_ns, end_ns)
-                row.figures["values in the controller already"] = max(
-                    forgiven, row.figures.get("values in the controller already", 0)
-                )
+                row.peak("values in the controller already", self.watch.forgive(most, injection.begin_ns, end_ns))
             fresh_wrong = self.watch.wrong_count - wrong
             row.wrong += fresh_wrong
             row.old += self.watch.old_count - old
-            if fresh_wrong and len(row.notes) < 8:
+            if fresh_wrong:
                 for each in self.watch.wrong[-min(fresh_wrong, 3) :]:
                     late = (each.at_ns - injection.begin_ns) / SECOND
-                    row.notes.append(
-                        f"wrong value {late:.3f} s after the injection: {each.message} {each.data}: {each.why}"
-                    )
-            if lost and len(row.notes) < 8:
+                    what = f"{each.message} {each.data}: {each.why}"
+                    row.notes.append(f"wrong value {late:.3f} s after the injection: {what}")
+            if lost:
                 when = [f"{(at - injection.begin_ns) / SECOND:.3f} s {what}" for at, what in self.losses[-lost:]]
                 row.notes.append(
                     f"{lost} values lost, cleared at {injection.after(injection.cleared_ns)}, recovered at "
@@ -484,8 +437,7 @@ class Bench:
                 row.transmitted += self._received - received
             echoed, self._echoed = self._echoed, sum(port.echoed for port in self.ports)
             if self._echoed > echoed:
-                name = "bytes echoed by the kernel before the port was set"
-                row.figures[name] = row.figures.get(name, 0) + self._echoed - echoed
+                row.count("bytes echoed by the kernel before the port was set", self._echoed - echoed)
             if not failed and injection.in_time:
                 row.recovered += 1
             row.worst_s = max(row.worst_s, injection.recovery_s)
@@ -528,33 +480,34 @@ class Injection:
         """The cause is gone; what is sent from now on has to arrive soon."""
         self.cleared_ns = time.monotonic_ns()
 
-    def wait_recovery(self, within_s: float | None = None) -> float:
-        """Wait for the first right value of each disturbed ESC that was sent since ``cleared``; the seconds from there."""
+    def wait_recovery(self) -> None:
+        """Wait for the first right value of each disturbed ESC that was sent since ``cleared``."""
         assert self.cleared_ns is not None
-        limit = within_s or (self.fault.limit_s or 1.0)
+        limit = self.fault.limit_s or 1.0
         self.recovered_ns = self.bench.wait_fresh(self.escs, self.cleared_ns, limit * 3 + 2, self.cleared_ns)
         self.recovery_s = self.bench.running_s(self.cleared_ns, self.recovered_ns)
-        return self.recovery_s
 
     def healed_at(self, at_ns: int) -> None:
         """Something else that had to heal too was good at that time."""
         assert self.cleared_ns is not None
         self.recovery_s = max(self.recovery_s, self.bench.running_s(self.cleared_ns, at_ns))
 
-    def wait_boot_up(self, node: int, within_s: float = 3) -> None:
+    def wait_boot_up(self, node: int) -> None:
         """Wait for a boot-up message of a node since the injection."""
 
-        def seen() -> bool:
-            return any(found == node for _, found in self.bench.watch.boot_ups[self.boot_ups :])
+        def seen() -> list[int]:
+            return [at_ns for at_ns, found in self.bench.watch.boot_ups[self.boot_ups :] if found == node]
 
-        self.bench.wait_until(seen, within_s, f"boot-up of node {node}")
-        at_ns = next(at for at, found in self.bench.watch.boot_ups[self.boot_ups :] if found == node)
-        if self.cleared_ns is not None:
-            self.healed_at(at_ns)
+        self.bench.wait_until(lambda: bool(seen()), 3, f"boot-up of node {node}")
+        self.healed_at(seen()[0])
 
     def emergency_codes(self, node: int) -> list[int]:
         """Codes of the EMCYs of a node since the injection."""
         return [each.code for each in self.bench.watch.emergencies[self.emergencies :] if each.node == node]
+
+    def wait_emergency(self, node: int, code: int) -> None:
+        """Wait for an EMCY of a node since the injection."""
+        self.bench.wait_until(lambda: code in self.emergency_codes(node), 3, f"EMCY {code:X}h")
 
     def expect(self, holds: bool, what: str) -> None:
         """NotRecovered unless something holds."""

@@ -93,8 +93,8 @@ class Load:
                 if parent == str(self.machine):
                     mine.append(session)
         for process in (each for session in mine for each in sessions[session]):
-            for file in process.glob("task/*/schedstat"):
-                with contextlib.suppress(OSError, IndexError):
+            with contextlib.suppress(OSError, IndexError):  # it may end meanwhile, even while its threads are listed
+                for file in process.glob("task/*/schedstat"):
                     waited = int(file.read_text().split()[1])
                     self._waited_ns += waited - self.waits.get(str(file), 0)
                     self.waits[str(file)] = waited
@@ -141,23 +141,11 @@ def run_inside(
 
     with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
         prepare(Path(folder))
-        command = [
-            sys.executable,
-            str(PROJECT / "tests" / "vm" / "vm_run.py"),
-            f"--backend={backend}",
-            f"--timeout={timeout_s:g}",
-        ]
-        command += [
-            f"--rw={folder}",
-            "--",
-            sys.executable,
-            "-B",
-            str(Path(__file__).with_name(script)),
-            f"--inside={folder}",
-        ]
-        with subprocess.Popen(
-            [*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
-        ) as process:
+        machine = [sys.executable, str(PROJECT / "tests" / "vm" / "vm_run.py")]
+        machine += [f"--backend={backend}", f"--timeout={timeout_s:g}", f"--rw={folder}", "--"]
+        inside = [sys.executable, "-B", str(Path(__file__).with_name(script)), f"--inside={folder}", *words]
+        pipe = subprocess.PIPE
+        with subprocess.Popen([*machine, *inside], stdin=subprocess.DEVNULL, stdout=pipe, text=True) as process:
             assert process.stdout
             load.machine = process.pid
             for text in process.stdout:
@@ -174,7 +162,7 @@ def run_inside(
         report = Report.read([file] if file.exists() else [])
         report.about["exit code"] = process.returncode
     for row in report.rows:
-        row.taken = shares.get(f"{row.area}: {row.name}", 0.0)
+        row.taken = shares.get(str(row), 0.0)
     return report
 
 
@@ -184,13 +172,12 @@ def judge(run: Callable[[Sequence[str]], Report], quiet: Callable[[], bool]) -> 
     deferred = [row for row in report.rows if row.state == NOT_JUDGED]
     if deferred and quiet():
         print(f"deferred to a quieter moment: {len(deferred)}", flush=True)
-        later = {row.name: row for row in run([f"{row.area}: {row.name}" for row in deferred]).rows}
+        later = {row.name: row for row in run([str(row) for row in deferred]).rows}
         for row in deferred:
             if row.name in later:
                 report.rows[report.rows.index(row)] = later[row.name]
-                later[row.name].notes.insert(
-                    0, f"deferred to a quieter moment: {row.taken:.0%} of the processor time was taken at first"
-                )
+                note = f"deferred to a quieter moment: {row.taken:.0%} of the processor time was taken at first"
+                later[row.name].notes.insert(0, note)
     return report
 
 
@@ -204,10 +191,8 @@ def conclude(report: Report, out: Path | None, junit: Path | None) -> int:
         for row in report.rows:
             if row.state == state:
                 print(line(row))
-    print(
-        f"{len(states)} faults: " + ", ".join(f"{states.count(state)} {state}" for state in sorted(set(states))),
-        flush=True,
-    )
+    counts = ", ".join(f"{states.count(state)} {state}" for state in sorted(set(states)))
+    print(f"{len(states)} faults: {counts}", flush=True)
     return int(FAILED in states or not states)
 
 
@@ -223,7 +208,7 @@ def parser(doc: str | None) -> argparse.ArgumentParser:
 
 
 def chosen(faults: Sequence[Fault], only: Sequence[str]) -> list[Fault]:
-    return [each for each in faults if not only or any(text in f"{each.area}: {each.name}" for text in only)]
+    return [each for each in faults if not only or any(text in str(each) for text in only)]
 
 
 def main(

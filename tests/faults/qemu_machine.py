@@ -28,17 +28,19 @@ USB_SERIAL = {
     "chardev": "ftdis",
     "always-plugged": True,
 }
+BITRATE = 1_000_000
 _TIOCGICOUNT = 0x545D
+_BREAKS = 9
+"""Place in struct serial_icounter_struct."""
 
 
-def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> float:
-    """Wait until something holds; the seconds it took. AssertionError when it does not come."""
+def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
+    """Wait until something holds. AssertionError when it does not come."""
     begin = time.monotonic()
     while not condition():
         if time.monotonic() - begin > seconds:
             raise AssertionError(f"{what}: not within {seconds} s")
         time.sleep(0.01)
-    return time.monotonic() - begin
 
 
 class Monitor:
@@ -46,36 +48,31 @@ class Monitor:
 
     def __init__(self) -> None:
         self._stream = (VIRTIO_PORTS / "qmp").open("r+b", buffering=0)
-        self._lock = threading.Lock()
         self._buffer = b""
         self.ask("qmp_capabilities")
 
     def ask(self, command: str, **arguments: object) -> dict[str, Any]:
         """The answer: with the key "return" or "error"."""
-        with self._lock:
-            self._stream.write(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
-            while True:
-                while b"\n" not in self._buffer:
-                    self._buffer += self._stream.read(4096) or b""
-                line, self._buffer = self._buffer.split(b"\n", 1)
-                answer: dict[str, Any] = json.loads(line)
-                if "return" in answer or "error" in answer:
-                    return answer
+        self._stream.write(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
+        while True:
+            while b"\n" not in self._buffer:
+                self._buffer += self._stream.read(4096) or b""
+            line, self._buffer = self._buffer.split(b"\n", 1)
+            answer: dict[str, Any] = json.loads(line)
+            if "return" in answer or "error" in answer:
+                return answer
 
-    def unplug_serial(self) -> None:
-        answer = self.ask("device_del", id="usbser0")
+    def must(self, command: str, **arguments: object) -> None:
+        """AssertionError where it is refused."""
+        answer = self.ask(command, **arguments)
         assert "return" in answer, answer
 
     def plug_serial(self) -> None:
         """QEMU takes its time to forget the device of an unplug: tried again until it has."""
-        deadline = time.monotonic() + 5
-        while "error" in (answer := self.ask("device_add", **USB_SERIAL)):
-            assert time.monotonic() < deadline, answer
-            time.sleep(0.02)
+        wait_until(lambda: "return" in self.ask("device_add", **USB_SERIAL), 5, "device_add")
 
-    def send_break(self, chardev: str) -> None:
-        answer = self.ask("chardev-send-break", id=chardev)
-        assert "return" in answer, answer
+    def close(self) -> None:
+        self._stream.close()
 
 
 class FarEnd:
@@ -83,8 +80,8 @@ class FarEnd:
 
     def __init__(self, name: str) -> None:
         self._fd = os.open(VIRTIO_PORTS / name, os.O_RDWR | os.O_NONBLOCK)
-        self.received = b""
-        """All that the machine has transmitted: it has to stay empty."""
+        self.received = 0
+        """Bytes that the machine has transmitted."""
         self._stop = False
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
@@ -105,7 +102,7 @@ class FarEnd:
         while not self._stop:
             if select.select([self._fd], [], [], 0.2)[0]:
                 with contextlib.suppress(BlockingIOError):
-                    self.received += os.read(self._fd, 4096)
+                    self.received += len(os.read(self._fd, 4096))
 
     def close(self) -> None:
         self._stop = True
@@ -116,28 +113,6 @@ class FarEnd:
 # --- serial ports
 
 
-class LineCounts(NamedTuple):
-    """What a driver has counted on a line, of struct serial_icounter_struct."""
-
-    received: int
-    transmitted: int
-    framing: int
-    overrun: int
-    parity: int
-    breaks: int
-    buffer_overrun: int
-
-
-def line_counts(device: str) -> LineCounts:
-    """Read beside whoever has the port; root may open one that is TIOCEXCL. Its settings are not touched."""
-    fd = os.open(device, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-    try:
-        counts = struct.unpack("=20i", fcntl.ioctl(fd, _TIOCGICOUNT, bytes(80)))
-    finally:
-        os.close(fd)
-    return LineCounts(*counts[4:11])
-
-
 class LineSetting(NamedTuple):
     baud: int
     bits: int
@@ -146,9 +121,23 @@ class LineSetting(NamedTuple):
     echo: bool
 
 
+def _beside(device: str) -> int:
+    """A port opened beside whoever has it, as root may; its settings are not touched."""
+    return os.open(device, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+
+
+def line_breaks(device: str) -> int:
+    """Breaks that the driver has counted."""
+    fd = _beside(device)
+    try:
+        return int(struct.unpack("=20i", fcntl.ioctl(fd, _TIOCGICOUNT, bytes(80)))[_BREAKS])
+    finally:
+        os.close(fd)
+
+
 def line_setting(device: str) -> LineSetting:
     """How a port is set, read from the kernel."""
-    fd = os.open(device, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    fd = _beside(device)
     try:
         _, _, control, local, _, speed, _ = termios.tcgetattr(fd)
     finally:
@@ -157,6 +146,15 @@ def line_setting(device: str) -> LineSetting:
     bits = {termios.CS5: 5, termios.CS6: 6, termios.CS7: 7, termios.CS8: 8}[control & termios.CSIZE]
     parity = "N" if not control & termios.PARENB else "O" if control & termios.PARODD else "E"
     return LineSetting(baud, bits, parity, 2 if control & termios.CSTOPB else 1, bool(local & termios.ECHO))
+
+
+def hold(device: str) -> int:
+    """Open a port as another program does, without echo, and keep it."""
+    fd = _beside(device)
+    mode = termios.tcgetattr(fd)
+    mode[3] &= ~(termios.ECHO | termios.ECHONL | termios.ICANON)
+    termios.tcsetattr(fd, termios.TCSANOW, mode)
+    return fd
 
 
 def serial_ports() -> set[str]:
@@ -170,21 +168,15 @@ def ip(*words: str) -> None:
     subprocess.run(["ip", *words], check=True)
 
 
-def can_up(name: str, bitrate: int = 500_000, restart_ms: int = 0, queue: int = 100) -> None:
-    ip("link", "set", name, "txqueuelen", str(queue))
-    ip("link", "set", name, "up", "type", "can", "bitrate", str(bitrate), "restart-ms", str(restart_ms))
+def can_up(name: str) -> None:
+    ip("link", "set", name, "down")
+    ip("link", "set", name, "txqueuelen", "100")
+    ip("link", "set", name, "up", "type", "can", "bitrate", str(BITRATE), "restart-ms", "100")
 
 
-def can_details(name: str) -> dict[str, Any]:
-    """What ``ip -d -s -j link show`` says of the controller."""
+def receive_overruns(name: str) -> int:
     done = subprocess.run(["ip", "-d", "-s", "-j", "link", "show", name], check=True, capture_output=True, text=True)
-    found: dict[str, Any] = json.loads(done.stdout)[0]
-    return found
-
-
-def controller_state(name: str) -> str:
-    """As ``ip`` names it: ERROR-ACTIVE, BUS-OFF ..."""
-    return str(can_details(name)["linkinfo"]["info_data"]["state"])
+    return int(json.loads(done.stdout)[0]["stats64"]["rx"]["over_errors"])
 
 
 def pci_slot(interface: str) -> str:

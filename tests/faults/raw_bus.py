@@ -8,8 +8,6 @@ from typing import Self
 
 _FRAME = struct.Struct("=IB3x8s")
 ERROR_FLAG = 0x20000000
-EXTENDED_FLAG = 0x80000000
-REMOTE_FLAG = 0x40000000
 
 
 class RawBus:

@@ -7,10 +7,14 @@ import random
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
-from harness import SECOND, Bench, Fault, Identity, PtyPort, fault
+from bus_watch import SECOND
+from encoding import Identity
+from fault_report import Fault, fault
+from harness import Bench, PtyPort, growth
 
-from kontronik_can_gw.protocol.codec import Layout
+from kontronik_can_gw.protocol.codec import Layout, encode
 from kontronik_can_gw.protocol.states import Device
 
 LIMIT_S = 2.0
@@ -30,11 +34,6 @@ def lost(bench: Bench) -> None:
     )
 
 
-def said(bench: Bench, text: str) -> None:
-    """Wait until the log says so."""
-    bench.wait_until(lambda: bench.gateway is not None and text in bench.gateway.log, 5, f"the log says {text!r}")
-
-
 @contextlib.contextmanager
 def mangled(bench: Bench, how: Callable[[bytes], tuple[bytes, bool]]) -> Iterator[None]:
     fed = bench.fed[0]
@@ -45,33 +44,31 @@ def mangled(bench: Bench, how: Callable[[bytes], tuple[bytes, bool]]) -> Iterato
         fed.mangle = None
 
 
+@contextlib.contextmanager
+def replugged(port: PtyPort) -> Iterator[None]:
+    """Unplug and plug in again; the gateway sees the port when the block ends."""
+    port.unplug()
+    link = port.link
+    port.link = link.with_name("hidden")
+    port.plug()
+    yield
+    port.link.rename(link)
+    port.link = link
+
+
 @fault("Serial", "port busy at its return", LIMIT_S)
 def busy(bench: Bench, fault: Fault, times: int) -> None:
     port = port_of(bench)
     for _ in range(times):
         with bench.injection(fault, [0]) as injection:
-            with _taken_by_another(port):
-                time.sleep(1.2)
+            with replugged(port):
+                fd = os.open(port.device, os.O_RDWR | os.O_NOCTTY)
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            time.sleep(1.2)
+            os.close(fd)
             injection.cleared()
             injection.wait_recovery()
-            said(bench, "in use")
-
-
-@contextlib.contextmanager
-def _taken_by_another(port: PtyPort) -> Iterator[None]:
-    """Unplug, plug in again, and lock the port before the gateway can see it."""
-    port.unplug()
-    hidden = port.link.with_name("hidden")
-    link, port.link = port.link, hidden
-    port.plug()
-    port.link = link
-    fd = os.open(port.device, os.O_RDWR | os.O_NOCTTY)
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        hidden.rename(link)
-        yield
-    finally:
-        os.close(fd)
+            bench.wait_log("in use")
 
 
 @fault("Serial", "permission missing at its return", LIMIT_S)
@@ -79,14 +76,10 @@ def permission(bench: Bench, fault: Fault, times: int) -> None:
     port = port_of(bench)
     for _ in range(times):
         with bench.injection(fault, [0]) as injection:
-            port.unplug()
-            link, port.link = port.link, port.link.with_name("hidden")
-            port.plug()
-            os.chmod(port.device, 0)
-            port.link.rename(link)
-            port.link = link
+            with replugged(port):
+                os.chmod(port.device, 0)
             time.sleep(1.2)
-            said(bench, "permission denied")
+            bench.wait_log("permission denied")
             injection.cleared()
             os.chmod(port.device, 0o620)
             injection.wait_recovery()
@@ -95,23 +88,12 @@ def permission(bench: Bench, fault: Fault, times: int) -> None:
 @fault("Serial", "port gone and back", LIMIT_S)
 def gone(bench: Bench, fault: Fault, times: int) -> None:
     port = port_of(bench)
-    for i in range(times * 2):
+    for pause in [0.05, 0.3, 0.7] * times + [24 if times > 10 else 4]:
         with bench.injection(fault, [0]) as injection:
             port.unplug()
-            time.sleep((0.05, 0.3, 0.7)[i % 3])
-            injection.cleared()
-            port.plug()
-            injection.wait_recovery()
-
-
-@fault("Serial", "port gone for long", LIMIT_S)
-def gone_long(bench: Bench, fault: Fault, times: int) -> None:
-    port = port_of(bench)
-    for i in range(max(1, times // 3)):
-        with bench.injection(fault, [0]) as injection:
-            port.unplug()
-            time.sleep(4 + 20 * i)
-            lost(bench)
+            if pause > 1:
+                lost(bench)
+            time.sleep(pause)
             injection.cleared()
             port.plug()
             injection.wait_recovery()
@@ -123,9 +105,8 @@ def other_name(bench: Bench, fault: Fault, times: int) -> None:
     for _ in range(times):
         before = port.device
         with bench.injection(fault, [0]) as injection:
-            held = os.open(
-                before, os.O_RDWR | os.O_NOCTTY
-            )  # keeps the old number taken, as a program does that reads on
+            # keeps the old number taken, as a program does that reads on
+            held = os.open(before, os.O_RDWR | os.O_NOCTTY)
             try:
                 port.unplug()
                 time.sleep(0.3)
@@ -137,92 +118,78 @@ def other_name(bench: Bench, fault: Fault, times: int) -> None:
                 os.close(held)
 
 
-@fault("Serial", "garbage between frames", None)
-def garbage(bench: Bench, fault: Fault, times: int) -> None:
+# --- what the line makes of the bytes: each takes a frame, and returns what comes and whether the frame is whole in it
+
+Mangle = Callable[[bytes], tuple[bytes, bool]]
+
+
+def garbage(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
     """Whatever comes between whole frames, bits of frames included, no frame is lost."""
-    generator = random.Random(1)
-
-    def with_garbage(wire: bytes) -> tuple[bytes, bool]:
-        kind = generator.randrange(5)
-        if kind == 0:
-            return generator.randbytes(generator.randrange(1, 400)) + wire, True
-        if kind == 1:
-            return b"KODL" + generator.randbytes(generator.randrange(20)) + wire, True
-        if kind == 2:
-            return wire[: generator.randrange(1, len(wire))] + wire, True
-        return wire, True
-
-    for _ in range(times):
-        with bench.injection(fault, []) as injection, mangled(bench, with_garbage):
-            time.sleep(1.5)
-            injection.cleared()
+    kind = generator.randrange(5)
+    if kind == 0:
+        return generator.randbytes(generator.randrange(1, 400)) + wire, True
+    if kind == 1:
+        return b"KODL" + generator.randbytes(generator.randrange(20)) + wire, True
+    if kind == 2:
+        return wire[: generator.randrange(1, len(wire))] + wire, True
+    return wire, True
 
 
-@fault("Serial", "bit errors and lost bytes", None)
-def bit_errors(bench: Bench, fault: Fault, times: int) -> None:
+def bit_errors(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
     """Frames that are hit are lost and nothing else; none of them shows a wrong value."""
-    generator = random.Random(2)
+    if generator.random() > 0.3:
+        return wire, True
+    at = generator.randrange(len(wire))
+    kind = generator.randrange(3)
+    if kind == 0:
+        return wire[:at] + wire[at + 1 :], False
+    if kind == 1:
+        return wire[:at] + bytes([wire[at] ^ 1 << generator.randrange(8)]) + wire[at + 1 :], False
+    return wire[:at] + bytes([generator.randrange(256)]) + wire[at:], False
 
-    def hit(wire: bytes) -> tuple[bytes, bool]:
-        if generator.random() > 0.3:
-            return wire, True
-        at = generator.randrange(len(wire))
-        kind = generator.randrange(3)
-        if kind == 0:
-            return wire[:at] + wire[at + 1 :], False
-        if kind == 1:
-            return wire[:at] + bytes([wire[at] ^ 1 << generator.randrange(8)]) + wire[at + 1 :], False
-        return wire[:at] + bytes([generator.randrange(256)]) + wire[at:], False
 
+def line_break(_generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
+    return bytes(200), False
+
+
+def parity(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
+    """8N1 for 8E1 reads the parity bit as the next byte's start: what comes out is different from byte to byte."""
+    return bytes(x ^ (0x80 if x.bit_count() & 1 else generator.choice((0, 1, 0x80))) for x in wire), False
+
+
+def slow_stream(generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
+    """Read twelve times too fast, each bit is a run of equal bits."""
+    return bytes(generator.choice((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0)) for _ in range(12)), False
+
+
+def undisturbed(bench: Bench, fault: Fault, times: int, how: Mangle) -> None:
     for _ in range(times):
-        with bench.injection(fault, []) as injection, mangled(bench, hit):
+        with bench.injection(fault, []) as injection, mangled(bench, how):
             time.sleep(1.5)
             injection.cleared()
 
 
-@fault("Serial", "break: only zero bytes", LIMIT_S)
-def line_break(bench: Bench, fault: Fault, times: int) -> None:
-    for _ in range(times):
-        with bench.injection(fault, [0]) as injection:
-            with mangled(bench, lambda wire: (bytes(200), False)):
-                time.sleep(0.8)
-                lost(bench)
-            injection.cleared()
-            injection.wait_recovery()
-
-
-@fault("Serial", "every byte hit, as by a wrong parity", LIMIT_S)
-def parity(bench: Bench, fault: Fault, times: int) -> None:
-    """8N1 for 8E1 reads the parity bit as the next byte's start: what comes out is different from byte to byte."""
-    generator = random.Random(3)
-
-    def hit(wire: bytes) -> tuple[bytes, bool]:
-        return bytes(x ^ (0x80 if x.bit_count() & 1 else generator.choice((0, 1, 0x80))) for x in wire), False
-
+def unreadable(bench: Bench, fault: Fault, times: int, how: Mangle) -> None:
+    """Nothing is right any more; that a wrong setting is likely is said after a while."""
     for i in range(times):
         with bench.injection(fault, [0]) as injection:
-            with mangled(bench, hit):
-                time.sleep(4.5 if i == 0 else 0.8)
-                said(bench, "parity")
-            injection.cleared()
-            injection.wait_recovery()
-
-
-@fault("Serial", "a 9600 baud stream", LIMIT_S)
-def slow_stream(bench: Bench, fault: Fault, times: int) -> None:
-    """Read twelve times too fast, each bit is a run of equal bits."""
-    generator = random.Random(4)
-
-    def runs(wire: bytes) -> tuple[bytes, bool]:
-        return bytes(generator.choice((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0)) for _ in range(12)), False
-
-    for _ in range(times):
-        with bench.injection(fault, [0]) as injection:
-            with mangled(bench, runs):
-                time.sleep(1)
+            with mangled(bench, how):
+                time.sleep(0.8)
                 lost(bench)
+                if i == 0 and "parity" in fault.name:
+                    bench.wait_log("parity")
             injection.cleared()
             injection.wait_recovery()
+
+
+for name, run, how, limit_s in (
+    ("garbage between frames", undisturbed, garbage, None),
+    ("bit errors and lost bytes", undisturbed, bit_errors, None),
+    ("break: only zero bytes", unreadable, line_break, LIMIT_S),
+    ("every byte hit, as by a wrong parity", unreadable, parity, LIMIT_S),
+    ("a 9600 baud stream", unreadable, slow_stream, LIMIT_S),
+):
+    fault("Serial", name, limit_s)(partial(run, how=partial(how, random.Random(name))))
 
 
 @fault("Serial", "ESC off and on", LIMIT_S)
@@ -254,12 +221,9 @@ def swapped(bench: Bench, fault: Fault, times: int) -> None:
             injection.cleared()
             fed.on = True
             injection.wait_recovery()
-            number = fed.identity.device.value
-
-            def known(number: int = number) -> bool:
-                return bench.watch.info_device(0) == number
-
-            bench.wait_until(known, 5, "the new ESC's device on the bus")
+            bench.wait_until(
+                lambda: bench.watch.info_device(0) == fed.identity.device.value, 5, "the new ESC's device on the bus"
+            )
 
 
 @fault("Serial", "a stream that stutters, bytes seconds apart", LIMIT_S)
@@ -269,22 +233,11 @@ def stutter(bench: Bench, fault: Fault, times: int) -> None:
     for _ in range(max(1, times // 2)):
         with bench.injection(fault, [0]) as injection:
             fed.on = False
-            pieces: list[bytes] = []
-
-            def caught(wire: bytes, pieces: list[bytes] = pieces) -> tuple[bytes, bool]:
-                pieces.append(wire)
-                return b"", False
-
-            fed.mangle = caught
-            try:
-                time.sleep(0.05)
-                fed.send_one()
-                wire = pieces[-1]
-                for at in range(0, len(wire), 14):
-                    port.write(wire[at : at + 14])
-                    time.sleep(1.2)
-            finally:
-                fed.mangle = None
+            time.sleep(0.05)
+            wire = encode(fed.live(len(fed.sent) - 1), fed.identity.layout)
+            for at in range(0, len(wire), 14):
+                port.write(wire[at : at + 14])
+                time.sleep(1.2)
             lost(bench)
             injection.cleared()
             fed.on = True
@@ -349,17 +302,9 @@ def cycles(bench: Bench, fault: Fault, times: int) -> None:
             injection.wait_recovery()
             if i == rounds // 5:
                 before = bench.gateway.figures()
+    time.sleep(0.5)
+    if growth(row, before, bench.gateway.figures(), 1024 + rounds):
+        row.recovered -= 1
     row.injected *= len(ports)
     row.recovered *= len(ports)
-    time.sleep(0.5)
-    after = bench.gateway.figures()
-    row.figures |= {f"{name} before": before[name] for name in before} | {
-        f"{name} after": after[name] for name in after
-    }
-    grown = [name for name in ("descriptors", "threads") if after[name] > before[name]]
-    if after["rss"] > before["rss"] + 1024 + rounds:
-        grown.append("rss")
-    if grown:
-        row.notes.append(f"grown over the cycles: {', '.join(grown)}")
-        row.recovered -= 1
     bench.watch.reset_silence()

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -128,15 +127,3 @@ def texts_of(words: Sequence[str], canopen: bool) -> list[str]:
             assert main(["dbc", *words, *options]) == 0
         texts.append(printed.getvalue())
     return texts
-
-
-def to_json(table: Table) -> str:
-    return json.dumps(list(table.values()))
-
-
-def from_json(text: str) -> Table:
-    messages = [
-        Message(can_id, stem, esc, kind, tuple(Place(*place) for place in places), (flags[0], flags[1]))
-        for can_id, stem, esc, kind, places, flags in json.loads(text)
-    ]
-    return {message.can_id: message for message in messages}

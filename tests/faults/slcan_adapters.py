@@ -30,7 +30,6 @@ class Adapter:
         """The firmware hangs: it takes nothing and tells nothing."""
         self.silent = False
         """Bus-off: it takes frames from the computer and gives none to the bus."""
-        self.commands: list[bytes] = []
         self._bus = bus
         self._closed = False
         self._master, self._slave = os.openpty()
@@ -87,7 +86,6 @@ class Adapter:
             if self.is_open and not self.silent:
                 self._bus.carry(self, command)
             return
-        self.commands.append(command)
         if kind == b"S":
             self.rate = _RATES[int(command[1:])]
         elif kind == b"O":
@@ -107,7 +105,6 @@ class Bus:
     """The wire between adapters."""
 
     def __init__(self, *names: str) -> None:
-        self.carried = 0
         self.adapters = [Adapter(self, name) for name in names]
 
     def carry(self, source: Adapter, frame: bytes) -> None:
@@ -117,9 +114,7 @@ class Bus:
                 acknowledged = True
                 if not adapter.stalled:
                     adapter.tell(frame.decode())
-        if acknowledged:
-            self.carried += 1
-        else:
+        if not acknowledged:
             source.tell_errors("a")
             source.tell_state("p", 0, 128)
 

@@ -10,8 +10,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 import programme  # noqa: F401  registers the faults of User Mode Linux
 import qemu_faults  # noqa: F401  and those of the emulated machine
 from fault_report import WITH_PYTHON, Report, Row, in_order
@@ -19,10 +17,6 @@ from fault_report import WITH_PYTHON, Report, Row, in_order
 BEGIN, END = "<!-- faults begin -->", "<!-- faults end -->"
 COLUMNS = ("machine", "fault", "injected", "recovered", "worst recovery", "wrong values", "values lost", "state")
 HEAD = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|\n"
-
-
-def name_of(area: str, name: str) -> str:
-    return f"{area}: {name}"
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -34,7 +28,7 @@ def table(rows: Sequence[Row]) -> str:
         worst = "undisturbed" if row.limit_s is None else f"{row.worst_s:.2f} s (limit {row.limit_s:g} s)"
         if WITH_PYTHON in row.figures:
             worst += f", {row.figures[WITH_PYTHON]:.2f} {WITH_PYTHON}"
-        text += f"| {row.machine} | {name_of(row.area, row.name)} | {row.injected} | {row.recovered} | {worst} "
+        text += f"| {row.machine} | {row} | {row.injected} | {row.recovered} | {worst} "
         text += f"| {row.wrong} | {row.lost} | {row.state} |\n"
     return text
 

@@ -7,8 +7,7 @@ import pytest
 from bus_watch import MS, SECOND, Judge
 from encoding import Identity, live, live_values, mix
 from feeder import CURRENT, SPEED, FedEsc
-from qemu_adapters import SerialAdapter
-from signals import Message, Table, from_json, table_of_shipped, to_json
+from signals import Message, Table, table_of_shipped
 
 from kontronik_can_gw.protocol.codec import Layout
 from kontronik_can_gw.protocol.fields import LiveData, rows
@@ -74,13 +73,8 @@ def test_right_and_fresh_values_are_right_and_noted(judge: Judge) -> None:
 
 
 def test_values_marked_as_not_available_are_never_wrong(judge: Judge) -> None:
-    message = judge.table[SPEED_ID]
-    bits = sum((place.not_available or 0 & place.mask) << place.start for place in message.places if place.sign == 0)
-    bits |= sum(
-        (place.not_available & place.mask) << place.start
-        for place in message.places
-        if place.sign and place.not_available
-    )
+    codes = {place.name: place.not_available or 0 for place in judge.table[SPEED_ID].places}
+    bits = sum((codes[place.name] & place.mask) << place.start for place in judge.table[SPEED_ID].places)
     judge.take(SPEED_ID, bits.to_bytes(8, "little"), START + 5 * SECOND)
     assert settled(judge) == []
     assert judge.marked == 1
@@ -144,39 +138,9 @@ def test_boot_ups_and_emergencies_are_noted(judge: Judge) -> None:
 
 def test_every_value_message_of_the_shipped_layouts_is_followed(table: Table) -> None:
     followed = {message.stem for message in table.values() if message.kind != "other"}
-    assert followed >= {
-        "Status",
-        "Speed",
-        "Current",
-        "Shaft",
-        "Bec",
-        "Energy",
-        "Info",
-        "ExtremesA",
-        "ExtremesB",
-        "ExtremesC",
-    }
+    assert followed >= {"Status", "Speed", "Current", "Shaft", "Bec", "Energy"}
+    assert followed >= {"Info", "ExtremesA", "ExtremesB", "ExtremesC"}
     assert followed >= {"Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4"}
-
-
-def test_a_table_survives_being_written_down(table: Table) -> None:
-    assert from_json(to_json(table)) == table
-
-
-def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gateways_from_then_on() -> None:
-    adapter = SerialAdapter(0, "x")
-
-    def set_line(divisor: int, parity_and_bits: int) -> None:
-        adapter.control(0x40, 3, divisor, 0, 0, b"")
-        adapter.control(0x40, 4, parity_and_bits, 0, 0, b"")
-
-    set_line(312, 0x0008)  # 9600 8N1, at the opening
-    adapter.taken(2, b"echo")
-    set_line(26, 0x0208)  # 115200 8E1
-    adapter.taken(2, b"A")
-    set_line(312, 0x0008)  # by another program
-    adapter.taken(2, b"B")
-    assert (adapter.echoed, adapter.received_from_host) == (4, b"AB")
 
 
 def test_no_two_frames_of_an_esc_look_alike_in_any_message_within_the_time_out() -> None:

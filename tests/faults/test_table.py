@@ -3,14 +3,14 @@
 from pathlib import Path
 
 from fault_report import FAULTS, Row, in_order
-from table import BEGIN, END, name_of, parse, put, table
+from table import BEGIN, END, parse, put, table
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
 
 def test_the_readme_names_exactly_the_faults_that_the_programme_has() -> None:
     shown = [(row["machine"], row["fault"]) for row in parse(README.read_text())]
-    assert shown == [(fault.machine, name_of(fault.area, fault.name)) for fault in in_order()]
+    assert shown == [(fault.machine, str(fault)) for fault in in_order()]
 
 
 def test_the_readme_shows_that_all_were_healed_without_a_wrong_or_lost_value() -> None:
@@ -28,7 +28,7 @@ def test_a_table_is_put_between_the_markers_and_read_again() -> None:
     assert text.startswith(f"before\n{BEGIN}\n| machine |")
     assert text.endswith(f"{END}\nafter\n")
     assert "old" not in text
-    assert [row["fault"] for row in parse(text)] == [name_of(f.area, f.name) for f in in_order()]
+    assert [row["fault"] for row in parse(text)] == [str(f) for f in in_order()]
 
 
 def test_what_went_wrong_is_shown_and_not_good() -> None:

@@ -2,18 +2,21 @@
 
 import signal
 import time
+from collections.abc import Callable
+from functools import partial
 
-from harness import Bench, Fault, fault
+from fault_report import Fault, fault
+from harness import Bench
 
 LIMIT_S = 1.0
 
 
-def _step(bench: Bench, fault: Fault, times: int, to: float | None, by: float = 0) -> None:
+def clock_set(bench: Bench, fault: Fault, times: int, to: Callable[[], float]) -> None:
     for _ in range(times):
         with bench.injection(fault, []) as injection:
             right = time.time() - time.monotonic()
             bench.watch.note_clocks()
-            time.clock_settime(time.CLOCK_REALTIME, time.time() + by if to is None else to)
+            time.clock_settime(time.CLOCK_REALTIME, to())
             bench.watch.note_clocks()
             try:
                 time.sleep(1.2)
@@ -23,19 +26,13 @@ def _step(bench: Bench, fault: Fault, times: int, to: float | None, by: float = 
             injection.cleared()
 
 
-@fault("Time", "wall clock set 1 h forward, and back", None)
-def forward(bench: Bench, fault: Fault, times: int) -> None:
-    _step(bench, fault, times, None, 3600)
-
-
-@fault("Time", "wall clock set 1 h back, and forward", None)
-def back(bench: Bench, fault: Fault, times: int) -> None:
-    _step(bench, fault, times, None, -3600)
-
-
-@fault("Time", "wall clock set to 1970, and right again", None)
-def epoch(bench: Bench, fault: Fault, times: int) -> None:
-    _step(bench, fault, times, time.monotonic() + 5)  # no kernel takes less: it would have been started before 1970
+for name, to in (
+    ("wall clock set 1 h forward, and back", lambda: time.time() + 3600),
+    ("wall clock set 1 h back, and forward", lambda: time.time() - 3600),
+    # no kernel takes less: it would have been started before 1970
+    ("wall clock set to 1970, and right again", lambda: time.monotonic() + 5),
+):
+    fault("Time", name, None)(partial(clock_set, to=to))
 
 
 @fault("Time", "process suspended (SIGSTOP, SIGCONT)", LIMIT_S)

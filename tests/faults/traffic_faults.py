@@ -5,7 +5,8 @@ import subprocess
 import time
 from collections.abc import Callable
 
-from harness import Bench, Fault, Gateway, Injection, PtyPort, fault
+from fault_report import Fault, fault
+from harness import Bench, Injection, PtyPort
 from raw_bus import RawBus
 
 CONFLICT = 0x8150
@@ -18,34 +19,22 @@ def still_answers(injection: Injection) -> None:
         injection.expect(found == 0, f"object 1000h is {found}")
 
 
+def cangen(bench: Bench, words: str) -> None:
+    """Frames from the far end, however full its queue is."""
+    subprocess.run(["cangen", bench.watched, "-i", *words.split()], check=True, stderr=subprocess.DEVNULL)
+
+
 @fault("Traffic", "random frames", None)
 def random_frames(bench: Bench, fault: Fault, times: int) -> None:
     """All identifiers, lengths and contents, remote and 29-bit frames among them; in the long run a million."""
     count = 1_000_000 if times > 10 else 5_000 * times
-    row = bench.report.row(fault)
     with bench.injection(fault, [], settle_s=1) as injection:
         before = bench.watch.foreign
-        for number, words in ((count * 8 // 10, []), (count // 10, ["-R"]), (count // 10, ["-e"])):
-            command = [
-                "cangen",
-                bench.watched,
-                "-g",
-                "0.3",
-                "-n",
-                str(number),
-                "-I",
-                "r",
-                "-L",
-                "r",
-                "-D",
-                "r",
-                "-i",
-                *words,
-            ]
-            subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+        for number, kind in ((count * 8 // 10, ""), (count // 10, "-R"), (count // 10, "-e")):
+            cangen(bench, f"-g 0.3 -n {number} -I r -L r -D r {kind}")
         injection.cleared()
         time.sleep(0.3)
-        row.figures["frames"] = row.figures.get("frames", 0) + bench.watch.foreign - before
+        bench.report.row(fault).count("frames", bench.watch.foreign - before)
         still_answers(injection)
 
 
@@ -53,7 +42,6 @@ def random_frames(bench: Bench, fault: Fault, times: int) -> None:
 def sdo_flood(bench: Bench, fault: Fault, times: int) -> None:
     """Requests without waiting for an answer: right ones, wrong ones, beginnings of transfers that nobody goes on with."""
     generator = random.Random(7)
-    row = bench.report.row(fault)
     requests = [
         bytes([0x40, 0, 0x10, 0, 0, 0, 0, 0]),
         bytes([0x40, 0x21, 0x10, 0, 0, 0, 0, 0]),
@@ -71,7 +59,7 @@ def sdo_flood(bench: Bench, fault: Fault, times: int) -> None:
                 vandal.send(0x601 + (sent & 1), request)
                 sent += 1
                 time.sleep(0.001)
-            row.figures["requests"] = row.figures.get("requests", 0) + sent
+            bench.report.row(fault).count("requests", sent)
             injection.cleared()
             time.sleep(0.3)
             vandal.send(0x601, bytes([0x80, 0, 0, 0, 0, 0, 0, 0]))
@@ -82,23 +70,21 @@ def sdo_flood(bench: Bench, fault: Fault, times: int) -> None:
 def sync(bench: Bench, fault: Fault, times: int) -> None:
     for _ in range(times):
         with bench.injection(fault, [], settle_s=1) as injection:
-            words = ["cangen", bench.watched, "-g", "1", "-n", "1500", "-I", "080", "-L", "0", "-i"]
-            subprocess.run(words, check=True, stderr=subprocess.DEVNULL)
+            cangen(bench, "-g 1 -n 1500 -I 080 -L 0")
             injection.cleared()
             still_answers(injection)
 
 
 def conflicts(bench: Bench, fault: Fault, times: int, frames: Callable[[int], list[tuple[int, bytes]]]) -> None:
     """Another node sends these frames, in turn as if it were node 1 and node 2."""
-    assert bench.gateway is not None
-    row = bench.report.row(fault)
+    gateway = bench.gateway
+    assert gateway is not None
     for i in range(max(2, times // 2)):
         node = 1 + i % 2
-        gateway = bench.gateway
-        ended = f"{frames(node)[0][0]:X}h: nobody else sends with it"
-        if i > 1 or conflicts_seen(gateway, node):  # the condition of before has to be over, or this is the same one
+        if any("somebody else" in text and f"node {node}" in text for text in gateway.lines):
+            # the condition of before has to be over, or this is the same one
             begun = gateway.log.count("somebody else")
-            bench.wait_until(lambda gateway=gateway, begun=begun: gateway.log.count("nobody else") >= begun, 15, ended)  # type: ignore[misc]
+            bench.wait_until(lambda: gateway.log.count("nobody else") >= begun, 15, "it is over")  # noqa: B023
         with bench.injection(fault, [], settle_s=1) as injection, RawBus(bench.watched) as vandal:
             lines = len(gateway.lines)
             for _ in range(50):
@@ -106,19 +92,11 @@ def conflicts(bench: Bench, fault: Fault, times: int, frames: Callable[[int], li
                     vandal.send(can_id, data)
                 time.sleep(0.01)
             injection.cleared()
-
-            def told(injection: Injection = injection, node: int = node) -> bool:
-                return CONFLICT in injection.emergency_codes(node)
-
-            bench.wait_until(told, 3, "EMCY 8150h")
+            injection.wait_emergency(node, CONFLICT)
             said = len(gateway.lines) - lines
-            row.figures["lines in the log"] = max(said, row.figures.get("lines in the log", 0))
+            bench.report.row(fault).peak("lines in the log", said)
             injection.expect(1 <= said <= 2 * len(frames(node)), f"{said} lines in the log for one condition")
             still_answers(injection)
-
-
-def conflicts_seen(gateway: Gateway, node: int) -> bool:
-    return any("somebody else" in text and f"node {node}" in text for text in gateway.lines)
 
 
 @fault("Traffic", "another node sends with our identifiers", None)

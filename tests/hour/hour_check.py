@@ -4,7 +4,7 @@ Tables: pandas, json, pyarrow, asammdf. CAN logs: python-can's readers and canto
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC
 from itertools import islice
@@ -13,7 +13,18 @@ from typing import Any
 
 import numpy as np
 from hour_recording import MS, SECOND, Times
-from hour_truth import ALIVE, JIVEPRO, LATE_NS, OPERATING_ERRORS, SAME_ROW_NS, SELFTEST_ERRORS, Expected, Floats, Truth
+from hour_truth import (
+    ALIVE,
+    INFO,
+    JIVEPRO,
+    LIVE,
+    OPERATING_ERRORS,
+    SAME_ROW_NS,
+    SELFTEST_ERRORS,
+    Expected,
+    Floats,
+    Truth,
+)
 from numpy.typing import NDArray
 
 from kontronik_can_gw.lean import without_asammdf
@@ -24,7 +35,6 @@ SLACK = 1e-7
 SHOWN = 12
 ALIVE_MODULUS = 15
 """Alive counters run from 0 to 14."""
-TABLES = ("csv", "jsonl", "parquet", "mf4")
 LOGS = ("log", "asc", "blf", "trc")
 FLAGS = (*OPERATING_ERRORS, *SELFTEST_ERRORS)
 BESIDE_FLAGS = ("OperatingState", "OperatingStateRaw", "PowerStageTemperature", "Variant", "FirmwareMain", "DeviceRaw")
@@ -88,8 +98,9 @@ class Chunk:
 # --- tables
 
 
-def check_table(path: Path, truth: Truth, chunks: Iterator[Chunk]) -> Verdict:
+def check_table(truth: Truth, path: Path) -> Verdict:
     """A table of the recording."""
+    chunks = READERS[path.suffix](path, truth)
     wall_ns = truth.recording.wall_ns(truth.row_ns)
     if path.suffix == ".mf4":  # it has one start, and goes on with the clock as it began
         wall_ns = wall_ns[0] + truth.row_ns - truth.row_ns[0]
@@ -152,17 +163,23 @@ def _column(values: Any, name: str, truth: Truth) -> Floats:
         return np.asarray(values, dtype=np.float64)
     if values.isna().all():
         return np.full(len(values), np.nan)
-    kinds = values.astype("category")
-    return (
-        _texts(list(kinds.cat.categories), truth.texts[name])[kinds.cat.codes]
-        if not kinds.isna().any()
-        else _texts(list(values), truth.texts[name])
-    )
+    return _texts(list(values), truth.texts[name])
+
+
+def _wall(frame: Any) -> Times | None:
+    """The column Utc of a text, read by pandas."""
+    import pandas as pd  # type: ignore[import-untyped]
+
+    if "Utc" not in frame:
+        return None
+    found = pd.to_datetime(frame["Utc"], format="ISO8601").dt.tz_convert(None).astype("datetime64[ns]")
+    wall: Times = found.astype(np.int64).to_numpy()
+    return wall
 
 
 def csv_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
     """By pandas."""
-    import pandas as pd  # type: ignore[import-untyped]
+    import pandas as pd
 
     names: dict[str, str] | None = None
     exact: dict[str, Any] = {"float_precision": "round_trip"} if int(pd.__version__.partition(".")[0]) < 3 else {}
@@ -171,12 +188,8 @@ def csv_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
         if names is None:
             names = {head: _split(head, truth) for head in frame.columns[1:] if head != "Utc"}
             assert frame.columns[0] == "Time [s]"
-        wall = None
-        if "Utc" in frame:
-            wall = pd.to_datetime(frame["Utc"], format="ISO8601").dt.tz_convert(None).astype("datetime64[ns]")
-            wall = wall.astype(np.int64).to_numpy()
         values = {name: _column(frame[head], name, truth) for head, name in names.items()}
-        yield Chunk(_ns(frame["Time [s]"]), wall, values)
+        yield Chunk(_ns(frame["Time [s]"]), _wall(frame), values)
 
 
 def jsonl_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
@@ -186,12 +199,8 @@ def jsonl_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
     with path.open(encoding="utf-8") as file:
         while lines := list(islice(file, ROWS)):
             frame = pd.DataFrame([json.loads(line) for line in lines])
-            wall = None
-            if "Utc" in frame:
-                wall = pd.to_datetime(frame["Utc"], format="ISO8601").dt.tz_convert(None).astype("datetime64[ns]")
-                wall = wall.astype(np.int64).to_numpy()
             values = {name: _column(frame[name], name, truth) for name in frame.columns if name not in ("Time", "Utc")}
-            yield Chunk(_ns(frame["Time"]), wall, values)
+            yield Chunk(_ns(frame["Time"]), _wall(frame), values)
 
 
 def parquet_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
@@ -215,29 +224,6 @@ def parquet_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
             else:
                 values[name] = column.cast("float64").to_numpy(zero_copy_only=False)
         yield Chunk(_ns(batch.column("Time [s]").to_numpy()), wall, values)
-
-
-def pandas_parquet_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
-    """By pandas, the whole file."""
-    import pandas as pd
-
-    frame = pd.read_parquet(path)
-    wall = (
-        frame["Utc"].dt.tz_convert(None).astype("datetime64[ns]").astype(np.int64).to_numpy()
-        if "Utc" in frame
-        else None
-    )
-    values = {}
-    for head in frame.columns[1:]:
-        if head == "Utc":
-            continue
-        name = _split(head, truth)
-        if isinstance(frame[head].dtype, pd.CategoricalDtype):
-            codes = np.append(_texts(list(frame[head].cat.categories), truth.texts[name]), np.nan)
-            values[name] = codes[frame[head].cat.codes]
-        else:
-            values[name] = _column(frame[head], name, truth)
-    yield Chunk(_ns(frame["Time [s]"]), wall, values)
 
 
 def mf4_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
@@ -265,12 +251,9 @@ def mf4_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
     yield Chunk(_ns(times), _ns(times) + start, values)
 
 
-TABLE_READERS: dict[str, tuple[str, Callable[[Path, Truth], Iterator[Chunk]]]] = {
-    "csv": ("pandas", csv_chunks),
-    "jsonl": ("json, pandas", jsonl_chunks),
-    "parquet": ("pyarrow", parquet_chunks),
-    "mf4": ("asammdf", mf4_chunks),
-}
+TABLES = {"csv": "pandas", "jsonl": "json, pandas", "parquet": "pyarrow", "mf4": "asammdf"}
+"""Forms, and by what they are read."""
+READERS = {".csv": csv_chunks, ".jsonl": jsonl_chunks, ".parquet": parquet_chunks, ".mf4": mf4_chunks}
 # text cuts at a microsecond, Parquet keeps nanoseconds, MF4 counts on from a start in microseconds
 WALL_TOLERANCE = {".csv": 999, ".jsonl": 999, ".parquet": 0, ".mf4": 1500}
 
@@ -446,7 +429,7 @@ def _groups(truth: Truth, frames: Frames) -> tuple[Times, Times]:
 # --- bytes
 
 
-def check_bytes(path: Path, truth: Truth, esc: int = 0) -> Verdict:
+def check_bytes(truth: Truth, esc: int, path: Path) -> Verdict:
     """The UART bytes of one ESC."""
     verdict = Verdict()
     got, wanted = np.fromfile(path, np.uint8), np.frombuffer(bytes(truth.recording.escs[esc].wire), np.uint8)
@@ -458,19 +441,11 @@ def check_bytes(path: Path, truth: Truth, esc: int = 0) -> Verdict:
     return verdict
 
 
-_WIRE_STEPS = {
-    "battery_voltage": 100,
-    "battery_current": 10,
-    "motor_current": 10,
-    "peak_current": 10,
-    "bec_current": 1000,
-}
-_WIRE_STEPS |= {f"{end}_{name}": steps for end in ("min", "max") for name, steps in _WIRE_STEPS.items()}
-_WIRE_STEPS |= {"bec_voltage": 1000, "min_bec_voltage": 1000}
+_WIRE_STEPS = dict([*LIVE.values(), *INFO.values(), ("bec_current", 1000)])
 _WIRE_NAMES = {"operating_state": "operating_state_raw"}
 
 
-def check_decoded(path: Path, truth: Truth, esc: int = 0) -> Verdict:
+def check_decoded(truth: Truth, esc: int, path: Path) -> Verdict:
     """The JSON lines of ``decode``: frames in their order, every field as meant."""
     verdict = Verdict()
     one = truth.escs[esc]
@@ -507,10 +482,10 @@ def check_decoded(path: Path, truth: Truth, esc: int = 0) -> Verdict:
 # --- monitor and report
 
 
-def check_last(line: str, truth: Truth, decoded: Decoded) -> Verdict:
+def check_last(truth: Truth, decoded: Decoded, path: Path) -> Verdict:
     """What ``monitor --once`` says: the values of each message's last frame."""
     verdict = Verdict()
-    told = json.loads(line)
+    told = json.loads(path.read_text(encoding="utf-8"))
     ids, data = np.array(truth.recording.sent.ids), np.array(truth.recording.sent.data, np.uint64)
     expected: dict[str, Floats] = {}
     for can_id in np.unique(ids).tolist():
@@ -530,7 +505,7 @@ def check_last(line: str, truth: Truth, decoded: Decoded) -> Verdict:
     return verdict
 
 
-def check_report(path: Path, truth: Truth) -> Verdict:
+def check_report(truth: Truth, path: Path) -> Verdict:
     """The report's page: rows, charge, extremes with their numbers, as the truth has them."""
     verdict = Verdict(rows=1)
     text = path.read_text(encoding="utf-8").replace("\u202f", "")  # between thousands
@@ -548,6 +523,3 @@ def check_report(path: Path, truth: Truth) -> Verdict:
         if words not in text:
             verdict.say(1, f"{path.name}: does not say {words!r}")
     return verdict
-
-
-assert LATE_NS > 100 * MS

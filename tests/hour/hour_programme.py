@@ -1,6 +1,6 @@
 """An hour of telemetry through every command that reads recordings, and each result read back by libraries that are not ours.
 
-    python tests/hour/hour_programme.py [--minutes 60] [--escs 1] [--folder DIR] [--json FILE]
+    python tests/hour/hour_programme.py [--minutes 60] [--escs 1] [--folder DIR]
 
 Makes a capture of so many minutes without waiting (hour_recording.py), converts, replays, decodes and reports it by the real commands as
 processes of their own, converts the CAN logs back, reads every file by pandas, pyarrow, asammdf, python-can and cantools (hour_check.py),
@@ -16,7 +16,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,6 @@ class Result:
     cpu_seconds: float = 0.0
     rows: int = 0
     peak_mb: float = 0.0
-    peak_mb_of_a_tenth: float | None = None
     size_mb: float = 0.0
     read_by: str = ""
     values: int = 0
@@ -63,8 +63,6 @@ class Step:
     output: Path
     read_by: str
     check: Callable[[], Any]
-    tenth: list[str] | None = None
-    """The same of the first tenth."""
     to_output: bool = False
     """What it prints is the result."""
 
@@ -103,111 +101,56 @@ class Runner:
         self._process.wait(60)
 
 
-def steps_of(folder: Path, truth: Any, seconds: float) -> list[Step]:
+def steps_of(folder: Path, truth: Any) -> list[Step]:
     """All that is done with the capture."""
     import hour_check as check
 
-    capture = truth.recording.path
+    capture = str(truth.recording.path)
     one_esc = len(truth.escs) == 1
     decoded = check.Decoded(truth)
     frames: dict[str, check.Frames] = {}
-    steps = []
+    steps: list[Step] = []
 
-    def log_step(name: str, arguments: list[str], path: Path, tenth: list[str] | None) -> Step:
-        def compare() -> check.Verdict:
-            verdict, frames[path.suffix] = check.check_log(path, truth, decoded)
-            return verdict
+    def step(name: str, words: list[str], output: str, read_by: str, compare: Callable[[Path], Any]) -> None:
+        """A command whose words have OUT for the file that it makes; one without it prints what is to be there."""
+        path = folder / output
+        arguments = [str(path) if word == "OUT" else word for word in words]
+        steps.append(Step(name, arguments, path, read_by, partial(compare, path), to_output="OUT" not in words))
 
-        return Step(name, arguments, path, "python-can, cantools", compare, tenth)
+    def compare_log(path: Path) -> Any:
+        verdict, frames[path.suffix] = check.check_log(path, truth, decoded)
+        return verdict
 
-    for form in check.TABLES:
-        path = folder / f"hour.{form}"
-        library, chunks = check.TABLE_READERS[form]
-        steps.append(
-            Step(
-                f"convert to {form}",
-                ["convert", str(capture), str(path)],
-                path,
-                library,
-                lambda path=path, chunks=chunks: check.check_table(path, truth, chunks(path, truth)),  # type: ignore[misc]
-                ["convert", str(capture), str(folder / f"tenth.{form}"), "--until", f"{seconds / 10:.3f}"],
-            )
+    def compare_table_of_log(form: str, path: Path) -> Any:
+        return check.check_table_of_log(path, truth, frames[f".{form}"], decoded)
+
+    for form, library in check.TABLES.items():
+        step(
+            f"convert to {form}",
+            ["convert", capture, "OUT"],
+            f"hour.{form}",
+            library,
+            partial(check.check_table, truth),
         )
-        if form == "parquet":
-            steps[-1].read_by = "pyarrow; pandas"
-            steps[-1].check = lambda path=path: _both(  # type: ignore[misc]
-                check.check_table(path, truth, check.parquet_chunks(path, truth)),
-                check.check_table(path, truth, check.pandas_parquet_chunks(path, truth)),
-            )
+    library = "python-can, cantools"
     for form in check.LOGS:
-        path = folder / f"hour.{form}"
-        tenth = ["convert", str(capture), str(folder / f"tenth.{form}"), "--until", f"{seconds / 10:.3f}"]
-        steps.append(log_step(f"convert to {form}", ["convert", str(capture), str(path)], path, tenth))
-    if one_esc:
-        for form in check.LOGS:
-            path = folder / f"of_{form}.csv"
-            steps.append(
-                Step(
-                    f"convert {form} to csv",
-                    ["convert", str(folder / f"hour.{form}"), str(path)],
-                    path,
-                    "pandas against python-can, cantools",
-                    lambda path=path, form=form: check.check_table_of_log(path, truth, frames[f".{form}"], decoded),  # type: ignore[misc]
-                )
-            )
-    replayed = folder / "replayed.log"
-    steps.append(
-        log_step("replay to log", ["replay", str(capture), "--to", "log", "-o", str(replayed)], replayed, None)
-    )
+        step(f"convert to {form}", ["convert", capture, "OUT"], f"hour.{form}", library, compare_log)
+    for form in check.LOGS if one_esc else ():
+        words = ["convert", str(folder / f"hour.{form}"), "OUT"]
+        compare = partial(compare_table_of_log, form)
+        step(f"convert {form} to csv", words, f"of_{form}.csv", f"pandas against {library}", compare)
+    step("replay to log", ["replay", capture, "--to", "log", "-o", "OUT"], "replayed.log", library, compare_log)
     for index in range(len(truth.escs)):
-        path = folder / f"esc{index + 1}.bin"
-        more = [] if one_esc else ["--esc", f"esc{index + 1}"]
-        steps.append(
-            Step(
-                "convert to bin",
-                ["convert", str(capture), str(path), *more],
-                path,
-                "numpy",
-                lambda path=path, index=index: check.check_bytes(path, truth, index),  # type: ignore[misc]
-            )
-        )
-        lines = folder / f"esc{index + 1}.decoded.jsonl"
-        steps.append(
-            Step(
-                "decode the bin",
-                ["decode", str(path)],
-                lines,
-                "json",
-                lambda lines=lines, index=index: check.check_decoded(lines, truth, index),  # type: ignore[misc]
-                to_output=True,
-            )
-        )
-    page, last = folder / "hour.html", folder / "last.json"
-    steps += [
-        Step(
-            "report",
-            ["report", str(capture), "-o", str(page)],
-            page,
-            "its text",
-            lambda: check.check_report(page, truth),
-        ),
-        Step(
-            "monitor --once",
-            ["monitor", str(capture), "--once"],
-            last,
-            "json against cantools",
-            lambda: check.check_last(last.read_text(encoding="utf-8"), truth, decoded),
-            to_output=True,
-        ),
-    ]
+        name = f"esc{index + 1}"
+        more = [] if one_esc else ["--esc", name]
+        compare = partial(check.check_bytes, truth, index)
+        step("convert to bin", ["convert", capture, "OUT", *more], f"{name}.bin", "numpy", compare)
+        words = ["decode", str(folder / f"{name}.bin")]
+        step("decode the bin", words, f"{name}.decoded.jsonl", "json", partial(check.check_decoded, truth, index))
+    step("report", ["report", capture, "-o", "OUT"], "hour.html", "its text", partial(check.check_report, truth))
+    compare = partial(check.check_last, truth, decoded)
+    step("monitor --once", ["monitor", capture, "--once"], "last.json", "json against cantools", compare)
     return steps
-
-
-def _both(first: Any, second: Any) -> Any:
-    first.values += second.values
-    first.differences += second.differences
-    first.problems += second.problems
-    return first
 
 
 def run(steps: list[Step], folder: Path, say: Callable[[str], None] = print) -> list[Result]:
@@ -217,13 +160,9 @@ def run(steps: list[Step], folder: Path, say: Callable[[str], None] = print) -> 
     try:
         for step in steps:
             runner.submit(step.arguments, step.output if step.to_output else folder / "output.txt")
-            if step.tenth is not None:
-                runner.submit(step.tenth, folder / "output.txt")
         for step in steps:
             result = Result(step.name, read_by=step.read_by)
             result.seconds, result.cpu_seconds, result.peak_mb = runner.result()
-            if step.tenth is not None:
-                result.peak_mb_of_a_tenth = runner.result()[2]
             result.size_mb = step.output.stat().st_size / 1e6
             verdict = step.check()
             result.rows, result.values = verdict.rows, verdict.values
@@ -239,27 +178,13 @@ def run(steps: list[Step], folder: Path, say: Callable[[str], None] = print) -> 
 
 def table(results: list[Result]) -> str:
     """The results as a Markdown table."""
-    heads = (
-        "",
-        "seconds",
-        "CPU s",
-        "rows/CPU s",
-        "peak MB",
-        "of a tenth",
-        "size MB",
-        "values compared",
-        "read back by",
-    )
-    lines = ["| " + " | ".join(heads) + " |", "|---" + "|---:" * 7 + "|---|"]
+    heads = ("", "seconds", "CPU s", "rows/CPU s", "peak MB", "size MB", "values compared", "read back by")
+    lines = ["| " + " | ".join(heads) + " |", "|---" + "|---:" * 6 + "|---|"]
     for one in results:
-        tenth = "" if one.peak_mb_of_a_tenth is None else f"{one.peak_mb_of_a_tenth:.0f}"
         rate = f"{one.rows / one.cpu_seconds:,.0f}".replace(",", " ") if one.rows > 10 else ""
         values = f"{one.values:,}".replace(",", " ") + (f" ({one.differences} differ)" if one.differences else "")
-        cells = (
-            *(one.name, f"{one.seconds:.1f}", f"{one.cpu_seconds:.1f}", rate, f"{one.peak_mb:.0f}", tenth),
-            *(f"{one.size_mb:.1f}", values, one.read_by),
-        )
-        lines.append("| " + " | ".join(cells) + " |")
+        cells = [one.name, f"{one.seconds:.1f}", f"{one.cpu_seconds:.1f}", rate, f"{one.peak_mb:.0f}"]
+        lines.append("| " + " | ".join([*cells, f"{one.size_mb:.1f}", values, one.read_by]) + " |")
     return "\n".join(lines)
 
 
@@ -267,10 +192,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--escs", type=int, default=1)
-    parser.add_argument(
-        "--folder", type=Path, help="keep the files there (default: a temporary folder that is removed)"
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results there too")
+    parser.add_argument("--folder", type=Path, help="a new one, in which the files are kept")
     args = parser.parse_args()
     if not 0.5 <= args.minutes <= 600 or not 1 <= args.escs <= 8:
         parser.error("--minutes 0.5 to 600, --escs 1 to 8")
@@ -278,15 +200,8 @@ def main() -> int:
     from hour_truth import Truth
 
     folder = args.folder or Path(tempfile.mkdtemp(prefix="hour."))
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in (
-        *folder.glob("hour.*"),
-        *folder.glob("tenth.*"),
-        *folder.glob("of_*"),
-        *folder.glob("*.bin"),
-        *folder.glob("*.log"),
-    ):
-        old.unlink(missing_ok=True)
+    if args.folder:
+        folder.mkdir(parents=True)
     try:
         begun = time.monotonic()
         seconds = args.minutes * 60
@@ -297,13 +212,11 @@ def main() -> int:
             f"{len(truth.sent_ns)} CAN frames; capture of {size:.1f} MB, made in {time.monotonic() - begun:.0f} s"
         )
         print(head, flush=True)
-        results = run(steps_of(folder, truth, seconds), folder, lambda text: print(text, flush=True))
+        results = run(steps_of(folder, truth), folder, lambda text: print(text, flush=True))
     finally:
         if args.folder is None:
             shutil.rmtree(folder, ignore_errors=True)
     print(f"\n{head}\n\n{table(results)}")
-    if args.json is not None:
-        args.json.write_text(json.dumps({"head": head, "results": [asdict(one) for one in results]}, indent=1) + "\n")
     bad = [one.name for one in results if one.differences]
     print(
         f"\n{sum(one.values for one in results)} values compared, "

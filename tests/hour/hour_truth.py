@@ -14,7 +14,7 @@ from typing import Any
 import cantools.database
 import numpy as np
 from cantools.database.can import Database
-from hour_recording import BYTE_NS, CELLS, GEAR, MS, SECOND, START, TIMEOUT_NS, Meant, Recording, Times
+from hour_recording import CELLS, GEAR, MS, SECOND, START, TIMEOUT_NS, Meant, Recording, Times
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -75,16 +75,8 @@ SELFTEST_ERRORS = (
     *("TestBecOvertemperature", "TestMotorPhaseMissing", "TestEepromEmpty", "TestEepromStickPositions"),
     *("TestEepromChecksum", "TestEepromSize", "TestEepromVersion"),
 )
-ALIVE = (
-    "StatusAlive",
-    "SpeedAlive",
-    "CurrentAlive",
-    "ShaftAlive",
-    "BecAlive",
-    "EnergyAlive",
-    "LinkAlive",
-    "GatewayAlive",
-)
+ALIVE = "Alive"
+"""How alive counters are called at their end."""
 NEVER_SEEN, OK, LOST, PORT_ERROR = 0, 2, 4, 5
 RUNNING, STOPPING = 1, 2
 
@@ -381,6 +373,3 @@ def database_of(recording: Recording) -> Database:
     made = recording.setup.database()
     assert made is not None
     return made[0]
-
-
-assert BYTE_NS == 95_486

@@ -1,6 +1,6 @@
 """How strong the tests of the core packages are: a fixed sample of 100 mutants of each, run against the package's tests.
 
-    python tests/mutants/mutants.py [PACKAGE...] [--json OUT] [--compare OLD] [--only KEY...] [--list]
+    python tests/mutants/mutants.py [PACKAGE...] [--json OUT] [--compare OLD] [--only KEY...]
 
 A mutant runs in a process of its own that imports the project afresh, with the tests that execute the mutated lines, the
 quickest first, until one fails. Nothing depends on the speed of the machine: hypothesis is derandomised, limits are CPU time
@@ -224,9 +224,6 @@ def compare(old: Result, new: Result) -> bool:
         for key, text in now["survived"].items():
             if key not in was["survived"]:
                 print(f"  survives{', was killed' if key in killed[0] else ' (new)'}: {key} {text}")
-        for key, text in was["survived"].items():
-            if key not in now["survived"]:
-                print(f"  {'is killed now' if key in killed[1] else 'is gone'}: {key} {text}")
     return not lost
 
 
@@ -236,7 +233,6 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="OUT", help="write what was killed and what survived")
     parser.add_argument("--compare", type=Path, metavar="OLD", help="a file of --json to compare with")
     parser.add_argument("--only", nargs="+", default=[], metavar="KEY", help="only these mutants of the sample")
-    parser.add_argument("--list", action="store_true", help="print the sample and run nothing")
     options = parser.parse_args()
     packages = options.packages or list(PACKAGES)
     if wrong := set(packages) - set(PACKAGES):
@@ -246,9 +242,6 @@ def main() -> int:
     os.chdir(PROJECT)
     sys.path.insert(0, str(PROJECT))
     warnings.simplefilter("ignore")
-    if options.list:
-        print(*(f"{each.key} {each}" for package in packages for each in sample(package)), sep="\n")
-        return 0
     found = {package: judge(package, options.only) for package in packages}
     if options.json:
         options.json.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n")

@@ -1,6 +1,6 @@
 """Puts each fault of faults.toml into a copy of the project and runs the tests that must see it.
 
-    python tests/mutants/put_in_faults.py [WORDS...] [--list]
+    python tests/mutants/put_in_faults.py [WORDS...]
 
 WORDS choose the faults whose text has one of them. The working tree is not touched. Exits with 0 if all faults were caught;
 with 1 and one line each for those that were not, or cannot be put in any more because the code is another one.
@@ -64,27 +64,14 @@ def faults(path: Path = LIST) -> list[Fault]:
     listed = tomllib.loads(path.read_text())["fault"]
     for number, each in enumerate(listed):
         if set(each) != {"what", "search", "replace", "seen_by"} or not each["seen_by"]:
-            raise ValueError(
-                f"{path.name}: fault {number + 1} needs what, search, replace and seen_by, and nothing else"
-            )
+            raise ValueError(f"{path.name}: fault {number + 1} needs what, search, replace, seen_by, and nothing else")
     return [Fault(each["what"], each["search"], each["replace"], tuple(each["seen_by"])) for each in listed]
 
 
 def run(tests: tuple[str, ...], folder: Path, limit_s: float) -> tuple[int, float]:
     """pytest's status in a copy of the project, and the CPU time it took."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "--tb=no",
-        "-m",
-        "not extended",
-        *tests,
-    ]
+    options = ["-x", "-q", "-p", "no:cacheprovider", "--tb=no", "-m", "not extended"]
+    command = [sys.executable, "-m", "pytest", *options, *tests]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"}
     before = _children_s()
     process = subprocess.run(
@@ -137,13 +124,8 @@ class Copy:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("words", nargs="*", metavar="WORDS")
-    parser.add_argument("--list", action="store_true", help="print the faults and who must see them, and run nothing")
     options = parser.parse_args()
     chosen = [fault for fault in faults() if not options.words or any(word in fault.what for word in options.words)]
-    if options.list:
-        for fault in chosen:
-            print(f"{fault.what}  [{' '.join(fault.seen_by)}]")
-        return 0
     wrong = 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))

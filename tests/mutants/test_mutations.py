@@ -73,18 +73,6 @@ def test_a_key_does_not_depend_on_what_stands_elsewhere() -> None:
     assert len({mutant.key for mutant in mutants(more)}) == len(mutants(more))
 
 
-def test_a_mutant_is_at_the_line_of_its_statement() -> None:
-    source = """\
-        if a < (
-            b
-        ):
-            x = (
-                1
-            )
-    """
-    assert {mutant.line for mutant in mutants(source)} == {1, 4}
-
-
 def test_each_statement_that_is_executed_is_noted() -> None:
     source = """\
         "docstring"

@@ -11,8 +11,7 @@ qemu    Emulated, Python 15 times slower. The same and ISO-TP; two kvaser_pci co
         a 16550A UART (/dev/ttyS1, its other end /dev/virtio-ports/com1); an FTDI USB serial adapter (/dev/ttyUSB0, its
         other end /dev/virtio-ports/ftdi) that QMP at /dev/virtio-ports/qmp unplugs (device_del, device_add usbser0).
         device_add takes driver=usb-serial id=usbser0 serial=ESC0002 bus=xhci.0 port=1 chardev=ftdis
-        always-plugged=true; right after a device_del it has to be tried again after 0.1 s. USB devices played by the
-        command itself can be plugged in by vhci_hcd (drivers ftdi_sio, usb_8dev).
+        always-plugged=true; right after a device_del it has to be tried again after 0.1 s.
 
 A VM sees the host's file system read-only at the same paths, with an empty /tmp, /var/tmp, /run and /dev/shm; each
 --rw DIR is writable. It is root in there, lo is up, the CAN modules are loaded, and there is no vcan interface yet.
@@ -102,27 +101,12 @@ def native_prefix() -> list[str] | None:
 
 
 def uml_command(job: str, out: int, err: int) -> list[str]:
-    return [
-        "linux.uml",
-        f"mem={UML_MEMORY_MIB}M",
-        "root=/dev/root",
-        "rootfstype=hostfs",
-        "rootflags=/",
-        "ro",
-        f"init={job}/guest-init.sh",
-        f"VM_JOB={job}",
-        "VM_BACKEND=uml",
-        f"GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512}",
-        "con=null",
-        "ssl=null",
-        f"ssl0=null,fd:{out}",
-        f"ssl1=null,fd:{err}",
-        f"uml_dir={job}",
-        "umid=uml",
-        "noreboot",
-        "quiet",
-        "loglevel=3",
-    ]
+    command = (
+        f"linux.uml mem={UML_MEMORY_MIB}M root=/dev/root rootfstype=hostfs rootflags=/ ro init={job}/guest-init.sh"
+    )
+    command += f" VM_JOB={job} VM_BACKEND=uml GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512} con=null ssl=null"
+    command += f" ssl0=null,fd:{out} ssl1=null,fd:{err} uml_dir={job} umid=uml noreboot quiet loglevel=3"
+    return command.split()
 
 
 def uml_guest_environment() -> dict[str, str]:
@@ -352,15 +336,13 @@ def installed() -> list[str]:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(usage=__doc__, add_help=True)
-    parser.add_argument("--backend", default=os.environ.get("KCG_VM_BACKEND") or "auto")
+    kinds = ("auto", "native", "uml", "qemu")
+    parser.add_argument("--backend", choices=kinds, default=os.environ.get("KCG_VM_BACKEND") or "auto")
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--rw", action="append", default=[])
     parser.add_argument("--which", action="store_true")
-    parser.add_argument("--verbose", action="store_true")
     parser.add_argument("command", nargs="*")
     args = parser.parse_args()
-    if args.backend not in ("auto", "native", "uml", "qemu"):
-        parser.error(f"--backend {args.backend}: auto, native, uml or qemu")
     args.rw = [os.path.realpath(folder) for folder in args.rw]
     for folder in args.rw:
         if not os.path.isdir(folder):
@@ -389,10 +371,7 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, leave)
     for vm in vms:
-        start = time.monotonic()
         code, started = run_in_vm(vm, args.command, args.rw, args.timeout)
-        if args.verbose:
-            print(f"vm/run: {vm}: exit {code}, {time.monotonic() - start:.1f} s", file=sys.stderr)
         if code != VM_FAILED or started:
             return code
     if not vms:
