@@ -1,20 +1,20 @@
-"""The README's table of faults is the programme's own: it names every fault there is, and shows no wrong and no lost value."""
+"""The table of faults in docs/faults.md is the programme's own: it names every fault there is, and shows no wrong and no lost value."""
 
 from pathlib import Path
 
 from fault_report import FAULTS, Row, in_order
 from table import BEGIN, END, parse, put, table
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
 
 
-def test_the_readme_names_exactly_the_faults_that_the_programme_has() -> None:
-    shown = [(row["machine"], row["fault"]) for row in parse(README.read_text())]
+def test_the_page_names_exactly_the_faults_that_the_programme_has() -> None:
+    shown = [(row["machine"], row["fault"]) for row in parse(PAGE.read_text())]
     assert shown == [(fault.machine, str(fault)) for fault in in_order()]
 
 
-def test_the_readme_shows_that_all_were_healed_without_a_wrong_or_lost_value() -> None:
-    found = parse(README.read_text())
+def test_the_page_shows_that_all_were_healed_without_a_wrong_or_lost_value() -> None:
+    found = parse(PAGE.read_text())
     assert found
     for row in found:
         assert int(row["injected"]) > 0, row

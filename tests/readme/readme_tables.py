@@ -1,4 +1,4 @@
-"""The README's tables, made from their sources of truth. ``python tests/readme/readme_tables.py`` writes them into README.md."""
+"""The tables of README.md and docs/, made from their sources of truth. ``python tests/readme/readme_tables.py`` writes them there."""
 
 import re
 from dataclasses import MISSING, fields
@@ -25,7 +25,10 @@ from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.sources import Group, sources
 from kontronik_can_gw.telemetry import EscSettings
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+PROJECT = Path(__file__).resolve().parents[2]
+PAGES = {
+    path: path.read_text(encoding="utf-8") for path in [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
+}
 _FOLDED = {*range(0x1800, 0x1C00), 0x2002}
 _TYPES = {2: "i8", 3: "i16", 4: "i32", 5: "u8", 6: "u16", 7: "u32", 9: "text", 15: "domain"}
 _FOUND_BY_GATEWAY = {
@@ -189,13 +192,13 @@ TABLES = {
 
 
 def with_tables(text: str) -> str:
-    """The README's text with every table made anew."""
+    """A page with each table in it made anew."""
     for name, make in TABLES.items():
         pattern = re.compile(rf"(<!-- made: {name} -->\n).*?(<!-- end: {name} -->)", re.DOTALL)
-        assert pattern.search(text), f"README.md has no place for the table {name}"
         text = pattern.sub(lambda found, make=make: f"{found[1]}{make()}\n{found[2]}", text)  # type: ignore[misc]
     return text
 
 
 if __name__ == "__main__":
-    README.write_text(with_tables(README.read_text(encoding="utf-8")), encoding="utf-8")
+    for path, text in PAGES.items():
+        path.write_text(with_tables(text), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The README's examples with ``canopen`` as master, run as they stand but for the interface, against a whole gateway."""
+"""The examples of docs/canopen.md with ``canopen`` as master, run as they stand but for the interface, against a whole gateway."""
 
 import contextlib
 import gc
@@ -25,9 +25,9 @@ from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, SimulatedEsc
 
 PROJECT = Path(__file__).resolve().parents[2]
-README = (PROJECT / "README.md").read_text(encoding="utf-8")
+PAGE = (PROJECT / "docs" / "canopen.md").read_text(encoding="utf-8")
 CONNECT = 'network.connect(interface="socketcan", channel="can0")'
-EXAMPLES = [block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if CONNECT in block]
+EXAMPLES = [block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if CONNECT in block]
 POLL, PDOS, EMERGENCIES, STORE, LSS = EXAMPLES
 pytestmark = pytest.mark.extended
 
@@ -78,7 +78,7 @@ def run(example: str, channel: str) -> str:
     assert code != example
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.chdir(PROJECT):
-        exec(compile(code, "<example of the README>", "exec"), {})
+        exec(compile(code, "<example of docs/canopen.md>", "exec"), {})
     return out.getvalue()
 
 

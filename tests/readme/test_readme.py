@@ -1,4 +1,4 @@
-"""The README is true: its tables are those of the sources, its commands run, its examples are valid."""
+"""README.md and docs/ are true: tables are those of the sources, commands exist, links lead somewhere, examples are valid."""
 
 import re
 import shutil
@@ -9,17 +9,20 @@ import zipfile
 from pathlib import Path
 
 import cantools.database
-from readme_tables import README, configuration, with_tables
+from readme_tables import PAGES, PROJECT, TABLES, configuration, with_tables
 
 from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.config import parse, schema, shipped
 
-TEXT = README.read_text(encoding="utf-8")
-PROJECT = README.parent
+README = PAGES[PROJECT / "README.md"]
+ALL = "\n".join(PAGES.values())
 
 
-def test_its_tables_are_those_of_the_sources() -> None:
-    assert with_tables(TEXT) == TEXT, "run: python tests/readme/readme_tables.py"
+def test_the_tables_are_those_of_the_sources() -> None:
+    for path, text in PAGES.items():
+        assert with_tables(text) == text, f"{path.name}: run: python tests/readme/readme_tables.py"
+    for name in TABLES:
+        assert ALL.count(f"<!-- made: {name} -->\n") == 1, name
 
 
 def test_its_configuration_table_has_every_key_of_every_table() -> None:
@@ -31,36 +34,49 @@ def test_its_configuration_table_has_every_key_of_every_table() -> None:
     assert rows == keys
 
 
-def test_its_links_lead_to_its_headings() -> None:
-    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", TEXT, flags=re.DOTALL), re.MULTILINE)
-    anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
-    assert set(re.findall(r"\]\(#([^)]+)\)", TEXT)) <= anchors
+def anchors(text: str) -> set[str]:
+    """Those that a page has, as GitHub makes them of its headings."""
+    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def test_its_configuration_is_valid() -> None:
-    for block in re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL):
+def test_links_lead_to_files_and_headings() -> None:
+    for path, text in PAGES.items():
+        for link in re.findall(r"\]\(([^)]+)\)", text):
+            if "://" in link:
+                continue
+            name, _, anchor = link.partition("#")
+            target = (path.parent / name).resolve() if name else path
+            assert target.exists(), f"{path.name}: {link}"
+            assert not anchor or anchor in anchors(PAGES[target]), f"{path.name}: {link}"
+
+
+def test_every_page_is_found_from_the_front() -> None:
+    assert {path for path in PAGES if path.parent != PROJECT} == {
+        PROJECT / link for link in re.findall(r"\]\((docs/[^)#]+\.md)\)", README)
+    }
+    assert README.count("\n") <= 230
+
+
+def test_configurations_are_valid() -> None:
+    for block in re.findall(r"```toml\n(.*?)```", ALL, re.DOTALL):
         parse({"esc": [{"port": "/dev/ttyUSB0"}]} | tomllib.loads(block), "README.md")  # some show a table alone
 
 
 def test_every_command_is_named() -> None:
-    assert all(f"`kontronik-can-gw {command}" in TEXT for command in COMMANDS)
+    assert all(f"`kontronik-can-gw {command}" in README for command in COMMANDS)
 
 
-def test_every_command_it_names_exists() -> None:
-    for command in re.findall(r"kontronik-can-gw ([a-z]+)\b(?! gateway)", TEXT):
+def test_every_command_that_is_named_exists() -> None:
+    for command in re.findall(r"kontronik-can-gw ([a-z]+)\b(?! gateway)", ALL):
         assert command in COMMANDS, command
 
 
-def test_every_make_target_it_names_exists() -> None:
+def test_every_make_target_that_is_named_exists() -> None:
     makefile = (PROJECT / "Makefile").read_text(encoding="utf-8")
-    for target in re.findall(r"`?make ([a-z]+)", TEXT):
+    for target in re.findall(r"`?make ([a-z]+)", ALL):
         if target not in ("sure", "no"):
             assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
-
-
-def test_files_it_links_to_exist() -> None:
-    for link in re.findall(r"\]\(([^)#:]+)\)", TEXT):
-        assert (PROJECT / link).exists(), link
 
 
 def test_a_wheel_carries_dbc_and_example_and_finds_them(tmp_path: Path) -> None:
