@@ -22,11 +22,10 @@ class Schedule:
     def __init__(self, plans: Sequence[MessagePlan], now: int) -> None:
         self._cycle = [plan.cycle_ns for plan in plans]
         self._delay = [plan.delay_ns for plan in plans]
-        self._last = [_NEVER] * len(plans)
+        self._free = [_NEVER] * len(plans)
+        """When the minimum distance to the last frame of each message is over."""
         self._waiting = [False] * len(plans)
         self._cycle_waits = [False] * len(plans)
-        self.last, self.waiting, self.cycle_waits = self._last, self._waiting, self._cycle_waits
-        """For the generated function that sends what follows live frames: it does as ``request`` and ``sent`` do."""
         self._heap = [
             (now + phase, index, False) for index, phase in enumerate(phases(self._cycle)) if self._cycle[index]
         ]
@@ -37,9 +36,9 @@ class Schedule:
 
     def request(self, index: int, now: int) -> bool:
         """True if the message may be sent now; otherwise it comes out of ``due`` when it may."""
-        if now >= self._last[index] + self._delay[index]:
+        if now >= self._free[index]:
             return True
-        self._put_off(index, self._last[index] + self._delay[index])
+        self._put_off(index, self._free[index])
         return False
 
     def wait(self, index: int, now: int) -> None:
@@ -48,8 +47,9 @@ class Schedule:
 
     def sent(self, index: int, now: int) -> None:
         """A frame of the message went out: it is the one that was waited for."""
-        self._last[index] = now
-        self._waiting[index] = self._cycle_waits[index] = False
+        self._free[index] = now + self._delay[index]
+        if self._waiting[index]:
+            self._waiting[index] = self._cycle_waits[index] = False
 
     def due(self, now: int) -> list[tuple[int, bool]]:
         """(message, True for its cycle, False for a request that had to wait), in the order of their deadlines, each once.
@@ -64,8 +64,8 @@ class Schedule:
                 heapq.heappop(heap)
                 if not self._waiting[index]:
                     continue  # a frame has gone out since
-                if now < self._last[index] + self._delay[index]:
-                    heapq.heappush(heap, (self._last[index] + self._delay[index], index, True))
+                if now < self._free[index]:
+                    heapq.heappush(heap, (self._free[index], index, True))
                     continue
                 self._waiting[index] = False
                 found[index] = found.get(index, False) or self._cycle_waits[index]

@@ -33,11 +33,12 @@ class Layout(Enum):
 class Form:
     """One of the four frame forms: its length, what its CRC covers, and how its body is packed."""
 
-    __slots__ = ("_data", "_struct", "covered", "crc_at", "data_type", "header", "kind", "layout", "length")
+    __slots__ = ("_data", "_struct", "covered", "crc_at", "data_type", "header", "kind", "layout", "length", "name")
 
     def __init__(self, kind: Kind, layout: Layout) -> None:
         self.kind = kind
         self.layout = layout
+        self.name = f"{kind.value}_{layout.value}"
         self.header = b"KODL" if kind is Kind.LIVE else b"KODI"
         self.data_type: DataType = LiveData if kind is Kind.LIVE else InfoData
         reserved = 0 if layout is Layout.LEGACY else -(4 + struct.calcsize("<" + body_format(self.data_type))) % 4

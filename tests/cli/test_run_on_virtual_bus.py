@@ -11,7 +11,7 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -325,9 +325,9 @@ def frame(can_id: int, value: int, extended: bool = False) -> CanFrame:
 def test_of_each_id_only_the_newest_frame_waits_and_the_order_is_that_of_waiting() -> None:
     mailboxes, sent = Mailboxes(), []
 
-    def take(each: CanFrame) -> Sent:
-        sent.append(each)
-        return Sent.OK
+    def take(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
+        sent.extend(frames)
+        return len(frames), Sent.OK
 
     for each in (frame(1, 1), frame(2, 1), frame(1, 2), frame(1, 9, True), frame(1, 3)):
         mailboxes.put(each)

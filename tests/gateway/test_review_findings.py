@@ -157,10 +157,11 @@ def test_a_fault_of_one_frame_is_not_passed_over_when_two_come_in_one_read(tmp_p
 def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
     mailboxes, sent, free = Mailboxes(), [], True
 
-    def send(frame: CanFrame) -> Sent:
-        if free:
-            sent.append(frame.page)
-        return Sent.OK if free else Sent.BUSY
+    def send(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
+        if not free:
+            return 0, Sent.BUSY
+        sent.extend(frame.page for frame in frames)
+        return len(frames), Sent.OK
 
     for n in range(100):
         free = n % 2 == 1

@@ -538,8 +538,8 @@ class Node(Gateway):
     def frames_wait(self) -> bool:
         return bool(self.waiting) or super().frames_wait
 
-    def take_ready(self) -> list[CanFrame | bytes]:
-        frames: list[CanFrame | bytes] = [*self.waiting, *super().take_ready()]
+    def take_frames(self) -> list[CanFrame]:
+        frames = [*self.waiting, *super().take_frames()]
         self.waiting = []
         return frames
 
