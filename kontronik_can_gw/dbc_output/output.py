@@ -59,7 +59,7 @@ class _Message:
         alive = next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)
         self.crc_at = None if crc is None else crc.pieces[0].at // 8
         self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 0
-        self.last: dict[int, int] = {}
+        self.last: dict[int | None, int] = {}
         # what also tells of the link always goes on
         self.silent_able = silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         self.by_event = SendType.EVENT in plan.send_type
@@ -188,11 +188,13 @@ class DbcOutput:
 
     def _note_changes(self, message: _Message, now: int) -> bool:
         """True if a page differs from what was sent of it last; with several pages those that do are owed."""
-        pack, last, pages = message.pack, message.last, message.pages
+        pack, last, pages = message.pack, message.last, message.plan.pages
         if len(pages) == 1:
-            return pack(self._escs, self._gateway, now, 0, pages[0]) != last.get(pages[0])
+            return pack(self._escs, self._gateway, now, 0, pages[0] or 0) != last.get(pages[0])
         changed = [
-            place for place, page in enumerate(pages) if pack(self._escs, self._gateway, now, 0, page) != last.get(page)
+            place
+            for place, page in enumerate(pages)
+            if pack(self._escs, self._gateway, now, 0, page or 0) != last.get(page)
         ]
         message.owed += [place for place in changed if place not in message.owed]
         return bool(changed)
@@ -215,7 +217,7 @@ class DbcOutput:
         if message.alive_modulus:
             message.alive = (alive + 1) % message.alive_modulus
         if message.on_change:
-            message.last[page] = message.pack(self._escs, self._gateway, now, 0, page)
+            message.last[message.plan.pages[place]] = message.pack(self._escs, self._gateway, now, 0, page)
         if message.crc_at is not None:
             at = message.crc_at
             data = data[:at] + bytes((e2e.crc(data, at, message.plan.data_id),)) + data[at + 1 :]

@@ -22,8 +22,7 @@ class Schedule:
     def __init__(self, plans: Sequence[MessagePlan], now: int) -> None:
         self._cycle = [plan.cycle_ns for plan in plans]
         self._delay = [plan.delay_ns for plan in plans]
-        self._free = [_NEVER] * len(plans)
-        """When the minimum distance to the last frame of each message is over."""
+        self._last = [_NEVER] * len(plans)
         self._waiting = [False] * len(plans)
         self._cycle_waits = [False] * len(plans)
         self._heap = [
@@ -36,9 +35,9 @@ class Schedule:
 
     def request(self, index: int, now: int) -> bool:
         """True if the message may be sent now; otherwise it comes out of ``due`` when it may."""
-        if now >= self._free[index]:
+        if now >= self._last[index] + self._delay[index]:
             return True
-        self._put_off(index, self._free[index])
+        self._put_off(index, self._last[index] + self._delay[index])
         return False
 
     def wait(self, index: int, now: int) -> None:
@@ -47,9 +46,8 @@ class Schedule:
 
     def sent(self, index: int, now: int) -> None:
         """A frame of the message went out: it is the one that was waited for."""
-        self._free[index] = now + self._delay[index]
-        if self._waiting[index]:
-            self._waiting[index] = self._cycle_waits[index] = False
+        self._last[index] = now
+        self._waiting[index] = self._cycle_waits[index] = False
 
     def due(self, now: int) -> list[tuple[int, bool]]:
         """(message, True for its cycle, False for a request that had to wait), in the order of their deadlines, each once.
@@ -64,8 +62,8 @@ class Schedule:
                 heapq.heappop(heap)
                 if not self._waiting[index]:
                     continue  # a frame has gone out since
-                if now < self._free[index]:
-                    heapq.heappush(heap, (self._free[index], index, True))
+                if now < self._last[index] + self._delay[index]:
+                    heapq.heappush(heap, (self._last[index] + self._delay[index], index, True))
                     continue
                 self._waiting[index] = False
                 found[index] = found.get(index, False) or self._cycle_waits[index]

@@ -323,7 +323,7 @@ def frame(can_id: int, value: int, extended: bool = False) -> CanFrame:
 
 
 def test_of_each_id_only_the_newest_frame_waits_and_the_order_is_that_of_waiting() -> None:
-    mailboxes, sent = Mailboxes(), []
+    mailboxes, sent = Mailboxes(), list[CanFrame]()
 
     def take(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
         sent.extend(frames)

@@ -155,7 +155,7 @@ def test_a_fault_of_one_frame_is_not_passed_over_when_two_come_in_one_read(tmp_p
 
 
 def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
-    mailboxes, sent, free = Mailboxes(), [], True
+    mailboxes, sent, free = Mailboxes(), list[int](), True
 
     def send(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
         if not free:

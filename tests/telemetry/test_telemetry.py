@@ -9,8 +9,10 @@ from operator import or_
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from protocol.reference import SHORTEST_FIRST, fits
 
-from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode, find_form
+from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode
+from kontronik_can_gw.protocol.codec import FORMS
 from kontronik_can_gw.protocol.fields import device_and_variant
 from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.sources import Source, sources
@@ -626,8 +628,9 @@ def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[LiveData]:
     ends = list(accumulate(len(piece) for piece, _ in timed))
     found = []
     for at in range(len(whole)):
-        form = find_form(whole, at)
-        if form is not None:
+        row = next((row for row in SHORTEST_FIRST if fits(whole, at, row)), None)
+        if row is not None:
+            form = next(form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout))
             first = timed[bisect_right(ends, at)][1]
             last = timed[bisect_right(ends, at + form.length - 1)][1]
             data = form.decode(whole, at)
