@@ -1,11 +1,5 @@
-"""The CAN frame as the pure core receives it and hands it out.
+"""The CAN frame as the pure core receives it and hands it out."""
 
-What follows each telemetry frame is made as an image instead: the bytes of SocketCAN's struct can_frame, which cost a quarter of a CanFrame
-and go to the socket as they are. Among the frames of one turn an image is the only one with its id.
-"""
-
-import struct
-import sys
 from typing import NamedTuple
 
 EXTENDED = 0x80000000
@@ -32,21 +26,3 @@ class CanFrame(NamedTuple):
     def key(self) -> int:
         """The id, with ``EXTENDED`` if it has 29 bits."""
         return self.can_id | EXTENDED if self.extended else self.can_id
-
-
-_IMAGE = struct.Struct("=IB3x8s")
-IMAGE = struct.Struct("<IB3xQ")
-"""An image from ``image_id``, length, and the frame's bits as a number (bit 0 is bit 0 of byte 0)."""
-
-
-def image_id(can_id: int, extended: bool) -> int:
-    """The id as the first number of ``IMAGE``."""
-    return int.from_bytes((can_id | (EXTENDED if extended else 0)).to_bytes(4, sys.byteorder), "little")
-
-
-def frame_of(frame: CanFrame | bytes) -> CanFrame:
-    """A frame or the image of one as a frame."""
-    if isinstance(frame, CanFrame):
-        return frame
-    key, length, data = _IMAGE.unpack(frame)
-    return CanFrame(key & ~EXTENDED, data[:length], bool(key & EXTENDED))

@@ -10,14 +10,13 @@ from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.dbc_output.output import DbcOutput
-from kontronik_can_gw.frames import EXTENDED, CanFrame, frame_of
+from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.telemetry import SECOND, EscSettings, EscTelemetry, Event
 
 _CONFLICT_NS = 10 * SECOND
 """So long without a further one, and a conflict of ids is over."""
 _ECHO_NS = SECOND // 5
-_LIVE = Event.LIVE
 _NOTHING: frozenset[int] = frozenset()
 
 
@@ -93,9 +92,6 @@ class Gateway:
         """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
         if now >= self._next_expiry:
             self._expire(now, but=esc)  # a message may hold values of several ESCs
-        elif self.escs[esc].receive_live(data, now, since):
-            self._follow(esc, _LIVE, now)
-            return
         for events in self.escs[esc].receive_each(data, now, since):
             self._follow(esc, events, now)
 
@@ -232,10 +228,6 @@ class Gateway:
 
     def take_frames(self) -> list[CanFrame]:
         """The frames to send, oldest first; the list is handed over."""
-        return [frame_of(frame) for frame in self.take_ready()]
-
-    def take_ready(self) -> list[CanFrame | bytes]:
-        """As ``take_frames``, but with images (frames.py) as they are."""
         frames = self._output.take()
         if self.nodes is not None and self.nodes.frames:
             frames = self.nodes.take() + frames
@@ -281,11 +273,6 @@ class Gateway:
             self._output.on_gateway_change(now, each_second=True)
 
     def _follow(self, esc: int, events: int, now: int) -> None:
-        if events == _LIVE:
-            self._output.on_live(esc, now)
-            if self.nodes is not None:
-                self.nodes.on_live(esc, now)
-            return
         if events:
             self._output.on_event(esc, events, now)
             if self.nodes is not None:

@@ -1,31 +1,15 @@
 """What waits to be sent: a slot for each CAN id (and multiplexer page), where the newest value wins, and a queue that keeps its order."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from operator import attrgetter
 
-from kontronik_can_gw.frames import CanFrame, frame_of
+from kontronik_can_gw.frames import CanFrame
 
 QUEUE_LENGTH = 2048
 _slot_of = attrgetter("can_id", "extended", "page")
 _is_queued = attrgetter("queued")
-
-
-_IMAGES_ONLY = {bytes}
-
-
-def are_images(frames: Sequence[CanFrame | bytes]) -> bool:
-    """True where all of them are images."""
-    return set(map(type, frames)) == _IMAGES_ONLY
-
-
-def stand_alone(frames: Sequence[CanFrame | bytes]) -> bool:
-    """True where no frame replaces another or goes in front of one: empty mailboxes would hand them out as they are."""
-    if len(frames) < 2 or are_images(frames):
-        return True
-    frames = [frame for frame in frames if isinstance(frame, CanFrame)]
-    return len(set(map(_slot_of, frames))) == len(frames) and not any(map(_is_queued, frames))
 
 
 class Sent(Enum):
@@ -62,44 +46,51 @@ class Mailboxes:
     def __len__(self) -> int:
         return len(self._slots) + len(self._queue)
 
-    def put(self, frame: CanFrame | bytes) -> None:
-        """Let a frame wait: behind the queued ones, or in place of an older one of its id."""
-        frame = frame_of(frame)
-        if frame.queued:
-            if len(self._queue) >= QUEUE_LENGTH:
-                self.dropped += 1
-            else:
-                self._queue.append(frame)
-            return
-        key = (frame.can_id, frame.extended, frame.page)
-        if key in self._slots:
-            self.replaced += 1
-        self._slots[key] = frame
+    def put_all(self, frames: Sequence[CanFrame]) -> None:
+        """Let frames wait: behind the queued ones, or in place of an older one of the id."""
+        if any(map(_is_queued, frames)):
+            room = QUEUE_LENGTH - len(self._queue)
+            queued = [frame for frame in frames if frame.queued]
+            self._queue += queued[:room]
+            self.dropped += len(queued[room:])
+            frames = [frame for frame in frames if not frame.queued]
+        slots = self._slots
+        count = len(slots) + len(frames)
+        slots.update(zip(map(_slot_of, frames), frames, strict=True))
+        self.replaced += count - len(slots)
 
-    def put_all(self, frames: Iterable[CanFrame | bytes]) -> None:
-        """Let frames wait, one behind the other."""
-        for frame in frames:
-            self.put(frame)
+    def put(self, frame: CanFrame) -> None:
+        """Let one frame wait."""
+        self.put_all((frame,))
 
-    def flush(self, send: Callable[[CanFrame], Sent]) -> tuple[int, Sent]:
-        """Send until nothing waits or the interface does not take more. Returns how many went and the last answer.
+    def flush(self, send: Callable[[Sequence[CanFrame]], tuple[int, Sent]]) -> tuple[int, Sent]:
+        """Let ``send`` have what waits; it says how many frames went, and why not more. Returns its answer.
 
         A frame that was not taken stays the first of its line.
         """
-        count = 0
-        while self._queue or self._slots:
-            queued = bool(self._queue) and (self._queue_has_turn or not self._slots)
-            key = None if queued else next(iter(self._slots))
-            answer = send(self._queue[0] if key is None else self._slots[key])
-            if answer is not Sent.OK:
-                return count, answer
-            if key is None:
+        frames = self._in_order()
+        count, answer = send(frames)
+        if count and self._queue and len(frames) > 1:
+            self._queue_has_turn = not frames[count - 1].queued
+        if count == len(frames):
+            self._slots.clear()
+            self._queue.clear()
+            return count, answer
+        for frame in frames[:count]:
+            if frame.queued:
                 self._queue.popleft()
             else:
-                del self._slots[key]
-            self._queue_has_turn = not queued
-            count += 1
-        return count, Sent.OK
+                del self._slots[_slot_of(frame)]
+        return count, answer
+
+    def _in_order(self) -> list[CanFrame]:
+        slots = list(self._slots.values())
+        if not self._queue:
+            return slots
+        first, second = (list(self._queue), slots) if self._queue_has_turn else (slots, list(self._queue))
+        by_turns = [frame for pair in zip(first, second, strict=False) for frame in pair]
+        both = len(by_turns) // 2
+        return by_turns + first[both:] + second[both:]
 
     def drop_measurements(self) -> bool:
         """Drop what waits in slots; True where something did."""

@@ -11,7 +11,7 @@ one interval. An adapter that bundles bytes adds what it holds them back for (1 
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
@@ -44,7 +44,6 @@ class LinkState(IntEnum):
     PORT_ERROR = 5
 
 
-_new = tuple.__new__
 # An enumeration's members are slow to look up.
 _NEVER_SEEN, _OK, _DEGRADED = LinkState.NEVER_SEEN, LinkState.OK, LinkState.DEGRADED
 
@@ -58,6 +57,7 @@ class Event:
     LINK = 4
     SECOND = 8
     """A second is over: counters and rates are as new as they are to be had."""
+    ALL = 15
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,6 @@ class EscTelemetry:
         self.live: LiveData | None = None
         self.info: InfoData | None = None
         self.last_live: LiveData | None = None
-        self.live_values: tuple[int, ...] = ()
-        """Of the newest live frame, for who needs them all and fast: a plain tuple."""
         self.last_info: InfoData | None = None
         self.link = LinkState.NEVER_SEEN
         self.layout = 0
@@ -152,20 +150,13 @@ class EscTelemetry:
         self.base = self.counters.copy()
         self.base_losses, self.base_line_errors = self.losses, self.line_errors
 
-    def receive(self, data: bytes, now: int, since: int) -> int:
-        """Take bytes that were read at ``now`` and came after ``since``, all frames at once."""
-        events = Event.NONE
-        for found in self.receive_each(data, now, since):
-            events |= found
-        return events
-
-    def receive_each(self, data: bytes, now: int, since: int) -> Iterable[int]:
+    def receive_each(self, data: bytes, now: int, since: int) -> Iterator[int]:
         """Take bytes that were read at ``now`` and came after ``since``; the events of each frame in turn: iterate to the end.
 
         An unfinished frame older than the time-out is given up first.
         """
         if events := self._expire(now):
-            return self._receive_behind(events, data, now, since)
+            yield events
         deframer, arrivals = self._deframer, self._arrivals
         if arrivals and now - arrivals[0][1] > self.settings.timeout_ns:
             self.late_frames += len(deframer.flush())
@@ -181,47 +172,6 @@ class EscTelemetry:
                 arrivals.popleft()
         elif arrivals:
             arrivals.clear()
-        if not frames and self.link is not _NEVER_SEEN:
-            return ()
-        return self._accept_each(frames, end, now, bound)
-
-    def receive_live(self, data: bytes, now: int, since: int) -> bool:
-        """What ``receive_each`` does where nothing is too old, one live frame has come, whole and alone, and nothing but it is new.
-
-        False for anything else: then nothing has happened. True: the event is LIVE.
-        """
-        bound = since + (len(data) - 1) * NS_PER_BYTE
-        if bound > now:
-            bound = now
-        late = now - bound
-        if (
-            (old := self.live) is None
-            or self.layout != 1
-            or late > self.settings.timeout_ns
-            or (values := self._deframer.take_live(data)) is None
-        ):
-            return False
-        when = now if late <= self._interval_ns else bound
-        before: int = self.live_ns  # type: ignore[assignment]  # there is a live frame
-        if when > before:
-            if self._last_power > 0:
-                self.energy += self._last_power * (when - before)
-            if old[0]:
-                self.run_time += when - before
-            self.live_ns = when
-        if bound > self.live_bound_ns:
-            self.live_bound_ns = bound
-        self.live = self.last_live = _new(LiveData, values)
-        self.live_values = values
-        self._last_power = values[1] * values[2]
-        return True
-
-    def _receive_behind(self, events: int, data: bytes, now: int, since: int) -> Iterator[int]:
-        yield events
-        yield from self.receive_each(data, now, since)
-
-    def _accept_each(self, frames: list[Frame], end: int, now: int, bound: int) -> Iterator[int]:
-        """``bound``: of the last byte of the read, which is at ``end``."""
         shown = now if now - bound <= self._interval_ns else bound
         for frame in frames:
             after = (end - frame.offset - frame.form.length) * NS_PER_BYTE
@@ -230,7 +180,7 @@ class EscTelemetry:
                 self.late_frames += 1
             else:
                 yield self._accept(frame, shown - after, bound - after)
-        if self.link is LinkState.NEVER_SEEN:
+        if self.link is _NEVER_SEEN:
             yield self._set_link(LinkState.SEARCHING)
 
     def port_opened(self) -> int:
@@ -296,7 +246,6 @@ class EscTelemetry:
                     self.run_time += when - before
         self._last_power = data.battery_voltage * data.battery_current
         self.live = self.last_live = data
-        self.live_values = tuple(data)
         self.live_ns, self.live_bound_ns = when, bound
         if self.link is not _OK and self.link is not _DEGRADED:
             events |= self._set_link(_OK)

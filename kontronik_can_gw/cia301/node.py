@@ -72,9 +72,6 @@ class Surroundings(Protocol):
     def send(self, frame: CanFrame) -> None:
         """Put a frame out."""
 
-    def send_pdo(self, image: int, length: int, bits: int) -> None:
-        """Put a PDO out: the numbers of frames.IMAGE."""
-
     def save(self, node: "Node", stored: Stored) -> None:
         """Begin to store; ``node.saved`` is called with the result."""
 
@@ -179,10 +176,6 @@ class Node:
         self.node_id = UNCONFIGURED
         self.pending_node_id = settings.node_id if stored.node_id is None else stored.node_id
         self.due = NEVER
-        self._followers: list[Tpdo] = []
-        """PDOs that each live frame is told to."""
-        self._other_due = NEVER
-        """When something else than these PDOs is due."""
         self.misfits: list[int] = []
         """Keys of stored values that were passed over at the last reset."""
         self._base = esc.settings
@@ -205,7 +198,7 @@ class Node:
         self.lss = LssSlave(self, self._send_lss)
         self._bound: dict[tuple[int, int], Bound] = {}
         self.tpdos = [
-            Tpdo(n, dictionary, self._bound, esc, gateway, around.send_pdo)
+            Tpdo(n, dictionary, self._bound, esc, gateway, around.send)
             for n in range(MOST)
             if dictionary.get(COMMUNICATION + n) is not None
         ]
@@ -319,20 +312,6 @@ class Node:
 
     # --- what happens
 
-    def on_live(self, now: int) -> bool:
-        """A live frame has come, and nothing else is new. False where more than PDOs may have to follow: then nothing has happened."""
-        live = self.esc.live
-        if live is None or not self._live or live.operating_errors != self.emergencies.word:
-            return False
-        due = self._other_due
-        for tpdo in self._followers:
-            if not tpdo.pending or now >= tpdo.due:
-                tpdo.on_event(now)
-            if tpdo.due < due:
-                due = tpdo.due
-        self.due = due
-        return True
-
     def on_event(self, events: int, now: int) -> None:
         """Something of the ESC changed: bits of telemetry.Event."""
         esc = self.esc
@@ -395,15 +374,6 @@ class Node:
     def advance(self, now: int) -> None:
         """Let time pass."""
         if now < self.due:
-            return
-        if now < self._other_due:
-            due = self._other_due
-            for tpdo in self._followers:
-                if now >= tpdo.due:
-                    tpdo.advance(now)
-                if tpdo.due < due:
-                    due = tpdo.due
-            self.due = due
             return
         if self.producer.ticks(now):
             self._send(heartbeat.COB_ID + self.node_id, bytes([self.state]))
@@ -605,9 +575,8 @@ class Node:
         due = [self.producer.due, max(self.consumer.due, self._judged_from), self.emergencies.due]
         if (sdo := self.sdo.next_deadline()) is not None:
             due.append(sdo)
-        self._followers = [tpdo for tpdo in self.tpdos if tpdo.follows_live]
-        self._other_due = min([*due, *[tpdo.due for tpdo in self.tpdos if not tpdo.follows_live]])
-        self.due = min([self._other_due, *[tpdo.due for tpdo in self._followers]])
+        due += [tpdo.due for tpdo in self.tpdos]
+        self.due = min(due)
 
     # --- parameters
 

@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 
 from kontronik_can_gw.cia301 import heartbeat, nmt
 from kontronik_can_gw.cia301.eds import Eds
@@ -22,13 +21,12 @@ from kontronik_can_gw.cia301.node import (
 from kontronik_can_gw.cia301.storage import Stored
 from kontronik_can_gw.cia305.lss import UNCONFIGURED
 from kontronik_can_gw.dbc_output.layout import classic_bits
-from kontronik_can_gw.frames import IMAGE, CanFrame, frame_of
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import CanState, GatewayStatus
-from kontronik_can_gw.telemetry import EscSettings, EscTelemetry, Event
+from kontronik_can_gw.telemetry import EscSettings, EscTelemetry
 
 _FIRST_IDS = (0x80, SDO_ANSWER, SDO_REQUEST, heartbeat.COB_ID)
 """COB-IDs of EMCY, SDO and heartbeat, less the node-ID."""
-_due_of = attrgetter("due")
 SettingsChanged = Callable[[int, EscSettings], None]
 
 
@@ -77,8 +75,7 @@ class Nodes:
         settings_changed: SettingsChanged,
         foreign_ids: Mapping[int, str] | None = None,
     ) -> None:
-        self.frames: list[CanFrame | bytes] = []
-        self._images: set[int] = set()
+        self.frames: list[CanFrame] = []
         self.saves: list[tuple[int, Stored]] = []
         self.receive_ids: frozenset[int] = frozenset()
         self.due = NEVER
@@ -98,8 +95,6 @@ class Nodes:
         for esc, base, settings, stored in zip(escs, bases, setup.settings, setup.stored, strict=True):
             dictionary = make_dictionary(setup.eds, base, settings, stored)
             self.nodes.append(Node(setup.eds, dictionary, esc, gateway, settings, stored, self))
-        self._first = self.nodes[0]
-        """The node that ``due`` is of."""
 
     # --- what happens
 
@@ -125,22 +120,10 @@ class Nodes:
             self.frames[begin:] = dict.fromkeys(self.frames[begin:])
         self._after(now)
 
-    def take(self) -> list[CanFrame | bytes]:
-        """The frames so far, oldest first, PDOs as images (frames.py); the list is handed over."""
+    def take(self) -> list[CanFrame]:
+        """The frames so far, oldest first; the list is handed over."""
         frames, self.frames = self.frames, []
-        self._images.clear()
         return frames
-
-    def on_live(self, esc: int, now: int) -> None:
-        """A live frame of an ESC has come, and nothing else is new."""
-        node = self.nodes[esc]
-        if not node.on_live(now):
-            self.on_event(esc, Event.LIVE, now)
-        elif node.due <= self.due:
-            self.due = node.due
-            self._first = node
-        elif node is self._first:
-            self._set_due()
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed."""
@@ -237,14 +220,6 @@ class Nodes:
         if frame.can_id in self._watched:
             self._to_watchers.append(frame)
 
-    def send_pdo(self, image: int, length: int, bits: int) -> None:
-        if image in self._images:  # twice in one turn: an image is the only frame with its id
-            self.frames = [frame_of(frame) for frame in self.frames]
-            self.frames.append(frame_of(IMAGE.pack(image, length, bits)))
-        else:
-            self._images.add(image)
-            self.frames.append(IMAGE.pack(image, length, bits))
-
     def save(self, node: Node, stored: Stored) -> None:
         self.saves.append((self.nodes.index(node), stored))
 
@@ -292,8 +267,4 @@ class Nodes:
                 for cob_id, taker in node.routes():
                     self._routes.setdefault(cob_id, []).append(taker)
             self.receive_ids = frozenset(self._routes)
-        self._set_due()
-
-    def _set_due(self) -> None:
-        self._first = min(self.nodes, key=_due_of)
-        self.due = self._first.due
+        self.due = min([node.due for node in self.nodes])

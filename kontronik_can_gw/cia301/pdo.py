@@ -16,7 +16,7 @@ from kontronik_can_gw.cia301.dictionary import Dictionary, Value, Variable
 from kontronik_can_gw.cia301.heartbeat import NEVER
 from kontronik_can_gw.dbc_output.layout import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
 from kontronik_can_gw.dbc_output.packer import Pack, compile_pack, place
-from kontronik_can_gw.frames import image_id
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import GatewayStatus, Group, Source
 from kontronik_can_gw.telemetry import MS, SECOND, EscTelemetry, Event
 
@@ -135,9 +135,8 @@ class Tpdo:
         bound: Mapping[tuple[int, int], Bound],
         esc: EscTelemetry,
         gateway: GatewayStatus,
-        send: Callable[[int, int, int], None],
+        send: Callable[[CanFrame], None],
     ) -> None:
-        """``send`` is called with image id, length and bits of each frame (frames.IMAGE)."""
         self.number = number
         self.bound = bound
         self.cob_id = 0
@@ -150,7 +149,6 @@ class Tpdo:
         self._escs = (esc,)
         self._gateway = gateway
         self._send_frame = send
-        self._image_id = 0
         self._started = False
         self._type = 255
         self._by_event = True
@@ -221,7 +219,6 @@ class Tpdo:
         cob_id = number(index, COB_ID)
         was_running = self._running
         self.cob_id = cob_id & 0x7FF
-        self._image_id = image_id(self.cob_id, False)
         self.valid = not cob_id & INVALID_BIT
         self._type = number(index, TYPE)
         self._by_event = self._type in EVENT_TYPES
@@ -333,11 +330,6 @@ class Tpdo:
         self.pending = False
         self._event_due = self.due = NEVER
 
-    @property
-    def follows_live(self) -> bool:
-        """Whether each live frame is told to it (``on_event``)."""
-        return self._started and self._running and bool(self.triggers & Event.LIVE)
-
     def on_event(self, now: int) -> None:
         """Something of ``triggers`` happened."""
         if not self._started or not self.valid or self._pack is None:
@@ -417,7 +409,7 @@ class Tpdo:
         bits = self._pack(self._escs, self._gateway, now, 0, 0)
         self._last_status = bits & self._status_mask
         self.sent += 1
-        self._send_frame(self._image_id, self._length, bits)
+        self._send_frame(CanFrame(self.cob_id, bits.to_bytes(self._length, "little")))
 
     def _next_event(self, now: int) -> int:
         return now + self._event_ns if self._event_ns and self._by_event else NEVER

@@ -2,17 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import groupby
 
 from kontronik_can_gw.dbc_output import e2e
 from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
-from kontronik_can_gw.dbc_output.packer import SendLive, alive_modulus, compile_live, compile_pack
+from kontronik_can_gw.dbc_output.packer import alive_modulus, compile_pack
 from kontronik_can_gw.dbc_output.schedule import Schedule
-from kontronik_can_gw.frames import CanFrame, frame_of
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.sources import GatewayStatus, Group, Source, sources
 from kontronik_can_gw.telemetry import EscSettings, EscTelemetry, Event
 
+_new = tuple.__new__
 _EVENT_OF_PACE = {Group.LIVE: Event.LIVE, Group.INFO: Event.INFO, Group.LINK: Event.LINK, Group.GATEWAY: Event.NONE}
 
 
@@ -31,14 +30,15 @@ class _Message:
         "crc_at",
         "extended",
         "fd",
-        "follows_live",
-        "is_plain",
+        "is_free",
+        "is_paged",
         "last",
         "length",
         "on_change",
         "owed",
         "pack",
         "page",
+        "pages",
         "plan",
         "silent_able",
         "triggers",
@@ -47,6 +47,10 @@ class _Message:
     def __init__(self, plan: MessagePlan, silent: bool) -> None:
         self.plan = plan
         self.can_id, self.length, self.extended, self.fd = plan.can_id, plan.length, plan.extended, plan.fd
+        self.pages = [page or 0 for page in plan.pages]
+        self.is_paged = plan.pages != (None,)
+        # no cycle, no minimum distance, nothing that follows by itself: the schedule never has to know of it
+        self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         self.pack = compile_pack(plan)
         self.page = 0
         self.owed: list[int] = []
@@ -54,22 +58,24 @@ class _Message:
         crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
         alive = next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)
         self.crc_at = None if crc is None else crc.pieces[0].at // 8
-        self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 1
+        self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 0
         self.last: dict[int | None, int] = {}
         # what also tells of the link always goes on
         self.silent_able = silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
-        # its frame is its pack and nothing else
-        self.is_plain = plan.pages == (None,) and not (self.silent_able or self.on_change or crc)
-        # and nothing but the minimum distance keeps it back when there is a live frame
-        self.follows_live = self.by_event and plan.pages == (None,) and not (self.on_change or crc)
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
             for pace in plan.paces:
                 self.triggers |= _EVENT_OF_PACE[pace]
             if self.triggers & Event.LINK and not plan.cycle_ns and not (self.by_event and self.triggers & Event.LIVE):
                 self.triggers |= Event.SECOND  # counters, rates and ages change all the time
+
+    def follows(self, events: int, up: bool) -> bool:
+        """Whether these events of an ESC are news to it. ``up``: the ESC's live data is fresh."""
+        if up and self.by_event and self.triggers & Event.LIVE:  # live frames set the pace
+            events &= ~Event.LINK
+        return bool(self.triggers & events)
 
 
 class DbcOutput:
@@ -81,48 +87,27 @@ class DbcOutput:
     def __init__(
         self, layout: Layout, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int, silent: bool = False
     ) -> None:
-        self.frames: list[CanFrame | bytes] = []
-        self._touched: set[int] = set()
-        """ESCs of which something was sent since the frames were taken."""
-        self._images_end = False
-        """No more images until the frames are taken."""
+        self.frames: list[CanFrame] = []
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
         self._of_gateway = [(i, m) for i, m in enumerate(self._messages) if Group.GATEWAY in m.plan.paces]
         self._schedule = Schedule(layout.messages, now)
-        self._listeners: list[list[tuple[int, _Message]]] = [[] for _ in escs]
-        for index, message in enumerate(self._messages):
-            for esc in message.plan.escs:
-                if message.triggers:
-                    self._listeners[esc].append((index, message))
-        self._live_steps = [self._steps_of_live(esc) for esc in range(len(escs))]
-        """What follows each live frame of an ESC, in order."""
+        self._listeners = [
+            [[self._listeners_of(esc, up, events) for events in range(Event.ALL + 1)] for up in (False, True)]
+            for esc in range(len(escs))
+        ]
+        """The messages that follow: by ESC, whether its live data is fresh, and combination of events."""
 
-    def _steps_of_live(self, esc: int) -> list[SendLive]:
-        steps: list[SendLive] = []
-        listeners = [(i, m) for i, m in self._listeners[esc] if m.triggers & Event.LIVE]
-        for is_plain, group in groupby(listeners, lambda one: one[1].follows_live):
-            if is_plain:
-                steps.append(self._compile_live(esc, dict(group)))
-            else:
-                steps += [partial(self._on_live, index, message) for index, message in group]
-        return steps
-
-    def _compile_live(self, esc: int, messages: Mapping[int, _Message]) -> SendLive:
-        schedule = self._schedule
-        names: dict[str, object] = {f"m{index}": message for index, message in messages.items()}
-        names |= {"escs": self._escs, "gateway": self._gateway, "request": schedule.request}
-        names |= {"last": schedule.last, "waiting": schedule.waiting, "cycle_waits": schedule.cycle_waits}
-        return compile_live({index: message.plan for index, message in messages.items()}, esc, names)
+    def _listeners_of(self, esc: int, up: bool, events: int) -> list[tuple[int, _Message]]:
+        return [(i, m) for i, m in enumerate(self._messages) if esc in m.plan.escs and m.follows(events, up)]
 
     def start(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
-        self._end_images()
         for index, message in enumerate(self._messages):
             message.last.clear()
             if not message.plan.cycle_ns:
-                message.owed = list(range(len(message.plan.pages)))
+                message.owed = list(range(len(message.pages)))
                 self._request(index, now)
 
     def apply(self, esc: int, settings: EscSettings) -> None:
@@ -135,49 +120,24 @@ class DbcOutput:
             if signals != message.plan.signals:
                 message.plan = replace(message.plan, signals=signals)
                 message.pack = compile_pack(message.plan)
-        self._live_steps = [self._steps_of_live(each) for each in range(len(self._escs))]
 
     def bits(self, index: int, now: int, page: int | None) -> int:
         """What a message would hold now, alive counter and CRC 0."""
         return self._messages[index].pack(self._escs, self._gateway, now, 0, page or 0)
 
-    def on_live(self, esc: int, now: int) -> None:
-        """A live frame has come, and nothing else is new."""
-        touched = self._touched
-        if esc in touched:
-            self._end_images()
-        else:
-            touched.add(esc)
-        append = self._append_plain if self._images_end else self.frames.append
-        for step in self._live_steps[esc]:
-            step(now, append)
-
-    def _append_plain(self, frame: CanFrame | bytes) -> None:
-        self.frames.append(frame_of(frame))
-
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
-        state = self._escs[esc]
-        if esc in self._touched:
-            self._end_images()
-        self._touched.add(esc)
-        for index, message in self._listeners[esc]:
-            triggers = message.triggers
-            if not triggers & events:
-                continue
+        state, request, send = self._escs[esc], self._schedule.request, self._send
+        up = state.live is not None
+        gone = not up or (events & Event.INFO and state.info is None)
+        for index, message in self._listeners[esc][up][events]:
             if message.by_event:
-                if triggers & Event.LIVE and triggers & events == Event.LINK and state.up:
-                    continue  # live frames set the pace
-                gone = not state.up or (events & Event.INFO and state.info is None)
-                if gone and len(message.plan.pages) > 1:  # no further event will bring the other pages
-                    message.owed = list(range(len(message.plan.pages)))
-                self._request(index, now)
-            elif self._note_changes(message, now):
-                self._request(index, now)
-
-    def _on_live(self, index: int, message: _Message, now: int, _append: object) -> None:
-        if message.by_event or self._note_changes(message, now):
-            self._request(index, now)
+                if gone and len(message.pages) > 1:  # no further event will bring the other pages
+                    message.owed = list(range(len(message.pages)))
+            elif not self._note_changes(message, now):
+                continue
+            if message.is_free or request(index, now):
+                send(index, now)
 
     def on_gateway_change(self, now: int, at_once: bool = False, each_second: bool = False) -> None:
         """The gateway's own state changed: messages with its values that are sent by event or on change follow.
@@ -203,28 +163,20 @@ class DbcOutput:
             return
         for index, cyclic in self._schedule.due(now):
             message = self._messages[index]
-            if cyclic and len(message.plan.pages) > 1:
+            if cyclic and len(message.pages) > 1:
                 if message.page not in message.owed:
                     message.owed.append(message.page)
-                message.page = (message.page + 1) % len(message.plan.pages)
+                message.page = (message.page + 1) % len(message.pages)
             if cyclic or message.by_event or message.owed or self._note_changes(message, now):
                 self._send(index, now)
 
-    def take(self) -> list[CanFrame | bytes]:
-        """The frames so far, images among them; the list is handed over."""
-        self._touched.clear()
-        self._images_end = False
+    def take(self) -> list[CanFrame]:
+        """The frames so far; the list is handed over."""
         frames = self.frames
         if not frames:
             return []
         self.frames = []
         return frames
-
-    def _end_images(self) -> None:
-        """What comes now may have the ids of images that wait: from now on they are frames as others."""
-        if not self._images_end:
-            self._images_end = True
-            self.frames = [frame_of(frame) for frame in self.frames]
 
     def next_deadline(self) -> int | None:
         """When ``advance`` has something to do."""
@@ -236,11 +188,9 @@ class DbcOutput:
 
     def _note_changes(self, message: _Message, now: int) -> bool:
         """True if a page differs from what was sent of it last; with several pages those that do are owed."""
-        pack, last = message.pack, message.last
-        pages = message.plan.pages
+        pack, last, pages = message.pack, message.last, message.plan.pages
         if len(pages) == 1:
-            page = pages[0]
-            return pack(self._escs, self._gateway, now, 0, page or 0) != last.get(page)
+            return pack(self._escs, self._gateway, now, 0, pages[0] or 0) != last.get(pages[0])
         changed = [
             place
             for place, page in enumerate(pages)
@@ -251,38 +201,31 @@ class DbcOutput:
 
     def _send(self, index: int, now: int) -> None:
         message = self._messages[index]
-        self._touched |= message.plan.escs
-        if message.is_plain:
-            message.owed.clear()
-            bits = message.pack(self._escs, self._gateway, now, message.alive, 0)
-            message.alive = (message.alive + 1) % message.alive_modulus
-            data = bits.to_bytes(message.length, "little")
-            self.frames.append(CanFrame(message.can_id, data, message.extended, message.fd))
-            self._schedule.sent(index, now)
-            return
-        plan = message.plan
-        if message.silent_able and not any(self._escs[esc].up for esc in plan.escs):
+        if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
             message.owed.clear()
             return
+        place = page = 0
         if message.owed:
             place = message.owed.pop(0)
-        else:
+            page = message.pages[place]
+        elif message.is_paged:
             place = message.page
-            message.page = (place + 1) % len(plan.pages)
-        page = plan.pages[place]
-        pack = message.pack
-        bits = pack(self._escs, self._gateway, now, message.alive, page or 0)
+            page = message.pages[place]
+            message.page = (place + 1) % len(message.pages)
+        alive = message.alive
+        data = message.pack(self._escs, self._gateway, now, alive, page).to_bytes(message.length, "little")
+        if message.alive_modulus:
+            message.alive = (alive + 1) % message.alive_modulus
         if message.on_change:
-            message.last[page] = pack(self._escs, self._gateway, now, 0, page or 0)
-        message.alive = (message.alive + 1) % message.alive_modulus
-        data = bits.to_bytes(plan.length, "little")
+            message.last[message.plan.pages[place]] = message.pack(self._escs, self._gateway, now, 0, page)
         if message.crc_at is not None:
             at = message.crc_at
-            data = data[:at] + bytes((e2e.crc(data, at, plan.data_id),)) + data[at + 1 :]
-        self.frames.append(CanFrame(plan.can_id, data, plan.extended, plan.fd, place))
-        self._schedule.sent(index, now)
-        if message.owed:
-            self._schedule.wait(index, now)
+            data = data[:at] + bytes((e2e.crc(data, at, message.plan.data_id),)) + data[at + 1 :]
+        self.frames.append(_new(CanFrame, (message.can_id, data, message.extended, message.fd, place, False, False)))
+        if not message.is_free:
+            self._schedule.sent(index, now)
+            if message.owed:
+                self._schedule.wait(index, now)
 
 
 def _rescaled(signal: SignalPlan, known: Mapping[str, Source]) -> SignalPlan:

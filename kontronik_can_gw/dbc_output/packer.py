@@ -11,17 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.dbc_output.layout import MessagePlan, Piece, Role, SignalPlan
-from kontronik_can_gw.frames import IMAGE, CanFrame, image_id
-from kontronik_can_gw.protocol.fields import LiveData
 from kontronik_can_gw.sources import GatewayStatus, Group
 from kontronik_can_gw.telemetry import EscTelemetry
 
-_LIVE_VALUE = re.compile(r"\blive\[(\d+)\]")
-_ADDED = "bits |= "
-_TABLE = re.compile(r"\bnumbers_at_")
 _PLAIN_VALUE = re.compile(r"live\[\d+\]|info\[\d+\]")
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
-SendLive = Callable[[int, Callable[[CanFrame | bytes], None]], None]
 
 
 def place(pieces: Sequence[Piece], raw: int) -> int:
@@ -90,58 +84,12 @@ def compile_pack(plan: MessagePlan, further: Mapping[str, object] | None = None)
     return names.pop("pack")  # type: ignore[return-value]  # what its own globals hold would be a circle
 
 
-def live_text(plans: Mapping[int, MessagePlan], esc: int) -> str:
-    """The generated function that sends the messages which follow each live frame of an ESC: ``send(now, append)``.
-
-    ``plans`` by their index: messages of one page and without CRC, which nothing but their minimum distance keeps back.
-    The function names, besides what packers do: ``escs``, ``gateway``, each message as ``m`` and its index, ``CanFrame``, ``image``, and of
-    their schedule ``last``, ``waiting``, ``cycle_waits`` and ``request``.
-    """
-    values = ", ".join(f"live{index}" for index in range(len(LiveData._fields)))
-    lines = [f"esc = escs[{esc}]", f"{values} = esc.live_values"]
-    others = any(len(plan.escs) > 1 for plan in plans.values())
-    for index, plan in plans.items():
-        body = [f"esc = escs[{esc}]"] if others else []
-        if (alive := next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)) is not None:
-            body += [f"alive = m{index}.alive", f"m{index}.alive = (alive + 1) % {alive_modulus(alive, False)}"]
-        constant = sum(place(s.pieces, s.constant) for s in plan.signals if s.role is Role.CONSTANT)
-        of_bits = [f"bits |= {constant:#x}"] if constant else []
-        of_bits += [_TABLE.sub(rf"m{index}_\g<0>", line) for line in _body(plan, None, False, esc)]
-        if of_bits and all(line.startswith(_ADDED) for line in of_bits):
-            bits = " | ".join(line.removeprefix(_ADDED) for line in of_bits)
-        else:
-            bits = "bits"
-            body += ["bits = 0", *of_bits]
-        if plan.fd or plan.cycle_ns or len(plan.escs) > 1 or Group.GATEWAY in plan.paces:
-            data = f'({bits}).to_bytes({plan.length}, "little")'
-            body.append(f"append(CanFrame({plan.can_id:#x}, {data}, {plan.extended}, {plan.fd}))")
-        else:  # nothing else sends it in the same turn
-            body.append(f"append(image({image_id(plan.can_id, plan.extended):#x}, {plan.length}, {bits}))")
-        if plan.cycle_ns or plan.delay_ns:
-            body.append(f"last[{index}] = now")
-            body.append(f"waiting[{index}] = cycle_waits[{index}] = False")
-        if plan.delay_ns:
-            lines.append(f"if now < last[{index}] + {plan.delay_ns}:")
-            lines += [f"    request({index}, now)", "else:", *(f"    {line}" for line in body)]
-        else:
-            lines += body
-    return "".join(f"{line}\n" for line in ["def send(now, append, image=image):", *(f"    {line}" for line in lines)])
-
-
-def compile_live(plans: Mapping[int, MessagePlan], esc: int, names: Mapping[str, object]) -> SendLive:
-    """The function of ``live_text``, compiled. ``names``: what it names that is not of the plans."""
-    tables = {f"m{index}_{name}": table for index, plan in plans.items() for name, table in _tables(plan).items()}
-    found = {"float_bits": float_bits, "inf": math.inf, "image": IMAGE.pack, "CanFrame": CanFrame, **tables, **names}
-    exec(compile(live_text(plans, esc), f"<live frames of ESC {esc}>", "exec"), found)  # noqa: S102  text made here, from checked plans
-    return found.pop("send")  # type: ignore[return-value]
-
-
 def _tables(plan: MessagePlan) -> dict[str, dict[int, int]]:
     return {_table_name(s): {int(k): v for k, v in s.numbers.items()} for s in plan.signals if s.numbers}
 
 
-def _body(plan: MessagePlan, page: int | None, has_crc: bool, fresh: int | None = None) -> list[str]:
-    """Lines that add a page's signals to ``bits``. ``fresh``: the ESC whose live values are there, as locals."""
+def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
+    """Lines that add a page's signals to ``bits``."""
     lines: list[str] = []
     chosen = [signal for signal in plan.signals if signal.page == page]
     for signal in chosen:
@@ -151,14 +99,11 @@ def _body(plan: MessagePlan, page: int | None, has_crc: bool, fresh: int | None 
     for signal in chosen:
         if signal.source is not None:
             by_owner.setdefault((signal.esc, signal.source.group), []).append(signal)
-    is_alone = {esc for esc, _ in by_owner} <= {fresh, None}  # ``esc`` is there too
     for (esc, group), signals in by_owner.items():
         line = f"bits |= {' | '.join(_terms(signals))}"
-        if esc is not None and not is_alone:
+        if esc is not None:
             lines.append(f"esc = escs[{esc}]")
-        if group is Group.LIVE and esc is not None and esc == fresh:
-            lines.append(_LIVE_VALUE.sub(r"live\1", line))
-        elif group in (Group.LIVE, Group.INFO):
+        if group in (Group.LIVE, Group.INFO):
             nothing = 0
             for signal in signals:
                 nothing |= not_available_bits(signal)

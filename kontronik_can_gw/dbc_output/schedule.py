@@ -25,8 +25,6 @@ class Schedule:
         self._last = [_NEVER] * len(plans)
         self._waiting = [False] * len(plans)
         self._cycle_waits = [False] * len(plans)
-        self.last, self.waiting, self.cycle_waits = self._last, self._waiting, self._cycle_waits
-        """For the generated function that sends what follows live frames: it does as ``request`` and ``sent`` do."""
         self._heap = [
             (now + phase, index, False) for index, phase in enumerate(phases(self._cycle)) if self._cycle[index]
         ]

@@ -4,13 +4,13 @@ The core is the same as live, and its clock is the recorded one; so frames and t
 entry is missing. Nothing here waits or sends.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture import COUNTERS, Entry, Kind, read_counters, read_frame, read_json, read_number
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Mailboxes, Sent, stand_alone
+from kontronik_can_gw.mailboxes import Mailboxes, Sent
 from kontronik_can_gw.sources import CanState, GatewayState
 
 
@@ -159,14 +159,12 @@ class Replay:
 
 def in_order(frames: list[CanFrame], waiting: Mailboxes) -> list[CanFrame]:
     """The frames of one turn as an interface that takes them all is given them; ``waiting``: the same one for each turn."""
-    if stand_alone(frames):
-        return frames
     waiting.put_all(frames)
     sent: list[CanFrame] = []
 
-    def take(frame: CanFrame) -> Sent:
-        sent.append(frame)
-        return Sent.OK
+    def take(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
+        sent.extend(frames)
+        return len(frames), Sent.OK
 
     waiting.flush(take)
     return sent

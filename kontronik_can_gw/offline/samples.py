@@ -40,9 +40,6 @@ class _ValuesOnly(DbcOutput):
     def start(self, now: int) -> None:
         pass
 
-    def on_live(self, esc: int, now: int) -> None:
-        pass
-
     def on_event(self, esc: int, events: int, now: int) -> None:
         pass
 

@@ -1,6 +1,6 @@
 """KONTRONIK telemetry as it is on the wire: fields, states, codec, deframer. Standard library only, no I/O, no clock."""
 
-from kontronik_can_gw.protocol.codec import Form, Kind, Layout, encode, find_form
+from kontronik_can_gw.protocol.codec import Form, Kind, Layout, encode
 from kontronik_can_gw.protocol.deframer import Counters, Deframer, Frame
 from kontronik_can_gw.protocol.fields import InfoData, LiveData, Row, rows
 from kontronik_can_gw.protocol.states import Device, OperatingError, OperatingState, SelfTestError
@@ -20,6 +20,5 @@ __all__ = [
     "Row",
     "SelfTestError",
     "encode",
-    "find_form",
     "rows",
 ]

@@ -33,11 +33,12 @@ class Layout(Enum):
 class Form:
     """One of the four frame forms: its length, what its CRC covers, and how its body is packed."""
 
-    __slots__ = ("_data", "_struct", "covered", "crc_at", "data_type", "header", "kind", "layout", "length")
+    __slots__ = ("_data", "_struct", "covered", "crc_at", "data_type", "header", "kind", "layout", "length", "name")
 
     def __init__(self, kind: Kind, layout: Layout) -> None:
         self.kind = kind
         self.layout = layout
+        self.name = f"{kind.value}_{layout.value}"
         self.header = b"KODL" if kind is Kind.LIVE else b"KODI"
         self.data_type: DataType = LiveData if kind is Kind.LIVE else InfoData
         reserved = 0 if layout is Layout.LEGACY else -(4 + struct.calcsize("<" + body_format(self.data_type))) % 4
@@ -50,17 +51,8 @@ class Form:
     def __repr__(self) -> str:
         return f"Form({self.kind.value}, {self.layout.value}, {self.length} bytes)"
 
-    def matches(self, buffer: bytes, at: int = 0) -> bool:
-        """True if a whole frame of this form stands at ``at``: header and CRC. False also where bytes are missing."""
-        end = at + self.length
-        return (
-            len(buffer) >= end
-            and buffer.startswith(self.header, at)
-            and crc32(buffer[at : at + self.covered]) == int.from_bytes(buffer[at + self.crc_at : end], "little")
-        )
-
     def decode(self, buffer: bytes, at: int = 0) -> Data:
-        """The fields of a frame that ``matches``; no check is repeated here."""
+        """The fields of a frame of this form; nothing is checked here."""
         return tuple.__new__(self.data_type, self._data.unpack_from(buffer, at))
 
     def encode(self, data: Data) -> bytes:
@@ -90,8 +82,3 @@ def encode(data: Data, layout: Layout) -> bytes:
     """The frame bytes of a LiveData or InfoData in the given layout. ValueError if a value does not fit its wire type."""
     kind = Kind.LIVE if isinstance(data, LiveData) else Kind.INFO
     return next(form for form in FORMS if form.kind is kind and form.layout is layout).encode(data)
-
-
-def find_form(buffer: bytes, at: int = 0) -> Form | None:
-    """The form of the whole frame that stands at ``at``, or None. Where two forms match, the shorter."""
-    return next((form for form in FORMS if form.matches(buffer, at)), None)

@@ -12,16 +12,11 @@ from typing import NamedTuple
 from zlib import crc32
 
 from kontronik_can_gw.protocol.codec import FORMS, FORMS_BY_KIND_BYTE, Form, Kind, Layout
-from kontronik_can_gw.protocol.fields import Data, LiveData, body_format
+from kontronik_can_gw.protocol.fields import Data, LiveData
 from kontronik_can_gw.protocol.states import LARGEST_STATE
 
-_LIVE_LEGACY, _LIVE_V4 = (form for form in FORMS if form.kind is Kind.LIVE)
-_LIVE, _V4_LENGTH = _LIVE_V4.header, _LIVE_V4.length
-_COVERED, _LEGACY_CRC_AT = _LIVE_LEGACY.covered, _LIVE_LEGACY.crc_at
+_new = tuple.__new__
 _u32_at = struct.Struct("<I").unpack_from
-_live_values = struct.Struct(f"<4x{body_format(LiveData)}").unpack_from
-_RESIDUE = 0x2144DF1C
-"""The CRC-32 of anything with its own CRC behind it."""
 _PREFIX = b"KOD"
 # A line that is read at a far higher rate than it is sent shows its bits as long runs: zeros, then ones.
 _LONG_RUNS = bytes(0x100 - (1 << n) for n in range(8)) + b"\0"
@@ -90,7 +85,7 @@ class Counters:
     @property
     def pending(self) -> int:
         """Bytes that are not decided yet; four or more begin with KODL or KODI."""
-        in_frames: int = sum(form.length * getattr(self, name) for form, name in _FRAME_COUNTER.items())
+        in_frames: int = sum(form.length * getattr(self, form.name) for form in FORMS)
         return self.bytes - self.dropped_bytes - in_frames
 
     def as_dict(self) -> dict[str, int]:
@@ -125,9 +120,6 @@ class Counters:
         )
 
 
-_FRAME_COUNTER = {form: f"{form.kind.value}_{form.layout.value}" for form in FORMS}
-
-
 class Deframer:
     """Finds the frames in one byte stream. Holds no mode: the layout is found from the CRC of each frame."""
 
@@ -155,32 +147,7 @@ class Deframer:
             self._pending += data
             self._need -= size
             return []
-        buffer = self._pending + data if self._pending else bytes(data)
-        return self._scan(buffer, ended=False)
-
-    def take_live(self, data: bytes) -> tuple[int, ...] | None:
-        """The values of one live frame of layout V4 and nothing else, as most reads bring it: one CRC over it and its own.
-
-        It is what ``feed`` would find. None for anything else, also while bytes are pending: then nothing has happened, and it is for
-        ``feed``.
-        """
-        if self._pending or len(data) != _V4_LENGTH:
-            return None
-        head = crc32(data[:_COVERED])
-        if (
-            crc32(data[_COVERED:], head) != _RESIDUE
-            or not data.startswith(_LIVE)
-            or _u32_at(data, _LEGACY_CRC_AT)[0] == head  # where two match, it is the shorter
-        ):
-            return None
-        counters = self.counters
-        counters.bytes += _V4_LENGTH
-        counters.headers += 1
-        counters.live_v4 += 1
-        self._base += _V4_LENGTH
-        if self._blame_until:
-            self._blame_until = 0
-        return _live_values(data)
+        return self._scan(self._pending + data, ended=False)
 
     def flush(self) -> list[Frame]:
         """The stream ended or was interrupted: search what is pending, drop the rest, be ready for a new start."""
@@ -195,7 +162,7 @@ class Deframer:
         size = len(buffer)
         at = 0
         self._need = 1
-        while True:
+        while at < size:
             start = buffer.find(_PREFIX, at)
             if start < 0:
                 keep = 0
@@ -205,8 +172,9 @@ class Deframer:
                 self._drop(buffer, at, size - keep)
                 at = size - keep
                 break
-            self._drop(buffer, at, start)
-            at = start
+            if start > at:
+                self._drop(buffer, at, start)
+                at = start
             have = size - at
             if have < 4:
                 if ended:
@@ -219,12 +187,14 @@ class Deframer:
                 self._drop(buffer, at, at + 3, "dropped_unknown_kind")
                 at += 3
                 continue
-            missing = 0
+            missing = crc = covered = 0
             for form in forms:
                 if have < form.length:
                     missing = form.length - have
                     break
-                if form.matches(buffer, at):
+                crc = crc32(buffer[at + covered : at + form.covered], crc)
+                covered = form.covered
+                if crc == _u32_at(buffer, at + form.crc_at)[0]:
                     break
             else:  # all forms checked, none matches
                 counters.headers += 1
@@ -234,9 +204,9 @@ class Deframer:
                 continue
             if not missing:
                 counters.headers += 1
-                name = _FRAME_COUNTER[form]
+                name = form.name
                 setattr(counters, name, getattr(counters, name) + 1)
-                frames.append(Frame(form, self._base + at, form.decode(buffer, at)))
+                frames.append(_new(Frame, (form, self._base + at, form.decode(buffer, at))))
                 at += form.length
                 self._blame_until = 0
             elif ended:

@@ -13,14 +13,13 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
-from operator import length_hint
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import EXTENDED, CanFrame, frame_of
+from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
@@ -152,43 +151,23 @@ class CanPort:
         self._known_drops = self._drops()
 
     def send(self, frame: CanFrame) -> Sent:
-        """Hand a frame to the interface. An interface that was down and is up again reports its old error once: retried."""
-        result = self._send(frame)
-        if result is Sent.DOWN:
-            result = self._send(frame)
-        if result is _OK:
-            if self.state is _DOWN or self.state is _UNKNOWN:
-                self.state = CanState.ERROR_ACTIVE
-        elif result is Sent.DOWN or result is Sent.GONE:
-            self.state = _DOWN
-        return result
+        """Hand one frame to the interface."""
+        return self.send_all((frame,))[1]
 
     def send_all(
-        self,
-        frames: Sequence[CanFrame | bytes],
-        clock: Callable[[], int] = time.monotonic_ns,
-        latest: int = sys.maxsize,
+        self, frames: Sequence[CanFrame], clock: Callable[[], int] = time.monotonic_ns, latest: int = sys.maxsize
     ) -> tuple[int, Sent]:
-        """Hand frames and images to the interface until it does not take one, or ``clock`` is beyond ``latest``.
+        """Hand frames to the interface until it does not take one, or ``clock`` is beyond ``latest``.
 
-        Returns how many went and the last answer.
+        Returns how many went and the last answer. An interface that was down and is up again reports its old error once: retried.
         """
-        if self._socket is None or self._removed or self.state is _DOWN or self.state is _UNKNOWN:
-            return one_by_one(self.send, frames, clock, latest)
-        send = self._socket.send
-        rest: Iterator[Any] = iter(
-            [_image(frame) for frame in frames] if CanFrame in set(map(type, frames)) else frames
-        )
-        try:
-            for image in rest:
-                if clock() > latest:
-                    return len(frames) - length_hint(rest) - 1, Sent.LATE
-                send(image)
-        except OSError:  # once more, to see what it means
-            count = len(frames) - length_hint(rest) - 1
-            more, answer = one_by_one(self.send, frames[count:], clock, latest)
-            return count + more, answer
-        return len(frames), _OK
+        send = self._send_message if self._socket is None else self._send_packed
+        count, answer = (0, Sent.GONE) if self.gone else one_by_one(send, frames, clock, latest)
+        if count and (self.state is _DOWN or self.state is _UNKNOWN):
+            self.state = CanState.ERROR_ACTIVE
+        if answer is Sent.DOWN or answer is Sent.GONE:
+            self.state = _DOWN
+        return count, answer
 
     def close(self) -> None:
         if self._reader is not None:
@@ -282,19 +261,25 @@ class CanPort:
             elif detail & _CTRL_ACTIVE:
                 self.state = CanState.ERROR_ACTIVE
 
-    def _send(self, frame: CanFrame) -> Sent:
-        if self._socket is None:
-            return Sent.GONE if self.gone else self._send_message(frame)
-        if self._removed:
-            return Sent.GONE
+    def _send_packed(self, frame: CanFrame) -> Sent:
+        can_id, data, extended, fd, _, remote, _ = frame
+        if extended:
+            can_id |= EXTENDED
+        if remote:
+            can_id |= _REMOTE
+        packed = _FD.pack(can_id, len(data), _FD_BRS, data) if fd else _CLASSIC.pack(can_id, len(data), data)
         try:
-            self._socket.send(_image(frame))
+            self._socket.send(packed)  # type: ignore[union-attr]  # there is one where this is called
         except OSError as error:
-            if error.errno == errno.EAGAIN:
-                return Sent.FULL
-            if error.errno in (errno.ENOBUFS, errno.ENOMEM):
-                return Sent.BUSY
-            return Sent.GONE if error.errno in (errno.ENXIO, errno.ENODEV, errno.EBADF) else Sent.DOWN
+            answer = _meaning(error)
+            return self._send_again(packed) if answer is Sent.DOWN else answer
+        return _OK
+
+    def _send_again(self, packed: bytes) -> Sent:
+        try:
+            self._socket.send(packed)  # type: ignore[union-attr]
+        except OSError as error:
+            return _meaning(error)
         return _OK
 
     def _send_message(self, frame: CanFrame) -> Sent:
@@ -327,23 +312,25 @@ def _monotonic(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
 
 
 def one_by_one(
-    send: Callable[[CanFrame], Sent], frames: Sequence[CanFrame | bytes], clock: Callable[[], int], latest: int
+    send: Callable[[CanFrame], Sent], frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
 ) -> tuple[int, Sent]:
-    """What ``CanPort.send_all`` does, by a function that sends one frame."""
+    """Send frames until one is not taken, or ``clock`` is beyond ``latest``: how many went, and the last answer."""
     for count, frame in enumerate(frames):
-        answer = Sent.LATE if clock() > latest else send(frame_of(frame))
+        if clock() > latest:  # the process was stopped in the middle of its turn
+            return count, Sent.LATE
+        answer = send(frame)
         if answer is not _OK:
             return count, answer
     return len(frames), _OK
 
 
-def _image(frame: CanFrame | bytes) -> bytes:
-    """A frame as the kernel has it (struct can_frame, canfd_frame)."""
-    if isinstance(frame, bytes):
-        return frame
-    can_id, data, extended, fd, _, remote, _ = frame
-    can_id |= (EXTENDED if extended else 0) | (_REMOTE if remote else 0)
-    return _FD.pack(can_id, len(data), _FD_BRS, data) if fd else _CLASSIC.pack(can_id, len(data), data)
+def _meaning(error: OSError) -> Sent:
+    """What it says that the kernel did not take a frame."""
+    if error.errno == errno.EAGAIN:
+        return Sent.FULL
+    if error.errno in (errno.ENOBUFS, errno.ENOMEM):
+        return Sent.BUSY
+    return Sent.GONE if error.errno in (errno.ENXIO, errno.ENODEV, errno.EBADF) else Sent.DOWN
 
 
 def _kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:

@@ -12,7 +12,7 @@ from kontronik_can_gw.config import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Conflict, Gateway
-from kontronik_can_gw.mailboxes import Mailboxes, Sent, are_images, stand_alone
+from kontronik_can_gw.mailboxes import Mailboxes, Sent
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
 from kontronik_can_gw.runtime.conditions import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
@@ -29,7 +29,7 @@ LASTING_BUSY_NS = SECOND
 ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
 """How often the kernel is asked for the controller's state: as a rule, and in bus-off."""
 ASK_RESTARTING_NS, SETTLING_NS = 20 * MS, 200 * MS
-_OK = Sent.OK
+_OK = Sent.OK  # an enumeration's members are slow to look up
 MAX_LATE_NS = 250 * MS
 """Measurements that are handed over later than this, or the shortest telemetry time-out, are old."""
 RESTARTED_NS = SECOND
@@ -351,42 +351,25 @@ class CanSide:
     def transmit(self, now: int) -> None:
         """Hand what is to be sent to the interface, as far as it takes it."""
         status, waiting = self._gateway.status, self.mailboxes
-        frames = self._gateway.take_ready()
+        frames = self._gateway.take_frames()
+        waiting.put_all(frames)
         if self.port is None or (self._off and self._sends_in_vain):
             if frames:
                 self._gateway.not_sent(now)
-            waiting.put_all(frames)
             self.clear()
             self._busy_until = self._busy_since = None
             return
-        self._turn_ns = now
-        if self._is_proven and self._busy_until is None and not waiting and are_images(frames):
-            # as nearly always
-            count, answer = self.port.send_all(frames, self._clock, now + self.longest_turn_ns)
-            if answer is _OK and not self._stalled:
+        self._count_losses()
+        if self._busy_until is not None:
+            if now < self._busy_until:
+                return
+            self._busy_until = None
+        if not waiting:
+            if not self._stalled:
                 self._busy_since = None
-                status.sent_frames += count
-                if self.port.state is not status.can_state or self.port.bus_off_count:
-                    self._follow_state(now)
-                return
-            waiting.put_all(frames[count:])
-        elif waiting or self._busy_until is not None or not stand_alone(frames):
-            waiting.put_all(frames)
-            self._count_losses()
-            if self._busy_until is not None:
-                if now < self._busy_until:
-                    return
-                self._busy_until = None
-            if not waiting:
-                self._nothing_waits()
-                return
-            count, answer = waiting.flush(self._send)
-        elif frames:  # the mailboxes would hand them out just so
-            count, answer = self._send_all(frames)
-            waiting.put_all(frames[count:])
-        else:
-            self._nothing_waits()
             return
+        self._turn_ns = now
+        count, answer = waiting.flush(self._send)
         status.sent_frames += count
         if count:
             self._busy_since = None
@@ -408,17 +391,9 @@ class CanSide:
             self._gateway.can_returned(now)
         self._follow_state(now)
 
-    def _nothing_waits(self) -> None:
-        if not self._stalled:
-            self._busy_since = None
-
-    def _send_all(self, frames: Sequence[CanFrame | bytes]) -> tuple[int, Sent]:
+    def _send(self, frames: Sequence[CanFrame]) -> tuple[int, Sent]:
         assert self.port is not None
-        # LATE where the process was stopped in the middle of its turn
         return self.port.send_all(frames, self._clock, self._turn_ns + self.longest_turn_ns)
-
-    def _send(self, frame: CanFrame) -> Sent:
-        return self._send_all((frame,))[1]
 
     def _busy(self, answer: Sent, now: int) -> Sent:
         """The interface takes no more for now; GONE if it has not for so long that it must be."""

@@ -89,8 +89,8 @@ class RecordedGateway(Gateway):
         self._note(now, Kind.ADVANCE)
         super().advance(now)
 
-    def take_ready(self) -> list[CanFrame | bytes]:
-        frames = super().take_ready()
+    def take_frames(self) -> list[CanFrame]:
+        frames = super().take_frames()
         # as a rule all of them are sent: only what comes otherwise is recorded
         self._counters = (self._counters[0] + len(frames), *self._counters[1:])
         return frames

@@ -1,5 +1,7 @@
 """What goes on a bus by itself: after an outage, from link and gateway counters, in which order; and which ids are a node's own."""
 
+from collections.abc import Sequence
+
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
 from kontronik_can_gw.cia301.bindings import GATEWAY, LINK
@@ -21,9 +23,9 @@ def put_out(frames: list[CanFrame]) -> list[CanFrame]:
     waiting, sent = Mailboxes(), list[CanFrame]()
     waiting.put_all(frames)
 
-    def send(frame: CanFrame) -> Sent:
-        sent.append(frame)
-        return Sent.OK
+    def send(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
+        sent.extend(frames)
+        return len(frames), Sent.OK
 
     waiting.flush(send)
     return sent

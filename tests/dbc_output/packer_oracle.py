@@ -618,11 +618,11 @@ def random_escs(rng: random.Random, settings: Sequence[EscSettings], now: int) -
             layout = rng.choice((Layout.V4, Layout.LEGACY))
             kind = rng.random()
             if kind < 0.7:
-                esc.receive(encode(random_live(rng), layout), now, now)
+                list(esc.receive_each(encode(random_live(rng), layout), now, now))
             if rng.random() < 0.4:
-                esc.receive(encode(random_info(rng), layout), now, now)
+                list(esc.receive_each(encode(random_info(rng), layout), now, now))
             if rng.random() < 0.2:
-                esc.receive(rng.randbytes(rng.randint(1, 50)), now, now)
+                list(esc.receive_each(rng.randbytes(rng.randint(1, 50)), now, now))
         now += rng.choice((1, 10, 33, 200)) * MS + rng.randrange(MS)
     if rng.random() < 0.15:
         now += 400 * MS

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.protocol import Deframer, Form, InfoData, Kind, Layout, LiveData, encode, find_form, rows
+from kontronik_can_gw.protocol import Deframer, Form, InfoData, Kind, Layout, LiveData, encode, rows
 from kontronik_can_gw.protocol.codec import FORMS
 from kontronik_can_gw.protocol.fields import Data, DataType, device_and_variant
 
@@ -117,11 +117,15 @@ def pack(row: FormRow, values: tuple[int, ...]) -> bytes:
     return reference.seal(row, body.ljust(row.crc_at - 4, b"\0"))
 
 
+def form_in(frame: bytes) -> Form:
+    """The form of bytes that are one frame."""
+    (found,) = Deframer().feed(frame)
+    assert (found.offset, found.form.length) == (0, len(frame))
+    return found.form
+
+
 def decode(frame: bytes) -> Data:
-    form = find_form(frame)
-    assert form is not None
-    assert form.length == len(frame)
-    return form.decode(frame)
+    return form_in(frame).decode(frame)
 
 
 def physical_values(data: Data) -> dict[str, int | float]:
@@ -158,8 +162,7 @@ def test_the_references_crc_is_the_standard_one() -> None:
 def test_a_recorded_frame_is_that_of_the_stated_values(
     frame: bytes, values: dict[str, int | float], data_type: DataType, kind: Kind
 ) -> None:
-    form = find_form(frame)
-    assert form is not None
+    form = form_in(frame)
     assert (form.kind, form.layout) == (kind, Layout.LEGACY)
     decoded = physical_values(form.decode(frame))
     assert {name: repr(value) for name, value in decoded.items()} == {n: repr(value) for n, value in values.items()}
@@ -195,7 +198,7 @@ def test_every_combination_of_raw_values_survives_the_round_trip(row: FormRow, c
     data = data_type(*values)
     frame = encode(data, Layout(row.layout))
     assert frame == pack(row, values)
-    form = find_form(frame)
+    form = form_in(frame)
     assert form is form_of(row)
     decoded = form.decode(frame)
     assert decoded == data
@@ -229,14 +232,15 @@ def test_the_reserved_bytes_are_sent_as_zero_and_accepted_with_any_value(row: Fo
 @form_rows
 def test_every_flipped_bit_under_the_crc_is_found(row: FormRow) -> None:
     frame = reference.random_frame(row, random.Random(7))
-    form = form_of(row)
-    assert form.matches(frame)
+    form = form_in(frame)
+    assert form is form_of(row)
     for offset in range(row.length):
         unprotected = row.covered <= offset < row.crc_at
         for bit in range(8):
             flipped = bytearray(frame)
             flipped[offset] ^= 1 << bit
-            assert form.matches(bytes(flipped)) == unprotected, f"byte {offset} bit {bit}"
+            found = [each.form for each in Deframer().feed(bytes(flipped))]
+            assert found == [form] * unprotected, f"byte {offset} bit {bit}"
 
 
 @pytest.mark.parametrize(
@@ -270,17 +274,28 @@ def test_a_frame_is_found_only_where_it_stands_and_only_whole(row: FormRow) -> N
     frame = next(frame for frame in iter(lambda: reference.random_frame(row, source), b"") if frame.endswith(b"\0"))
     form = form_of(row)
     buffer = b"\x4b\x4f\x44" + frame + b"\x4b"
-    assert [at for at in range(len(buffer) + 2) if form.matches(buffer, at)] == [3]
-    assert [at for at in range(len(buffer) + 2) if find_form(buffer, at) is form] == [3]
+    assert [(found.offset, found.form) for found in Deframer().feed(buffer)] == [(3, form)]
     assert form.decode(buffer, 3) == form.decode(frame)
     for size in range(row.length):
-        assert not form.matches(frame[:size])
-        assert find_form(frame[:size]) is None
+        assert Deframer().feed(frame[:size]) == []
+
+
+@form_rows
+def test_a_frame_without_its_last_byte_is_no_frame_even_where_that_byte_is_zero(row: FormRow) -> None:
+    source = random.Random(12)
+    frame = next(frame for frame in iter(lambda: reference.random_frame(row, source), b"") if frame.endswith(b"\0"))
+    assert form_in(frame) is form_of(row)
+    assert Deframer().feed(frame[:-1]) == []
 
 
 @pytest.mark.parametrize("kind", ["live", "info"])
 def test_where_both_layouts_fit_the_shorter_is_taken(kind: str) -> None:
     frame = reference.ambiguous(kind)
-    fitting = [form for form in FORMS if form.matches(frame)]
-    assert [(form.kind.value, form.layout) for form in fitting] == [(kind, Layout.LEGACY), (kind, Layout.V4)]
-    assert find_form(frame) is fitting[0]
+    fitting = [row for row in sheet.FORM_ROWS if reference.fits(frame, 0, row)]
+    assert {(row.kind, row.layout) for row in fitting} == {(kind, "legacy"), (kind, "v4")}
+    assert [found.form for found in Deframer().feed(frame)] == [form_of(reference.form_row(kind, "legacy"))]
+
+
+def test_the_crc_is_sent_little_endian() -> None:
+    frame = encode(LiveData(), Layout.V4)
+    assert int.from_bytes(frame[36:], "little") == reference.crc32_of_bits(frame[:36])

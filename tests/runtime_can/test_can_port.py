@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import CanConfig, parse
 from kontronik_can_gw.dbc_output.layout import Layout
-from kontronik_can_gw.frames import IMAGE, CanFrame, image_id
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.offline.pty import PtyEsc
@@ -279,14 +279,12 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
 
 
 FRAMES = [CanFrame(0x100 + n, bytes((n,))) for n in range(6)]
-IMAGES = [IMAGE.pack(image_id(0x100 + n, False), 1, n) for n in range(6)]
 
 
 @pytest.mark.parametrize("proven", [True, False])
-@pytest.mark.parametrize("frames", [FRAMES, IMAGES, [*FRAMES[:3], *IMAGES[3:]]])
 @pytest.mark.parametrize("stopped_before", range(7))
 def test_what_became_late_in_the_middle_of_a_turn_stays(
-    socket_port: tuple[CanPort, FakeSocket], proven: bool, frames: list[CanFrame | bytes], stopped_before: int
+    socket_port: tuple[CanPort, FakeSocket], proven: bool, stopped_before: int
 ) -> None:
     """The process is stopped in front of one of the frames: those before have gone, and nothing after."""
     port, fake = socket_port
@@ -294,7 +292,7 @@ def test_what_became_late_in_the_middle_of_a_turn_stays(
         assert port.send(CanFrame(0x7FF, b"")) is Sent.OK
         fake.sent.clear()
     steps = itertools.count()
-    answer = port.send_all(frames, lambda: 1000 if next(steps) < stopped_before else 1001, 1000)
+    answer = port.send_all(FRAMES, lambda: 1000 if next(steps) < stopped_before else 1001, 1000)
     assert answer == ((6, Sent.OK) if stopped_before == 6 else (stopped_before, Sent.LATE))
     assert [data[8] for data in fake.sent] == list(range(stopped_before))[:6]
 

@@ -1,7 +1,7 @@
 """The two lines that wait to be sent: the queue that keeps its order, the slots of which the newest wins, and their turns."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 from hypothesis import given, settings
@@ -19,15 +19,17 @@ def slot(can_id: int, number: int = 0) -> CanFrame:
     return CanFrame(can_id, number.to_bytes(2, "little"))
 
 
-def taking(sent: list[CanFrame], count: int, then: Sent = Sent.BUSY) -> Callable[[CanFrame], Sent]:
+Send = Callable[[Sequence[CanFrame]], tuple[int, Sent]]
+
+
+def taking(sent: list[CanFrame], count: int, then: Sent = Sent.BUSY) -> Send:
     """An interface that takes ``count`` frames and then answers otherwise."""
     end = len(sent) + count
 
-    def send(frame: CanFrame) -> Sent:
-        if len(sent) == end:
-            return then
-        sent.append(frame)
-        return Sent.OK
+    def send(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
+        taken = frames[: end - len(sent)]
+        sent.extend(taken)
+        return len(taken), Sent.OK if len(taken) == len(frames) else then
 
     return send
 

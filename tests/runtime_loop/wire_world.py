@@ -191,7 +191,7 @@ class Bus:
             self.on_send(frame)
         return self.answer
 
-    def send_all(self, frames: Sequence[CanFrame | bytes], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
+    def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
         return one_by_one(self.send, frames, clock, latest)
 
     def close(self) -> None:

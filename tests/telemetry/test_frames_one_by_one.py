@@ -1,12 +1,10 @@
-"""Live frames as a read mostly brings them: one, whole and alone. The gateway asks ``receive_live`` first, then ``receive``."""
-
-import zlib
+"""Live frames as a read mostly brings them: one, whole and alone."""
 
 import pytest
 from protocol.reference import ambiguous
 
-from kontronik_can_gw.protocol import InfoData, Layout, LiveData, encode
-from kontronik_can_gw.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings, EscTelemetry
+from kontronik_can_gw.protocol import Layout, LiveData, encode
+from kontronik_can_gw.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings, EscTelemetry, Event
 
 STEP = 10 * MS
 FLIGHT = [
@@ -18,17 +16,14 @@ FLIGHT = [
 ]
 
 
-def read(telemetry: EscTelemetry, data: bytes, now: int) -> bool:
-    """As the gateway gives what it has read; True if it was taken as one live frame."""
-    if telemetry.receive_live(data, now, now):
-        return True
-    telemetry.receive(data, now, now)
-    return False
+def read(telemetry: EscTelemetry, data: bytes, now: int) -> list[int]:
+    """As the gateway gives what it has read; the events of each frame."""
+    return list(telemetry.receive_each(data, now, now))
 
 
 def started() -> tuple[EscTelemetry, int]:
     telemetry = EscTelemetry(EscSettings(), 0)
-    telemetry.receive(encode(LiveData(), Layout.V4), SECOND, SECOND)
+    read(telemetry, encode(LiveData(), Layout.V4), SECOND)
     return telemetry, SECOND
 
 
@@ -41,8 +36,8 @@ def test_values_counters_energy_and_run_time() -> None:
         now += STEP
         energy += max(0, before.battery_voltage * before.battery_current) * STEP
         run_time += STEP if before.electrical_speed else 0
-        assert read(telemetry, encode(data, Layout.V4), now)
-        assert (telemetry.live, telemetry.last_live, telemetry.live_values) == (data, data, tuple(data))
+        assert read(telemetry, encode(data, Layout.V4), now) == [Event.LIVE]
+        assert (telemetry.live, telemetry.last_live) == (data, data)
         assert telemetry.live_ns == now
         assert telemetry.energy == energy
         assert telemetry.run_time == run_time
@@ -58,8 +53,8 @@ def test_no_energy_while_time_stands_still_or_goes_back() -> None:
     frame = encode(FLIGHT[0], Layout.V4)
     read(telemetry, frame, now + STEP)
     energy, run_time = telemetry.energy, telemetry.run_time
-    assert read(telemetry, frame, now + STEP)
-    assert read(telemetry, frame, now)
+    assert read(telemetry, frame, now + STEP) == [Event.LIVE]
+    assert read(telemetry, frame, now) == [Event.LIVE]
     assert (telemetry.energy, telemetry.run_time, telemetry.live_ns) == (energy, run_time, now + STEP)
 
 
@@ -86,7 +81,7 @@ def test_bytes_behind_a_frame_make_it_as_much_older_whatever_came_before(behind:
         now += STEP
         read(telemetry, FRAME, now)
     now += STEP
-    telemetry.receive(FRAME + b"\x55" * behind, now, now)
+    read(telemetry, FRAME + b"\x55" * behind, now)
     assert telemetry.live_ns == now - behind * NS_PER_BYTE
     assert telemetry.late_frames == 0
 
@@ -94,38 +89,7 @@ def test_bytes_behind_a_frame_make_it_as_much_older_whatever_came_before(behind:
 FRAME = encode(FLIGHT[0], Layout.V4)
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        FRAME[:-1],
-        FRAME + FRAME,
-        FRAME + b"K",
-        FRAME[1:] + b"K",
-        FRAME[:-1] + bytes((FRAME[-1] ^ 0x80,)),
-        b"KODX" + FRAME[4:-4] + zlib.crc32(b"KODX" + FRAME[4:-4]).to_bytes(4, "little"),
-        encode(InfoData(), Layout.V4),
-        encode(FLIGHT[0], Layout.LEGACY),
-        encode(InfoData(), Layout.LEGACY),
-    ],
-)
-def test_of_anything_else_nothing_has_happened(data: bytes) -> None:
-    telemetry, now = started()
-    before = telemetry.counters.copy()
-    assert not telemetry.receive_live(data, now + STEP, now + STEP)
-    assert (telemetry.counters, telemetry.live, telemetry.live_ns) == (before, LiveData(), now)
-
-
 def test_where_two_layouts_match_it_is_the_shorter() -> None:
     telemetry, now = started()
-    assert not read(telemetry, ambiguous("live"), now + STEP)
+    read(telemetry, ambiguous("live"), now + STEP)
     assert (telemetry.counters.live_v4, telemetry.counters.live_legacy) == (1, 1)
-
-
-def test_not_while_bytes_are_pending_or_there_is_no_live_frame_yet() -> None:
-    assert not EscTelemetry(EscSettings(), 0).receive_live(FRAME, SECOND, SECOND)
-    telemetry, now = started()
-    telemetry.receive(b"KOD", now, now)
-    assert not read(telemetry, FRAME, now + STEP)
-    assert telemetry.counters.live == 2
-    assert telemetry.live == FLIGHT[0]

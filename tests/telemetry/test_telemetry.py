@@ -2,13 +2,17 @@
 
 import random
 from bisect import bisect_right
+from functools import reduce
 from itertools import accumulate, pairwise
+from operator import or_
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from protocol.reference import SHORTEST_FIRST, fits
 
-from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode, find_form
+from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode
+from kontronik_can_gw.protocol.codec import FORMS
 from kontronik_can_gw.protocol.fields import device_and_variant
 from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.sources import Source, sources
@@ -44,9 +48,9 @@ def esc(**known: int) -> EscTelemetry:
     return EscTelemetry(EscSettings(timeout_ns=known.pop("timeout_ns", TIMEOUT), **known), 0)  # type: ignore[arg-type]
 
 
-def read(telemetry: EscTelemetry, data: bytes, now: int) -> int:
-    """Bytes that came just now, as far as one knows: the port was empty a moment ago."""
-    return telemetry.receive(data, now, now)
+def read(telemetry: EscTelemetry, data: bytes, now: int, since: int | None = None) -> int:
+    """Bytes that came after ``since``, or just now: the port was empty a moment ago. The events of all frames."""
+    return reduce(or_, telemetry.receive_each(data, now, now if since is None else since), 0)
 
 
 def alive(now: int = SECOND) -> EscTelemetry:
@@ -290,8 +294,7 @@ def test_time_outs_count_from_when_bytes_can_have_come_and_ages_do_beyond_an_int
     telemetry = esc()
     now = TIMEOUT + (stream(telemetry, SECOND, 2.5) if known else SECOND)
     data, since = bytes(noise) + live(5), now - waited - noise * NS_PER_BYTE
-    if not telemetry.receive_live(data, now, since):
-        telemetry.receive(data, now, since)
+    read(telemetry, data, now, since)
     if bound is None or shown is None:
         assert telemetry.live is None or telemetry.live.electrical_speed != 5
         assert telemetry.late_frames == 1
@@ -308,14 +311,14 @@ def test_time_outs_count_from_when_bytes_can_have_come_and_ages_do_beyond_an_int
 def test_an_info_frame_is_late_by_its_own_time_out() -> None:
     telemetry = alive()
     now = 30 * SECOND
-    telemetry.receive(info(), now, now - INFO_TIMEOUT_NS)
+    read(telemetry, info(), now, now - INFO_TIMEOUT_NS)
     assert telemetry.info is not None
     assert (
         telemetry.last_info_ns
         == telemetry.info_bound_ns
         == now - INFO_TIMEOUT_NS + WIRE + (len(info()) - 40) * NS_PER_BYTE
     )
-    telemetry.receive(info(), 2 * now, 2 * now - INFO_TIMEOUT_NS - SECOND)
+    read(telemetry, info(), 2 * now, 2 * now - INFO_TIMEOUT_NS - SECOND)
     assert info_of(telemetry) is None
     assert telemetry.late_frames == 1
 
@@ -548,8 +551,9 @@ def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[LiveData]:
     ends = list(accumulate(len(piece) for piece, _ in timed))
     found = []
     for at in range(len(whole)):
-        form = find_form(whole, at)
-        if form is not None:
+        row = next((row for row in SHORTEST_FIRST if fits(whole, at, row)), None)
+        if row is not None:
+            form = next(form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout))
             first = timed[bisect_right(ends, at)][1]
             last = timed[bisect_right(ends, at + form.length - 1)][1]
             data = form.decode(whole, at)

@@ -183,8 +183,8 @@ class Node(Gateway):
     def frames_wait(self) -> bool:
         return bool(self.waiting) or super().frames_wait
 
-    def take_ready(self) -> list[CanFrame | bytes]:
-        frames, self.waiting = [*self.waiting, *super().take_ready()], []
+    def take_frames(self) -> list[CanFrame]:
+        frames, self.waiting = [*self.waiting, *super().take_frames()], []
         return frames
 
 
