@@ -1,0 +1,1 @@
+"""Captures: every call that the core was given, to be played again."""

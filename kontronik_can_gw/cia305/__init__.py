@@ -1,1 +1,0 @@
-"""Layer setting services (LSS) by CiA 305: the slave."""

@@ -1,0 +1,1 @@
+"""The TOML configuration: its keys, and everything that it means put together."""

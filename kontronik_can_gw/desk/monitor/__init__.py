@@ -1,0 +1,1 @@
+"""The live screen's model, that CAN frames go into."""
