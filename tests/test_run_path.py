@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.offline.pty import PtyEsc
-from kontronik_can_gw.protocol.codec import Layout, encode
-from kontronik_can_gw.protocol.fields import LiveData
+from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 
 LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), Layout.V4)
 STANDIN = Path(__file__).resolve().parent / "benchmarks"
@@ -27,9 +27,8 @@ ALWAYS = {"kontronik_can_gw", "serial"}
 """Libraries that every gateway may have."""
 CANOPEN = {"canopen"} | PYTHON_CAN
 OWN = {
-    "cli": {"run", "common", "arguments", "node_setup", "recording"},
-    "offline": set[str](),
-    "simulator": set[str](),
+    "cli": {"run", "common", "arguments", "recording"},
+    "desk": set[str](),
 }
 """Of our own rooms that are large, what may be there; the others are the gateway itself."""
 NEVER = (
@@ -165,7 +164,7 @@ def test_a_running_gateway_has_what_it_needs_and_no_more(name: str, tmp_path: Pa
 
 def test_the_list_can_fail(tmp_path: Path) -> None:
     """With a library and a room of ours that do not belong there, imported on purpose."""
-    modules = imported(tmp_path, "", "import rich.console, kontronik_can_gw.offline.pacing")
+    modules = imported(tmp_path, "", "import rich.console, kontronik_can_gw.desk.recordings.pacing")
     found = surplus(modules, ALWAYS | CANTOOLS)
-    assert {"rich", "kontronik_can_gw.offline.pacing"} <= found
+    assert {"rich", "kontronik_can_gw.desk.recordings.pacing"} <= found
     assert "rich" in [name for name in NEVER if name in modules]

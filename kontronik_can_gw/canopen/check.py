@@ -2,12 +2,11 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from kontronik_can_gw.cia301 import bindings as at
-from kontronik_can_gw.cia301.abort import SdoAbort
-from kontronik_can_gw.cia301.bindings import bindings
-from kontronik_can_gw.cia301.dictionary import Dictionary, Variable, fits
-from kontronik_can_gw.cia301.eds import Eds
-from kontronik_can_gw.cia301.node import (
+from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.abort import SdoAbort
+from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, fits
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.node import (
     CHECKED,
     COMMUNICATION_PROFILE,
     SDO_ANSWER,
@@ -17,12 +16,13 @@ from kontronik_can_gw.cia301.node import (
     default_ids,
     range_of,
 )
-from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
-from kontronik_can_gw.cia301.pdo import COMMUNICATION, MAPPING
-from kontronik_can_gw.cia301.storage import Stored
+from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
+from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAPPING
+from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.sources import GatewayStatus
-from kontronik_can_gw.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.values import GatewayStatus
 
 _WHOLE = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x15, 0x1B})  # data types
 _UNSIGNED = {

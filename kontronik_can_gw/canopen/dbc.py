@@ -10,22 +10,22 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cia301 import bindings as at
-from kontronik_can_gw.cia301 import emergency, heartbeat
-from kontronik_can_gw.cia301.eds import Entry
-from kontronik_can_gw.cia301.emergency import GatewayError, code_of_bit
-from kontronik_can_gw.cia301.nmt import NmtState
-from kontronik_can_gw.cia301.node import Node
-from kontronik_can_gw.cia301.nodes import Nodes
-from kontronik_can_gw.cia301.pdo import EVENT_TYPES, Mapped, Tpdo, message_plan
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.dbc_output.expand import esc_prefix
-from kontronik_can_gw.dbc_output.layout import SignalPlan
+from kontronik_can_gw.canopen import emergency, heartbeat
+from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.eds import Entry
+from kontronik_can_gw.canopen.emergency import GatewayError, code_of_bit
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.nmt import NmtState
+from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.canopen.nodes import Nodes
+from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Mapped, Tpdo, message_plan
+from kontronik_can_gw.dbc.expand import esc_prefix
+from kontronik_can_gw.dbc.layout import SignalPlan
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.kontronik.states import Device, ErrorBit, OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.telemetry import MS, EscSettings, LinkState
+from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.protocol.states import Device, ErrorBit, OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.sources import Group
-from kontronik_can_gw.telemetry import MS, EscSettings, LinkState
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

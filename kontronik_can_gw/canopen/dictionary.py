@@ -7,8 +7,8 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from kontronik_can_gw.cia301.abort import Abort, SdoAbort
-from kontronik_can_gw.cia301.eds import Eds, Entry
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.eds import Eds, Entry
 
 Value = int | float | bytes
 Read = Callable[[int], Value]

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple, Self
 
-from kontronik_can_gw.cia301.heartbeat import NEVER
-from kontronik_can_gw.protocol.states import OperatingError, Severity
+from kontronik_can_gw.canopen.heartbeat import NEVER
+from kontronik_can_gw.esc.kontronik.states import OperatingError, Severity
 
 GENERIC, CURRENT, VOLTAGE, TEMPERATURE, COMMUNICATION, MANUFACTURER = 0x01, 0x02, 0x04, 0x08, 0x10, 0x80
 _REGISTER_OF_CLASS = {0x2: CURRENT, 0x3: VOLTAGE, 0x4: TEMPERATURE, 0x8: COMMUNICATION, 0xF: MANUFACTURER}

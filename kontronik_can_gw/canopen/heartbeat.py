@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable
 
-from kontronik_can_gw.cia301.abort import Abort, SdoAbort
-from kontronik_can_gw.telemetry import MS
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.esc.telemetry import MS
 
 COB_ID = 0x700
 NEVER = 1 << 62

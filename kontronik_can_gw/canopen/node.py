@@ -11,23 +11,23 @@ from fractions import Fraction
 from functools import partial
 from typing import Protocol
 
-from kontronik_can_gw.cia301 import bindings as at
-from kontronik_can_gw.cia301 import heartbeat, nmt, sync
-from kontronik_can_gw.cia301.abort import Abort, SdoAbort
-from kontronik_can_gw.cia301.bindings import Bound, bindings, reader_text
-from kontronik_can_gw.cia301.dictionary import Dictionary, Value, Variable, fits, key
-from kontronik_can_gw.cia301.eds import Eds
-from kontronik_can_gw.cia301.emergency import Emergencies, GatewayError
-from kontronik_can_gw.cia301.heartbeat import NEVER
-from kontronik_can_gw.cia301.nmt import Command, NmtState
-from kontronik_can_gw.cia301.pdo import COB_ID, COMMUNICATION, INVALID_BIT, MAPPING, MOST, Tpdo, restricted
-from kontronik_can_gw.cia301.sdo import SdoServer
-from kontronik_can_gw.cia301.storage import VERIFY, Stored
-from kontronik_can_gw.cia305.lss import UNCONFIGURED, LssSlave
+from kontronik_can_gw.canopen import heartbeat, nmt, sync
+from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable, fits, key
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.emergency import Emergencies, GatewayError
+from kontronik_can_gw.canopen.heartbeat import NEVER
+from kontronik_can_gw.canopen.lss import UNCONFIGURED, LssSlave
+from kontronik_can_gw.canopen.nmt import Command, NmtState
+from kontronik_can_gw.canopen.objects import Bound, bindings, reader_text
+from kontronik_can_gw.canopen.pdo import COB_ID, COMMUNICATION, INVALID_BIT, MAPPING, MOST, Tpdo, restricted
+from kontronik_can_gw.canopen.sdo import SdoServer
+from kontronik_can_gw.canopen.storage import VERIFY, Stored
+from kontronik_can_gw.esc.kontronik.states import Device, device_text
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry, Event, LinkState
+from kontronik_can_gw.esc.values import CanState, GatewayState, GatewayStatus, Group
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.protocol.states import Device, device_text
-from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus, Group
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry, Event, LinkState
 
 SAVE, LOAD, RESET = (int.from_bytes(word, "little") for word in (b"save", b"load", b"rset"))
 EMERGENCY, SDO_REQUEST, SDO_ANSWER, LSS_REQUEST, LSS_ANSWER = 0x80, 0x600, 0x580, 0x7E5, 0x7E4

@@ -4,11 +4,12 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from kontronik_can_gw.cia301 import heartbeat, nmt
-from kontronik_can_gw.cia301.eds import Eds
-from kontronik_can_gw.cia301.emergency import GatewayError
-from kontronik_can_gw.cia301.heartbeat import NEVER
-from kontronik_can_gw.cia301.node import (
+from kontronik_can_gw.canopen import heartbeat, nmt
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.emergency import GatewayError
+from kontronik_can_gw.canopen.heartbeat import NEVER
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.node import (
     LSS_REQUEST,
     SDO_ANSWER,
     SDO_REQUEST,
@@ -18,12 +19,11 @@ from kontronik_can_gw.cia301.node import (
     esc_settings,
     make_dictionary,
 )
-from kontronik_can_gw.cia301.storage import Stored
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.dbc_output.layout import classic_bits
+from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.dbc.layout import classic_bits
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.values import CanState, GatewayStatus
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.sources import CanState, GatewayStatus
-from kontronik_can_gw.telemetry import EscSettings, EscTelemetry
 
 _FIRST_IDS = (0x80, SDO_ANSWER, SDO_REQUEST, heartbeat.COB_ID)
 """COB-IDs of EMCY, SDO and heartbeat, less the node-ID."""

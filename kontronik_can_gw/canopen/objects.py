@@ -7,10 +7,10 @@ import re
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from kontronik_can_gw.dbc_output.packer import scaled_text
-from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
-from kontronik_can_gw.sources import Group, Source, sources
-from kontronik_can_gw.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.values import Group, Source, sources
+from kontronik_can_gw.signals.packer import scaled_text
 
 U8, U16, U32 = 0xFF, 0xFFFF, 0xFFFFFFFF
 LIVE, DERIVED, INFO, EXTREMES, LINK, GATEWAY = 0x2000, 0x2001, 0x2010, 0x2011, 0x2020, 0x2021

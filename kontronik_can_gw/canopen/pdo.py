@@ -10,15 +10,15 @@ carry the link status: those go on, with all ones (80..0h for signed types) for 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from kontronik_can_gw.cia301.abort import Abort, SdoAbort
-from kontronik_can_gw.cia301.bindings import LINK, Bound
-from kontronik_can_gw.cia301.dictionary import Dictionary, Value, Variable
-from kontronik_can_gw.cia301.heartbeat import NEVER
-from kontronik_can_gw.dbc_output.layout import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
-from kontronik_can_gw.dbc_output.packer import Pack, compile_pack, place
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
+from kontronik_can_gw.canopen.heartbeat import NEVER
+from kontronik_can_gw.canopen.objects import LINK, Bound
+from kontronik_can_gw.dbc.layout import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscTelemetry, Event
+from kontronik_can_gw.esc.values import GatewayStatus, Group, Source
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.sources import GatewayStatus, Group, Source
-from kontronik_can_gw.telemetry import MS, SECOND, EscTelemetry, Event
+from kontronik_can_gw.signals.packer import Pack, compile_pack, place
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
 MOST = 512

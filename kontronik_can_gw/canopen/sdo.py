@@ -25,7 +25,7 @@ from collections.abc import Callable
 from enum import Enum, auto
 from typing import NoReturn, Protocol
 
-from kontronik_can_gw.cia301.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 
 TIMEOUT_NS = 2_000_000_000
 """A transfer ends with 05040000h this long after the last frame of either side."""

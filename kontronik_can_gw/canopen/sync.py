@@ -1,6 +1,6 @@
 """SYNC, consumer side (CiA 301, 7.2.5; objects 1005h and 1019h)."""
 
-from kontronik_can_gw.cia301.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 
 PRODUCER_BIT, FRAME_BIT = 1 << 30, 1 << 29
 

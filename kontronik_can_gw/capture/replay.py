@@ -7,11 +7,11 @@ entry is missing. Nothing here waits or sends.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.capture import COUNTERS, Entry, Kind, read_counters, read_frame, read_json, read_number
+from kontronik_can_gw.capture.format import COUNTERS, Entry, Kind, read_counters, read_frame, read_json, read_number
+from kontronik_can_gw.esc.values import CanState, GatewayState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Mailboxes, Sent
-from kontronik_can_gw.sources import CanState, GatewayState
+from kontronik_can_gw.transmit_queue import Mailboxes, Sent
 
 
 class TimedFrame(NamedTuple):

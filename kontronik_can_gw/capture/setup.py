@@ -18,18 +18,18 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.capture import FORMAT, VERSION, VERSIONS
-from kontronik_can_gw.cia301.eds import load as eds_of
-from kontronik_can_gw.cia301.node import NodeSettings
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia301.storage import Stored, decode, encode
-from kontronik_can_gw.config import parse
-from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, parse_database
-from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.canopen.eds import load as eds_of
+from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.storage import Stored, decode, encode
+from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.dbc.layout import DbcSettings, Layout, parse_database
+from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.states import Device
-from kontronik_can_gw.telemetry import MS, EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

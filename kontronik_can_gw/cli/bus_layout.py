@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from kontronik_can_gw.config import shipped
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
 
 
 def add_layout_arguments(parser: argparse.ArgumentParser) -> None:

@@ -5,15 +5,15 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.cia301.nodes import Nodes
-from kontronik_can_gw.cia301.pdo import EVENT_TYPES, Tpdo
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.nodes import Nodes
+from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Tpdo
 from kontronik_can_gw.cli.common import Loaded, load_all, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
-from kontronik_can_gw.config import as_toml
-from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SendType, SignalPlan
-from kontronik_can_gw.dbc_output.loss import is_mute, reporter
-from kontronik_can_gw.telemetry import MS
+from kontronik_can_gw.config.keys import as_toml
+from kontronik_can_gw.dbc.layout import Layout, MessagePlan, Role, SendType, SignalPlan
+from kontronik_can_gw.dbc.loss import is_mute, reporter
+from kontronik_can_gw.esc.telemetry import MS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,27 +11,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cia301.check import without_objects
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.check import without_objects
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
-from kontronik_can_gw.cli.node_setup import (
+from kontronik_can_gw.config.keys import Config, EscConfig, examine
+from kontronik_can_gw.config.nodes import (
     load_of_stored,
     parameter_folder,
     plain_setup,
     read_stored,
     with_stored,
 )
-from kontronik_can_gw.config import Config, EscConfig, examine
-from kontronik_can_gw.dbc_output.layout import Layout, normalize, parse_database, read_dbc
-from kontronik_can_gw.dbc_output.loss import unreported
-from kontronik_can_gw.dbc_output.prepare import check_load, prepare
+from kontronik_can_gw.dbc.layout import Layout, normalize, parse_database, read_dbc
+from kontronik_can_gw.dbc.loss import unreported
+from kontronik_can_gw.dbc.prepare import check_load, prepare
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.can_port import check_interface
 from kontronik_can_gw.runtime.store import ParameterStore
-from kontronik_can_gw.telemetry import EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

@@ -5,14 +5,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.offline.convert import BYTES, FORMATS, LOGS, ON_SCREEN, STREAMS, TABLES
+from kontronik_can_gw.desk.recordings.convert import BYTES, FORMATS, LOGS, ON_SCREEN, STREAMS, TABLES
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from kontronik_can_gw.offline.convert import Conversion
-    from kontronik_can_gw.offline.inputs import Input
-    from kontronik_can_gw.offline.layouts import BusLayout
+    from kontronik_can_gw.desk.recordings.convert import Conversion
+    from kontronik_can_gw.desk.recordings.inputs import Input
+    from kontronik_can_gw.desk.recordings.layouts import BusLayout
 
 SUFFIXES = {
     ".csv": "csv",
@@ -131,9 +131,9 @@ def _convert(args: argparse.Namespace, form: str) -> None:
 
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.progress import Progress
+    from kontronik_can_gw.desk.recordings.convert import Output
+    from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput
     from kontronik_can_gw.errors import RunError, UserError
-    from kontronik_can_gw.offline.convert import Output
-    from kontronik_can_gw.offline.inputs import LIVE_RATE, CanLogInput
 
     source, target = Path(args.input), Path(args.output)
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
@@ -176,8 +176,8 @@ def _convert(args: argparse.Namespace, form: str) -> None:
 def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None") -> "Input":
     """The recording; of a pipe with a bar while it is read into a file."""
     from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.offline.inputs import LIVE_RATE, open_input
-    from kontronik_can_gw.offline.spool import is_stream
+    from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, open_input
+    from kontronik_can_gw.desk.recordings.spool import is_stream
 
     rate = args.live_rate or LIVE_RATE
     if not is_stream(source):
@@ -188,8 +188,8 @@ def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None"
 
 def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Conversion":
     """What is to be done. UserError for what the recording has not."""
-    from kontronik_can_gw.offline.convert import BytesConversion, LogConversion, TableConversion
-    from kontronik_can_gw.offline.tables import Choice
+    from kontronik_can_gw.desk.recordings.convert import BytesConversion, LogConversion, TableConversion
+    from kontronik_can_gw.desk.recordings.tables import Choice
 
     if form == BYTES:
         return BytesConversion(_esc(args, recording, needed=True) or 0)
@@ -283,7 +283,7 @@ def _esc(args: argparse.Namespace, recording: "Input", needed: bool = False) -> 
 
 def _nothing(args: argparse.Namespace, recording: "Input", damage: list[str]) -> list[str]:
     """Why there is nothing to convert."""
-    from kontronik_can_gw.offline.inputs import CanLogInput
+    from kontronik_can_gw.desk.recordings.inputs import CanLogInput
 
     told = [f"{args.input}: damaged: {line}" for line in damage]
     if args.start is not None or args.end is not None:

@@ -5,13 +5,13 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen_dbc import database as canopen_database
-from kontronik_can_gw.canopen_dbc import waiting_for_lss
+from kontronik_can_gw.canopen.dbc import database as canopen_database
+from kontronik_can_gw.canopen.dbc import waiting_for_lss
 from kontronik_can_gw.cli.common import canopen_of, load_all, say, write_output
-from kontronik_can_gw.cli.node_setup import shipped_canopen
-from kontronik_can_gw.config import name_problem, shipped
+from kontronik_can_gw.config.keys import name_problem, shipped
+from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.dbc_output.expand import dbc_text
+    from kontronik_can_gw.dbc.expand import dbc_text
 
     text = dbc_text(_canopen(args) if args.canopen else _database(args))
     try:
@@ -92,9 +92,9 @@ def _canopen(args: argparse.Namespace) -> "Database":
 
 
 def _database(args: argparse.Namespace) -> "Database":
-    from kontronik_can_gw.dbc_output.expand import among_canopen, expand
-    from kontronik_can_gw.dbc_output.layout import DbcSettings, choose_node, load_database
-    from kontronik_can_gw.dbc_output.prepare import prepare
+    from kontronik_can_gw.dbc.expand import among_canopen, expand
+    from kontronik_can_gw.dbc.layout import DbcSettings, choose_node, load_database
+    from kontronik_can_gw.dbc.prepare import prepare
 
     if args.config is not None:
         _refuse(args, ("esc", "name", "base_id", "id_step", "node", "from"), "--config, which says all that")

@@ -31,8 +31,8 @@ def main(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from kontronik_can_gw.cli.progress import Progress
+    from kontronik_can_gw.desk.recordings import decode
     from kontronik_can_gw.errors import RunError, UserError
-    from kontronik_can_gw.offline import decode
 
     name = "standard input" if args.file == "-" else args.file
     with ExitStack() as stack:

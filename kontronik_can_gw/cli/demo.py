@@ -16,13 +16,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cia301 import heartbeat, nmt, node
-from kontronik_can_gw.cia301.nmt import NmtState
+from kontronik_can_gw.canopen import heartbeat, nmt, node
+from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.protocol.states import OperatingError
 
 if TYPE_CHECKING:
     import can
@@ -155,9 +155,9 @@ def main(args: argparse.Namespace) -> int:
         import can
 
     from kontronik_can_gw.cli.common import assemble
-    from kontronik_can_gw.config import parse
+    from kontronik_can_gw.config.keys import parse
+    from kontronik_can_gw.desk.pty import PtyEsc
     from kontronik_can_gw.gateway import Gateway
-    from kontronik_can_gw.offline.pty import PtyEsc
     from kontronik_can_gw.runtime.loop import Loop
 
     logging.getLogger("kontronik_can_gw").addHandler(logging.NullHandler())  # the screen tells what the log would
@@ -210,8 +210,8 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _feed(esc: object, seed: int, stop: threading.Event) -> None:
-    from kontronik_can_gw.offline import pty
-    from kontronik_can_gw.simulator import FLIGHT, SECOND_NS, Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc
+    from kontronik_can_gw.desk import pty
+    from kontronik_can_gw.esc.simulator import FLIGHT, SECOND_NS, Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc
 
     thrown_in = (
         OperatingError.POWER_STAGE_OVERTEMP_WARNING,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.printable import printable, printable_json
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.offline.describe.facts import Description
+    from kontronik_can_gw.desk.describe.facts import Description
 
 EPILOG = """\
 Signals and messages of the DBC in use, the CANopen nodes with their objects and emergencies, error bits and states with meaning and
@@ -44,18 +44,18 @@ def _text(args: argparse.Namespace) -> str:
     facts = _facts(args)
     if args.format == "json":
         return printable_json(facts.as_json(), indent=2, allow_nan=False) + "\n"
-    from kontronik_can_gw.offline.describe.document import document
-    from kontronik_can_gw.offline.describe.markdown import markdown
+    from kontronik_can_gw.desk.describe.document import document
+    from kontronik_can_gw.desk.describe.markdown import markdown
 
     return markdown(document(facts))
 
 
 def _facts(args: argparse.Namespace) -> "Description":
     from kontronik_can_gw.cli.common import load_all
-    from kontronik_can_gw.cli.node_setup import shipped_canopen
-    from kontronik_can_gw.config import shipped
-    from kontronik_can_gw.offline.describe.facts import describe
-    from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
+    from kontronik_can_gw.config.keys import shipped
+    from kontronik_can_gw.config.nodes import shipped_canopen
+    from kontronik_can_gw.desk.describe.facts import describe
+    from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 
     if args.config is not None:
         loaded = load_all(args.config)

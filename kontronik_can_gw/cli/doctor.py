@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.cli.common import Loaded, assemble, show
-from kontronik_can_gw.cli.node_setup import parameter_folder
-from kontronik_can_gw.config import SHIPPED, Config, load
+from kontronik_can_gw.config.keys import SHIPPED, Config, load
+from kontronik_can_gw.config.nodes import parameter_folder
+from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity, count, document
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.can_port import check_interface
-from kontronik_can_gw.runtime.doctor.findings import Finding, Findings, Severity, count, document
 from kontronik_can_gw.runtime.store import parameter_file
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.doctor.service import Unit
-    from kontronik_can_gw.runtime.doctor.system import System
+    from kontronik_can_gw.desk.doctor.service import Unit
+    from kontronik_can_gw.desk.doctor.system import System
 
 _STYLES = {
     Severity.OK: "green",
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.runtime.doctor.system import System
+    from kontronik_can_gw.desk.doctor.system import System
 
     findings, code = examine(System(), args.config)
     if args.json:
@@ -56,11 +56,11 @@ def main(args: argparse.Namespace) -> int:
 
 def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
     """All findings, and the exit code. What does not depend on a faulty part of the configuration is looked at all the same."""
-    from kontronik_can_gw.runtime.doctor.can_interface import check_can
-    from kontronik_can_gw.runtime.doctor.line import look
-    from kontronik_can_gw.runtime.doctor.machine import check_machine
-    from kontronik_can_gw.runtime.doctor.serial_ports import check_port
-    from kontronik_can_gw.runtime.doctor.service import unit_of
+    from kontronik_can_gw.desk.doctor.can_interface import check_can
+    from kontronik_can_gw.desk.doctor.line import look
+    from kontronik_can_gw.desk.doctor.machine import check_machine
+    from kontronik_can_gw.desk.doctor.serial_ports import check_port
+    from kontronik_can_gw.desk.doctor.service import unit_of
 
     unit = unit_of(system, str(path.absolute()))
     about = Findings("Configuration")
@@ -100,7 +100,7 @@ def _configuration(
     system: "System", findings: Findings, config: Config, loaded: Loaded | None, unit: "Unit | None"
 ) -> None:
     from kontronik_can_gw.cli.recording import record_folder
-    from kontronik_can_gw.runtime.doctor.folders import check_folder, check_readable
+    from kontronik_can_gw.desk.doctor.folders import check_folder, check_readable
 
     if loaded is not None:
         _outputs(findings, config, loaded)

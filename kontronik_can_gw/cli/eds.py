@@ -3,19 +3,19 @@
 import argparse
 from pathlib import Path
 
-from kontronik_can_gw.cia301 import bindings as at
-from kontronik_can_gw.cia301.abort import SdoAbort
-from kontronik_can_gw.cia301.bindings import bindings
-from kontronik_can_gw.cia301.dictionary import Value
-from kontronik_can_gw.cia301.eds import dcf
-from kontronik_can_gw.cia301.node import Node
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia301.storage import VERIFY
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.abort import SdoAbort
+from kontronik_can_gw.canopen.dictionary import Value
+from kontronik_can_gw.canopen.eds import dcf
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.canopen.storage import VERIFY
 from kontronik_can_gw.cli.common import canopen_of, load_all, write_output
-from kontronik_can_gw.cli.node_setup import shipped_canopen
+from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 
 _STATES_AND_COMMANDS = frozenset(
     {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, VERIFY, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE}

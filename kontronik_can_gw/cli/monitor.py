@@ -18,18 +18,18 @@ from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
 from kontronik_can_gw.cli.common import check_devices, say, stopping_on_signals
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable_json
-from kontronik_can_gw.telemetry import SECOND
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from kontronik_can_gw.cli.monitor_screen import Choice, Glyphs, Where
-    from kontronik_can_gw.config import CanConfig
+    from kontronik_can_gw.config.keys import CanConfig
+    from kontronik_can_gw.desk.monitor.model import Monitor
+    from kontronik_can_gw.desk.recordings.inputs import Input
+    from kontronik_can_gw.desk.recordings.layouts import BusLayout
     from kontronik_can_gw.frames import CanFrame
-    from kontronik_can_gw.offline.inputs import Input
-    from kontronik_can_gw.offline.layouts import BusLayout
-    from kontronik_can_gw.offline.monitor import Monitor
 
 _REFRESH_S = 0.15
 _PLAIN_LINE_S = 1.0
@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     _check_usage(args)
     with _source_of(args) as source:
-        from kontronik_can_gw.offline.monitor import Monitor
+        from kontronik_can_gw.desk.monitor.model import Monitor
 
         monitor = Monitor(source.bus)
         if args.once:
@@ -148,7 +148,7 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
         finally:
             live.close()
         return
-    from kontronik_can_gw.offline.inputs import CaptureInput, open_input
+    from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 
     given = bus_layout(args.config, args.dbc) if args.config is not None or args.dbc is not None else None
     with open_input(args.file, given) as opened:
@@ -161,8 +161,8 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
 
 def last_ns(opened: "Input") -> int | None:
     """When the last entry of a capture comes; None where a look at its end does not tell."""
-    from kontronik_can_gw.capture import Block, Scanner, read_entries
-    from kontronik_can_gw.offline.inputs import CaptureInput
+    from kontronik_can_gw.capture.format import Block, Scanner, read_entries
+    from kontronik_can_gw.desk.recordings.inputs import CaptureInput
 
     if not isinstance(opened, CaptureInput) or opened.last_path is None:
         return None
@@ -182,7 +182,7 @@ def last_ns(opened: "Input") -> int | None:
 
 def can_config(bus: "BusLayout", interface: str | None, channel: str | None) -> "CanConfig":
     """The interface to listen on. UserError where it would be the port of an ESC, to which nothing may be sent."""
-    from kontronik_can_gw.config import CanConfig
+    from kontronik_can_gw.config.keys import CanConfig
 
     if bus.config is None:
         is_fd = any(message.fd for message in bus.layout.messages)
@@ -203,8 +203,8 @@ class Bus:
     paused = False
 
     def __init__(self, bus: "BusLayout", config: "CanConfig") -> None:
-        from kontronik_can_gw.dbc_output.unpacker import SignalReader
         from kontronik_can_gw.runtime.bus_listener import BusListener
+        from kontronik_can_gw.signals.unpacker import SignalReader
 
         self.bus = bus
         self.name = config.channel

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from kontronik_can_gw.cli.status import Line, Piece, compact, duration
-from kontronik_can_gw.dbc_output.layout import normalize
-from kontronik_can_gw.offline.monitor import (
+from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.desk.monitor.model import (
     PERCENT,
     QUANTITIES,
     QUANTITY,
@@ -22,9 +22,9 @@ from kontronik_can_gw.offline.monitor import (
     Zone,
     words,
 )
+from kontronik_can_gw.esc.kontronik.states import Severity
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
-from kontronik_can_gw.protocol.states import Severity
-from kontronik_can_gw.telemetry import SECOND
 
 GOOD, POOR, BAD, FAINT, TITLE, MARKED = "green", "yellow", "bold red", "dim", "bold", "bold black on yellow"
 _ZONES = {Zone.GOOD: GOOD, Zone.WARNING: POOR, Zone.ALARM: "red"}

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
 from kontronik_can_gw.cli.common import logging_to_stderr, say, stopping_on_signals
-from kontronik_can_gw.config import CanConfig, MqttConfig, mqtt_with
+from kontronik_can_gw.config.keys import CanConfig, MqttConfig, mqtt_with
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 
 if TYPE_CHECKING:
+    from kontronik_can_gw.desk.mqtt.client import Broker
+    from kontronik_can_gw.desk.mqtt.messages import Message, Topics
+    from kontronik_can_gw.desk.recordings.inputs import Input
+    from kontronik_can_gw.desk.recordings.layouts import BusLayout
     from kontronik_can_gw.frames import CanFrame
-    from kontronik_can_gw.offline.inputs import Input
-    from kontronik_can_gw.offline.layouts import BusLayout
-    from kontronik_can_gw.offline.mqtt_messages import Message, Topics
-    from kontronik_can_gw.runtime.mqtt_client import Broker
     from kontronik_can_gw.runtime.systemd import Notifier
 
 log = logging.getLogger("kontronik_can_gw")
@@ -107,9 +107,9 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _main(args: argparse.Namespace, notifier: "Notifier") -> int:
-    from kontronik_can_gw.offline.mqtt_messages import Topics
+    from kontronik_can_gw.desk.mqtt.client import check
+    from kontronik_can_gw.desk.mqtt.messages import Topics
     from kontronik_can_gw.runtime.locks import Locks
-    from kontronik_can_gw.runtime.mqtt_client import check
 
     if args.file is None and args.discovery is not None and Path(args.discovery).is_file():
         raise UserError(f"--discovery {args.discovery}: is a file. Give FILE before the options.")
@@ -161,7 +161,7 @@ def _settings(args: argparse.Namespace, bus: "BusLayout | None") -> MqttConfig:
 
 
 def _broker(settings: MqttConfig, topics: "Topics") -> "Broker":
-    from kontronik_can_gw.runtime.mqtt_client import Broker
+    from kontronik_can_gw.desk.mqtt.client import Broker
 
     assert settings.address is not None
     host, port = settings.address
@@ -173,8 +173,8 @@ def _broker(settings: MqttConfig, topics: "Topics") -> "Broker":
 
 def _remove(broker: "Broker", topics: "Topics", discovery: str) -> int:
     """Clear the retained discovery; of a gateway that is not online its other retained topics too."""
-    from kontronik_can_gw.offline.mqtt_messages import OFFLINE, is_ours
-    from kontronik_can_gw.runtime.mqtt_client import remove
+    from kontronik_can_gw.desk.mqtt.client import remove
+    from kontronik_can_gw.desk.mqtt.messages import OFFLINE, is_ours
 
     kept: dict[str, bytes] = {}
 
@@ -223,7 +223,7 @@ class _Source(Protocol):
 
 def _source(args: argparse.Namespace, bus: "BusLayout | None") -> _Source:
     if args.file is not None:
-        from kontronik_can_gw.offline.inputs import open_input
+        from kontronik_can_gw.desk.recordings.inputs import open_input
 
         return _Recording(open_input(args.file, bus))
     assert bus is not None
@@ -352,9 +352,9 @@ class _Run:
     def __init__(
         self, source: _Source, settings: MqttConfig, topics: "Topics", broker: "Broker", notifier: "Notifier"
     ) -> None:
-        from kontronik_can_gw.offline.mqtt_messages import Publisher
-        from kontronik_can_gw.runtime.conditions import Conditions
-        from kontronik_can_gw.runtime.mqtt_client import MqttClient
+        from kontronik_can_gw.desk.mqtt.client import MqttClient
+        from kontronik_can_gw.desk.mqtt.messages import Publisher
+        from kontronik_can_gw.runtime.fault_log import Conditions
 
         self._source, self._notifier = source, notifier
         self._publisher: Publisher = Publisher(

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from kontronik_can_gw.capture_setup import CaptureSetup
+from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli.common import Loaded
-from kontronik_can_gw.config import Config, as_toml
+from kontronik_can_gw.config.keys import Config, as_toml
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.machine import state_folder
 from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings
-from kontronik_can_gw.telemetry import SECOND
 
 _MB = 1_000_000
 _STATE = "state"

@@ -12,9 +12,9 @@ from kontronik_can_gw.errors import RunError, UserError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from kontronik_can_gw.desk.recordings.inputs import Input
+    from kontronik_can_gw.desk.recordings.pacing import Pace
     from kontronik_can_gw.frames import CanFrame
-    from kontronik_can_gw.offline.inputs import Input
-    from kontronik_can_gw.offline.pacing import Pace
     from kontronik_can_gw.runtime.can_port import CanPort
 
 EPILOG = """\
@@ -85,8 +85,8 @@ def main(args: argparse.Namespace) -> int:
     """Replay args.file."""
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.common import say, stopping_on_signals
-    from kontronik_can_gw.offline.inputs import open_input
-    from kontronik_can_gw.offline.pacing import Pace
+    from kontronik_can_gw.desk.recordings.inputs import open_input
+    from kontronik_can_gw.desk.recordings.pacing import Pace
 
     for place, names in _OPTIONS.items():
         given = [name for name in names if getattr(args, name)]
@@ -111,9 +111,9 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     from itertools import chain
 
     from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.offline.can_logs import SUFFIXES, CanLogWriter
-    from kontronik_can_gw.offline.inputs import CaptureInput
-    from kontronik_can_gw.offline.part_file import PartFile
+    from kontronik_can_gw.desk.recordings.can_logs import SUFFIXES, CanLogWriter
+    from kontronik_can_gw.desk.recordings.inputs import CaptureInput
+    from kontronik_can_gw.desk.recordings.part_file import PartFile
 
     name = args.output
     suffix = Path(name).suffix
@@ -164,14 +164,14 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
 
 
 def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
-    from kontronik_can_gw.cia305.lss import UNCONFIGURED
+    from kontronik_can_gw.canopen.lss import UNCONFIGURED
     from kontronik_can_gw.cli.common import say
-    from kontronik_can_gw.config import CanConfig
-    from kontronik_can_gw.dbc_output.unpacker import SignalReader
-    from kontronik_can_gw.offline.inputs import CaptureInput
-    from kontronik_can_gw.offline.marking import Marker
+    from kontronik_can_gw.config.keys import CanConfig
+    from kontronik_can_gw.desk.recordings.inputs import CaptureInput
+    from kontronik_can_gw.desk.recordings.marking import Marker
     from kontronik_can_gw.runtime.can_port import CanPort, check_interface
     from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
+    from kontronik_can_gw.signals.unpacker import SignalReader
 
     config = recording.bus.config.can if args.config and recording.bus.config else None
     channel = args.channel or (config.channel if config else None)
@@ -220,7 +220,7 @@ def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> Non
     """Hand over one frame; what is full is waited for. RunError where the bus takes nothing any more."""
     import time
 
-    from kontronik_can_gw.mailboxes import Sent
+    from kontronik_can_gw.transmit_queue import Sent
 
     since = time.monotonic()
     while (answer := port.send(frame)) is not Sent.OK:
@@ -238,8 +238,8 @@ def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> Non
 def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     from contextlib import ExitStack
 
-    from kontronik_can_gw.offline.inputs import CaptureInput, DumpInput
-    from kontronik_can_gw.offline.pty import PtyEsc
+    from kontronik_can_gw.desk.pty import PtyEsc
+    from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput
 
     chunks = _chunks(recording)
     names = [esc.name for esc in recording.setup.escs] if isinstance(recording, (CaptureInput, DumpInput)) else []
@@ -275,8 +275,8 @@ _DRAIN_S = 0.2
 
 def _chunks(recording: "Input") -> "Iterator[tuple[int, int, bytes]]":
     """(time, ESC, bytes) of a capture or of plain bytes."""
-    from kontronik_can_gw.capture import Kind
-    from kontronik_can_gw.offline.inputs import CaptureInput, DumpInput
+    from kontronik_can_gw.capture.format import Kind
+    from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput
 
     if isinstance(recording, CaptureInput):
         return ((e.time_ns, e.esc, e.data) for e in recording.entries() if e.kind == Kind.BYTES)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.offline.inputs import Input
-    from kontronik_can_gw.offline.report.analysis import Analysis
+    from kontronik_can_gw.desk.recordings.inputs import Input
+    from kontronik_can_gw.desk.report.analysis import Analysis
 
 EPILOG = """\
 IN is a capture (.kcap; a folder, or the beginning of the names of one run's, for all its parts), a file of plain UART bytes,
@@ -51,10 +51,10 @@ def main(args: argparse.Namespace) -> int:
 
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.common import say, write_output
+    from kontronik_can_gw.desk.recordings.inputs import open_input
+    from kontronik_can_gw.desk.report.analysis import Analysis
+    from kontronik_can_gw.desk.report.page import render
     from kontronik_can_gw.errors import RunError, UserError
-    from kontronik_can_gw.offline.inputs import open_input
-    from kontronik_can_gw.offline.report.analysis import Analysis
-    from kontronik_can_gw.offline.report.page import render
 
     if args.start is not None and args.end is not None and args.end <= args.start:
         raise UserError(f"--to {args.end:g}: must be greater than --from {args.start:g}")

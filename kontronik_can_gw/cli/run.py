@@ -17,7 +17,7 @@ from kontronik_can_gw.cli.common import (
     stopping_on_signals,
 )
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.esc.telemetry import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.loop import Loop

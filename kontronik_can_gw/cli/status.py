@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
-from kontronik_can_gw.config import load
+from kontronik_can_gw.config.keys import load
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.printable import printable, printable_json
-from kontronik_can_gw.protocol.states import OperatingError, SelfTestError
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS, pid_namespace, start_ticks
-from kontronik_can_gw.telemetry import MS, SECOND
 
 if TYPE_CHECKING:
     from rich.text import Text

@@ -16,13 +16,14 @@ from pathlib import Path
 from posixpath import normpath
 from typing import Any, TypeVar, cast
 
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.dbc_output import send_types, units
-from kontronik_can_gw.dbc_output.layout import DbcSettings, normalize
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.dbc import send_types
+from kontronik_can_gw.dbc.layout import DbcSettings, normalize
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.protocol.states import Device
-from kontronik_can_gw.sources import sources
-from kontronik_can_gw.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.values import sources
+from kontronik_can_gw.signals import units
 
 T = TypeVar("T")
 SHIPPED = "shipped"
@@ -408,7 +409,7 @@ For a year each is ignored with a warning: a gateway must not fall silent after 
 
 def shipped(name: str) -> Path:
     """A file that comes with the package: inside it when installed, beside it in a checkout."""
-    package = Path(__file__).parent
+    package = Path(__file__).parent.parent
     installed = package / "shipped" / name
     return installed if installed.exists() else package.parent / name
 

@@ -9,21 +9,21 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cia301.check import check_eds
-from kontronik_can_gw.cia301.eds import MAX_BYTES, Eds, without
-from kontronik_can_gw.cia301.eds import load as eds_of
-from kontronik_can_gw.cia301.node import NodeSettings
-from kontronik_can_gw.cia301.nodes import CanopenSetup, Nodes
-from kontronik_can_gw.cia301.storage import Stored, decode
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.config import Config, shipped
-from kontronik_can_gw.dbc_output.layout import Layout, classic_bits
-from kontronik_can_gw.dbc_output.prepare import WARN_LOAD
+from kontronik_can_gw.canopen.check import check_eds
+from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds, without
+from kontronik_can_gw.canopen.eds import load as eds_of
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
+from kontronik_can_gw.canopen.storage import Stored, decode
+from kontronik_can_gw.config.keys import Config, shipped
+from kontronik_can_gw.dbc.layout import Layout, classic_bits
+from kontronik_can_gw.dbc.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
 from kontronik_can_gw.runtime.store import ParameterStore, parameter_file
-from kontronik_can_gw.telemetry import SECOND, EscSettings
 
 
 @dataclass

@@ -6,7 +6,7 @@ Long endings say it by themselves; short ones only as a whole word, because they
 import re
 from enum import Enum
 
-from kontronik_can_gw.dbc_output.names import normalize
+from kontronik_can_gw.dbc.names import normalize
 
 
 class Kind(Enum):

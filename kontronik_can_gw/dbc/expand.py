@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from copy import copy, deepcopy
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc_output.layout import Binder, is_one_esc_layout
-from kontronik_can_gw.dbc_output.writer import dbc_text, frame_id
+from kontronik_can_gw.dbc.layout import Binder, is_one_esc_layout
+from kontronik_can_gw.dbc.writer import dbc_text, frame_id
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.sources import Group
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import Group
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message

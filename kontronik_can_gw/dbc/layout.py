@@ -16,14 +16,15 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from kontronik_can_gw.dbc_output import counters, send_types, units
-from kontronik_can_gw.dbc_output.bounds import MAX_BYTES, check_bounds, check_size
-from kontronik_can_gw.dbc_output.names import normalize as normalize
-from kontronik_can_gw.dbc_output.send_types import SendType as SendType
+from kontronik_can_gw.dbc import counters, send_types
+from kontronik_can_gw.dbc.bounds import MAX_BYTES, check_bounds, check_size
+from kontronik_can_gw.dbc.names import normalize as normalize
+from kontronik_can_gw.dbc.send_types import SendType as SendType
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.values import Group, Source, sources
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.sources import Group, Source, sources
-from kontronik_can_gw.telemetry import MS, EscSettings
+from kontronik_can_gw.signals import units
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal

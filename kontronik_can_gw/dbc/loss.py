@@ -3,8 +3,8 @@
 import math
 import struct
 
-from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, SignalPlan
-from kontronik_can_gw.sources import Group
+from kontronik_can_gw.dbc.layout import Layout, MessagePlan, SignalPlan
+from kontronik_can_gw.esc.values import Group
 
 _OF_LINK = frozenset({"link_state", "data_age"})
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from enum import Flag
 
-from kontronik_can_gw.dbc_output.names import normalize
+from kontronik_can_gw.dbc.names import normalize
 
 
 class SendType(Flag):

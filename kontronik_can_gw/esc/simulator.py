@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import NamedTuple
 
-from kontronik_can_gw.protocol.codec import Layout, encode
-from kontronik_can_gw.protocol.fields import Data, InfoData, LiveData, device_and_variant, rows
-from kontronik_can_gw.protocol.states import Device, OperatingError, OperatingState, SelfTestError, peak_current_of
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, device_and_variant, rows
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, OperatingState, SelfTestError, peak_current_of
 
 BYTE_NS = 11 * 1_000_000_000 // 115_200
 """Wire time of a byte: start, 8 data, parity, stop."""

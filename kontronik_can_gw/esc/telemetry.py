@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
 
-from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.deframer import Counters, Deframer, Frame
-from kontronik_can_gw.protocol.fields import InfoData, LiveData
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.kontronik.states import Device
 
 MS = 1_000_000
 SECOND = 1000 * MS

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from fractions import Fraction
 
-from kontronik_can_gw.protocol.fields import DataType, InfoData, LiveData, rows
-from kontronik_can_gw.protocol.states import Device, ErrorBit, OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.telemetry import MS, MW_NS_PER_WH, SECOND, EscSettings, LinkState
+from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, rows
+from kontronik_can_gw.esc.kontronik.states import Device, ErrorBit, OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.telemetry import MS, MW_NS_PER_WH, SECOND, EscSettings, LinkState
 
 
 class Group(Enum):

@@ -8,11 +8,11 @@ import logging
 import select
 import time
 
-from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, fault_of, socketcan_error
-from kontronik_can_gw.sources import CanState
 
 RETRY_S = 0.5
 """Between two looks at an interface that does not work, and at whether one that works is still up."""

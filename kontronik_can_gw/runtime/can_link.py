@@ -7,21 +7,21 @@ import selectors
 import time
 from collections.abc import Callable, Sequence
 
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Conflict, Gateway
-from kontronik_can_gw.mailboxes import Mailboxes, Sent
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
-from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.fault_log import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.snapshot import CanFacts, name_in_words
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.transmit_queue import Mailboxes, Sent
 
 LONGEST_RETRY_NS = SECOND // 2
 BUSY_RETRY_NS = 2 * MS

@@ -17,14 +17,14 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.transmit_queue import Sent
 
 if TYPE_CHECKING:
     import can

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.kontronik.states import device_text
+from kontronik_can_gw.esc.telemetry import NS_PER_BYTE, SECOND, LinkState
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.states import device_text
-from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.fault_log import Conditions
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import (
@@ -23,7 +24,6 @@ from kontronik_can_gw.runtime.serial_port import (
     is_mini_uart,
 )
 from kontronik_can_gw.runtime.snapshot import PortFacts
-from kontronik_can_gw.telemetry import NS_PER_BYTE, SECOND, LinkState
 
 LONGEST_RETRY_NS = SECOND
 DIAGNOSIS_NS = 3 * SECOND

@@ -4,7 +4,7 @@ import logging
 import time
 from collections import deque
 
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.esc.telemetry import SECOND
 
 log = logging.getLogger("kontronik_can_gw")
 

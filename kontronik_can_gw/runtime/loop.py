@@ -13,15 +13,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from kontronik_can_gw.cia301.nmt import NmtState
-from kontronik_can_gw.cia301.storage import Stored, encode
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.nmt import NmtState
+from kontronik_can_gw.canopen.storage import Stored, encode
+from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.can_side import CanSide
-from kontronik_can_gw.runtime.conditions import Conditions
-from kontronik_can_gw.runtime.esc_input import EscInput
+from kontronik_can_gw.runtime.can_link import CanSide
+from kontronik_can_gw.runtime.esc_port import EscInput
+from kontronik_can_gw.runtime.fault_log import Conditions
 from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.serial_port import Identity
@@ -29,7 +30,6 @@ from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, name_in_
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.runtime.systemd import Notifier
-from kontronik_can_gw.telemetry import MS, SECOND
 
 log = logging.getLogger("kontronik_can_gw")
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from kontronik_can_gw.telemetry import MS
+from kontronik_can_gw.esc.telemetry import MS
 
 Handler = Callable[[int, int], None]
 """Called with the time and what has happened (selectors.EVENT_READ, EVENT_WRITE)."""

@@ -13,12 +13,12 @@ import socket
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from kontronik_can_gw.cia301.nmt import NmtState
+from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.protocol.states import ErrorBit, OperatingError, SelfTestError
+from kontronik_can_gw.esc.kontronik.states import ErrorBit, OperatingError, SelfTestError
+from kontronik_can_gw.esc.telemetry import SECOND, LinkState
+from kontronik_can_gw.esc.values import CanState, GatewayState
 from kontronik_can_gw.runtime.snapshot import STALE_NS, name_in_words
-from kontronik_can_gw.sources import CanState, GatewayState
-from kontronik_can_gw.telemetry import SECOND, LinkState
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 CONNECTIONS = 8

@@ -1,14 +1,14 @@
-"""A gateway whose every call is handed to a recorder: played again in their order they give the same frames (offline/replay.py)."""
+"""A gateway whose every call is handed to a recorder: played again in their order they give the same frames (capture/replay.py)."""
 
 from collections.abc import Callable, Sequence
 
-from kontronik_can_gw.capture import COUNTERS, Kind, counters_data, frame_data, number_data
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import EscSettings
 
 Put = Callable[[int, int, int, bytes, int, int | None], None]
 """(time, kind, ESC's index, data, flags, time of arrival), as the fields of ``capture.Entry``."""

@@ -1,4 +1,4 @@
-"""Captures of a running gateway: a folder of .kcap files (capture.py), written by a thread.
+"""Captures of a running gateway: a folder of .kcap files (capture/format.py), written by a thread.
 
 What may touch what: ``put``, ``note`` and ``reports`` are called by the loop's thread and never wait; only ``_work`` and
 what it calls touch the disk. Entries go from one to the other by a deque with a bound: what finds no room is counted, and the count is
@@ -18,12 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.capture import SUFFIX, Kind, block, data_payload, json_payload, number_data
+from kontronik_can_gw.capture.format import SUFFIX, Kind, block, data_payload, json_payload, number_data
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.kontronik.states import device_text
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.states import device_text
 from kontronik_can_gw.runtime.threads import start_beside_the_loop
-from kontronik_can_gw.telemetry import MS, SECOND
 
 CAPACITY = 50_000
 """Entries that may wait to be written: about two minutes of one ESC, 15 seconds of eight."""

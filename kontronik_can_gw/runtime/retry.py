@@ -1,6 +1,6 @@
 """When to try again what failed: soon at first, then more and more seldom, up to a bound, for ever."""
 
-from kontronik_can_gw.telemetry import MS
+from kontronik_can_gw.esc.telemetry import MS
 
 FIRST_NS = 100 * MS
 

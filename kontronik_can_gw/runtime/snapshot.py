@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.states import (
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.esc.kontronik.states import (
     ErrorBit,
     OperatingError,
     SelfTestError,
@@ -27,8 +26,9 @@ from kontronik_can_gw.protocol.states import (
     peak_current_of,
     state_text,
 )
-from kontronik_can_gw.sources import GatewayStatus, Group, Source, sources
-from kontronik_can_gw.telemetry import INFO_TIMEOUT_NS, SECOND, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, SECOND, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.values import GatewayStatus, Group, Source, sources
+from kontronik_can_gw.gateway import Gateway
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import RecorderFacts

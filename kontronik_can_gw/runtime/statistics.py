@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.snapshot import STALE_NS, Document, with_rates
 from kontronik_can_gw.runtime.threads import start_beside_the_loop
-from kontronik_can_gw.telemetry import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.prometheus import MetricsServer

@@ -16,7 +16,7 @@ import threading
 from collections import deque
 from pathlib import Path
 
-from kontronik_can_gw.cia301.storage import Stored, decode
+from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.locks import Taken, lock_file
 from kontronik_can_gw.runtime.threads import start_beside_the_loop

@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from kontronik_can_gw.dbc_output.layout import Layout, MessagePlan, Role, SignalPlan
-from kontronik_can_gw.dbc_output.packer import take
+from kontronik_can_gw.dbc.layout import Layout, MessagePlan, Role, SignalPlan
+from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.sources import Group
+from kontronik_can_gw.signals.packer import take
 
 Value = int | float | str | None
 Chunk = tuple[int, list[Value]]
@@ -31,7 +31,7 @@ class Column:
     key: int
     """CAN id of the message, with ``EXTENDED`` for 29 bits."""
     source: str
-    """What the signal is bound to: a name of sources.py."""
+    """What the signal is bound to: a name of values.py."""
     esc: int | None
     """Index of the ESC; None for the gateway's own."""
     texts: tuple[tuple[int, str], ...] = ()

@@ -11,10 +11,10 @@ import re
 import time
 from pathlib import Path
 
-from kontronik_can_gw.offline.convert import TABLES, Conversion, LogConversion, Output, TableConversion
-from kontronik_can_gw.offline.inputs import DumpInput
-from kontronik_can_gw.offline.layouts import layout_of_dbc
-from kontronik_can_gw.offline.tables import Choice
+from kontronik_can_gw.desk.recordings.convert import TABLES, Conversion, LogConversion, Output, TableConversion
+from kontronik_can_gw.desk.recordings.inputs import DumpInput
+from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
+from kontronik_can_gw.desk.recordings.tables import Choice
 
 
 def peak_mb() -> float:

@@ -35,8 +35,8 @@ PERIOD_NS = 10_000_000
 
 def frames(count: int) -> list[bytes]:
     """Live frames with values that go up and down."""
-    from kontronik_can_gw.protocol.codec import Layout, encode
-    from kontronik_can_gw.protocol.fields import LiveData
+    from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+    from kontronik_can_gw.esc.kontronik.fields import LiveData
 
     chance = random.Random(1)
     found = []

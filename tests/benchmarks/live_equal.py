@@ -6,10 +6,10 @@ import tempfile
 from bench_programs import running
 from registry import Benchmark, Context, Figure, NotEqual
 
-from kontronik_can_gw.protocol.codec import Layout, encode
-from kontronik_can_gw.protocol.deframer import Deframer
-from kontronik_can_gw.protocol.fields import InfoData, LiveData, device_and_variant, rows
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.deframer import Deframer
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant, rows
+from kontronik_can_gw.esc.kontronik.states import Device
 
 
 def random_live(chance: random.Random) -> LiveData:

@@ -57,7 +57,7 @@ def main(arguments: list[str]) -> int:
         obvious.main(rest)
         return 0
     from kontronik_can_gw.cli import main as run
-    from kontronik_can_gw.dbc_output import prepare
+    from kontronik_can_gw.dbc import prepare
     from kontronik_can_gw.runtime import locks
 
     prepare.REFUSE_LOAD = math.inf  # 64 ESCs need several buses' worth

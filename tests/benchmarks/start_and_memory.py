@@ -13,8 +13,8 @@ from pathlib import Path
 from bench_programs import STANDIN, config_text, end, free_port, median, running, start
 from registry import ROOT, Benchmark, Context, Figure, judged
 
+from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.offline.pty import PtyEsc
 
 SHIPPED = ROOT / "dbc" / "kontronik_esc.dbc"
 CANOPEN = '[canopen]\nenabled = true\nnode_id = 1\nstore = "{folder}/store"\n'

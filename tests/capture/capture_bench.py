@@ -3,21 +3,21 @@
 import random
 from dataclasses import dataclass, field
 
-from kontronik_can_gw.capture import Entry
-from kontronik_can_gw.capture_setup import CaptureSetup
-from kontronik_can_gw.cia301.nodes import CanopenSetup
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.capture.format import Entry
+from kontronik_can_gw.capture.replay import TimedFrame, in_order
+from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.cli.recording import setup_of
-from kontronik_can_gw.config import parse
-from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.esc.kontronik import Device
+from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.mailboxes import Mailboxes
-from kontronik_can_gw.offline.replay import TimedFrame, in_order
-from kontronik_can_gw.protocol import Device
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
-from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.transmit_queue import Mailboxes
 
 START = 5_000 * SECOND + 123
 

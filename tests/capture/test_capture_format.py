@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kontronik_can_gw.capture import (
+from kontronik_can_gw.capture.format import (
     MAGIC,
     Block,
     Damage,

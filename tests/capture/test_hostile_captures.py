@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw import capture
-from kontronik_can_gw.capture import MAGIC, Block, Entry, Kind, Scanner, block, data_payload, json_payload
+from kontronik_can_gw.capture import format as capture
+from kontronik_can_gw.capture.format import MAGIC, Block, Entry, Kind, Scanner, block, data_payload, json_payload
+from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.offline.inputs import CaptureInput, open_input
 
 VALUES: tuple[Any, ...] = (
     *(None, 0, -1, 10**30, 1.5, 1e308, float("inf"), float("nan"), "", "x", "1/0", "1e9999", "9" * 5000),

@@ -11,17 +11,17 @@ import cantools.database
 import pytest
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw.capture import Entry, block, data_payload, json_payload
-from kontronik_can_gw.capture_setup import CaptureSetup
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.dbc_output.unpacker import SignalReader
+from kontronik_can_gw.capture.format import Entry, block, data_payload, json_payload
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.decode import Decoder
+from kontronik_can_gw.desk.recordings.inputs import CanLogInput, CaptureInput, DumpInput, Input, open_input
+from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.offline.decode import Decoder
-from kontronik_can_gw.offline.inputs import CanLogInput, CaptureInput, DumpInput, Input, open_input
-from kontronik_can_gw.offline.layouts import layout_of_dbc
-from kontronik_can_gw.protocol import Device
-from kontronik_can_gw.simulator import Dropout, EscOptions, Faults, SimulatedEsc
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.esc.kontronik import Device
+from kontronik_can_gw.esc.simulator import Dropout, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.signals.unpacker import SignalReader
 
 _LOADED = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
 assert isinstance(_LOADED, cantools.database.can.Database)

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.offline import pty
-from kontronik_can_gw.offline.inputs import open_input
-from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.desk import pty
+from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 

@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw.capture import Entry, Kind, read_number
+from kontronik_can_gw.capture.format import Entry, Kind, read_number
+from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.offline.inputs import CaptureInput, open_input
-from kontronik_can_gw.protocol import InfoData
+from kontronik_can_gw.esc.kontronik import InfoData
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime import recorder
 from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder, RecordSettings, is_ours
-from kontronik_can_gw.telemetry import SECOND
 
 HEADER = made(1)[0].header()
 

@@ -12,8 +12,8 @@ from capture_bench import START, Bench, made
 from command_line import refused, run, written
 from test_inputs import capture, plain_run
 
-from kontronik_can_gw.offline.pacing import Pace
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.desk.recordings.pacing import Pace
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 

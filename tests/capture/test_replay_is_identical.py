@@ -3,7 +3,7 @@
 import pytest
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw.capture import (
+from kontronik_can_gw.capture.format import (
     Block,
     Entry,
     Kind,
@@ -14,9 +14,9 @@ from kontronik_can_gw.capture import (
     read_entries,
     read_json,
 )
-from kontronik_can_gw.capture_setup import CaptureSetup
-from kontronik_can_gw.offline.marking import Marker
-from kontronik_can_gw.offline.replay import Replay, TimedFrame
+from kontronik_can_gw.capture.replay import Replay, TimedFrame
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.desk.recordings.marking import Marker
 
 
 def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:

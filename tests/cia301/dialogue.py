@@ -27,19 +27,19 @@ from typing import Any
 from script import MS, bytes_of, hexadecimal, ms
 from sdo_client import Refused, download, upload
 
-from kontronik_can_gw.cia301.eds import Eds, load, without
-from kontronik_can_gw.cia301.node import Node, NodeSettings
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia301.storage import Stored
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.canopen.eds import Eds, load, without
+from kontronik_can_gw.canopen.node import Node, NodeSettings
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.esc.kontronik import codec
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol import codec
-from kontronik_can_gw.protocol.fields import InfoData, LiveData
-from kontronik_can_gw.protocol.states import Device
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import EscSettings
 
 EMPTY = Layout("", "", ())
 OFF = 0xC0000000

@@ -2,7 +2,7 @@
 
 import re
 
-from kontronik_can_gw.config import shipped
+from kontronik_can_gw.config.keys import shipped
 
 SHIPPED = shipped("eds/kontronik_esc.eds").read_bytes().decode("ascii")
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 from script import MS, Heard, bytes_of, hexadecimal, ms
 
-from kontronik_can_gw.cia301.abort import Abort, SdoAbort
-from kontronik_can_gw.cia301.sdo import SdoServer
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.sdo import SdoServer
 
 
 @dataclass

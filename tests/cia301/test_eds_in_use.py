@@ -6,15 +6,15 @@ import pytest
 from dialogue import Bench, changed, info, live, shipped_eds
 from eds_text import SHIPPED, with_key
 
-from kontronik_can_gw.cia301.check import check_eds, without_objects
-from kontronik_can_gw.cia301.dictionary import _IF_ABSENT, key
-from kontronik_can_gw.cia301.eds import load, without
-from kontronik_can_gw.cia301.node import NodeSettings
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia301.storage import Stored
-from kontronik_can_gw.config import shipped
+from kontronik_can_gw.canopen.check import check_eds, without_objects
+from kontronik_can_gw.canopen.dictionary import _IF_ABSENT, key
+from kontronik_can_gw.canopen.eds import load, without
+from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 
 DATA = shipped("eds/kontronik_esc.eds").read_bytes()
 PDOS = frozenset(range(0x1800, 0x1C00))

@@ -9,7 +9,7 @@ from pathlib import Path
 from dialogue import NO_HEARTBEAT, Bench, live
 from wire import Wire
 
-from kontronik_can_gw.config import shipped
+from kontronik_can_gw.config.keys import shipped
 
 EDS = shipped("eds/kontronik_esc.eds")
 BUS = """

@@ -7,12 +7,12 @@ from dialogue import NO_HEARTBEAT, OFF, QUIET, SPARE, Bench, default, live, ship
 from eds_text import SHIPPED, variable, with_object
 from script import MS
 
-from kontronik_can_gw.cia301.eds import load
-from kontronik_can_gw.cia301.pdo import message_plan
-from kontronik_can_gw.cia301.storage import Stored, encode
+from kontronik_can_gw.canopen.eds import load
+from kontronik_can_gw.canopen.pdo import message_plan
+from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli.common import Loaded, assemble
-from kontronik_can_gw.config import parse
-from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number
 
 VALUE, TAKEN = 0x06090030, 0x06040043

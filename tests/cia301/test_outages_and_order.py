@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
-from kontronik_can_gw.cia301.bindings import GATEWAY, LINK
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia301.storage import Stored
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.objects import GATEWAY, LINK
+from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Mailboxes, Sent
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.transmit_queue import Mailboxes, Sent
 
 LINK_STATUS = LINK << 16 | 0x0108
 CRC_ERRORS = LINK << 16 | 0x0720

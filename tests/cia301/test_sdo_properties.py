@@ -18,7 +18,7 @@ from sdo_bench import Bench, Dictionary, usual_entries
 from sdo_client import Refused, answer_to, download, upload, uploaded
 from wire import Wire
 
-from kontronik_can_gw.cia301.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 
 # ---- a model
 

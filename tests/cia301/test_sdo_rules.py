@@ -2,7 +2,7 @@
 
 from sdo_bench import Bench, Dictionary, Entry
 
-from kontronik_can_gw.cia301.sdo import SdoServer
+from kontronik_can_gw.canopen.sdo import SdoServer
 
 WRITE_LATE = bytes.fromhex("2305200073617665")
 LATE_OK = bytes.fromhex("6005200000000000")

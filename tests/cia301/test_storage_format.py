@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.cia301.storage import Stored, decode, encode
+from kontronik_can_gw.canopen.storage import Stored, decode, encode
 
 SAMPLE = Stored(
     7,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from script import Heard, bytes_of, hexadecimal, ms
 
-from kontronik_can_gw.cia305.lss import LssSlave
+from kontronik_can_gw.canopen.lss import LssSlave
 
 Identity = tuple[int, int, int, int]
 ME: Identity = (0x01020304, 0x11121314, 0x00020001, 0xA1B2C3D4)

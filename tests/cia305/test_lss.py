@@ -12,7 +12,7 @@ from lss_bench import ME, UNCONFIGURED, Identity, Node, Talk
 from script import Dialogue, play_lines, read_dialogues
 from wire import Wire
 
-from kontronik_can_gw.cia305.lss import LssSlave
+from kontronik_can_gw.canopen.lss import LssSlave
 
 FILES = Path(__file__).parent.glob("dialogues/*.txt")
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lss_bench import Identity, Node
 
-from kontronik_can_gw.cia305.lss import LssSlave
+from kontronik_can_gw.canopen.lss import LssSlave
 
 SERVICES = (0x04, 0x11, 0x13, 0x15, 0x17, *range(0x40, 0x45), *range(0x46, 0x52), *range(0x5A, 0x5F))
 

@@ -5,15 +5,15 @@ from pathlib import Path
 
 from capture_bench import START, Bench
 
-from kontronik_can_gw.capture import block, data_payload, json_payload
+from kontronik_can_gw.capture.format import block, data_payload, json_payload
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
+from kontronik_can_gw.esc.simulator import FLIGHT, SECOND_NS, ErrorWindow, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.values import GatewayState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.protocol.states import OperatingError, SelfTestError
-from kontronik_can_gw.simulator import FLIGHT, SECOND_NS, ErrorWindow, EscOptions, Faults, SimulatedEsc
-from kontronik_can_gw.sources import GatewayState
 
 STEP_NS = 10_000_000
 START_S = 1_790_000_000

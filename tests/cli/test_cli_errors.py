@@ -15,8 +15,8 @@ import pytest
 from command_line import refused, run
 
 from kontronik_can_gw.cli.arguments import REMOVED_OPTIONS
-from kontronik_can_gw.config import REMOVED_KEYS, load, schema
-from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.config.keys import REMOVED_KEYS, load, schema
+from kontronik_can_gw.desk.pty import PtyEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 Done = subprocess.CompletedProcess[str]

@@ -10,12 +10,12 @@ import canopen
 import pytest
 from command_line import refused, run
 
-from kontronik_can_gw.cia301.bindings import bindings
-from kontronik_can_gw.cia301.eds import without
-from kontronik_can_gw.cia301.storage import Stored, encode
-from kontronik_can_gw.cli.node_setup import shipped_canopen
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.canopen.eds import without
+from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.canopen.storage import Stored, encode
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.esc.telemetry import EscSettings
 
 EDS = shipped("eds/kontronik_esc.eds")
 Key = tuple[int, int]

@@ -15,10 +15,10 @@ from kontronik_can_gw.cli import main, say, show
 from kontronik_can_gw.cli.common import write_output
 from kontronik_can_gw.cli.doctor import _show
 from kontronik_can_gw.cli.status import Piece, _rich
-from kontronik_can_gw.config import shipped
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.doctor.findings import Findings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
-from kontronik_can_gw.runtime.doctor.findings import Findings
 from kontronik_can_gw.runtime.log_writer import BackgroundHandler
 
 EVIL = "a\x1b]0;x\x07\x9b31m\u202eb\u2066\x7f\r\nINFO fake"

@@ -21,16 +21,16 @@ import pytest
 from cantools.database.can import Database
 
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import CanConfig, parse
+from kontronik_can_gw.config.keys import CanConfig, parse
+from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Sent
-from kontronik_can_gw.offline.pty import PtyEsc
-from kontronik_can_gw.protocol import Layout, LiveData, encode
 from kontronik_can_gw.runtime import can_port
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.transmit_queue import Sent
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 LIVE = LiveData(electrical_speed=12_345, battery_voltage=2442, battery_current=-17, operating_state=21)

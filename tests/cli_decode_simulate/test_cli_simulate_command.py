@@ -9,8 +9,8 @@ from pathlib import Path
 from command_line import refused
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.protocol import Deframer, Device, Frame, InfoData, Layout, LiveData, OperatingError
-from kontronik_can_gw.simulator import SimulatedEsc
+from kontronik_can_gw.esc.kontronik import Deframer, Device, Frame, InfoData, Layout, LiveData, OperatingError
+from kontronik_can_gw.esc.simulator import SimulatedEsc
 
 COMMAND = [sys.executable, "-m", "kontronik_can_gw", "simulate"]
 

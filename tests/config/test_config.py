@@ -15,10 +15,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import kontronik_can_gw
-from kontronik_can_gw.config import REMOVED_KEYS, Config, as_toml, load, mqtt_with, parse, schema, shipped
+from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, as_toml, load, mqtt_with, parse, schema, shipped
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.protocol.states import Device
-from kontronik_can_gw.telemetry import MS
+from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.telemetry import MS
 
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
 DEFAULTS: dict[str, dict[str, object]] = {

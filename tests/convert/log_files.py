@@ -5,8 +5,8 @@ from pathlib import Path
 
 import can
 
+from kontronik_can_gw.desk.recordings.can_logs import CanLog, CanLogWriter
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.offline.can_logs import CanLog, CanLogWriter
 
 Item = tuple[int, CanFrame, bool]
 

@@ -10,10 +10,10 @@ from capture_bench import Bench, made
 from simulated_bus import capture_file
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.protocol import Device
-from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.esc.kontronik import Device
+from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.telemetry import SECOND
 
 WALL_NS = 1_700_000_000 * SECOND + 250_000_000
 

@@ -8,9 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from log_files import READERS, SUFFIX, Item, at_wall, read_by_library, read_log, some_frames, write_log
 
+from kontronik_can_gw.desk.recordings.can_logs import CanLog, CanLogWriter, log_format
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.offline.can_logs import CanLog, CanLogWriter, log_format
 
 FORMATS = sorted(READERS)
 WITH_FD = sorted(set(FORMATS) - {"trc"})

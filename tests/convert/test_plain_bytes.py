@@ -11,9 +11,9 @@ from protocol.sheet import LIVE_STRUCT
 from protocol.streams import random_stream
 from recordings import convert, dump_bytes
 
-from kontronik_can_gw.offline import inputs
-from kontronik_can_gw.offline.inputs import DumpInput
-from kontronik_can_gw.offline.layouts import layout_of_dbc
+from kontronik_can_gw.desk.recordings import inputs
+from kontronik_can_gw.desk.recordings.inputs import DumpInput
+from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 
 DBC = """VERSION ""
 BS_:

@@ -13,7 +13,7 @@ from recordings import candump_lines, capture_bytes, convert, dump_bytes, write_
 from simulated_bus import flight, layout_of
 from simulated_bus import write_log as write_bus_log
 
-from kontronik_can_gw.offline.can_logs import NAMES, CanLog
+from kontronik_can_gw.desk.recordings.can_logs import NAMES, CanLog
 
 
 def program(command: str, data: bytes | None = None, cwd: Path | None = None) -> "subprocess.CompletedProcess[bytes]":

@@ -26,11 +26,11 @@ from recordings import (
     write_candump,
 )
 
-from kontronik_can_gw.dbc_output.unpacker import Column
-from kontronik_can_gw.offline.inputs import Input, open_input
-from kontronik_can_gw.offline.tables import Field, Row, Table, open_table
-from kontronik_can_gw.offline.tables.fields import Kind, fields_of
-from kontronik_can_gw.offline.tables.rows import thinned
+from kontronik_can_gw.desk.recordings.inputs import Input, open_input
+from kontronik_can_gw.desk.recordings.tables import Field, Row, Table, open_table
+from kontronik_can_gw.desk.recordings.tables.fields import Kind, fields_of
+from kontronik_can_gw.desk.recordings.tables.rows import thinned
+from kontronik_can_gw.signals.unpacker import Column
 
 Cells = list[dict[str, Any]]
 """Of each row the values by signal name, None where not available; Time in seconds, Utc as text to the microsecond."""

@@ -13,25 +13,25 @@ from eds_text import SHIPPED as EDS_TEXT
 from eds_text import variable, with_object
 from packer_oracle import pascal, read
 
-from kontronik_can_gw import canopen_dbc
-from kontronik_can_gw.cia301 import eds as reader
-from kontronik_can_gw.cia301.eds import Eds
-from kontronik_can_gw.cia301.emergency import GatewayError
-from kontronik_can_gw.cia301.node import NodeSettings
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia301.storage import Stored, encode
+from kontronik_can_gw.canopen import dbc as canopen_dbc
+from kontronik_can_gw.canopen import eds as reader
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.emergency import GatewayError
+from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.dbc_output.expand import esc_prefix
-from kontronik_can_gw.dbc_output.layout import Layout
-from kontronik_can_gw.dbc_output.writer import dbc_text
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.dbc.expand import esc_prefix
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
+from kontronik_can_gw.esc.simulator import BYTE_NS, Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
-from kontronik_can_gw.protocol.states import Device, OperatingError
-from kontronik_can_gw.simulator import BYTE_NS, Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, EscTelemetry
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_canopen.dbc"
 EDS = reader.load(EDS_TEXT.encode(), "kontronik_esc.eds")

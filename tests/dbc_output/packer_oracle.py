@@ -17,10 +17,10 @@ import cantools.database
 from cantools.database.can import Database
 from protocol import sheet
 
-from kontronik_can_gw.protocol.codec import Layout, encode
-from kontronik_can_gw.protocol.fields import InfoData, LiveData
-from kontronik_can_gw.sources import CanState, GatewayState, GatewayStatus
-from kontronik_can_gw.telemetry import MS, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
+from kontronik_can_gw.esc.values import CanState, GatewayState, GatewayStatus
 
 # --- bits, counted one by one -------------------------------------------------------------------------------------------
 

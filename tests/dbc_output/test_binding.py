@@ -12,17 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from packer_oracle import STATES, Msg, Sig, dbc_text, get, pascal, read
 
-from kontronik_can_gw.dbc_output import e2e
-from kontronik_can_gw.dbc_output.layout import Binder, DbcSettings, Layout, Role
-from kontronik_can_gw.dbc_output.packer import compile_pack
-from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.dbc.layout import Binder, DbcSettings, Layout, Role
+from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.values import sources
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.codec import Layout as WireLayout
-from kontronik_can_gw.protocol.codec import encode
-from kontronik_can_gw.protocol.fields import InfoData, LiveData
-from kontronik_can_gw.sources import sources
-from kontronik_can_gw.telemetry import MS, EscSettings
+from kontronik_can_gw.signals import e2e
+from kontronik_can_gw.signals.packer import compile_pack
 
 LIVE = LiveData(
     electrical_speed=70_000,

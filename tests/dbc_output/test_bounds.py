@@ -5,11 +5,11 @@ from pathlib import Path
 import cantools.database
 import pytest
 
-from kontronik_can_gw.dbc_output.bounds import MAX_BYTES, check_size
-from kontronik_can_gw.dbc_output.layout import DbcSettings, load_database, parse_database
-from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.dbc.bounds import MAX_BYTES, check_size
+from kontronik_can_gw.dbc.layout import DbcSettings, load_database, parse_database
+from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
 SIGNAL = 'SG_ s : 0|8@1+ (1,0) [0|0] "" A\n'

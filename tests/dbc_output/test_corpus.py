@@ -14,17 +14,17 @@ import opendbc  # type: ignore[import-untyped]
 import pytest
 from cantools.database.can import Database, Message, Signal
 
-from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, load_database
-from kontronik_can_gw.dbc_output.packer import compile_pack
-from kontronik_can_gw.dbc_output.prepare import prepare
-from kontronik_can_gw.dbc_output.units import conversion, says_nothing
+from kontronik_can_gw.dbc.layout import DbcSettings, Layout, load_database
+from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.values import sources
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.codec import Layout as WireLayout
-from kontronik_can_gw.protocol.codec import encode
-from kontronik_can_gw.protocol.fields import LiveData
-from kontronik_can_gw.sources import sources
-from kontronik_can_gw.telemetry import MS, EscSettings
+from kontronik_can_gw.signals.packer import compile_pack
+from kontronik_can_gw.signals.units import conversion, says_nothing
 
 FOLDER = Path(opendbc.__file__).parent / "dbc"
 FILES = sorted(FOLDER.rglob("*.dbc"))

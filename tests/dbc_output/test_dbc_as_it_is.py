@@ -7,23 +7,23 @@ from typing import Any
 
 import pytest
 
-from kontronik_can_gw.capture_setup import CaptureSetup
+from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check
-from kontronik_can_gw.config import parse
-from kontronik_can_gw.dbc_output import counters
-from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, Role, parse_database
-from kontronik_can_gw.dbc_output.loss import unreported
-from kontronik_can_gw.dbc_output.packer import compile_pack
-from kontronik_can_gw.dbc_output.prepare import prepare
-from kontronik_can_gw.dbc_output.send_types import NAMES, SendType
-from kontronik_can_gw.dbc_output.units import conversion
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.dbc import counters
+from kontronik_can_gw.dbc.layout import DbcSettings, Layout, Role, parse_database
+from kontronik_can_gw.dbc.loss import unreported
+from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.send_types import NAMES, SendType
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.values import sources
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.codec import Layout as WireLayout
-from kontronik_can_gw.protocol.codec import encode
-from kontronik_can_gw.protocol.fields import LiveData
-from kontronik_can_gw.sources import sources
-from kontronik_can_gw.telemetry import MS, EscSettings
+from kontronik_can_gw.signals.packer import compile_pack
+from kontronik_can_gw.signals.units import conversion
 
 HEAD = (
     'VERSION ""\nNS_ :\n\tNS_DESC_\n\tVAL_\n\tVAL_TABLE_\n\tBA_DEF_\n\tSIG_VALTYPE_\n\nBS_:\n\nBU_: Gateway Other\n\n'

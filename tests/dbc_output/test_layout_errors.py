@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, load_database
-from kontronik_can_gw.dbc_output.prepare import check_load, prepare
+from kontronik_can_gw.dbc.layout import DbcSettings, Layout, load_database
+from kontronik_can_gw.dbc.prepare import check_load, prepare
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 VOLTAGE = Sig("BatteryVoltage", 0, 16, factor="0.01", unit="V")

@@ -15,16 +15,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get, read
 
-from kontronik_can_gw.dbc_output.layout import DbcSettings, load_database
-from kontronik_can_gw.dbc_output.prepare import prepare
-from kontronik_can_gw.dbc_output.schedule import phases
+from kontronik_can_gw.dbc.layout import DbcSettings, load_database
+from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.schedule import phases
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
+from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.codec import Layout as WireLayout
-from kontronik_can_gw.protocol.codec import encode
-from kontronik_can_gw.protocol.fields import InfoData, LiveData, device_and_variant
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)

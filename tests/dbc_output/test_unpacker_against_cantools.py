@@ -10,13 +10,13 @@ import pytest
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, bit_places, dbc_text, get, put, read
 from test_packer_against_cantools import ESCS, MESSAGES
 
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, compile_layout
-from kontronik_can_gw.dbc_output.unpacker import SignalReader
-from kontronik_can_gw.dbc_output.view import View
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.dbc.layout import DbcSettings, Layout, compile_layout
+from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.offline.layouts import layout_of_dbc
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.signals.unpacker import SignalReader
 
 
 def wanted(plan: Any, raw: Any, bits: int) -> Any:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from command_line import run
 
-from kontronik_can_gw.config import shipped
+from kontronik_can_gw.config.keys import shipped
 
 DBC = shipped("dbc/kontronik_esc.dbc")
 EDS = shipped("eds/kontronik_esc.eds")

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 from kontronik_can_gw.cli import COMMANDS
-from kontronik_can_gw.offline.describe.document import Code, Document, Section, Table
-from kontronik_can_gw.offline.describe.markdown import markdown
+from kontronik_can_gw.desk.describe.document import Code, Document, Section, Table
+from kontronik_can_gw.desk.describe.markdown import markdown
 
 Rows = list[list[str]]
 

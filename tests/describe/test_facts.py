@@ -12,12 +12,12 @@ from canopen.objectdictionary import ODVariable
 from command_line import run
 from described import DBC, EDS, TWO_ESCS, configuration, described
 
-from kontronik_can_gw.cia301.emergency import GatewayError
-from kontronik_can_gw.offline.describe.facts import DATA_TYPES
-from kontronik_can_gw.offline.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
-from kontronik_can_gw.protocol.states import OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.sources import CanState, GatewayState, Group, sources
-from kontronik_can_gw.telemetry import EscSettings, LinkState
+from kontronik_can_gw.canopen.emergency import GatewayError
+from kontronik_can_gw.desk.describe.facts import DATA_TYPES
+from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
+from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
+from kontronik_can_gw.esc.values import CanState, GatewayState, Group, sources
 
 Facts = dict[str, Any]
 

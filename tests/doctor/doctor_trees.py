@@ -5,8 +5,8 @@ import stat
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.runtime.doctor.findings import Finding, Severity
-from kontronik_can_gw.runtime.doctor.system import FileSystem, System, User
+from kontronik_can_gw.desk.doctor.findings import Finding, Severity
+from kontronik_can_gw.desk.doctor.system import FileSystem, System, User
 
 DIALOUT = 20
 ME = User("anna", 1000, frozenset({1000, DIALOUT}))

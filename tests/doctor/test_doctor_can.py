@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from doctor_trees import Tree, grave, only
 
-from kontronik_can_gw.config import CanConfig
-from kontronik_can_gw.runtime.doctor.can_interface import check_can
-from kontronik_can_gw.runtime.doctor.findings import Severity
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.desk.doctor.can_interface import check_can
+from kontronik_can_gw.desk.doctor.findings import Severity
 from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER, file_name, messages_lock, node_lock
 
 OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR

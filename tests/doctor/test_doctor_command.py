@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from command_line import run, written
 
-from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.desk.pty import PtyEsc
 
 
 @pytest.fixture

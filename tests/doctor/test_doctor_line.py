@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.runtime.doctor import line
-from kontronik_can_gw.runtime.doctor.line import look
+from kontronik_can_gw.desk.doctor import line
+from kontronik_can_gw.desk.doctor.line import look
 
 PACKAGE = Path(line.__file__).parent
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from doctor_trees import Tree, grave, only
 
-from kontronik_can_gw.runtime.doctor.findings import Finding, Findings, Severity
-from kontronik_can_gw.runtime.doctor.folders import check_folder, check_readable
-from kontronik_can_gw.runtime.doctor.machine import check_machine
-from kontronik_can_gw.runtime.doctor.service import unit_of
-from kontronik_can_gw.runtime.doctor.system import FileSystem, System
+from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity
+from kontronik_can_gw.desk.doctor.folders import check_folder, check_readable
+from kontronik_can_gw.desk.doctor.machine import check_machine
+from kontronik_can_gw.desk.doctor.service import unit_of
+from kontronik_can_gw.desk.doctor.system import FileSystem, System
 
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 STORE = "/var/lib/kontronik-can-gw"

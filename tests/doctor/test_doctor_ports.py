@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from doctor_trees import Tree, grave, only
 
-from kontronik_can_gw.runtime.doctor.findings import Finding, Severity
-from kontronik_can_gw.runtime.doctor.line import Line
-from kontronik_can_gw.runtime.doctor.serial_ports import check_port
-from kontronik_can_gw.runtime.doctor.service import unit_of
+from kontronik_can_gw.desk.doctor.findings import Finding, Severity
+from kontronik_can_gw.desk.doctor.line import Line
+from kontronik_can_gw.desk.doctor.serial_ports import check_port
+from kontronik_can_gw.desk.doctor.service import unit_of
 
 OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR
 BY_ID = "/dev/serial/by-id/usb-FTDI_A1234-port0"

@@ -5,7 +5,7 @@ from pathlib import Path
 import canopen.objectdictionary.eds
 import pytest
 
-from kontronik_can_gw.cia301 import eds as reader
+from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.errors import UserError
 
 SHIPPED = (Path(__file__).parents[2] / "eds" / "kontronik_esc.eds").read_text("ascii")

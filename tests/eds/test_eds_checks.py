@@ -13,11 +13,11 @@ from eds_text import SHIPPED, variable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.cia301 import eds as reader
-from kontronik_can_gw.cia301.check import check_eds
-from kontronik_can_gw.cia301.eds import Entry
+from kontronik_can_gw.canopen import eds as reader
+from kontronik_can_gw.canopen.check import check_eds
+from kontronik_can_gw.canopen.eds import Entry
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
 
 
 def with_object(content: str, index: int = 0x2200) -> str:
@@ -245,6 +245,6 @@ def test_a_dcf_is_not_taken_for_an_eds() -> None:
 
 
 def test_the_canopen_library_is_not_loaded_before_an_eds_is() -> None:
-    code = "import sys, kontronik_can_gw.cia301.eds; print('canopen' in sys.modules)"
+    code = "import sys, kontronik_can_gw.canopen.eds; print('canopen' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"

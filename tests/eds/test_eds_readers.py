@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from kontronik_can_gw.cia301 import eds as reader
-from kontronik_can_gw.cia301.eds import Eds, Entry
+from kontronik_can_gw.canopen import eds as reader
+from kontronik_can_gw.canopen.eds import Eds, Entry
 
 SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
 PDO_NAMES = [

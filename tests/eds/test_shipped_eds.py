@@ -12,10 +12,10 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from kontronik_can_gw.cia301 import eds as reader
-from kontronik_can_gw.cia301.eds import RECORD, VAR, Eds, Entry
-from kontronik_can_gw.config import EscConfig
-from kontronik_can_gw.protocol.fields import DataType, InfoData, LiveData, Row, rows
+from kontronik_can_gw.canopen import eds as reader
+from kontronik_can_gw.canopen.eds import RECORD, VAR, Eds, Entry
+from kontronik_can_gw.config.keys import EscConfig
+from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, Row, rows
 
 SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
 DATA = SHIPPED.read_bytes()

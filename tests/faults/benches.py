@@ -13,8 +13,8 @@ from harness import Bench, PtyPort
 from signals import Table, table_of_shipped
 from slcan_adapters import Bus
 
-from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.states import Device
 
 WITHOUT_OVERRIDE = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")
 """Root that file permissions hold for."""

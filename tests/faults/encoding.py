@@ -6,9 +6,9 @@ recognised. All values are inside the sheet's ranges and differ from the DBC's c
 
 from typing import NamedTuple
 
-from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.fields import InfoData, LiveData, device_and_variant
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
+from kontronik_can_gw.esc.kontronik.states import Device
 
 _MASK = 0xFFFFFFFF
 POLE_PAIRS = 7

@@ -13,8 +13,8 @@ from typing import Self
 
 from encoding import Identity, info, live
 
-from kontronik_can_gw.protocol.codec import encode
-from kontronik_can_gw.protocol.fields import InfoData, LiveData
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 
 SECOND = 1_000_000_000
 SLOW_WRITE_NS = 5_000_000

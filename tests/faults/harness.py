@@ -27,7 +27,7 @@ from fault_report import Fault, Report, Row
 from feeder import CURRENT, SPEED, FedEsc, Feeder
 from signals import Table, table_of_configuration
 
-from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.desk.pty import PtyEsc
 
 IN_FLIGHT_NS = 60 * MS
 """A frame that was handed over so shortly before a fault may be its victim."""

@@ -27,8 +27,8 @@ from qemu_machine import Monitor, can_up
 from qemu_ports import FarPort, UsbPort
 from signals import table_of
 
-from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.states import Device
 
 ESCS = 2
 SLACK_NS = 400 * MS

@@ -14,8 +14,8 @@ from encoding import Identity
 from fault_report import Fault, fault
 from harness import Bench, PtyPort, growth
 
-from kontronik_can_gw.protocol.codec import Layout, encode
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.states import Device
 
 LIMIT_S = 2.0
 LOST, PORT_ERROR = 4, 5

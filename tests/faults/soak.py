@@ -19,8 +19,8 @@ from encoding import Identity
 from fault_report import Fault, Report, in_order
 from harness import Bench, growth
 
-from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.states import Device
 
 NEW_PROCESS = ("missing at start", "kill -9", "SIGTERM", "frozen", "conf")
 """Faults that end the gateway: its memory could not be followed over them."""

@@ -9,8 +9,8 @@ from encoding import Identity, live, live_values, mix
 from feeder import CURRENT, SPEED, FedEsc
 from signals import Message, Table, table_of_shipped
 
-from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.fields import LiveData, rows
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.fields import LiveData, rows
 
 START = 100 * SECOND
 PERIOD = 20 * MS

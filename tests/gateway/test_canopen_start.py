@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse, shipped
+from kontronik_can_gw.config.keys import parse, shipped
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import SECOND
 
 
 def gateway() -> Gateway:

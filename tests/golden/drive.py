@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import kontronik_can_gw
-from kontronik_can_gw.cia301.storage import encode
+from kontronik_can_gw.canopen.storage import encode
+from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse, shipped
+from kontronik_can_gw.config.keys import parse, shipped
+from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Mailboxes
-from kontronik_can_gw.offline.inputs import CaptureInput, open_input
-from kontronik_can_gw.offline.replay import in_order
-from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.transmit_queue import Mailboxes
 
 VERSION = kontronik_can_gw.__version__
 FOLDERS = {str(shipped("dbc").parent): "SHIPPED"}

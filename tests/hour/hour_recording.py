@@ -16,21 +16,21 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from kontronik_can_gw.capture import Entry, Kind, block, data_payload, json_payload, number_data
-from kontronik_can_gw.capture_setup import CaptureSetup
+from kontronik_can_gw.capture.format import Entry, Kind, block, data_payload, json_payload, number_data
+from kontronik_can_gw.capture.replay import in_order
+from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.cli.recording import setup_of
-from kontronik_can_gw.config import parse
-from kontronik_can_gw.dbc_output.layout import Layout
-from kontronik_can_gw.mailboxes import Mailboxes
-from kontronik_can_gw.offline.replay import in_order
-from kontronik_can_gw.protocol import Device
-from kontronik_can_gw.protocol.fields import InfoData, LiveData
-from kontronik_can_gw.protocol.states import OperatingError, SelfTestError
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.esc.kontronik import Device
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
+from kontronik_can_gw.esc.simulator import Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc, Swap
+from kontronik_can_gw.esc.simulator import Sent as Wired
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
-from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc, Swap
-from kontronik_can_gw.simulator import Sent as Wired
-from kontronik_can_gw.sources import CanState
+from kontronik_can_gw.transmit_queue import Mailboxes
 
 MS = 1_000_000
 SECOND = 1000 * MS

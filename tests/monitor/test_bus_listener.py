@@ -5,12 +5,12 @@ import itertools
 import pytest
 from simulated_bus import Clock
 
-from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime import bus_listener, can_port
 from kontronik_can_gw.runtime.bus_listener import BusListener
-from kontronik_can_gw.sources import CanState
 
 FRAME = CanFrame(0x123, b"\x01\x02")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from simulated_bus import flight, layout_of, with_errors, write_log
 
-from kontronik_can_gw.protocol.states import OperatingError
+from kontronik_can_gw.esc.kontronik.states import OperatingError
 
 pytestmark = [
     pytest.mark.extended,

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from simulated_bus import STEP_NS, Timed, flight, layout_of, with_errors
 
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse
-from kontronik_can_gw.dbc_output.layout import normalize
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError, Severity
+from kontronik_can_gw.esc.simulator import SECOND_NS, EscOptions
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import sources
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.offline.monitor import Monitor
-from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError, Severity
-from kontronik_can_gw.simulator import SECOND_NS, EscOptions
-from kontronik_can_gw.sources import sources
-from kontronik_can_gw.telemetry import EscSettings
 
 ONE = layout_of(["esc1"])
 TWO = layout_of(["left", "right"])

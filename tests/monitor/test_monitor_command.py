@@ -15,11 +15,11 @@ from simulated_bus import Clock, capture_file, flight, layout_of, write_log
 
 from kontronik_can_gw.cli import monitor, monitor_screen
 from kontronik_can_gw.cli.monitor import Recording
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.offline import monitor as model
-from kontronik_can_gw.offline.inputs import open_input
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.monitor import model as model
+from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.esc.simulator import SECOND_NS, EscOptions, SimulatedEsc
 from kontronik_can_gw.runtime import bus_listener
-from kontronik_can_gw.simulator import SECOND_NS, EscOptions, SimulatedEsc
 
 DBC = shipped("dbc/kontronik_esc.dbc")
 ONE = layout_of(["esc1"])

@@ -15,9 +15,9 @@ from kontronik_can_gw.cli.monitor_screen import (
     number,
     screen,
 )
-from kontronik_can_gw.offline.monitor import Monitor
-from kontronik_can_gw.protocol.states import Device, OperatingError
-from kontronik_can_gw.simulator import SECOND_NS, EscOptions
+from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
+from kontronik_can_gw.esc.simulator import SECOND_NS, EscOptions
 
 LIVE = Where("can0", hints=("Is the gateway running?",))
 

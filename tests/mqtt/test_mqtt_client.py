@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from mqtt_bench import PATIENCE, Mosquitto, Subscriber, wait_for
 
-from kontronik_can_gw.runtime import mqtt_client
-from kontronik_can_gw.runtime.mqtt_client import Broker, MqttClient, check
+from kontronik_can_gw.desk.mqtt import client as mqtt_client
+from kontronik_can_gw.desk.mqtt.client import Broker, MqttClient, check
 
 pytestmark = pytest.mark.extended
 

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of
 
-from kontronik_can_gw.dbc_output.unpacker import SignalReader
-from kontronik_can_gw.offline.mqtt_messages import (
+from kontronik_can_gw.desk.mqtt.messages import (
     IDENTITY_NS,
     LEAST_PAUSE_NS,
     MOST_CHANGES,
@@ -24,8 +23,9 @@ from kontronik_can_gw.offline.mqtt_messages import (
     entity,
     is_ours,
 )
-from kontronik_can_gw.protocol.states import OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, Phase
+from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, Phase
+from kontronik_can_gw.signals.unpacker import SignalReader
 
 TOPICS = Topics("fleet", "boat")
 MS = 1_000_000

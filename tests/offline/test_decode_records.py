@@ -5,15 +5,15 @@ import json
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.offline.decode import (
+from kontronik_can_gw.desk.recordings.decode import (
     Decoder,
     Record,
     json_lines,
     physical_fields,
 )
-from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode, rows
-from kontronik_can_gw.protocol.fields import device_and_variant
-from kontronik_can_gw.simulator import EscOptions, Faults, SimulatedEsc, Swap
+from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode, rows
+from kontronik_can_gw.esc.kontronik.fields import device_and_variant
+from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc, Swap
 
 S = 1_000_000_000
 

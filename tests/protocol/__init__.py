@@ -1,1 +1,1 @@
-"""Tests of kontronik_can_gw.protocol. sheet.py and reference.py are the second opinion: they import nothing of the package."""
+"""Tests of kontronik_can_gw.esc.kontronik. sheet.py and reference.py are the second opinion: they import nothing of the package."""

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.protocol import Deframer, Form, InfoData, Kind, Layout, LiveData, encode, rows
-from kontronik_can_gw.protocol.codec import FORMS
-from kontronik_can_gw.protocol.fields import Data, DataType, device_and_variant
+from kontronik_can_gw.esc.kontronik import Deframer, Form, InfoData, Kind, Layout, LiveData, encode, rows
+from kontronik_can_gw.esc.kontronik.codec import FORMS
+from kontronik_can_gw.esc.kontronik.fields import Data, DataType, device_and_variant
 
 from . import reference, sheet
 from .sheet import Field, FormRow

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.protocol import Counters, Deframer, Frame, InfoData, Kind, Layout, LiveData, codec, encode
+from kontronik_can_gw.esc.kontronik import Counters, Deframer, Frame, InfoData, Kind, Layout, LiveData, codec, encode
 
 from . import sheet
 from .reference import certain_at, counters_of, frames_of, random_frame, seal

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from kontronik_can_gw.protocol import (
+from kontronik_can_gw.esc.kontronik import (
     Device,
     InfoData,
     LiveData,
@@ -14,9 +14,9 @@ from kontronik_can_gw.protocol import (
     SelfTestError,
     rows,
 )
-from kontronik_can_gw.protocol.codec import FORMS, Form
-from kontronik_can_gw.protocol.fields import DataType, device_and_variant
-from kontronik_can_gw.protocol.states import (
+from kontronik_can_gw.esc.kontronik.codec import FORMS, Form
+from kontronik_can_gw.esc.kontronik.fields import DataType, device_and_variant
+from kontronik_can_gw.esc.kontronik.states import (
     LARGEST_STATE,
     ErrorBit,
     bit_texts,

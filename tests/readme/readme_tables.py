@@ -7,10 +7,10 @@ from pathlib import Path
 
 import cantools.database
 
-from kontronik_can_gw.cia301.bindings import bindings
-from kontronik_can_gw.cia301.eds import ARRAY, RECORD, Eds, load
-from kontronik_can_gw.cia301.emergency import GatewayError, code_of_bit
-from kontronik_can_gw.config import (
+from kontronik_can_gw.canopen.eds import ARRAY, RECORD, Eds, load
+from kontronik_can_gw.canopen.emergency import GatewayError, code_of_bit
+from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.config.keys import (
     CanConfig,
     CanopenConfig,
     DbcConfig,
@@ -21,9 +21,9 @@ from kontronik_can_gw.config import (
     StatisticsConfig,
     shipped,
 )
-from kontronik_can_gw.protocol.states import OperatingError
-from kontronik_can_gw.sources import Group, sources
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import Group, sources
 
 PROJECT = Path(__file__).resolve().parents[2]
 PAGES = {

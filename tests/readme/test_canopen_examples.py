@@ -14,15 +14,15 @@ from unittest.mock import patch
 import can
 import pytest
 
-from kontronik_can_gw.cia301.storage import decode
+from kontronik_can_gw.canopen.storage import decode
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.desk import pty
+from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.esc.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.offline import pty
-from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.store import ParameterStore
-from kontronik_can_gw.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, SimulatedEsc
 
 PROJECT = Path(__file__).resolve().parents[2]
 PAGE = (PROJECT / "docs" / "canopen.md").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ import cantools.database
 from readme_tables import PAGES, PROJECT, TABLES, configuration, with_tables
 
 from kontronik_can_gw.cli import COMMANDS
-from kontronik_can_gw.config import parse, schema, shipped
+from kontronik_can_gw.config.keys import parse, schema, shipped
 
 README = PAGES[PROJECT / "README.md"]
 ALL = "\n".join(PAGES.values())

@@ -5,12 +5,12 @@ from collections.abc import Iterator, Sequence
 
 from simulated_bus import layout_of
 
-from kontronik_can_gw.dbc_output.unpacker import SignalReader, Value
-from kontronik_can_gw.dbc_output.view import View
+from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 Row = tuple[int, list[Value]]
 

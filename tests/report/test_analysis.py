@@ -7,15 +7,15 @@ import pandas as pd  # type: ignore[import-untyped]
 import pytest
 from report_flights import Row, column, shipped_bus, simulated
 
-from kontronik_can_gw.dbc_output.unpacker import SignalReader, Value
-from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.offline.report.analysis import Analysis
-from kontronik_can_gw.offline.report.fit import ResistanceFit
-from kontronik_can_gw.offline.report.flight import Event, Flight
-from kontronik_can_gw.offline.report.quantities import PLOTS
-from kontronik_can_gw.protocol.states import Device, OperatingError, SelfTestError
-from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
-from kontronik_can_gw.telemetry import SECOND as S
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.report.analysis import Analysis
+from kontronik_can_gw.desk.report.fit import ResistanceFit
+from kontronik_can_gw.desk.report.flight import Event, Flight
+from kontronik_can_gw.desk.report.quantities import PLOTS
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
+from kontronik_can_gw.esc.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
+from kontronik_can_gw.esc.telemetry import SECOND as S
+from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 GAP_NS = 500_000_000
 FAULTS = Faults(

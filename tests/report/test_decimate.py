@@ -6,7 +6,7 @@ from itertools import accumulate, pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.offline.report.decimate import LEAST_POINTS, Decimator, Number, Points
+from kontronik_can_gw.desk.report.decimate import LEAST_POINTS, Decimator, Number, Points
 
 NUMBERS = st.one_of(st.none(), st.integers(-50, 50))
 ROWS = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=300)

@@ -7,13 +7,13 @@ import pytest
 from report_browser import MISSING, PROGRAM, Browser
 from report_flights import shipped_bus, simulated
 
-from kontronik_can_gw.offline.report.analysis import Analysis
-from kontronik_can_gw.offline.report.flight import Flight
-from kontronik_can_gw.offline.report.page import render
-from kontronik_can_gw.offline.report.quantities import PLOTS
-from kontronik_can_gw.protocol.states import OperatingError
-from kontronik_can_gw.simulator import Dropout, ErrorWindow, EscOptions, Faults
-from kontronik_can_gw.telemetry import SECOND as S
+from kontronik_can_gw.desk.report.analysis import Analysis
+from kontronik_can_gw.desk.report.flight import Flight
+from kontronik_can_gw.desk.report.page import render
+from kontronik_can_gw.desk.report.quantities import PLOTS
+from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.esc.simulator import Dropout, ErrorWindow, EscOptions, Faults
+from kontronik_can_gw.esc.telemetry import SECOND as S
 
 pytestmark = [pytest.mark.extended, pytest.mark.skipif(PROGRAM is None, reason=MISSING)]
 

@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_flights import shipped_bus, simulated
 
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.offline.layouts import layout_of_dbc
-from kontronik_can_gw.offline.report.analysis import Analysis
-from kontronik_can_gw.offline.report.decimate import Number
-from kontronik_can_gw.offline.report.flight import Flight
-from kontronik_can_gw.offline.report.page import encode, render
-from kontronik_can_gw.telemetry import SECOND as S
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
+from kontronik_can_gw.desk.report.analysis import Analysis
+from kontronik_can_gw.desk.report.decimate import Number
+from kontronik_can_gw.desk.report.flight import Flight
+from kontronik_can_gw.desk.report.page import encode, render
+from kontronik_can_gw.esc.telemetry import SECOND as S
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u2028{{data}}"
 

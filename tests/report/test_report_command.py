@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from command_line import refused, run
 
-from kontronik_can_gw.protocol.states import OperatingError
-from kontronik_can_gw.simulator import ErrorWindow, EscOptions, Faults, SimulatedEsc
-from kontronik_can_gw.telemetry import SECOND as S
+from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.esc.simulator import ErrorWindow, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.telemetry import SECOND as S
 
 
 def report(*words: object) -> tuple[object, str, str]:

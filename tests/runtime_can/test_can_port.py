@@ -19,18 +19,18 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import CanConfig, parse
-from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.config.keys import CanConfig, parse
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Sent
-from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.runtime import can_port
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.transmit_queue import Sent
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 NO_MESSAGES = Layout("x", "Gw", ())

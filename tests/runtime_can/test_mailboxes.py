@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.mailboxes import QUEUE_LENGTH, Mailboxes, Sent
+from kontronik_can_gw.transmit_queue import QUEUE_LENGTH, Mailboxes, Sent
 
 
 def queued(number: int, can_id: int = 0x581) -> CanFrame:

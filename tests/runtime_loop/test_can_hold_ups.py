@@ -5,14 +5,14 @@ from collections.abc import Iterable, Iterator
 import pytest
 from wire_world import World, loop_in, run
 
-from kontronik_can_gw.cia301.nmt import NmtState
+from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import GatewayState
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.mailboxes import Sent
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.sources import GatewayState
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.transmit_queue import Sent
 
 HELD_UP_NS = 400 * MS
 REQUEST, ANSWER, EMCY, HEARTBEAT, TPDO = 0x601, 0x581, 0x081, 0x701, 0x181

@@ -7,19 +7,19 @@ import pytest
 from wire_world import CAN_FD, Bus, World
 
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse
+from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Sent
-from kontronik_can_gw.protocol import Layout, LiveData, encode
-from kontronik_can_gw.runtime import can_side
+from kontronik_can_gw.runtime import can_link as can_side
+from kontronik_can_gw.runtime.can_link import CanSide
 from kontronik_can_gw.runtime.can_port import socketcan_error
-from kontronik_can_gw.runtime.can_side import CanSide
-from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.fault_log import Conditions
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import MS, SECOND
+from kontronik_can_gw.transmit_queue import Sent
 
 ACTIVE = LinkFacts(True, True, "can", CanState.ERROR_ACTIVE, 500_000, 100, (0, 0))
 OFF = ACTIVE._replace(state=CanState.BUS_OFF)

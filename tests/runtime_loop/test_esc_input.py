@@ -11,18 +11,19 @@ from typing import Any
 
 import pytest
 
-from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.kontronik import codec
+from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.offline.pty import PtyEsc
-from kontronik_can_gw.protocol import codec
-from kontronik_can_gw.protocol.fields import LiveData
-from kontronik_can_gw.runtime import esc_input, serial_port
-from kontronik_can_gw.runtime.conditions import Conditions
-from kontronik_can_gw.runtime.esc_input import EscInput
+from kontronik_can_gw.runtime import esc_port as esc_input
+from kontronik_can_gw.runtime import serial_port
+from kontronik_can_gw.runtime.esc_port import EscInput
+from kontronik_can_gw.runtime.fault_log import Conditions
 from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.serial_port import Identity, PortLost, is_mini_uart
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 
 LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2", "1.0")
 LIVE = codec.encode(LiveData(battery_voltage=2442), codec.Layout.V4)

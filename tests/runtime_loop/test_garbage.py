@@ -10,12 +10,14 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw.cli.common import Loaded, assemble
-from kontronik_can_gw.config import CanConfig, parse
+from kontronik_can_gw.config.keys import CanConfig, parse
+from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.offline.pty import PtyEsc
-from kontronik_can_gw.protocol.codec import Layout, encode
-from kontronik_can_gw.protocol.fields import InfoData, LiveData
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.prometheus import metrics
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
@@ -29,8 +31,6 @@ from kontronik_can_gw.runtime.snapshot import (
     snapshot,
     with_rates,
 )
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import MS, SECOND
 
 FRAMES = 3000
 START = range(1, 100)

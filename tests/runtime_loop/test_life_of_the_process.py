@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.offline.pty import PtyEsc
-from kontronik_can_gw.protocol.codec import Layout, encode
-from kontronik_can_gw.protocol.fields import LiveData
+from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 
 LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), Layout.V4)
 LIMIT_S = 120

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw.cli.common import assemble
-from kontronik_can_gw.config import parse
+from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import locks
-from kontronik_can_gw.runtime.can_side import CanSide
-from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.runtime.can_link import CanSide
+from kontronik_can_gw.runtime.fault_log import Conditions
 from kontronik_can_gw.runtime.locks import (
     Locks,
     Taken,

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from kontronik_can_gw.cli import main
+from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.offline.pty import PtyEsc
 from kontronik_can_gw.runtime import realtime
 from kontronik_can_gw.runtime.threads import start_beside_the_loop
 

@@ -8,25 +8,26 @@ from collections.abc import Callable, Iterable, Sequence
 
 import pytest
 
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.config import CanConfig
-from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, parse_database
-from kontronik_can_gw.dbc_output.prepare import prepare
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.dbc.layout import DbcSettings, Layout, parse_database
+from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.mailboxes import Sent
-from kontronik_can_gw.protocol.codec import Layout as WireLayout
-from kontronik_can_gw.protocol.codec import encode
-from kontronik_can_gw.protocol.fields import LiveData
-from kontronik_can_gw.runtime import can_side, esc_input
+from kontronik_can_gw.runtime import can_link as can_side
+from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, one_by_one
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler
 from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.systemd import Notifier
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings
+from kontronik_can_gw.transmit_queue import Sent
 
 NOT_AVAILABLE = 0xFFFFFFFF
 _FIRST_PORT, CAN_FD = 1000, 2000

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.cia301.storage import Stored, decode, encode
+from kontronik_can_gw.canopen.storage import Stored, decode, encode
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.store import CAPACITY, ParameterStore
 
@@ -309,7 +309,7 @@ HELPERS = """
 import os, select, subprocess, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from kontronik_can_gw.cia301.storage import Stored, decode, encode
+from kontronik_can_gw.canopen.storage import Stored, decode, encode
 from kontronik_can_gw.runtime.store import ParameterStore
 
 def numbered(number, size=16):

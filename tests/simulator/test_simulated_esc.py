@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.protocol import (
+from kontronik_can_gw.esc.kontronik import (
     Deframer,
     Device,
     Frame,
@@ -17,7 +17,7 @@ from kontronik_can_gw.protocol import (
     OperatingState,
     SelfTestError,
 )
-from kontronik_can_gw.simulator import (
+from kontronik_can_gw.esc.simulator import (
     FLIGHT,
     IDLE,
     Dropout,

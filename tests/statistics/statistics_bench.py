@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
-from kontronik_can_gw.dbc_output.layout import Layout
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.protocol.fields import InfoData, LiveData
 from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     PortFacts,
@@ -17,8 +19,6 @@ from kontronik_can_gw.runtime.snapshot import (
     StoreFacts,
     snapshot,
 )
-from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
 
 START = 1000 * SECOND
 PROGRAM = ProgramFacts("/etc/kontronik-can-gw/gateway.toml", "1.2.3", 4711, 99, "pid:[1]", "2026-01-02T03:04:05Z")

@@ -16,10 +16,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from statistics_bench import Bench
 
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.prometheus import CONNECTIONS, REQUEST_LIMIT, TIME_LIMIT_NS, MetricsServer
 from kontronik_can_gw.runtime.snapshot import STALE_NS
 from kontronik_can_gw.runtime.statistics import Statistics
-from kontronik_can_gw.telemetry import SECOND
 
 PATIENCE = 60.0
 COMPLETE = b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n"

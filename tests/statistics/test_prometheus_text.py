@@ -8,8 +8,8 @@ from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 from statistics_bench import Bench, with_nodes
 
-from kontronik_can_gw.protocol.fields import LiveData
-from kontronik_can_gw.protocol.states import OperatingError, SelfTestError
+from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.runtime.prometheus import metrics
 from kontronik_can_gw.runtime.snapshot import CanFacts, PortFacts, StoreFacts
 

@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 from statistics_bench import Bench
 
-from kontronik_can_gw.protocol.deframer import Counters
-from kontronik_can_gw.protocol.fields import InfoData, LiveData, rows
-from kontronik_can_gw.protocol.states import OperatingError, state_text
+from kontronik_can_gw.esc.kontronik.deframer import Counters
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
+from kontronik_can_gw.esc.kontronik.states import OperatingError, state_text
+from kontronik_can_gw.esc.simulator import EscOptions, Faults
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import GatewayStatus
 from kontronik_can_gw.runtime.snapshot import (
     LOG_LINES,
     PortFacts,
@@ -19,9 +22,6 @@ from kontronik_can_gw.runtime.snapshot import (
     start_ticks,
 )
 from kontronik_can_gw.runtime.statistics import default_file
-from kontronik_can_gw.simulator import EscOptions, Faults
-from kontronik_can_gw.sources import GatewayStatus
-from kontronik_can_gw.telemetry import MS, SECOND
 
 
 def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime import statistics as statistics_module
 from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.snapshot import STALE_NS
 from kontronik_can_gw.runtime.statistics import PERIOD_NS, Report, Statistics
-from kontronik_can_gw.telemetry import SECOND
 
 PATIENCE = 60.0
 """Seconds that something may take on a busy machine before a test fails."""

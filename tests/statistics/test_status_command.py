@@ -23,6 +23,8 @@ from statistics_bench import Bench, with_nodes
 
 from kontronik_can_gw.cli import status
 from kontronik_can_gw.cli.status import HEALTHY, NOT_RUNNING, TROUBLE, Node, Seen, judge, look_at, screen
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.runtime.snapshot import (
     STALE_NS,
     CanFacts,
@@ -31,8 +33,6 @@ from kontronik_can_gw.runtime.snapshot import (
     StoreFacts,
     program_facts,
 )
-from kontronik_can_gw.sources import CanState
-from kontronik_can_gw.telemetry import SECOND
 
 Document = dict[str, Any]
 

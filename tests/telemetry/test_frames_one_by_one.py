@@ -3,8 +3,8 @@
 import pytest
 from protocol.reference import ambiguous
 
-from kontronik_can_gw.protocol import Layout, LiveData, encode
-from kontronik_can_gw.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
+from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings, EscTelemetry, Event
 
 STEP = 10 * MS
 FLIGHT = [

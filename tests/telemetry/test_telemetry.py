@@ -11,12 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from protocol.reference import SHORTEST_FIRST, fits
 
-from kontronik_can_gw.protocol import Device, InfoData, Layout, LiveData, encode
-from kontronik_can_gw.protocol.codec import FORMS
-from kontronik_can_gw.protocol.fields import device_and_variant
-from kontronik_can_gw.simulator import EscOptions, SimulatedEsc
-from kontronik_can_gw.sources import Source, sources
-from kontronik_can_gw.telemetry import (
+from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode
+from kontronik_can_gw.esc.kontronik.codec import FORMS
+from kontronik_can_gw.esc.kontronik.fields import device_and_variant
+from kontronik_can_gw.esc.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.telemetry import (
     INFO_TIMEOUT_NS,
     MS,
     NS_PER_BYTE,
@@ -26,6 +25,7 @@ from kontronik_can_gw.telemetry import (
     Event,
     LinkState,
 )
+from kontronik_can_gw.esc.values import Source, sources
 
 TIMEOUT = 250 * MS
 LIVE = LiveData(electrical_speed=21_000, battery_voltage=2400, battery_current=100, operating_state=21)

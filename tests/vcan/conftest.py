@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from vcan_tools import GatewayProcess, ip
 
-from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.desk.pty import PtyEsc
 
 _numbers = itertools.count()
 

@@ -14,10 +14,10 @@ from canopen import SdoAbortedError
 from encoding import Identity
 from vcan_tools import EDS, SERIAL, Chain, Master, Recorded, canopen_table, chain, wait_for
 
-from kontronik_can_gw.cia301.eds import load as load_eds
-from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.fields import InfoData
-from kontronik_can_gw.protocol.states import OperatingError
+from kontronik_can_gw.canopen.eds import load as load_eds
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.fields import InfoData
+from kontronik_can_gw.esc.kontronik.states import OperatingError
 
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 COMMANDS = {OPERATIONAL: "OPERATIONAL", STOPPED: "STOPPED", PRE_OPERATIONAL: "PRE-OPERATIONAL"}

@@ -14,8 +14,8 @@ from slcan_adapters import Adapter, Bus
 from vcan_tools import Candump, GatewayProcess, bench, canopen_table, configuration, ip, wait_for
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.offline.pty import PtyEsc
-from kontronik_can_gw.simulator import EscOptions
+from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.esc.simulator import EscOptions
 
 Start = Callable[..., GatewayProcess]
 

@@ -11,8 +11,8 @@ from encoding import POLE_PAIRS, Identity
 from harness import PtyPort
 from vcan_tools import Chain, chain, configuration, gateway_process, wait_for
 
-from kontronik_can_gw.protocol.codec import Layout
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.states import Device
 
 LINK_THERE, LINK_LOST, STOPPING = (2, 3), 4, 2
 """A link is Degraded rather than Ok when its ESC waits for the bus to show each frame."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from encoding import Identity
 from vcan_tools import Candump, GatewayProcess, canopen_table, chain, configuration, ip, wait_for
 
-from kontronik_can_gw.offline.pty import PtyEsc
+from kontronik_can_gw.desk.pty import PtyEsc
 
 ERROR_FRAMES = {  # as a controller's driver makes them; the state that follows
     "20000004#0008000000000000": 2,  # transmit error counter at warning level

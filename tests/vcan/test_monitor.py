@@ -13,11 +13,11 @@ from typing import Any
 import can
 from vcan_tools import LIMIT_S, Candump, GatewayProcess, bench, configuration, ip, wait_for
 
-from kontronik_can_gw.config import CanConfig
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.esc.simulator import ErrorWindow, EscOptions, Faults
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.protocol.states import OperatingError
 from kontronik_can_gw.runtime.bus_listener import BusListener
-from kontronik_can_gw.simulator import ErrorWindow, EscOptions, Faults
 
 Start = Callable[..., GatewayProcess]
 FAULTY = EscOptions(faults=Faults(errors=(ErrorWindow(OperatingError.BEC_OVERCURRENT, 0),)))

@@ -13,10 +13,10 @@ import cantools.database
 import pytest
 from vcan_tools import LIMIT_S, Bench, Candump, GatewayProcess, bench, canopen_table, configuration, ip, wait_for
 
-from kontronik_can_gw.capture import Kind
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.offline.inputs import CaptureInput, open_input
-from kontronik_can_gw.simulator import Dropout, EscOptions, Faults
+from kontronik_can_gw.capture.format import Kind
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
+from kontronik_can_gw.esc.simulator import Dropout, EscOptions, Faults
 
 Start = Callable[..., GatewayProcess]
 pytestmark = pytest.mark.extended

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from kontronik_can_gw.offline.describe.facts import (
+from kontronik_can_gw.desk.describe.facts import (
     BY_GATEWAY,
     CanopenFacts,
     DbcFacts,

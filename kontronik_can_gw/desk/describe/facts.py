@@ -14,21 +14,21 @@ from pathlib import PurePath
 from typing import Any, Protocol
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.canopen_dbc import pascal_case
-from kontronik_can_gw.cia301 import bindings as at
-from kontronik_can_gw.cia301.bindings import bindings
-from kontronik_can_gw.cia301.dictionary import Dictionary, codec
-from kontronik_can_gw.cia301.eds import ARRAY, DOMAIN, RECORD, VAR, Eds, Entry
-from kontronik_can_gw.cia301.emergency import GatewayError, code_of_bit, register_of
-from kontronik_can_gw.cia301.node import Node
-from kontronik_can_gw.cia301.nodes import CanopenSetup
-from kontronik_can_gw.cia305.lss import UNCONFIGURED
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.dbc_output.layout import Role, SendType, SignalPlan
-from kontronik_can_gw.offline.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES, Text
-from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.protocol.fields import LiveData, rows
-from kontronik_can_gw.protocol.states import (
+from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.dbc import pascal_case
+from kontronik_can_gw.canopen.dictionary import Dictionary, codec
+from kontronik_can_gw.canopen.eds import ARRAY, DOMAIN, RECORD, VAR, Eds, Entry
+from kontronik_can_gw.canopen.emergency import GatewayError, code_of_bit, register_of
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.dbc.layout import Role, SendType, SignalPlan
+from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES, Text
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.esc.kontronik.fields import LiveData, rows
+from kontronik_can_gw.esc.kontronik.states import (
     Device,
     ErrorBit,
     OperatingError,
@@ -37,8 +37,8 @@ from kontronik_can_gw.protocol.states import (
     Severity,
     peak_current_of,
 )
-from kontronik_can_gw.sources import Group, sources
-from kontronik_can_gw.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.esc.values import Group, sources
 
 FORMAT = "kontronik-can-gw description"
 VERSION = 1

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from kontronik_can_gw.cia301.emergency import GatewayError
-from kontronik_can_gw.sources import CanState, GatewayState
-from kontronik_can_gw.telemetry import LinkState
+from kontronik_can_gw.canopen.emergency import GatewayError
+from kontronik_can_gw.esc.telemetry import LinkState
+from kontronik_can_gw.esc.values import CanState, GatewayState
 
 NOTHING = "Nothing to do."
 

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 
-from kontronik_can_gw.offline.describe.document import Code, Document, Section, Table
+from kontronik_can_gw.desk.describe.document import Code, Document, Section, Table
 
 
 def markdown(document: Document) -> str:

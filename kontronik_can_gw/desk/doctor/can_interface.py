@@ -3,10 +3,10 @@
 import platform
 from importlib import import_module
 
-from kontronik_can_gw.config import CanConfig
-from kontronik_can_gw.runtime.doctor.can_link import Link, can_interfaces, link_of
-from kontronik_can_gw.runtime.doctor.findings import Finding, Findings
-from kontronik_can_gw.runtime.doctor.system import System
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.desk.doctor.can_link import Link, can_interfaces, link_of
+from kontronik_can_gw.desk.doctor.findings import Finding, Findings
+from kontronik_can_gw.desk.doctor.system import System
 from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER, is_held, lock_folder, lock_name
 
 SHORTEST_QUEUE = 8

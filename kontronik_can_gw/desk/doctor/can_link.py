@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from kontronik_can_gw.runtime.doctor.system import System
+from kontronik_can_gw.desk.doctor.system import System
 
 _CAN_TYPE = 280
 """ARPHRD_CAN"""

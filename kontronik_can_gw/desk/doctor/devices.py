@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from kontronik_can_gw.runtime.doctor.system import System
+from kontronik_can_gw.desk.doctor.system import System
 from kontronik_can_gw.runtime.serial_port import MINI_UART
 
 _BUS_DRIVERS = ("port", "ctrl", "usb", "")

@@ -3,9 +3,9 @@
 from pathlib import Path, PurePath
 from stat import S_ISDIR
 
-from kontronik_can_gw.runtime.doctor.findings import Findings
-from kontronik_can_gw.runtime.doctor.service import Unit
-from kontronik_can_gw.runtime.doctor.system import System
+from kontronik_can_gw.desk.doctor.findings import Findings
+from kontronik_can_gw.desk.doctor.service import Unit
+from kontronik_can_gw.desk.doctor.system import System
 
 _LEAST_BYTES = 64 * 1024
 _LOW_BYTES = 16 * 1024 * 1024

@@ -6,9 +6,9 @@ import time
 from importlib.metadata import PackageNotFoundError, version
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.runtime.doctor.findings import Finding, Findings
-from kontronik_can_gw.runtime.doctor.service import Unit, check_service
-from kontronik_can_gw.runtime.doctor.system import System
+from kontronik_can_gw.desk.doctor.findings import Finding, Findings
+from kontronik_can_gw.desk.doctor.service import Unit, check_service
+from kontronik_can_gw.desk.doctor.system import System
 
 _PACKAGES = ("python-can", "canopen", "pyserial", "cantools", "rich")
 _FIRST_YEAR = 2024

@@ -4,11 +4,11 @@ import os
 import stat
 from collections.abc import Callable
 
-from kontronik_can_gw.runtime.doctor.devices import Adapter, adapter_of, ports_there, stable_names
-from kontronik_can_gw.runtime.doctor.findings import Finding, Findings
-from kontronik_can_gw.runtime.doctor.line import Line
-from kontronik_can_gw.runtime.doctor.service import Unit
-from kontronik_can_gw.runtime.doctor.system import Process, System, User
+from kontronik_can_gw.desk.doctor.devices import Adapter, adapter_of, ports_there, stable_names
+from kontronik_can_gw.desk.doctor.findings import Finding, Findings
+from kontronik_can_gw.desk.doctor.line import Line
+from kontronik_can_gw.desk.doctor.service import Unit
+from kontronik_can_gw.desk.doctor.system import Process, System, User
 
 Look = Callable[[str, bool], Line]
 SERVICE_INSTALL = "sudo kontronik-can-gw service install"

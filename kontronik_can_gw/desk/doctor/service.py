@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import PurePath
 
-from kontronik_can_gw.runtime.doctor.findings import Findings
-from kontronik_can_gw.runtime.doctor.system import System, User
+from kontronik_can_gw.desk.doctor.findings import Findings
+from kontronik_can_gw.desk.doctor.system import System, User
 from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
 
 NAME = "kontronik-can-gw"

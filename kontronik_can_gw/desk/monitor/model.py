@@ -1,6 +1,6 @@
 """What a person who looks on wants to know of one to eight ESCs: newest values, extremes, state, errors, link. Pure; time is handed in.
 
-Everything is asked for by the names of sources (sources.py), never by those of signals: so it works with any DBC, and in the units of
+Everything is asked for by the names of sources (values.py), never by those of signals: so it works with any DBC, and in the units of
 the sources, whatever units the DBC has. A value that is not available is None, never an old one.
 """
 
@@ -10,13 +10,10 @@ from collections.abc import Collection, Iterable, Mapping
 from enum import Enum
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.dbc_output import units
-from kontronik_can_gw.dbc_output.layout import normalize
-from kontronik_can_gw.dbc_output.unpacker import SignalReader, Value
-from kontronik_can_gw.dbc_output.view import View
-from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.protocol.states import (
+from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.kontronik.states import (
     Device,
     ErrorBit,
     OperatingError,
@@ -25,8 +22,11 @@ from kontronik_can_gw.protocol.states import (
     device_text,
     state_text,
 )
-from kontronik_can_gw.sources import CanState, GatewayState, Group, sources
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, LinkState
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
+from kontronik_can_gw.esc.values import CanState, GatewayState, Group, sources
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 SILENCE_NS = 5 * SECOND
 """So long without a frame it is said in words what may be wrong."""

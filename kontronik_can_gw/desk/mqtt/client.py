@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.conditions import Conditions
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.runtime.fault_log import Conditions
 from kontronik_can_gw.runtime.retry import Retry
-from kontronik_can_gw.telemetry import SECOND
 
 LONGEST_PAUSE_NS = 30 * SECOND
 """Between two attempts to connect."""

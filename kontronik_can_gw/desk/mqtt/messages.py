@@ -19,13 +19,20 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.dbc_output.layout import normalize
-from kontronik_can_gw.dbc_output.unpacker import Column, SignalReader, Value
-from kontronik_can_gw.dbc_output.view import View
-from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.protocol.states import Device, ErrorBit, OperatingError, OperatingState, SelfTestError, Severity
-from kontronik_can_gw.sources import Group, sources
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    ErrorBit,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+    Severity,
+)
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
+from kontronik_can_gw.esc.values import Group, sources
+from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
 ONLINE, OFFLINE = b"online", b"offline"
 PROGRAM = "kontronik-can-gw"

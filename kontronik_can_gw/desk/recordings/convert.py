@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Protocol, Self
 
-from kontronik_can_gw.offline.part_file import PartFile
+from kontronik_can_gw.desk.recordings.part_file import PartFile
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.offline.inputs import Input
-    from kontronik_can_gw.offline.replay import TimedFrame
-    from kontronik_can_gw.offline.tables import Choice
+    from kontronik_can_gw.capture.replay import TimedFrame
+    from kontronik_can_gw.desk.recordings.inputs import Input
+    from kontronik_can_gw.desk.recordings.tables import Choice
 
 TABLES = ("csv", "jsonl", "parquet", "mf4")
 LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
@@ -79,7 +79,7 @@ class TableConversion:
     units_line: bool = False
 
     def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
-        from kontronik_can_gw.offline.tables import Rows, open_table
+        from kontronik_can_gw.desk.recordings.tables import Rows, open_table
 
         rows = Rows(recording, self.choice, self.by_frame)
         table = rows.table
@@ -109,9 +109,9 @@ class LogConversion:
     end_ns: int | None = None
 
     def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
-        from kontronik_can_gw.offline.can_logs import CanLogWriter
-        from kontronik_can_gw.offline.inputs import CaptureInput
-        from kontronik_can_gw.offline.tables import first_of
+        from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
+        from kontronik_can_gw.desk.recordings.inputs import CaptureInput
+        from kontronik_can_gw.desk.recordings.tables import first_of
 
         first, frames = first_of(recording.frames())
         if first is None:
@@ -147,7 +147,7 @@ class LogConversion:
         return told
 
     def _cut(self, frames: "Iterator[TimedFrame]", origin_ns: int) -> "Iterator[TimedFrame]":
-        from kontronik_can_gw.offline.tables import DISORDER_NS
+        from kontronik_can_gw.desk.recordings.tables import DISORDER_NS
 
         start_ns, end_ns = self.start_ns, self.end_ns
         for frame in frames:

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from functools import lru_cache
 from io import StringIO
 
-from kontronik_can_gw.protocol.codec import Kind, Layout
-from kontronik_can_gw.protocol.deframer import Counters, Deframer, Frame
-from kontronik_can_gw.protocol.fields import Data, InfoData, LiveData, rows
-from kontronik_can_gw.protocol.states import (
+from kontronik_can_gw.esc.kontronik.codec import Kind, Layout
+from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
+from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, rows
+from kontronik_can_gw.esc.kontronik.states import (
     ErrorBit,
     OperatingError,
     SelfTestError,

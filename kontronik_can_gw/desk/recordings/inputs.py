@@ -14,7 +14,7 @@ from itertools import chain
 from pathlib import Path
 from typing import IO, Any, Protocol, Self
 
-from kontronik_can_gw.capture import (
+from kontronik_can_gw.capture.format import (
     MAGIC,
     SUFFIX,
     Block,
@@ -26,20 +26,20 @@ from kontronik_can_gw.capture import (
     read_json,
     read_number,
 )
-from kontronik_can_gw.capture_setup import CaptureSetup
-from kontronik_can_gw.config import shipped
-from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout
-from kontronik_can_gw.dbc_output.unpacker import SignalReader
+from kontronik_can_gw.capture.replay import Replay, TimedFrame, follow_bytes
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.dbc.layout import DbcSettings, Layout
+from kontronik_can_gw.desk.recordings.can_logs import NAMES, SUFFIXES, CanLog, log_format
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
+from kontronik_can_gw.desk.recordings.more_escs import more_escs
+from kontronik_can_gw.desk.recordings.samples import Sample, SampledGateway, samples_of_frames
+from kontronik_can_gw.desk.recordings.spool import is_stream, spooled
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.offline.can_logs import NAMES, SUFFIXES, CanLog, log_format
-from kontronik_can_gw.offline.layouts import BusLayout, layout_of_dbc, shown_by
-from kontronik_can_gw.offline.more_escs import more_escs
-from kontronik_can_gw.offline.replay import Replay, TimedFrame, follow_bytes
-from kontronik_can_gw.offline.samples import Sample, SampledGateway, samples_of_frames
-from kontronik_can_gw.offline.spool import is_stream, spooled
-from kontronik_can_gw.protocol.codec import Kind as FrameKind
-from kontronik_can_gw.protocol.deframer import Deframer
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.esc.kontronik.codec import Kind as FrameKind
+from kontronik_can_gw.esc.kontronik.deframer import Deframer
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.signals.unpacker import SignalReader
 
 CHUNK = 1 << 18
 LIVE_RATE = 100.0

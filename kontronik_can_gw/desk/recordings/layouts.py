@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.config import Config
-from kontronik_can_gw.dbc_output.layout import DbcSettings, Layout, choose_node, load_database, normalize
+from kontronik_can_gw.config.keys import Config
+from kontronik_can_gw.dbc.layout import DbcSettings, Layout, choose_node, load_database, normalize
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.sources import Group, sources
-from kontronik_can_gw.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import Group, sources
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -48,7 +48,7 @@ def shown_by(layout: BusLayout, known: Sequence[EscSettings]) -> BusLayout:
 
 
 def _made(database: "Database", node: str, file: str, known: Sequence[EscSettings]) -> BusLayout:
-    from kontronik_can_gw.dbc_output.prepare import prepare
+    from kontronik_can_gw.dbc.prepare import prepare
 
     names = esc_names(database, node)
     if names and known and len(names) != len(known):

@@ -1,10 +1,10 @@
 """Frames of a log, marked as replay: where a message tells the gateway's state, it says Replay."""
 
-from kontronik_can_gw.dbc_output import e2e
-from kontronik_can_gw.dbc_output.layout import Layout, Role
-from kontronik_can_gw.dbc_output.packer import place
+from kontronik_can_gw.dbc.layout import Layout, Role
+from kontronik_can_gw.esc.values import GatewayState
 from kontronik_can_gw.frames import EXTENDED, CanFrame
-from kontronik_can_gw.sources import GatewayState
+from kontronik_can_gw.signals import e2e
+from kontronik_can_gw.signals.packer import place
 
 
 class Marker:

@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from contextlib import suppress
 
-from kontronik_can_gw.config import shipped
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.telemetry import EscSettings
 
 MOST_ESCS = 8
 
@@ -42,7 +42,7 @@ def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
 
 def _ids(bus: BusLayout, count: int) -> list[set[int]]:
     """The ids of each of so many ESCs, as ``dbc`` gives them."""
-    from kontronik_can_gw.dbc_output.expand import esc_prefix, expand
+    from kontronik_can_gw.dbc.expand import esc_prefix, expand
 
     escs = [EscSettings(f"esc{number}") for number in range(1, count + 1)]
     names = {message.name for message in bus.database.messages}

@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.esc.telemetry import SECOND
 
 
 class Pace:

@@ -8,15 +8,15 @@ message, within 5 ms goes into the same row.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from kontronik_can_gw.capture_setup import CaptureSetup
-from kontronik_can_gw.dbc_output.layout import Layout
-from kontronik_can_gw.dbc_output.output import DbcOutput
-from kontronik_can_gw.dbc_output.unpacker import Part, SignalReader, Value
-from kontronik_can_gw.dbc_output.view import View
+from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.dbc.layout import Layout
+from kontronik_can_gw.dbc.output import DbcOutput
+from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.esc.telemetry import MS, Event
+from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.offline.replay import TimedFrame
-from kontronik_can_gw.sources import Group
-from kontronik_can_gw.telemetry import MS, Event
+from kontronik_can_gw.signals.unpacker import Part, SignalReader, Value
 
 SAME_ROW_NS = 5 * MS
 GATEWAY_NS = 100 * MS

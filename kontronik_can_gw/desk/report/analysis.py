@@ -10,12 +10,10 @@ from enum import IntEnum
 from operator import itemgetter
 from typing import NamedTuple, TypeVar
 
-from kontronik_can_gw.dbc_output import units
-from kontronik_can_gw.dbc_output.layout import normalize
-from kontronik_can_gw.dbc_output.unpacker import Column, SignalReader, Value
-from kontronik_can_gw.offline.layouts import BusLayout
-from kontronik_can_gw.offline.report.decimate import Decimator, Number, Points
-from kontronik_can_gw.offline.report.flight import (
+from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.report.decimate import Decimator, Number, Points
+from kontronik_can_gw.desk.report.flight import (
     Event,
     Extreme,
     Facts,
@@ -26,9 +24,9 @@ from kontronik_can_gw.offline.report.flight import (
     Segment,
     Summary,
 )
-from kontronik_can_gw.offline.report.ledger import Counter, Ledger
-from kontronik_can_gw.offline.report.quantities import PLOTS, STATE_CLASSES, UNKNOWN_CLASS, class_of
-from kontronik_can_gw.protocol.states import (
+from kontronik_can_gw.desk.report.ledger import Counter, Ledger
+from kontronik_can_gw.desk.report.quantities import PLOTS, STATE_CLASSES, UNKNOWN_CLASS, class_of
+from kontronik_can_gw.esc.kontronik.states import (
     ErrorBit,
     OperatingError,
     OperatingState,
@@ -36,8 +34,10 @@ from kontronik_can_gw.protocol.states import (
     device_text,
     state_text,
 )
-from kontronik_can_gw.sources import GatewayState, sources
-from kontronik_can_gw.telemetry import MS, SECOND, EscSettings, LinkState
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
+from kontronik_can_gw.esc.values import GatewayState, sources
+from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
 CHUNK = 4096
 """Rows that are looked at together."""

@@ -7,7 +7,7 @@ middle half of them as spread. With fewer than three such stretches nothing is s
 
 from typing import NamedTuple
 
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.esc.telemetry import SECOND
 
 STRETCH_NS = 10 * SECOND
 LEAST_PAIRS = 20

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
-from kontronik_can_gw.offline.report.decimate import Number
-from kontronik_can_gw.offline.report.fit import Resistance
+from kontronik_can_gw.desk.report.decimate import Number
+from kontronik_can_gw.desk.report.fit import Resistance
 
 Kind = Literal["error", "state", "link", "device"]
 

@@ -3,11 +3,11 @@
 from collections import deque
 from collections.abc import Sequence
 
-from kontronik_can_gw.dbc_output.unpacker import Column, Value
-from kontronik_can_gw.offline.report.decimate import Number
-from kontronik_can_gw.offline.report.fit import ResistanceFit
-from kontronik_can_gw.offline.report.flight import Extreme, Summary
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.desk.report.decimate import Number
+from kontronik_can_gw.desk.report.fit import ResistanceFit
+from kontronik_can_gw.desk.report.flight import Extreme, Summary
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.signals.unpacker import Column, Value
 
 HOUR_NS = 3600 * SECOND
 REST_CURRENT = 1.0

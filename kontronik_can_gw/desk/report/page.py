@@ -10,11 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from kontronik_can_gw.offline.report.analysis import state_name
-from kontronik_can_gw.offline.report.decimate import Number
-from kontronik_can_gw.offline.report.flight import Extreme, Facts, Flight, Summary
-from kontronik_can_gw.offline.report.quantities import PLOTS, STATE_CLASSES, STYLES, class_of
-from kontronik_can_gw.telemetry import SECOND
+from kontronik_can_gw.desk.report.analysis import state_name
+from kontronik_can_gw.desk.report.decimate import Number
+from kontronik_can_gw.desk.report.flight import Extreme, Facts, Flight, Summary
+from kontronik_can_gw.desk.report.quantities import PLOTS, STATE_CLASSES, STYLES, class_of
+from kontronik_can_gw.esc.telemetry import SECOND
 
 HERE = Path(__file__).parent
 MOST_DEVICES = 8

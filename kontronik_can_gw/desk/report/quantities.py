@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from kontronik_can_gw.protocol.states import OperatingState
+from kontronik_can_gw.esc.kontronik.states import OperatingState
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A line of a plot: a source of sources.py, in the source's own unit whatever the DBC has."""
+    """A line of a plot: a source of values.py, in the source's own unit whatever the DBC has."""
 
     source: str
     label: str

@@ -13,7 +13,7 @@ import struct
 from enum import Enum
 from zlib import crc32
 
-from kontronik_can_gw.protocol.fields import Data, DataType, InfoData, LiveData, body_format, rows
+from kontronik_can_gw.esc.kontronik.fields import Data, DataType, InfoData, LiveData, body_format, rows
 
 
 class Kind(Enum):

@@ -11,9 +11,9 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 from zlib import crc32
 
-from kontronik_can_gw.protocol.codec import FORMS, FORMS_BY_KIND_BYTE, Form, Kind, Layout
-from kontronik_can_gw.protocol.fields import Data, LiveData
-from kontronik_can_gw.protocol.states import LARGEST_STATE
+from kontronik_can_gw.esc.kontronik.codec import FORMS, FORMS_BY_KIND_BYTE, Form, Kind, Layout
+from kontronik_can_gw.esc.kontronik.fields import Data, LiveData
+from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 
 _new = tuple.__new__
 _u32_at = struct.Struct("<I").unpack_from

@@ -7,7 +7,7 @@ range is information for people, every value that fits the wire type is passed o
 import struct
 from typing import Annotated, NamedTuple, get_args, get_type_hints
 
-from kontronik_can_gw.protocol.states import Device
+from kontronik_can_gw.esc.kontronik.states import Device
 
 
 class Row(NamedTuple):

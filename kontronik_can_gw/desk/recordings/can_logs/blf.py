@@ -10,8 +10,8 @@ from collections.abc import Generator, Iterator
 from datetime import UTC, datetime
 from typing import BinaryIO
 
+from kontronik_can_gw.desk.recordings.can_logs.record import OLDEST_WALL_S, SECOND_NS, Damage, LogFrame, is_possible
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.offline.can_logs.record import OLDEST_WALL_S, SECOND_NS, Damage, LogFrame, is_possible
 
 _FILE_HEADER = struct.Struct("<4sL8xQQLL8H8H")
 _FILE_HEADER_SIZE = 144

@@ -5,11 +5,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Self
 
-from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.offline.can_logs.blf import BlfReader
-from kontronik_can_gw.offline.can_logs.record import SECOND_NS, Damage, LogFrame, Reader
-from kontronik_can_gw.offline.can_logs.text import (
+from kontronik_can_gw.desk.recordings.can_logs.blf import BlfReader
+from kontronik_can_gw.desk.recordings.can_logs.record import SECOND_NS, Damage, LogFrame, Reader
+from kontronik_can_gw.desk.recordings.can_logs.text import (
     ASC_HEAD,
     ASC_LINE,
     CANDUMP_LINE,
@@ -21,6 +19,8 @@ from kontronik_can_gw.offline.can_logs.text import (
     CandumpReader,
     TrcReader,
 )
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import CanFrame
 
 FORMATS = ("candump", "asc", "blf", "trc", "mf4")
 SUFFIXES = {
@@ -138,7 +138,7 @@ class CanLog:
             raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
         self._reader: Reader
         if self._file is None:
-            from kontronik_can_gw.offline.can_logs.mf4 import Mf4Reader
+            from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Reader
 
             self._reader = self._mf4 = Mf4Reader(path, self._damage)
         else:

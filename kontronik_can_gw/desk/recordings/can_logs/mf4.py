@@ -10,9 +10,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.offline.can_logs.record import (
+from kontronik_can_gw.desk.recordings.can_logs.record import (
     FD_LENGTHS,
     OLDEST_WALL_S,
     SECOND_NS,
@@ -20,6 +18,8 @@ from kontronik_can_gw.offline.can_logs.record import (
     LogFrame,
     is_possible,
 )
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import CanFrame
 
 if TYPE_CHECKING:
     from types import ModuleType

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from typing import BinaryIO
 
-from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.offline.can_logs.record import (
+from kontronik_can_gw.desk.recordings.can_logs.record import (
     FD_LENGTHS,
     OLDEST_WALL_S,
     SECOND_NS,
@@ -17,6 +16,7 @@ from kontronik_can_gw.offline.can_logs.record import (
     LogFrame,
     is_possible,
 )
+from kontronik_can_gw.frames import CanFrame
 
 LONGEST_LINE = 4096
 """Bytes; a line of any of these formats is far shorter."""

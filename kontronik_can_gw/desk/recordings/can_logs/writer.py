@@ -9,9 +9,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from kontronik_can_gw.desk.recordings.can_logs.record import SECOND_NS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
-from kontronik_can_gw.offline.can_logs.record import SECOND_NS
 
 if TYPE_CHECKING:
     from can import Message
@@ -46,7 +46,7 @@ class CanLogWriter:
         self._close: Callable[[], None] = lambda: None
         self._discard: Callable[[], None] = lambda: None
         if format_ == "mf4":
-            from kontronik_can_gw.offline.can_logs.mf4 import Mf4Writer
+            from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Writer
 
             assert isinstance(file, Path)
             start_ns = None if wall_start_ns is None else _whole_us(wall_start_ns + first_ns)

@@ -1,8 +1,8 @@
 """Tables of ESC values, a row at each time: CSV, JSON lines, Parquet, MF4."""
 
-from kontronik_can_gw.offline.tables.fields import Field, Table
-from kontronik_can_gw.offline.tables.rows import DISORDER_NS, Choice, Row, Rows, first_of
-from kontronik_can_gw.offline.tables.writers import FORMATS, TableWriter, open_table
+from kontronik_can_gw.desk.recordings.tables.fields import Field, Table
+from kontronik_can_gw.desk.recordings.tables.rows import DISORDER_NS, Choice, Row, Rows, first_of
+from kontronik_can_gw.desk.recordings.tables.writers import FORMATS, TableWriter, open_table
 
 __all__ = [
     "DISORDER_NS",

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
-from kontronik_can_gw.dbc_output.unpacker import Column
+from kontronik_can_gw.signals.unpacker import Column
 
 TIME = "Time"
 UTC = "Utc"

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.dbc_output.unpacker import Value
-from kontronik_can_gw.offline.can_logs.mf4 import asammdf_module, quiet, save_mf4, set_start
-from kontronik_can_gw.offline.tables.fields import Field, Kind, Table
-from kontronik_can_gw.offline.tables.rows import SECOND_NS, Row
+from kontronik_can_gw.desk.recordings.can_logs.mf4 import asammdf_module, quiet, save_mf4, set_start
+from kontronik_can_gw.desk.recordings.tables.fields import Field, Kind, Table
+from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
+from kontronik_can_gw.signals.unpacker import Value
 
 ROWS = 8192
 NOT_AVAILABLE = "NotAvailable"

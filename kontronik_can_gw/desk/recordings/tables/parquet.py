@@ -5,9 +5,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from kontronik_can_gw.desk.recordings.tables.fields import TIME, UTC, Field, Kind, Table
+from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.offline.tables.fields import TIME, UTC, Field, Kind, Table
-from kontronik_can_gw.offline.tables.rows import SECOND_NS, Row
 
 ROWS = 16_384
 """Rows that gather as such."""

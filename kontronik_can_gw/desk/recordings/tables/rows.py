@@ -8,12 +8,12 @@ from itertools import chain
 from operator import itemgetter
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-from kontronik_can_gw.dbc_output.unpacker import Column, SignalReader, Value
+from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.samples import Sample
+from kontronik_can_gw.desk.recordings.tables.fields import Table, fields_of, frame_fields
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.offline.replay import TimedFrame
-from kontronik_can_gw.offline.samples import Sample
-from kontronik_can_gw.offline.tables.fields import Table, fields_of, frame_fields
+from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
 SECOND_NS = 1_000_000_000
 DISORDER_NS = SECOND_NS

@@ -7,9 +7,9 @@ from datetime import UTC as UTC_ZONE
 from datetime import datetime
 from typing import IO
 
-from kontronik_can_gw.dbc_output.unpacker import Value
-from kontronik_can_gw.offline.tables.fields import TIME, UTC, Field, Kind, Table
-from kontronik_can_gw.offline.tables.rows import SECOND_NS, Row
+from kontronik_can_gw.desk.recordings.tables.fields import TIME, UTC, Field, Kind, Table
+from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
+from kontronik_can_gw.signals.unpacker import Value
 
 _Line = Callable[[str, str, Sequence[Value]], str]
 

@@ -5,9 +5,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Protocol
 
-from kontronik_can_gw.offline.tables.fields import Table
-from kontronik_can_gw.offline.tables.rows import Row
-from kontronik_can_gw.offline.tables.text import CsvTable, JsonTable
+from kontronik_can_gw.desk.recordings.tables.fields import Table
+from kontronik_can_gw.desk.recordings.tables.rows import Row
+from kontronik_can_gw.desk.recordings.tables.text import CsvTable, JsonTable
 
 FORMATS = ("csv", "jsonl", "parquet", "mf4")
 
@@ -34,11 +34,11 @@ def open_table(target: IO[bytes] | Path, form: str, table: Table, units_line: bo
     writer: TableWriter
     if isinstance(target, Path):
         if form == "parquet":
-            from kontronik_can_gw.offline.tables.parquet import ParquetTable
+            from kontronik_can_gw.desk.recordings.tables.parquet import ParquetTable
 
             writer = ParquetTable(target, table)
         else:
-            from kontronik_can_gw.offline.tables.mf4 import Mf4Table
+            from kontronik_can_gw.desk.recordings.tables.mf4 import Mf4Table
 
             writer = Mf4Table(target, table)
     elif form == "jsonl":
