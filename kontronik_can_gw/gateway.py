@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.dbc.output import DbcOutput
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.signals.plan import Layout
 
 _CONFLICT_NS = 10 * SECOND
 """So long without a further one, and a conflict of ids is over."""

@@ -20,12 +20,12 @@ from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Mapped, Tpdo, message_plan
 from kontronik_can_gw.dbc.expand import esc_prefix
-from kontronik_can_gw.dbc.layout import SignalPlan
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import Device, ErrorBit, OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, LinkState
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.signals.plan import SignalPlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

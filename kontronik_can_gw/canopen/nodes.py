@@ -20,10 +20,10 @@ from kontronik_can_gw.canopen.node import (
     make_dictionary,
 )
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.dbc.layout import classic_bits
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import CanState, GatewayStatus
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.signals.plan import classic_bits
 
 _FIRST_IDS = (0x80, SDO_ANSWER, SDO_REQUEST, heartbeat.COB_ID)
 """COB-IDs of EMCY, SDO and heartbeat, less the node-ID."""

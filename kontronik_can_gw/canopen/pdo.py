@@ -14,11 +14,11 @@ from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
 from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.objects import LINK, Bound
-from kontronik_can_gw.dbc.layout import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscTelemetry, Event
 from kontronik_can_gw.esc.values import GatewayStatus, Group, Source
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.packer import Pack, compile_pack, place
+from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
 MOST = 512

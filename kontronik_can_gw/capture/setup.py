@@ -24,12 +24,14 @@ from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, decode, encode
 from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
 from kontronik_can_gw.config.keys import parse
-from kontronik_can_gw.dbc.layout import DbcSettings, Layout, parse_database
+from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

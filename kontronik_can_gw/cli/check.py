@@ -11,9 +11,9 @@ from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Tpdo
 from kontronik_can_gw.cli.common import Loaded, load_all, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config.keys import as_toml
-from kontronik_can_gw.dbc.layout import Layout, MessagePlan, Role, SendType, SignalPlan
 from kontronik_can_gw.dbc.loss import is_mute, reporter
 from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -24,14 +24,16 @@ from kontronik_can_gw.config.nodes import (
     read_stored,
     with_stored,
 )
-from kontronik_can_gw.dbc.layout import Layout, normalize, parse_database, read_dbc
 from kontronik_can_gw.dbc.loss import unreported
+from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.prepare import check_load, prepare
+from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.can_port import check_interface
 from kontronik_can_gw.runtime.store import ParameterStore
+from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

@@ -92,9 +92,10 @@ def _canopen(args: argparse.Namespace) -> "Database":
 
 
 def _database(args: argparse.Namespace) -> "Database":
+    from kontronik_can_gw.dbc.compiler import DbcSettings
     from kontronik_can_gw.dbc.expand import among_canopen, expand
-    from kontronik_can_gw.dbc.layout import DbcSettings, choose_node, load_database
     from kontronik_can_gw.dbc.prepare import prepare
+    from kontronik_can_gw.dbc.reader import choose_node, load_database
 
     if args.config is not None:
         _refuse(args, ("esc", "name", "base_id", "id_step", "node", "from"), "--config, which says all that")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from kontronik_can_gw.cli.status import Line, Piece, compact, duration
-from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.monitor.model import (
     PERCENT,
     QUANTITIES,

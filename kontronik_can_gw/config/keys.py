@@ -18,7 +18,8 @@ from typing import Any, TypeVar, cast
 
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.dbc import send_types
-from kontronik_can_gw.dbc.layout import DbcSettings, normalize
+from kontronik_can_gw.dbc.compiler import DbcSettings
+from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS, EscSettings

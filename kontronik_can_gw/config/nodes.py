@@ -17,13 +17,13 @@ from kontronik_can_gw.canopen.node import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.config.keys import Config, shipped
-from kontronik_can_gw.dbc.layout import Layout, classic_bits
 from kontronik_can_gw.dbc.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
 from kontronik_can_gw.runtime.store import ParameterStore, parameter_file
+from kontronik_can_gw.signals.plan import Layout, classic_bits
 
 
 @dataclass

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy, deepcopy
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc.layout import Binder, is_one_esc_layout
+from kontronik_can_gw.dbc.binding import Binder, is_one_esc_layout
 from kontronik_can_gw.dbc.writer import dbc_text, frame_id
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings

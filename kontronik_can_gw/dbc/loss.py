@@ -3,8 +3,8 @@
 import math
 import struct
 
-from kontronik_can_gw.dbc.layout import Layout, MessagePlan, SignalPlan
 from kontronik_can_gw.esc.values import Group
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, SignalPlan
 
 _OF_LINK = frozenset({"link_state", "data_age"})
 

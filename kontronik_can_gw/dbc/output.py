@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from kontronik_can_gw.dbc.layout import Layout, MessagePlan, Role, SendType, SignalPlan
 from kontronik_can_gw.dbc.schedule import Schedule
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import GatewayStatus, Group, Source, sources
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 _new = tuple.__new__
 _EVENT_OF_PACE = {Group.LIVE: Event.LIVE, Group.INFO: Event.INFO, Group.LINK: Event.LINK, Group.GATEWAY: Event.NONE}

@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
 from kontronik_can_gw.dbc.expand import among_canopen, expand, needs_expansion
-from kontronik_can_gw.dbc.layout import DbcSettings, Layout, choose_node, compile_layout
+from kontronik_can_gw.dbc.reader import choose_node
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

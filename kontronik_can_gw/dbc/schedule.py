@@ -7,7 +7,7 @@ says when to ask again.
 import heapq
 from collections.abc import Sequence
 
-from kontronik_can_gw.dbc.layout import MessagePlan
+from kontronik_can_gw.signals.plan import MessagePlan
 
 _NEVER = -(1 << 62)
 

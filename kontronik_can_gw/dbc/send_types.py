@@ -1,19 +1,9 @@
 """When a message is sent: GenMsgSendType as Vector's and OEM templates spell it."""
 
 from collections.abc import Mapping
-from enum import Flag
 
 from kontronik_can_gw.dbc.names import normalize
-
-
-class SendType(Flag):
-    """When a message is sent. Several may hold."""
-
-    CYCLIC = 1
-    EVENT = 2
-    """With each UART frame (or change of the link) that brings one of its signals."""
-    ON_CHANGE = 4
-
+from kontronik_can_gw.signals.plan import SendType
 
 NAMES = {
     "Cyclic": SendType.CYCLIC,

@@ -5,9 +5,9 @@ three cycles, one that comes with telemetry for a second, one that comes on chan
 the shortest cycles (3 s at least; never where no message has a cycle, because then nobody knows).
 """
 
-from kontronik_can_gw.dbc.layout import SendType
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import Group
+from kontronik_can_gw.signals.plan import SendType
 from kontronik_can_gw.signals.unpacker import Chunk, Part, SignalReader, Value
 
 _LEAST_NS = 250 * MS

@@ -10,9 +10,9 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 
-from kontronik_can_gw.dbc.layout import MessagePlan, Piece, Role, SignalPlan
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.esc.values import GatewayStatus, Group
+from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
 _PLAIN_VALUE = re.compile(r"live\[\d+\]|info\[\d+\]")
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]

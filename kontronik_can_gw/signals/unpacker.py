@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from kontronik_can_gw.dbc.layout import Layout, MessagePlan, Role, SignalPlan
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals.packer import take
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 Value = int | float | str | None
 Chunk = tuple[int, list[Value]]

@@ -32,7 +32,6 @@ from kontronik_can_gw.canopen.node import Node, NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.states import Device
@@ -40,6 +39,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.signals.plan import Layout
 
 EMPTY = Layout("", "", ())
 OFF = 0xC0000000

@@ -12,8 +12,8 @@ from kontronik_can_gw.canopen.pdo import message_plan
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli.common import Loaded, assemble
 from kontronik_can_gw.config.keys import parse
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number
+from kontronik_can_gw.signals.plan import Layout
 
 VALUE, TAKEN = 0x06090030, 0x06040043
 

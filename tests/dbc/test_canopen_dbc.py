@@ -23,7 +23,6 @@ from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc.expand import esc_prefix
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
@@ -32,6 +31,7 @@ from kontronik_can_gw.esc.simulator import BYTE_NS, Dropout, ErrorWindow, EscOpt
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.signals.plan import Layout
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_canopen.dbc"
 EDS = reader.load(EDS_TEXT.encode(), "kontronik_esc.eds")

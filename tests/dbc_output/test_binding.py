@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from packer_oracle import STATES, Msg, Sig, dbc_text, get, pascal, read
 
-from kontronik_can_gw.dbc.layout import Binder, DbcSettings, Layout, Role
+from kontronik_can_gw.dbc.binding import Binder
+from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -23,6 +24,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import compile_pack
+from kontronik_can_gw.signals.plan import Layout, Role
 
 LIVE = LiveData(
     electrical_speed=70_000,

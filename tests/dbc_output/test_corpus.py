@@ -14,8 +14,9 @@ import opendbc  # type: ignore[import-untyped]
 import pytest
 from cantools.database.can import Database, Message, Signal
 
-from kontronik_can_gw.dbc.layout import DbcSettings, Layout, load_database
+from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.reader import load_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -24,6 +25,7 @@ from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.esc.values import sources
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.packer import compile_pack
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.units import conversion, says_nothing
 
 FOLDER = Path(opendbc.__file__).parent / "dbc"

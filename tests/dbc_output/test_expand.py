@@ -15,10 +15,12 @@ from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc import expand
-from kontronik_can_gw.dbc.layout import DbcSettings, MessagePlan, compile_layout, load_database, parse_database
+from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
 from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.reader import load_database, parse_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.signals.plan import MessagePlan
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 EIGHT = [EscSettings(f"esc{number}") for number in range(1, 9)]

@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.dbc.layout import DbcSettings, Layout, load_database
+from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import check_load, prepare
+from kontronik_can_gw.dbc.reader import load_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.signals.plan import Layout
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 VOLTAGE = Sig("BatteryVoltage", 0, 16, factor="0.01", unit="V")

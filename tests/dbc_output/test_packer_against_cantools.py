@@ -25,11 +25,12 @@ from packer_oracle import (
     read,
 )
 
-from kontronik_can_gw.dbc.layout import DbcSettings, MessagePlan, compile_layout
+from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import GatewayStatus
 from kontronik_can_gw.esc.values import sources as all_sources
 from kontronik_can_gw.signals.packer import compile_pack, float_bits
+from kontronik_can_gw.signals.plan import MessagePlan
 
 ESCS = (
     EscSettings("left", pole_pairs=7, gear=Fraction(31, 4), timeout_ns=250 * MS),

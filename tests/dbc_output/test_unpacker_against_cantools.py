@@ -11,11 +11,12 @@ from packer_oracle import LayoutMaker, Msg, Sig, bindings, bit_places, dbc_text,
 from test_packer_against_cantools import ESCS, MESSAGES
 
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.layout import DbcSettings, Layout, compile_layout
+from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 

@@ -2,12 +2,14 @@
 
 import pytest
 
-from kontronik_can_gw.dbc.layout import DbcSettings, Layout, parse_database
+from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc.kontronik import Device, InfoData, LiveData, codec, encode
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.signals.plan import Layout
 
 HEAD = 'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: Gw Car\n\nBO_ 256 M: 8 Gw\n'
 ATTRIBUTES = """

@@ -22,7 +22,6 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.keys import parse
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
@@ -30,6 +29,7 @@ from kontronik_can_gw.esc.simulator import Dropout, ErrorWindow, EscOptions, Fau
 from kontronik_can_gw.esc.simulator import Sent as Wired
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Mailboxes
 
 MS = 1_000_000

@@ -11,7 +11,7 @@ from simulated_bus import STEP_NS, Timed, flight, layout_of, with_errors
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config.keys import parse
-from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError, Severity

@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config.keys import CanConfig, parse
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import CanState
@@ -30,6 +29,7 @@ from kontronik_can_gw.runtime import can_port
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
 from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000

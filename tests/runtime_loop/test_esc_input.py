@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import codec
@@ -24,6 +23,7 @@ from kontronik_can_gw.runtime.esc_port import EscInput
 from kontronik_can_gw.runtime.fault_log import Conditions
 from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.serial_port import Identity, PortLost, is_mini_uart
+from kontronik_can_gw.signals.plan import Layout
 
 LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2", "1.0")
 LIVE = codec.encode(LiveData(battery_voltage=2442), codec.Layout.V4)

@@ -10,8 +10,9 @@ import pytest
 
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.dbc.layout import DbcSettings, Layout, parse_database
+from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -27,6 +28,7 @@ from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler
 from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.systemd import Notifier
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
 
 NOT_AVAILABLE = 0xFFFFFFFF

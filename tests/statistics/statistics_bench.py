@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
@@ -19,6 +18,7 @@ from kontronik_can_gw.runtime.snapshot import (
     StoreFacts,
     snapshot,
 )
+from kontronik_can_gw.signals.plan import Layout
 
 START = 1000 * SECOND
 PROGRAM = ProgramFacts("/etc/kontronik-can-gw/gateway.toml", "1.2.3", 4711, 99, "pid:[1]", "2026-01-02T03:04:05Z")

@@ -14,7 +14,6 @@ import pytest
 from vcan_tools import LIMIT_S, ip, wait_for
 
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik import Layout as UartLayout
 from kontronik_can_gw.esc.kontronik import LiveData, encode
@@ -24,6 +23,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000

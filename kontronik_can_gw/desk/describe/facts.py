@@ -24,7 +24,6 @@ from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import bindings
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.layout import Role, SendType, SignalPlan
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES, Text
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.esc.kontronik.fields import LiveData, rows
@@ -39,6 +38,7 @@ from kontronik_can_gw.esc.kontronik.states import (
 )
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.esc.values import Group, sources
+from kontronik_can_gw.signals.plan import Role, SendType, SignalPlan
 
 FORMAT = "kontronik-can-gw description"
 VERSION = 1

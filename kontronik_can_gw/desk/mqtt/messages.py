@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.states import (

@@ -29,7 +29,7 @@ from kontronik_can_gw.capture.format import (
 from kontronik_can_gw.capture.replay import Replay, TimedFrame, follow_bytes
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.layout import DbcSettings, Layout
+from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.desk.recordings.can_logs import NAMES, SUFFIXES, CanLog, log_format
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.more_escs import more_escs
@@ -39,6 +39,7 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.kontronik.codec import Kind as FrameKind
 from kontronik_can_gw.esc.kontronik.deframer import Deframer
 from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 CHUNK = 1 << 18

@@ -1,10 +1,10 @@
 """Frames of a log, marked as replay: where a message tells the gateway's state, it says Replay."""
 
-from kontronik_can_gw.dbc.layout import Layout, Role
 from kontronik_can_gw.esc.values import GatewayState
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import place
+from kontronik_can_gw.signals.plan import Layout, Role
 
 
 class Marker:

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.dbc.layout import Layout
 from kontronik_can_gw.dbc.output import DbcOutput
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.esc.telemetry import MS, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import Part, SignalReader, Value
 
 SAME_ROW_NS = 5 * MS

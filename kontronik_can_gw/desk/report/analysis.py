@@ -10,7 +10,7 @@ from enum import IntEnum
 from operator import itemgetter
 from typing import NamedTuple, TypeVar
 
-from kontronik_can_gw.dbc.layout import normalize
+from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.report.decimate import Decimator, Number, Points
 from kontronik_can_gw.desk.report.flight import (

@@ -6,152 +6,43 @@ limits, value tables and timing come from the file and from nowhere else.
 
 import difflib
 import math
-import re
 import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from fractions import Fraction
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc import counters, send_types
-from kontronik_can_gw.dbc.bounds import MAX_BYTES, check_bounds, check_size
-from kontronik_can_gw.dbc.names import normalize as normalize
-from kontronik_can_gw.dbc.send_types import SendType as SendType
+from kontronik_can_gw.dbc.binding import Binder
+from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.dbc.reader import attribute, choose_node, listed
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
-from kontronik_can_gw.esc.values import Group, Source, sources
-from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.esc.values import Group, Source
 from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.plan import FD_LENGTHS, Layout, MessagePlan, Piece, Role, SendType, SignalPlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
 
+
 _NOT_AVAILABLE_TEXTS = frozenset({"notavailable", "sna", "na", "signalnotavailable"})
+
 _ERROR_TEXTS = frozenset({"error", "err", "invalid"})
+
 _LARGEST_FLOAT = int(struct.unpack("<f", b"\xff\xff\x7f\x7f")[0])
-_MAX_REASON = 300
-"""Characters: cantools may quote the whole file."""
+
 _MAX_PAGES = 1024
 """Multiplexer values of a message of ours."""
+
 _MANY = 5
+
 _SUSPECT = {
     None: "",
     counters.Kind.COUNTER: ' If it counts the frames: bind = "alive".',
     counters.Kind.CHECKSUM: ' If it is the CRC of AUTOSAR E2E profile 1: bind = "crc".',
 }
-FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-EXPECTED_LIVE_HZ = 100
-"""What a UART is expected to bring, for the computed bus load only; the gateway sends as frames come."""
-
-
-class Role(Enum):
-    """What fills a signal."""
-
-    SOURCE = "source"
-    ALIVE = "alive counter"
-    CRC = "CRC"
-    CONSTANT = "constant"
-    MULTIPLEXER = "multiplexer"
-
-
-class Piece(NamedTuple):
-    """``(raw >> shift & (1 << width) - 1) << at``, ``at`` counted from bit 0 of byte 0 upward."""
-
-    shift: int
-    width: int
-    at: int
-
-
-@dataclass(frozen=True)
-class SignalPlan:
-    """One signal with what fills it. Raw value of a source in steps x: ``x * slope + intercept``, rounded."""
-
-    name: str
-    unit: str
-    role: Role
-    length: int
-    signed: bool
-    is_float: bool
-    pieces: tuple[Piece, ...]
-    low: int
-    high: int
-    not_available: int
-    error: int
-    slope: Fraction = Fraction(1)
-    intercept: Fraction = Fraction(0)
-    source: Source | None = None
-    esc: int | None = None
-    """Index of the ESC the source is read from; None for the gateway."""
-    numbers: Mapping[int, int] | None = None
-    """Source number to raw value for an enumeration; what is missing is sent as Error."""
-    constant: int = 0
-    limits: tuple[float, float] = (-math.inf, math.inf)
-    """Of a float, in raw values; its codes are bit patterns."""
-    page: int | None = None
-    """The multiplexer value under which the signal is sent; None: always."""
-    factor: Fraction = Fraction(1)
-    offset: Fraction = Fraction(0)
-    """Physical value of a raw one: ``raw * factor + offset``, in ``unit``."""
-    texts: Mapping[int, str] = field(default_factory=dict)
-    """Value table, raw value to text, without the codes for not available and error."""
-    notes: tuple[str, ...] = ()
-    """What resolution or range is lost, for people."""
-    unbound: bool = False
-    """A constant because it is bound to nothing."""
-
-
-def classic_bits(length: int, extended: bool = False) -> int:
-    """Bits of a classic CAN frame with so many data bytes, with the most stuffing that is possible."""
-    head = 54 if extended else 34
-    return head + 13 + 8 * length + (head + 8 * length - 1) // 4
-
-
-@dataclass(frozen=True)
-class MessagePlan:
-    """One message of ours, as it is sent."""
-
-    name: str
-    can_id: int
-    extended: bool
-    fd: bool
-    length: int
-    send_type: SendType
-    cycle_ns: int
-    """0: not cyclic."""
-    delay_ns: int
-    """Minimum distance between two frames."""
-    signals: tuple[SignalPlan, ...]
-    escs: frozenset[int]
-    paces: frozenset[Group]
-    """What the message's values change with."""
-    pages: tuple[int | None, ...] = (None,)
-    data_id: int = 0
-    """AUTOSAR E2E profile 1 data id, used where the message has a CRC signal."""
-
-    @property
-    def bits(self) -> tuple[int, int]:
-        """Bits on the bus at the nominal rate and at CAN FD's data rate, with the most stuffing that is possible."""
-        if self.fd:
-            head = 36 if self.extended else 17
-            data = 5 + 8 * self.length
-            return head + head // 4 + 13, data + data // 4 + (33 if self.length > 16 else 28)
-        return classic_bits(self.length, self.extended), 0
-
-    @property
-    def rate_hz(self) -> float:
-        """Frames a second to be expected with all UARTs at 100 Hz; messages sent on change are counted by their cycle."""
-        events = 0.0
-        if SendType.EVENT in self.send_type:
-            if Group.LIVE in self.paces:
-                events = EXPECTED_LIVE_HZ * len(self.escs)
-            else:
-                events = 1.0 * max(1, len(self.escs))
-        if self.cycle_ns:
-            events += 1e9 / self.cycle_ns
-        return min(events, 1e9 / self.delay_ns) if self.delay_ns else events
 
 
 @dataclass(frozen=True)
@@ -175,251 +66,6 @@ class DbcSettings:
     """What becomes of a signal without a source: "error", or its "start_value" for ever."""
     flags_on_loss: int | None = None
     """What a flag without a code is without telemetry; None: its own start value, else 0."""
-
-
-@dataclass(frozen=True)
-class Layout:
-    """All messages of ours and what should be said about them."""
-
-    file: str
-    node: str
-    messages: tuple[MessagePlan, ...]
-    warnings: tuple[str, ...] = ()
-
-    def bus_load(self, bitrate: int, data_bitrate: int = 2_000_000) -> float:
-        """Share of the bus, 0 to 1 and above, that the messages need at these rates in bit/s."""
-        return sum(
-            message.rate_hz * (message.bits[0] / bitrate + message.bits[1] / data_bitrate) for message in self.messages
-        )
-
-
-def load_database(path: Path, warnings: list[str] | None = None) -> "Database":
-    """Read a DBC file, as ``parse_database``. UserError with one line for a file that cannot be read or is no DBC."""
-    return parse_database(read_dbc(path), str(path), warnings)
-
-
-def read_dbc(path: Path) -> bytes:
-    """The bytes of a DBC file. UserError with one line where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(MAX_BYTES + 1)  # no more is needed to see that it is too large
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
-
-
-def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> "Database":
-    """Read the bytes of a DBC file. UserError with one line that names ``path`` for what is no DBC.
-
-    Entries for what the file does not have are ignored, with a line for ``warnings``.
-    """
-    check_size(len(raw), path)
-    if b"\0" in raw:
-        raise UserError(f"{path}: is a binary file, not a DBC")
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("cp1252", errors="replace")
-    if not text.strip():
-        raise UserError(f"{path}: is empty, not a DBC")
-    check_bounds(text, path)
-    with without_asammdf():
-        import cantools.database
-
-    text, ignored = _spelled_out(text, path)
-    if warnings is not None:
-        warnings += ignored
-    try:
-        database = cantools.database.load_string(text, database_format="dbc", strict=False, sort_signals=None)
-    except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
-        reason = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
-        raise UserError(f"{path}: is not a DBC that can be read: {reason}") from None
-    if not isinstance(database, cantools.database.Database):
-        raise UserError(f"{path}: is not a CAN database")
-    if not database.messages:
-        raise UserError(f"{path}: has no message; is it a DBC file?")
-    return database
-
-
-_STRING = re.compile(r'"(?:\\"|[^"])*"')
-_PAIRS = r'(?:[^\s";]+\s+"\0\d+\0"\s*)*'
-"""Values and their texts, masked. Never simply up to a semicolon: NS_ lists keywords without one."""
-_MASKED = re.compile(r'"\0(\d+)\0"')
-
-
-def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
-    """What other tools write and cantools does not read: a VAL_ that names a VAL_TABLE_, enumeration attributes by text.
-
-    Entries for signals, tables and attributes that the file does not have are taken out, each kind with a warning; cantools refuses the
-    whole file for them. Strings are masked meanwhile, so that no comment and no value text is touched, and lines keep their numbers.
-    """
-    strings: list[str] = []
-
-    def mask(found: re.Match[str]) -> str:
-        strings.append(found[0])
-        return f'"\0{len(strings) - 1}\0"'
-
-    def shown(masked: str) -> str:
-        return _MASKED.sub(lambda found: strings[int(found[1])], masked)
-
-    text = _STRING.sub(mask, text)
-    ignored: dict[str, list[str]] = {}
-
-    def without(entry: re.Match[str], reason: str, what: str) -> str:
-        ignored.setdefault(reason, []).append(shown(what))
-        return "\n" * entry[0].count("\n")
-
-    tables = dict(re.findall(rf"^[ \t]*VAL_TABLE_\s+(\w+)\s+({_PAIRS});", text, re.MULTILINE))
-    signals: set[tuple[str, str]] = set()
-    message = ""
-    for found in re.finditer(r"^[ \t]*(?:BO_\s+0*(\d+)\s+\w+\s*:|SG_\s+(\w+))", text, re.MULTILINE):
-        message = found[1] or message
-        signals.add((message, found[2]))
-
-    def of_signal(found: re.Match[str]) -> str:
-        keyword, number, name, body = found["keyword"], found["message"], found["signal"], found["body"]
-        what = f"{keyword} {number or ''} {name}".replace("  ", " ")
-        if number is not None and (number.lstrip("0") or "0", name) not in signals:
-            return without(found, "for signals that are not in the file", what)
-        if keyword != "VAL_" or not re.fullmatch(r"[A-Za-z_]\w*", body.strip()):
-            return found[0]
-        if (table := tables.get(body.strip())) is None:
-            return without(found, "naming a VAL_TABLE_ that is not in the file", f"{what} {body.strip()}")
-        return f"{found['head']}{table};"
-
-    text = re.sub(
-        r"^(?P<head>[ \t]*(?P<keyword>VAL_|SIG_VALTYPE_)\s+(?:(?P<message>\d+)\s+)?(?P<signal>[A-Za-z_]\w*+)\s*+)"
-        rf"(?P<body>{_PAIRS}|[A-Za-z_]\w*\s*|:?\s*\d+\s*);",
-        of_signal,
-        text,
-        flags=re.MULTILINE,
-    )
-    defined = set(map(shown, re.findall(r"^[ \t]*BA_DEF_\s+(?:\w+\s+)?(\"\0\d+\0\")", text, re.MULTILINE)))
-    text = re.sub(
-        r"^[ \t]*(BA_|BA_DEF_DEF_)\s+(\"\0\d+\0\")[^;\n]*;",
-        lambda found: (
-            found[0]
-            if shown(found[2]) in defined
-            else without(found, "of attributes that no BA_DEF_ defines", f"{found[1]} {found[2]}")
-        ),
-        text,
-        flags=re.MULTILINE,
-    )
-    listed = re.findall(
-        r"^[ \t]*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?(\"\0\d+\0\")\s+ENUM\s+([^;]*)", text, re.MULTILINE
-    )
-    numbers = {
-        shown(name): {shown(value[0]): str(n) for n, value in enumerate(re.finditer(_MASKED, values))}
-        for name, values in listed
-    }
-
-    def number(found: re.Match[str]) -> str:
-        name, value = shown(found[2]), shown(found[4])
-        if name in numbers and value not in numbers[name]:
-            raise UserError(f"{path}: attribute {name}: {value} is none of its values {', '.join(numbers[name])}")
-        return f"{found[1]}{found[2]}{found[3]}{numbers.get(name, {}).get(value, found[4])}{found[5]}"
-
-    text = re.sub(r"^([ \t]*BA_\s+)(\"\0\d+\0\")(\s[^\";]*)(\"\0\d+\0\")(\s*;)", number, text, flags=re.MULTILINE)
-    return shown(text), [f"{path}: ignored, {reason}: {_listed(found)}" for reason, found in ignored.items()]
-
-
-def _listed(names: Sequence[str], most: int = 6) -> str:
-    """Each name once, and how many more there are."""
-    names = list(dict.fromkeys(names))
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
-
-
-def choose_node(database: "Database", wanted: str | None, file: str) -> str:
-    """The transmitter node whose messages are ours."""
-    senders = sorted({sender for message in database.messages for sender in message.senders})
-    if wanted is not None:
-        if wanted in senders:
-            return wanted
-        raise UserError(
-            f"{file}: no message is sent by node {wanted!r}; nodes that send: {', '.join(senders) or 'none'}. "
-            f"Set dbc.node to one of them."
-        )
-    if len(senders) == 1:
-        return senders[0]
-    gateways = [sender for sender in senders if sender == "KontronikGateway"]
-    if gateways:
-        return gateways[0]
-    if not senders:
-        raise UserError(f"{file}: no message has a transmitter, so none is ours. Name one in the DBC (BU_ and BO_).")
-    raise UserError(f"{file}: several nodes send: {', '.join(senders)}. Set dbc.node to the gateway's.")
-
-
-def attribute(owner: Any, name: str, database: "Database") -> Any:
-    """An attribute's value, its default where it is not set, None where it is not defined; enumerations as text."""
-    definition = database.dbc.attribute_definitions.get(name) if database.dbc else None
-    if definition is None:
-        return None
-    own = owner.dbc.attributes.get(name) if owner.dbc else None
-    value = definition.default_value if own is None else own.value
-    choices = definition.choices
-    if choices and isinstance(value, int):
-        return choices[value] if 0 <= value < len(choices) else None
-    return value
-
-
-class Binder:
-    """Finds the source that a signal name means, for a given set of ESCs."""
-
-    def __init__(self, escs: Sequence[EscSettings], bind: Mapping[str, str | float]) -> None:
-        self.escs = escs
-        self.bind = bind
-        self.used: set[str] = set()
-        self._sources = [sources(esc) for esc in escs]
-        self._by_key = {normalize(name): name for name in self._sources[0]}
-        self._prefixes = sorted(((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0]))
-
-    def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Source, int | None] | None:
-        """The source of a normalized name, ``percent`` at its end ignored; ``esc`` None: unprefixed."""
-        name = self._by_key.get(key) or self._by_key.get(key.removesuffix("percent"))
-        if name is None:
-            return None
-        source = self._sources[esc or 0][name]
-        return (source, None) if source.group is Group.GATEWAY else (source, esc)
-
-    def by_name(self, name: str) -> tuple[Source, int | None] | None:
-        """The source a signal name or a bound name means, and its ESC (None: the name says no ESC, or the gateway)."""
-        key = normalize(name)
-        if len(self.escs) == 1 and (found := self.gateway_or_esc(key, 0)):
-            return found
-        for prefix, esc in self._prefixes:
-            if key.startswith(prefix) and (found := self.gateway_or_esc(key[len(prefix) :], esc)):
-                return found
-        return self.gateway_or_esc(key, None)
-
-    def bound(self, message: str, signal: str) -> str | float | None:
-        """What ``[dbc.bind]`` says of a signal."""
-        for key in (f"{message}.{signal}", signal):
-            if key in self.bind:
-                self.used.add(key)
-                return self.bind[key]
-        return None
-
-    def suggestions(self, name: str) -> str:
-        """A sentence with the nearest known names, or an empty text."""
-        key = normalize(name)
-        for prefix, _ in self._prefixes:
-            key = key.removeprefix(prefix) or key
-        near = difflib.get_close_matches(key, self._by_key, n=3, cutoff=0.5)
-        names = [self._by_key[n] for n in near]
-        return f" Did you mean {' or '.join(names)}?" if names else ""
-
-
-def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
-    """True if signals of ours mean an ESC's values, and none says of which ESC."""
-    escs = set()
-    for message in database.messages:
-        if node in message.senders:
-            for signal in message.signals:
-                bound = binder.bound(message.name, signal.name)
-                found = binder.by_name(bound if isinstance(bound, str) else signal.name)
-                if found and found[0].group is not Group.GATEWAY:
-                    escs.add(found[1])
-    return escs == {None}
 
 
 def compile_layout(
@@ -464,10 +110,10 @@ def compile_layout(
     once = [plan.name for plan in plans if not plan.cycle_ns and not plan.paces]
     if once:
         compiler.warnings.append(
-            f"{file}: sent once at the start, without a cycle and a value that changes: {_listed(once)}"
+            f"{file}: sent once at the start, without a cycle and a value that changes: {listed(once)}"
         )
     if names := compiler.while_active:
-        compiler.warnings.append(f"{file}: sent all the time, not only while something is active: {_listed(names)}")
+        compiler.warnings.append(f"{file}: sent all the time, not only while something is active: {listed(names)}")
     return Layout(file, node, tuple(plans), tuple(compiler.warnings))
 
 

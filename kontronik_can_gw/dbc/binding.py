@@ -1,0 +1,72 @@
+"""Which value a signal means: by its name, the ESC's prefix, or [dbc.bind]."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import Group, Source, sources
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+
+class Binder:
+    """Finds the source that a signal name means, for a given set of ESCs."""
+
+    def __init__(self, escs: Sequence[EscSettings], bind: Mapping[str, str | float]) -> None:
+        self.escs = escs
+        self.bind = bind
+        self.used: set[str] = set()
+        self._sources = [sources(esc) for esc in escs]
+        self._by_key = {normalize(name): name for name in self._sources[0]}
+        self._prefixes = sorted(((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0]))
+
+    def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Source, int | None] | None:
+        """The source of a normalized name, ``percent`` at its end ignored; ``esc`` None: unprefixed."""
+        name = self._by_key.get(key) or self._by_key.get(key.removesuffix("percent"))
+        if name is None:
+            return None
+        source = self._sources[esc or 0][name]
+        return (source, None) if source.group is Group.GATEWAY else (source, esc)
+
+    def by_name(self, name: str) -> tuple[Source, int | None] | None:
+        """The source a signal name or a bound name means, and its ESC (None: the name says no ESC, or the gateway)."""
+        key = normalize(name)
+        if len(self.escs) == 1 and (found := self.gateway_or_esc(key, 0)):
+            return found
+        for prefix, esc in self._prefixes:
+            if key.startswith(prefix) and (found := self.gateway_or_esc(key[len(prefix) :], esc)):
+                return found
+        return self.gateway_or_esc(key, None)
+
+    def bound(self, message: str, signal: str) -> str | float | None:
+        """What ``[dbc.bind]`` says of a signal."""
+        for key in (f"{message}.{signal}", signal):
+            if key in self.bind:
+                self.used.add(key)
+                return self.bind[key]
+        return None
+
+    def suggestions(self, name: str) -> str:
+        """A sentence with the nearest known names, or an empty text."""
+        key = normalize(name)
+        for prefix, _ in self._prefixes:
+            key = key.removeprefix(prefix) or key
+        near = difflib.get_close_matches(key, self._by_key, n=3, cutoff=0.5)
+        names = [self._by_key[n] for n in near]
+        return f" Did you mean {' or '.join(names)}?" if names else ""
+
+
+def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
+    """True if signals of ours mean an ESC's values, and none says of which ESC."""
+    escs = set()
+    for message in database.messages:
+        if node in message.senders:
+            for signal in message.signals:
+                bound = binder.bound(message.name, signal.name)
+                found = binder.by_name(bound if isinstance(bound, str) else signal.name)
+                if found and found[0].group is not Group.GATEWAY:
+                    escs.add(found[1])
+    return escs == {None}
