@@ -8,8 +8,9 @@ from pathlib import Path
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Tpdo
-from kontronik_can_gw.cli.common import Loaded, load_all, show
+from kontronik_can_gw.cli.common import load_all, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
+from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.keys import as_toml
 from kontronik_can_gw.dbc.loss import is_mute, reporter
 from kontronik_can_gw.esc.telemetry import MS

@@ -154,7 +154,7 @@ def main(args: argparse.Namespace) -> int:
     with without_asammdf():
         import can
 
-    from kontronik_can_gw.cli.common import assemble
+    from kontronik_can_gw.config.assemble import assemble
     from kontronik_can_gw.config.keys import parse
     from kontronik_can_gw.desk.pty import PtyEsc
     from kontronik_can_gw.gateway import Gateway

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cli.common import Loaded, assemble, show
+from kontronik_can_gw.cli.common import show
+from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import SHIPPED, Config, load
 from kontronik_can_gw.config.nodes import parameter_folder
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity, count, document

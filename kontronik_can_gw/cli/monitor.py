@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
-from kontronik_can_gw.cli.common import check_devices, say, stopping_on_signals
+from kontronik_can_gw.cli.common import say, stopping_on_signals
+from kontronik_can_gw.config.assemble import check_devices
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable_json

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.cli.common import Loaded
+from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.keys import Config, as_toml
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.machine import state_folder

@@ -10,12 +10,8 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cli import need_descriptors
 from kontronik_can_gw.cli.arguments import number_from
-from kontronik_can_gw.cli.common import (
-    Loaded,
-    load_all,
-    logging_to_stderr,
-    stopping_on_signals,
-)
+from kontronik_can_gw.cli.common import load_all, logging_to_stderr, stopping_on_signals
+from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import SECOND
 

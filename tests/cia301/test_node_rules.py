@@ -10,7 +10,7 @@ from script import MS
 from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.canopen.pdo import message_plan
 from kontronik_can_gw.canopen.storage import Stored, encode
-from kontronik_can_gw.cli.common import Loaded, assemble
+from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number
 from kontronik_can_gw.signals.plan import Layout

@@ -6,7 +6,7 @@ from pathlib import Path
 from capture_bench import START, Bench
 
 from kontronik_can_gw.capture.format import block, data_payload, json_payload
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError

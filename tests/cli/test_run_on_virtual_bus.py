@@ -20,7 +20,7 @@ import can
 import pytest
 from cantools.database.can import Database
 
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import CanConfig, parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse, shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import SECOND

@@ -12,7 +12,7 @@ import kontronik_can_gw
 from kontronik_can_gw.canopen.storage import encode
 from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse, shipped
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.esc.values import CanState

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from kontronik_can_gw.capture.format import Entry, Kind, block, data_payload, json_payload, number_data
 from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.cli.recording import setup_of
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData

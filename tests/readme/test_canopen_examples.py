@@ -15,7 +15,7 @@ import can
 import pytest
 
 from kontronik_can_gw.canopen.storage import decode
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.desk import pty
 from kontronik_can_gw.esc.kontronik.states import OperatingError

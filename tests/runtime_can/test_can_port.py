@@ -18,7 +18,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import CanConfig, parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND

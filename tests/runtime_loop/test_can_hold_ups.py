@@ -6,7 +6,7 @@ import pytest
 from wire_world import World, loop_in, run
 
 from kontronik_can_gw.canopen.nmt import NmtState
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import GatewayState

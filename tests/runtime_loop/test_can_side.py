@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 from wire_world import CAN_FD, Bus, World
 
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode

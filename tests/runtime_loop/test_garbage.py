@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from kontronik_can_gw.cli.common import Loaded, assemble
+from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import CanConfig, parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from kontronik_can_gw.cli.common import assemble
+from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway import Gateway

@@ -1,0 +1,152 @@
+"""Everything that a configuration means: ESCs, DBC, CANopen nodes, what masters stored. All mistakes at once."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.canopen.check import without_objects
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.config.keys import Config, EscConfig, examine
+from kontronik_can_gw.config.nodes import (
+    load_of_stored,
+    parameter_folder,
+    plain_setup,
+    read_stored,
+    with_stored,
+)
+from kontronik_can_gw.dbc.loss import unreported
+from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.dbc.prepare import check_load, prepare
+from kontronik_can_gw.dbc.reader import parse_database, read_dbc
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.runtime.can_port import check_interface
+from kontronik_can_gw.runtime.store import ParameterStore
+from kontronik_can_gw.signals.plan import Layout
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+
+@contextmanager
+def collecting(problems: list[str]) -> Iterator[None]:
+    """Mistakes of people are added to ``problems``; what failed outside goes on as it is."""
+    try:
+        yield
+    except RunError:
+        raise
+    except UserError as error:
+        problems += error.problems
+
+
+def told_apart(config: Config) -> Config:
+    """Without the ESCs whose name, port or node-ID is that of another one or none at all, so that the rest can be looked at."""
+    kept: list[EscConfig] = []
+    seen: set[object] = set()
+    for esc, node_id in zip(config.esc, config.node_ids, strict=True):
+        own = {normalize(esc.name), ("port", esc.port), *({node_id} - {UNCONFIGURED})}
+        if not own & seen and (node_id <= 127 or node_id == UNCONFIGURED):
+            kept.append(replace(esc, node_id=node_id))
+            seen |= own
+    return replace(config, esc=tuple(kept))
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A checked configuration and what belongs to it. ``database`` None: no DBC output; ``canopen`` None: no nodes."""
+
+    config: Config
+    escs: list[EscSettings]
+    """As they hold: with what masters stored worked in."""
+    database: "Database | None"
+    layout: Layout
+    canopen: CanopenSetup | None
+    damaged: tuple[tuple[int, str], ...]
+    """ESCs whose stored parameters cannot be read, and why."""
+    store: ParameterStore | None
+    warnings: tuple[str, ...] = ()
+    dbc: bytes = b""
+    """The DBC file as it was read."""
+
+
+def load_configuration(path: Path, store: Callable[[Path], ParameterStore] | None = None) -> Loaded:
+    """Everything that a configuration means. UserError with every mistake.
+
+    ``store`` makes the store of what masters stored, for the one who runs; None: it is only looked at.
+    """
+    config, problems = examine(path)
+    if config is None:
+        raise UserError(*problems)
+    with collecting(problems):
+        check_interface(config.can)
+    if problems:
+        with collecting(problems):
+            assemble(told_apart(config))
+        raise UserError(*problems)
+    return assemble(config, store(parameter_folder(config)) if store and config.canopen.enabled else None)
+
+
+def check_devices(config: Config) -> None:
+    """What leads to one device by two names: two ESCs on one port, or the CAN adapter on an ESC's. UserError with each."""
+    problems = []
+    ports: dict[str, str] = {}
+    for esc in config.esc:
+        real = os.path.realpath(esc.port)
+        if (other := ports.setdefault(real, esc.name)) != esc.name:
+            problems.append(f"{config.file}: the ports of {other} and {esc.name} are one device, {real}")
+    channel = os.path.realpath(config.can.channel.partition("@")[0])
+    if "/" in config.can.channel and channel in ports:
+        problems.append(
+            f"{config.file}: can.channel {config.can.channel} is the port of {ports[channel]}: nothing may be sent to an ESC."
+        )
+    if problems:
+        raise UserError(*problems)
+
+
+def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
+    """What belongs to a configuration. Without a store its files are only looked at.
+
+    Configuration, DBC and EDS may be refused here. What masters stored may not: it gives way, with a warning, where it does not fit them.
+    """
+    problems: list[str] = []
+    with collecting(problems):
+        check_devices(config)
+    escs, plain, kept = config.escs, None, None
+    ignored: list[str] = []
+    taken: dict[int, str] = {}
+    bits = 0.0
+    if config.canopen.enabled:
+        with collecting(problems):
+            plain = plain_setup(config)
+            nodes = plain.nodes(plain.esc_settings(config.escs))
+            taken, bits = nodes.cob_ids(), nodes.bits_per_second()
+            ignored += [f"{plain.eds.name}: {line}" for line in without_objects(nodes)]
+        if plain is not None and not problems:
+            kept = read_stored(config, store)
+            escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
+    database, layout, dbc = None, Layout("", "", ()), b""
+    if config.dbc.enabled:
+        file = str(config.dbc_path)
+        with collecting(problems):
+            dbc = read_dbc(config.dbc_path)
+            found = parse_database(dbc, file, ignored)
+            database, layout = prepare(found, file, escs, config.dbc_settings, config.can.fd, taken)
+    if problems:
+        raise UserError(*problems)
+    bitrate, data_bitrate = config.can.bitrate, config.can.data_bitrate
+    warnings = [check_load(layout, bitrate, data_bitrate, bits)]
+    canopen = None
+    if plain is not None and kept is not None:
+        foreign = {message.can_id: message.name for message in layout.messages if not message.extended}
+        canopen, given_way = with_stored(plain, kept.stored, config, escs, foreign)
+        if canopen is not plain:
+            bits = canopen.nodes(escs).bits_per_second()
+        warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
+    damaged = () if kept is None else tuple(kept.damaged)
+    mute = unreported(layout, config.dbc.on_loss == "silent")
+    said = tuple(warning for warning in (*config.warnings, *ignored, *mute, *warnings) if warning)
+    return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc)
