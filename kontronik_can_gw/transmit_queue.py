@@ -25,7 +25,7 @@ class Sent(Enum):
     """Not sent: it has become old while it was to be handed over."""
 
 
-class Mailboxes:
+class TransmitQueue:
     """Frames that wait to be sent: slots in the order in which their ids began to wait, ``queued`` frames in the order of ``put``.
 
     While both wait they take turns, so that neither a long SDO block nor fast PDOs keep the other from the bus.

@@ -37,8 +37,8 @@ def test_a_cantools_that_is_there_already_stays() -> None:
 
 
 def test_a_database_is_read_as_ever() -> None:
-    code = "from pathlib import Path; from kontronik_can_gw.config.keys import shipped; from kontronik_can_gw.dbc import layout\n"
-    code += "database = layout.load_database(shipped('dbc/kontronik_esc.dbc')); import cantools.database, sys\n"
+    code = "from pathlib import Path; from kontronik_can_gw.config.keys import shipped; from kontronik_can_gw.dbc import reader\n"
+    code += "database = reader.load_database(shipped('dbc/kontronik_esc.dbc')); import cantools.database, sys\n"
     code += "whole = cantools.database.load_file(shipped('dbc/kontronik_esc.dbc'))\n"
     code += "print(len(database.messages) == len(whole.messages) > 5, 'can' in sys.modules)"
     assert result(code) == "True False"

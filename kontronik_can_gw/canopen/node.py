@@ -399,7 +399,7 @@ class Node:
             self.sdo.confirm(None if error is None else Abort.HARDWARE, now, ticket)
         self._set_due()
 
-    # --- LSS: the node as its slave sees it (cia305.lss.Host)
+    # --- LSS: the node as its slave sees it (lss.Host)
 
     @property
     def identity(self) -> tuple[int, int, int, int]:

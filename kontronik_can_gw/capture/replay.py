@@ -11,7 +11,7 @@ from kontronik_can_gw.capture.format import COUNTERS, Entry, Kind, read_counters
 from kontronik_can_gw.esc.values import CanState, GatewayState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.transmit_queue import Mailboxes, Sent
+from kontronik_can_gw.transmit_queue import Sent, TransmitQueue
 
 
 class TimedFrame(NamedTuple):
@@ -36,7 +36,7 @@ class Replay:
         self.passed_over = 0
         """Entries that make no sense."""
         self._marked = marked
-        self._waiting = Mailboxes()
+        self._waiting = TransmitQueue()
         self._taken: list[TimedFrame] = []
         """Of the last turn: whether they were sent, the next entry tells."""
         self._started = False
@@ -157,7 +157,7 @@ class Replay:
             self.gateway.status.can_state = CanState(state["can_state"])
 
 
-def in_order(frames: list[CanFrame], waiting: Mailboxes) -> list[CanFrame]:
+def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
     """The frames of one turn as an interface that takes them all is given them; ``waiting``: the same one for each turn."""
     waiting.put_all(frames)
     sent: list[CanFrame] = []
@@ -172,7 +172,7 @@ def in_order(frames: list[CanFrame], waiting: Mailboxes) -> list[CanFrame]:
 
 def follow_bytes(gateway: Gateway, chunks: Iterable[tuple[int, bytes]]) -> Iterator[TimedFrame]:
     """What a gateway sends that is given (time, bytes) of its first ESC, starts with them, and is never late."""
-    waiting = Mailboxes()
+    waiting = TransmitQueue()
     started = False
     for now, data in chunks:
         if not started:

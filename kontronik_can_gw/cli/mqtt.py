@@ -354,7 +354,7 @@ class _Run:
     ) -> None:
         from kontronik_can_gw.desk.mqtt.client import MqttClient
         from kontronik_can_gw.desk.mqtt.messages import Publisher
-        from kontronik_can_gw.runtime.fault_log import Conditions
+        from kontronik_can_gw.runtime.fault_log import FaultLog
 
         self._source, self._notifier = source, notifier
         self._publisher: Publisher = Publisher(
@@ -366,7 +366,7 @@ class _Run:
             replay=source.is_replay,
         )
         self._client: MqttClient = MqttClient(broker, topics.online)
-        self._conditions = Conditions()
+        self._conditions = FaultLog()
         self._topics = topics
         self._stopping = False
         self._status_ns = 0

@@ -15,13 +15,13 @@ from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Conflict, Gateway
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
-from kontronik_can_gw.runtime.fault_log import Conditions
+from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.snapshot import CanFacts, name_in_words
-from kontronik_can_gw.transmit_queue import Mailboxes, Sent
+from kontronik_can_gw.transmit_queue import Sent, TransmitQueue
 
 LONGEST_RETRY_NS = SECOND // 2
 BUSY_RETRY_NS = 2 * MS
@@ -36,7 +36,7 @@ RESTARTED_NS = SECOND
 """So long behind a restart a driver may go on telling of bus-off."""
 
 
-class CanSide:
+class CanLink:
     """The interface of a gateway. ``esc_at`` names the ESC that a path leads to: it must never be opened as a CAN adapter."""
 
     def __init__(
@@ -44,7 +44,7 @@ class CanSide:
         config: CanConfig,
         gateway: Gateway,
         selector: Registry,
-        conditions: Conditions,
+        conditions: FaultLog,
         esc_at: Callable[[str], str | None] = lambda _path: None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -52,7 +52,7 @@ class CanSide:
         self.port: CanPort | None = None
         self.just_opened = False
         """Set at each opening; who looks at it sets it back."""
-        self.mailboxes = Mailboxes()
+        self.mailboxes = TransmitQueue()
         self.facts: LinkFacts | None = None
         """What the kernel told last; None where it tells nothing of this interface."""
         self._gateway = gateway

@@ -10,7 +10,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.states import device_text
 from kontronik_can_gw.esc.telemetry import NS_PER_BYTE, SECOND, LinkState
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.fault_log import Conditions
+from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import (
@@ -31,7 +31,7 @@ SETTINGS_NS = SECOND // 2
 """While another program has echo on, what the ESC sends goes back to it."""
 
 
-class EscInput:
+class EscPort:
     """One ESC's port. ``reopened``: how often it came back; ``line_errors``: since the start, by kind.
 
     While the port is lost it is in ``lost``, so that nobody need look at each.
@@ -43,8 +43,8 @@ class EscInput:
         path: str,
         gateway: Gateway,
         selector: Registry,
-        conditions: Conditions,
-        lost: "set[EscInput]",
+        conditions: FaultLog,
+        lost: "set[EscPort]",
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.path = path

@@ -25,7 +25,7 @@ class _Condition:
         self.total = 0
 
 
-class Conditions:
+class FaultLog:
     """The conditions of a gateway by name. ``recent``: the last lines, for the statistics."""
 
     def __init__(self) -> None:

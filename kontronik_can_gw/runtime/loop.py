@@ -20,9 +20,9 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.can_link import CanSide
-from kontronik_can_gw.runtime.esc_port import EscInput
-from kontronik_can_gw.runtime.fault_log import Conditions
+from kontronik_can_gw.runtime.can_link import CanLink
+from kontronik_can_gw.runtime.esc_port import EscPort
+from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.serial_port import Identity
@@ -34,7 +34,7 @@ from kontronik_can_gw.runtime.systemd import Notifier
 log = logging.getLogger("kontronik_can_gw")
 
 MIN_HELD_UP_NS = 20 * MS
-"""A loop that comes round this much too late at least, and by ``can_side.longest_turn``, was held up."""
+"""A loop that comes round this much too late at least, and by ``can_link.longest_turn``, was held up."""
 _LOOKS_PER_TIMEOUT = 8
 """The ports are looked at so often within the shortest telemetry time-out at least: by how much of it a value may go early."""
 STATUS_NS = SECOND
@@ -63,7 +63,7 @@ class Loop:
         poller: Poller | None = None,
     ) -> None:
         self.gateway = gateway
-        self.conditions = Conditions()
+        self.conditions = FaultLog()
         self._clock = clock
         self._wait = wait_for_devices
         self._store = store
@@ -85,11 +85,11 @@ class Loop:
         self._recorder = recorder
         self._stopping = False
         self._poller = poller or Poller(clock)
-        self._lost: set[EscInput] = set()
+        self._lost: set[EscPort] = set()
         self.escs = [
-            EscInput(i, path, gateway, self._poller, self.conditions, self._lost, clock) for i, path in enumerate(ports)
+            EscPort(i, path, gateway, self._poller, self.conditions, self._lost, clock) for i, path in enumerate(ports)
         ]
-        self.can = CanSide(can_config, gateway, self._poller, self.conditions, self._esc_at, clock)
+        self.can = CanLink(can_config, gateway, self._poller, self.conditions, self._esc_at, clock)
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._poller.register(self._wake_read, selectors.EVENT_READ, self._woken)
         if store is not None:
@@ -216,7 +216,7 @@ class Loop:
         can_due = self.can.due
         return due if can_due is None or due < can_due else can_due
 
-    def _others(self, esc: EscInput) -> tuple[Identity | None, ...]:
+    def _others(self, esc: EscPort) -> tuple[Identity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)
 
     def _esc_at(self, path: str) -> str | None:

@@ -17,7 +17,7 @@ from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.transmit_queue import Mailboxes
+from kontronik_can_gw.transmit_queue import TransmitQueue
 
 START = 5_000 * SECOND + 123
 
@@ -48,7 +48,7 @@ class Bench:
         self.gateway = RecordedGateway(
             self._put, self.setup.escs, self.layout, START, self.setup.silent_on_loss, canopen
         )
-        self._waiting = Mailboxes()
+        self._waiting = TransmitQueue()
         self._saves: list[int] = []
         self._is_open = True
 

@@ -11,7 +11,7 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.transmit_queue import Mailboxes, Sent
+from kontronik_can_gw.transmit_queue import Sent, TransmitQueue
 
 LINK_STATUS = LINK << 16 | 0x0108
 CRC_ERRORS = LINK << 16 | 0x0720
@@ -20,7 +20,7 @@ SENT_FRAMES = GATEWAY << 16 | 0x0320
 
 def put_out(frames: list[CanFrame]) -> list[CanFrame]:
     """As they leave a gateway whose interface was busy until now."""
-    waiting, sent = Mailboxes(), list[CanFrame]()
+    waiting, sent = TransmitQueue(), list[CanFrame]()
     waiting.put_all(frames)
 
     def send(frames: Sequence[CanFrame]) -> tuple[int, Sent]:

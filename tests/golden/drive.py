@@ -18,7 +18,7 @@ from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.transmit_queue import Mailboxes
+from kontronik_can_gw.transmit_queue import TransmitQueue
 
 VERSION = kontronik_can_gw.__version__
 FOLDERS = {str(shipped("dbc").parent): "SHIPPED"}
@@ -72,7 +72,7 @@ class Drive:
         self.warnings = [line.replace(f"{file.parent}/", "") for line in (*loaded.layout.warnings, *loaded.warnings)]
         silent = loaded.config.dbc.on_loss == "silent"
         self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.canopen)
-        self._waiting = Mailboxes()
+        self._waiting = TransmitQueue()
         self._open = True
         self._looked = 0
 

@@ -30,7 +30,7 @@ from kontronik_can_gw.esc.simulator import Sent as Wired
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.transmit_queue import Mailboxes
+from kontronik_can_gw.transmit_queue import TransmitQueue
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -216,7 +216,7 @@ def record(path: Path, seconds: float, escs: int = 1, seed: int = 1) -> Recordin
     with path.open("wb") as file:
         writer = _Writer(file, setup)
         gateway = RecordedGateway(writer.put, setup.escs, layout, START)
-        sent, waiting = recording.sent, Mailboxes()
+        sent, waiting = recording.sent, TransmitQueue()
 
         def take(now: int) -> None:
             frames = in_order(gateway.take_frames(), waiting)

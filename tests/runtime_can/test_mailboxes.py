@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.transmit_queue import QUEUE_LENGTH, Mailboxes, Sent
+from kontronik_can_gw.transmit_queue import QUEUE_LENGTH, Sent, TransmitQueue
 
 
 def queued(number: int, can_id: int = 0x581) -> CanFrame:
@@ -35,7 +35,7 @@ def taking(sent: list[CanFrame], count: int, then: Sent = Sent.BUSY) -> Send:
 
 
 def test_the_turns_go_on_where_a_full_interface_broke_them_off() -> None:
-    mailboxes, sent = Mailboxes(), list[CanFrame]()
+    mailboxes, sent = TransmitQueue(), list[CanFrame]()
     for n in range(6):
         mailboxes.put(queued(n))
     for n in range(6):
@@ -46,7 +46,7 @@ def test_the_turns_go_on_where_a_full_interface_broke_them_off() -> None:
 
 
 def test_a_refused_frame_stays_first_in_its_line() -> None:
-    mailboxes, sent = Mailboxes(), list[CanFrame]()
+    mailboxes, sent = TransmitQueue(), list[CanFrame]()
     mailboxes.put(queued(0))
     mailboxes.put(slot(0x181, 1))
     for _ in range(3):
@@ -60,7 +60,7 @@ def test_a_refused_frame_stays_first_in_its_line() -> None:
 
 
 def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
-    mailboxes, sent = Mailboxes(), list[CanFrame]()
+    mailboxes, sent = TransmitQueue(), list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
         mailboxes.put(queued(n))
     assert (len(mailboxes), mailboxes.dropped) == (QUEUE_LENGTH, 10)
@@ -74,7 +74,7 @@ def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
 
 
 def test_each_page_of_a_multiplexed_message_has_its_own_slot() -> None:
-    mailboxes, sent = Mailboxes(), list[CanFrame]()
+    mailboxes, sent = TransmitQueue(), list[CanFrame]()
     for number in range(10):
         mailboxes.put(CanFrame(1, bytes((number,)), page=number % 2))
     mailboxes.flush(taking(sent, 9))
@@ -91,7 +91,7 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
     steps: list[tuple[bool, int] | int],
 ) -> None:
     """``steps``: put a (queued?, id) frame, or let the interface take so many frames."""
-    mailboxes, sent = Mailboxes(), list[CanFrame]()
+    mailboxes, sent = TransmitQueue(), list[CanFrame]()
     put: list[CanFrame] = []
     newest: dict[int, CanFrame] = {}  # slots that wait
     for number, step in enumerate(steps):

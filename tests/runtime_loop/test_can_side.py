@@ -15,9 +15,9 @@ from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import can_link as can_side
-from kontronik_can_gw.runtime.can_link import CanSide
+from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.can_port import socketcan_error
-from kontronik_can_gw.runtime.fault_log import Conditions
+from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.transmit_queue import Sent
 
@@ -82,7 +82,7 @@ class Bench:
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         self.kernel, self.now, self.clock = kernel, 0, 0
-        self.can = CanSide(loaded.config.can, self.gateway, World(), Conditions(), clock=lambda: self.clock)
+        self.can = CanLink(loaded.config.can, self.gateway, World(), FaultLog(), clock=lambda: self.clock)
 
     @property
     def port(self) -> Port:
@@ -273,7 +273,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> None:
     loaded = assemble(parse({"can": {"interface": "slcan", "channel": "/dev/ttyUSB1"}, "esc": [{"port": "p"}]}, "test"))
     gateway = Gateway(loaded.escs, loaded.layout, 0)
-    side = CanSide(loaded.config.can, gateway, World(), Conditions(), lambda path: "left" if "USB1" in path else None)
+    side = CanLink(loaded.config.can, gateway, World(), FaultLog(), lambda path: "left" if "USB1" in path else None)
     with pytest.raises(RunError, match="is the port of left: nothing may be sent to an ESC"):
         side.open(0, wait=False)
     side.close()

@@ -1,4 +1,4 @@
-"""Conditions: a line at the beginning, a line at the end, and no flood in between. Time is passed in."""
+"""FaultLog: a line at the beginning, a line at the end, and no flood in between. Time is passed in."""
 
 import logging
 
@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime.fault_log import FLAPPING, MINUTE, REMEMBERED, Conditions, duration
+from kontronik_can_gw.runtime.fault_log import FLAPPING, MINUTE, REMEMBERED, FaultLog, duration
 
 NAME = "kontronik_can_gw"
 
@@ -19,7 +19,7 @@ def told(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
 
 
 def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(told: pytest.LogCaptureFixture) -> None:
-    conditions = Conditions()
+    conditions = FaultLog()
     for now in range(10):
         conditions.begin("port", "gone", now * SECOND)
     assert conditions.is_on("port")
@@ -35,7 +35,7 @@ def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(told: pytes
 def test_another_reason_is_said_and_the_time_runs_on_also_after_a_quiet_beginning(
     told: pytest.LogCaptureFixture,
 ) -> None:
-    conditions = Conditions()
+    conditions = FaultLog()
     conditions.end("port", "over", 0)
     conditions.begin("port", "because of another", 0, quiet=True)
     assert told.messages == []
@@ -45,7 +45,7 @@ def test_another_reason_is_said_and_the_time_runs_on_also_after_a_quiet_beginnin
 
 
 def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(told: pytest.LogCaptureFixture) -> None:
-    conditions = Conditions()
+    conditions = FaultLog()
     now = 0
     for _ in range(300):  # ten minutes, each second lost and found
         conditions.begin("esc1: telemetry", "lost", now)
@@ -66,7 +66,7 @@ def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(told: p
 
 
 def test_a_condition_that_lasts_while_it_is_summed_up_is_said_to_last(told: pytest.LogCaptureFixture) -> None:
-    conditions = Conditions()
+    conditions = FaultLog()
     for n in range(FLAPPING):
         conditions.begin("x", "bad", n * SECOND)
         if n < FLAPPING - 1:
@@ -76,7 +76,7 @@ def test_a_condition_that_lasts_while_it_is_summed_up_is_said_to_last(told: pyte
 
 
 def test_events_are_said_one_by_one_and_then_summed_up(told: pytest.LogCaptureFixture) -> None:
-    conditions = Conditions()
+    conditions = FaultLog()
     for n in range(20):
         conditions.event("suspended", f"suspended for {n} s", n * SECOND)
     assert len(told.messages) == FLAPPING
@@ -85,7 +85,7 @@ def test_events_are_said_one_by_one_and_then_summed_up(told: pytest.LogCaptureFi
 
 
 def test_lines_can_be_held_back_and_the_last_ones_are_remembered(told: pytest.LogCaptureFixture) -> None:
-    conditions = Conditions()
+    conditions = FaultLog()
     conditions.hold()
     conditions.say(logging.INFO, "open")
     assert told.messages == []
@@ -98,7 +98,7 @@ def test_lines_can_be_held_back_and_the_last_ones_are_remembered(told: pytest.Lo
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))
 def test_however_it_flaps_the_lines_are_few(happenings: list[tuple[str, bool, int]]) -> None:
-    conditions, now, lines = Conditions(), 0, 0
+    conditions, now, lines = FaultLog(), 0, 0
     conditions.hold()
     for name, begins, seconds in happenings:
         now += seconds * SECOND

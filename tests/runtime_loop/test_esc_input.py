@@ -19,8 +19,8 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime import serial_port
-from kontronik_can_gw.runtime.esc_port import EscInput
-from kontronik_can_gw.runtime.fault_log import Conditions
+from kontronik_can_gw.runtime.esc_port import EscPort
+from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.serial_port import Identity, PortLost, is_mini_uart
 from kontronik_can_gw.signals.plan import Layout
@@ -78,11 +78,11 @@ class Bench:
     def __init__(self, *paths: str) -> None:
         escs = [EscSettings(name) for name in ("left", "right")[: len(paths)]]
         self.gateway = Gateway(escs, Layout("x", "Gw", ()), 0)
-        self.conditions = Conditions()
+        self.conditions = FaultLog()
         self.selector = Poller(lambda: 0)
-        self.lost: set[EscInput] = set()
+        self.lost: set[EscPort] = set()
         self.escs = [
-            EscInput(n, path, self.gateway, self.selector, self.conditions, self.lost) for n, path in enumerate(paths)
+            EscPort(n, path, self.gateway, self.selector, self.conditions, self.lost) for n, path in enumerate(paths)
         ]
         for esc in self.escs:
             esc.open(0, wait=False)

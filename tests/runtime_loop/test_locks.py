@@ -17,8 +17,8 @@ from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import locks
-from kontronik_can_gw.runtime.can_link import CanSide
-from kontronik_can_gw.runtime.fault_log import Conditions
+from kontronik_can_gw.runtime.can_link import CanLink
+from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.locks import (
     Locks,
     Taken,
@@ -123,7 +123,7 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_op
     try:
         for _ in range(2):
             gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
-            sides.append(CanSide(loaded.config.can, gateway, Poller(), Conditions()))
+            sides.append(CanLink(loaded.config.can, gateway, Poller(), FaultLog()))
         sides[0].open(0, wait=True)
         with pytest.raises(RunError, match=f"messages from 680h|CANopen node 42 on {CHANNEL}"):
             sides[1].open(0, wait=True)

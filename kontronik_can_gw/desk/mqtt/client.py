@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime.fault_log import Conditions
+from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.retry import Retry
 
 LONGEST_PAUSE_NS = 30 * SECOND
@@ -300,7 +300,7 @@ class MqttClient:
         self.failure: BaseException | None = None
         """What ended the thread, which nothing should."""
         self._online_topic = online_topic
-        self._conditions = Conditions()
+        self._conditions = FaultLog()
         self._lock = threading.Lock()
         self._waiting: OrderedDict[str, Offer] = OrderedDict()
         self._lasting: OrderedDict[str, Offer] = OrderedDict()
