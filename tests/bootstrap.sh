@@ -128,7 +128,7 @@ install_vm() { # $1: uml or qemu
     PATH=$PATH:/usr/sbin:/sbin
     case $1 in
         uml) command -v linux.uml >/dev/null && return ;;
-        qemu) command -v qemu-system-x86_64 >/dev/null && grep -qs ftdi_sio "${VM_CACHE:-tests/vm/.cache}"/*/modules && return ;;
+        qemu) command -v qemu-system-x86_64 >/dev/null && grep -qs vhci_hcd "${VM_CACHE:-tests/vm/.cache}"/*/modules && return ;;
     esac
     can_root || { say "cannot install what the fault programme needs:  sudo tests/vm/setup.sh $1"; return; }
     apt_update

@@ -23,7 +23,7 @@ def ip(*words: str) -> None:
 
 def wait_can_state(bench: Bench, state: int) -> None:
     """Wait until GatewayStatus says so."""
-    bench.wait_until(lambda: bench.watch.value("GatewayStatus", "can_state") == state, 2, f"CanState {state}")
+    bench.wait_until(lambda: bench.watch.value("GatewayStatus", "can_state") == state, 3, f"CanState {state}")
 
 
 def boot_ups(injection: Injection) -> None:

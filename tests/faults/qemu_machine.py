@@ -30,8 +30,6 @@ USB_SERIAL = {
 }
 BITRATE = 1_000_000
 _TIOCGICOUNT = 0x545D
-_BREAKS = 9
-"""Place in struct serial_icounter_struct."""
 
 
 def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
@@ -113,6 +111,15 @@ class FarEnd:
 # --- serial ports
 
 
+class LineCounts(NamedTuple):
+    """What a driver has counted on a line, of struct serial_icounter_struct."""
+
+    framing: int
+    overrun: int
+    parity: int
+    breaks: int
+
+
 class LineSetting(NamedTuple):
     baud: int
     bits: int
@@ -126,11 +133,10 @@ def _beside(device: str) -> int:
     return os.open(device, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
 
 
-def line_breaks(device: str) -> int:
-    """Breaks that the driver has counted."""
+def line_counts(device: str) -> LineCounts:
     fd = _beside(device)
     try:
-        return int(struct.unpack("=20i", fcntl.ioctl(fd, _TIOCGICOUNT, bytes(80)))[_BREAKS])
+        return LineCounts(*struct.unpack("=20i", fcntl.ioctl(fd, _TIOCGICOUNT, bytes(80)))[6:10])
     finally:
         os.close(fd)
 
@@ -168,15 +174,24 @@ def ip(*words: str) -> None:
     subprocess.run(["ip", *words], check=True)
 
 
-def can_up(name: str) -> None:
+def can_up(name: str, bitrate: int = BITRATE, restart_ms: int = 100) -> None:
     ip("link", "set", name, "down")
     ip("link", "set", name, "txqueuelen", "100")
-    ip("link", "set", name, "up", "type", "can", "bitrate", str(BITRATE), "restart-ms", "100")
+    ip("link", "set", name, "up", "type", "can", "bitrate", str(bitrate), "restart-ms", str(restart_ms))
+
+
+def _can_details(name: str) -> Any:
+    done = subprocess.run(["ip", "-d", "-s", "-j", "link", "show", name], check=True, capture_output=True, text=True)
+    return json.loads(done.stdout)[0]
 
 
 def receive_overruns(name: str) -> int:
-    done = subprocess.run(["ip", "-d", "-s", "-j", "link", "show", name], check=True, capture_output=True, text=True)
-    return int(json.loads(done.stdout)[0]["stats64"]["rx"]["over_errors"])
+    return int(_can_details(name)["stats64"]["rx"]["over_errors"])
+
+
+def controller_state(name: str) -> str:
+    """As ``ip`` names it: ERROR-ACTIVE, BUS-OFF ..."""
+    return str(_can_details(name)["linkinfo"]["info_data"]["state"])
 
 
 def pci_slot(interface: str) -> str:
@@ -186,6 +201,13 @@ def pci_slot(interface: str) -> str:
 def pci_bind(slot: str, bound: bool) -> None:
     """Give a CAN controller to its driver, or take it away: then its interface is gone."""
     (KVASER / ("bind" if bound else "unbind")).write_text(slot)
+
+
+def driver_back(slot: str) -> None:
+    """Give the first controller to its driver again, and bring its interface up."""
+    pci_bind(slot, True)
+    wait_until(Path("/sys/class/net/can0").exists, 3, "can0")
+    can_up("can0")
 
 
 def controller_registers(slot: str) -> int:

@@ -1,16 +1,33 @@
-"""The ESCs of the emulated machine: on its 16550A, and on QEMU's USB adapter."""
+"""The ESCs of the emulated machine: on its 16550A, on QEMU's USB adapter, and on a played adapter whose wire has real bits."""
 
 import os
+import random
 from collections.abc import Callable
 
 from encoding import Identity
 from feeder import FedEsc
+from qemu_adapters import ESC_LINE, Line, SerialAdapter
 from qemu_machine import FarEnd, LineSetting, Monitor, line_setting, serial_ports, wait_until
 
 AS_SET = LineSetting(115_200, 8, "E", 1, False)
 """How the gateway sets a port: without echo. Until then the kernel echoes on one that was never used, as a USB port is at each plug-in."""
 RATE_HZ = 10
 INFO_EVERY = 20
+
+
+def pull(how: Callable[[], None], device: str) -> None:
+    """Unplug an adapter; returns when its device file is gone."""
+    how()
+    wait_until(lambda: device not in serial_ports(), 5, f"{device} gone")
+
+
+def put_back(how: Callable[[], None]) -> str:
+    """Plug in an adapter; its device file, maybe another than before."""
+    before = serial_ports()
+    how()
+    wait_until(lambda: serial_ports() - before, 5, "the adapter's device file")
+    (device,) = serial_ports() - before
+    return device
 
 
 class FarPort:
@@ -77,12 +94,59 @@ class UsbPort(FarPort):
         self._known = None
         self._is_set = False
         before, self.device = self.device, ""
-        self._monitor.must("device_del", id="usbser0")
-        wait_until(lambda: before not in serial_ports(), 5, f"{before} gone")
+        pull(lambda: self._monitor.must("device_del", id="usbser0"), before)
 
     def plug(self) -> None:
-        """Returns when there is a device file again, maybe another."""
-        before = serial_ports()
-        self._monitor.plug_serial()
-        wait_until(lambda: serial_ports() - before, 5, "the adapter's device file")
-        (self.device,) = serial_ports() - before
+        self.device = put_back(self._monitor.plug_serial)
+
+
+class WirePort:
+    """A played adapter. ``send`` is how a frame gets onto the wire; setting it to another of the methods is the fault."""
+
+    def __init__(self, adapter: SerialAdapter, identity: Identity) -> None:
+        self.adapter = adapter
+        self.fed = FedEsc(self.write, identity, RATE_HZ, INFO_EVERY)
+        self.send: Callable[[bytes], bool] = self.clean
+        self._random = random.Random(1)
+        self.path = self.device = put_back(adapter.plug)
+
+    def write(self, data: bytes) -> bool:
+        return self.send(data)
+
+    def clean(self, data: bytes) -> bool:
+        self.adapter.put(data)
+        return self.adapter.plugged
+
+    def silent(self, data: bytes) -> bool:
+        return False
+
+    def flipped(self, data: bytes) -> bool:
+        """One bit time of the frame, start, parity and stop bits among them, has the wrong level."""
+        self.adapter.flip(data, self._random.randrange(1, len(data) * ESC_LINE.bits + 1))
+        return False
+
+    def at(self, line: Line) -> Callable[[bytes], bool]:
+        """As an ESC sends whose UART is set otherwise."""
+
+        def send(data: bytes) -> bool:
+            self.adapter.put(data, line)
+            return False
+
+        return send
+
+    def unplug(self) -> None:
+        before, self.device = self.device, ""
+        pull(self.adapter.unplug, before)
+
+    def plug(self) -> None:
+        self.device = put_back(self.adapter.plug)
+
+    @property
+    def echoed(self) -> int:
+        return self.adapter.echoed
+
+    def received(self) -> int:
+        return self.adapter.received
+
+    def close(self) -> None:
+        self.unplug()

@@ -11,7 +11,8 @@ qemu    Emulated, Python 15 times slower. The same and ISO-TP; two kvaser_pci co
         a 16550A UART (/dev/ttyS1, its other end /dev/virtio-ports/com1); an FTDI USB serial adapter (/dev/ttyUSB0, its
         other end /dev/virtio-ports/ftdi) that QMP at /dev/virtio-ports/qmp unplugs (device_del, device_add usbser0).
         device_add takes driver=usb-serial id=usbser0 serial=ESC0002 bus=xhci.0 port=1 chardev=ftdis
-        always-plugged=true; right after a device_del it has to be tried again after 0.1 s.
+        always-plugged=true; right after a device_del it has to be tried again after 0.1 s. USB devices played by the
+        command itself can be plugged in by vhci_hcd (drivers ftdi_sio, usb_8dev).
 
 A VM sees the host's file system read-only at the same paths, with an empty /tmp, /var/tmp, /run and /dev/shm; each
 --rw DIR is writable. It is root in there, lo is up, the CAN modules are loaded, and there is no vcan interface yet.
