@@ -57,7 +57,7 @@ _MAX_ENTRIES = 10_000
 _MAX_MAPPED = 0x40
 _MAX_SAID = 400
 """Characters of a mistake: it quotes the file."""
-_MOST_PROBLEMS = 20
+_MAX_PROBLEMS = 20
 _PDO_BITS = 64
 
 _HEADING = re.compile(r"\s*\[([^\]]*)\]")
@@ -217,9 +217,9 @@ def load(data: bytes, name: str) -> Eds:
         raise UserError(f"{name}: is larger than {MAX_BYTES // 1_000_000} MB or {_MAX_LINES} lines. Is it an EDS?")
     checker = _Checker(name)
     checker.read(data)
-    if len(checker.problems) > _MOST_PROBLEMS:
-        more = len(checker.problems) - _MOST_PROBLEMS
-        raise UserError(*checker.problems[:_MOST_PROBLEMS], f"{name}: and {more} more mistakes.")
+    if len(checker.problems) > _MAX_PROBLEMS:
+        more = len(checker.problems) - _MAX_PROBLEMS
+        raise UserError(*checker.problems[:_MAX_PROBLEMS], f"{name}: and {more} more mistakes.")
     if checker.problems:
         raise UserError(*checker.problems)
     objects = checker.objects

@@ -42,8 +42,8 @@ _CATCHING_UP_NS = SECOND // 2
 FrameTaker = Callable[[bytes, int, int], None]
 """Is given a frame's data, the time, and when the frame came."""
 _SELF_START_OFF = 4
-_MOST_SAVES = 4
-_LEAST_TIMEOUT_MS, _MOST_TIMEOUT_MS = 20, 60_000  # whatever the limits of an EDS are
+_MAX_SAVES = 4
+_MIN_TIMEOUT_MS, _MAX_TIMEOUT_MS = 20, 60_000  # whatever the limits of an EDS are
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
 
 
@@ -105,7 +105,7 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
         base,
         pole_pairs=max(1, number(at.SETTINGS, 1, base.pole_pairs)),
         gear=gear,
-        timeout_ns=min(max(_LEAST_TIMEOUT_MS, number(at.SETTINGS, 4, base.timeout_ns // MS)), _MOST_TIMEOUT_MS) * MS,
+        timeout_ns=min(max(_MIN_TIMEOUT_MS, number(at.SETTINGS, 4, base.timeout_ns // MS)), _MAX_TIMEOUT_MS) * MS,
         cell_count=number(at.SETTINGS, 7, base.cell_count),
         crc_error_threshold=number(at.SETTINGS, 8, base.crc_error_threshold),
     )
@@ -646,7 +646,7 @@ class Node:
         self._bus_node_id = node_id
 
     def _save(self, ticket: int | None, stored: Stored) -> None:
-        if len(self._waiting_saves) >= _MOST_SAVES:  # a disk that does not come round
+        if len(self._waiting_saves) >= _MAX_SAVES:  # a disk that does not come round
             raise SdoAbort(Abort.LOCAL_CONTROL)
         self._wanted = stored
         self._waiting_saves.append((ticket, stored))

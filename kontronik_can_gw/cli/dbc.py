@@ -16,7 +16,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
-_MOST_NODES = 127
+_MAX_NODES = 127
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,8 +81,8 @@ def _canopen(args: argparse.Namespace) -> "Database":
         setup, escs = canopen_of(loaded), loaded.escs
     else:
         escs = _escs(args)
-        if len(escs) > _MOST_NODES:
-            raise UserError(f"--esc: {len(escs)} are more than the {_MOST_NODES} nodes that a CANopen bus has")
+        if len(escs) > _MAX_NODES:
+            raise UserError(f"--esc: {len(escs)} are more than the {_MAX_NODES} nodes that a CANopen bus has")
         setup = shipped_canopen(range(1, len(escs) + 1))
         escs = setup.esc_settings(escs)
     nodes = setup.nodes(escs)

@@ -39,11 +39,11 @@ _TROUBLES = {
 _FILLERS = {"from", "for", "target", "during", "operation"}
 _LABEL = 23
 """Columns of what a value is called, with its unit."""
-_LEAST_GROUP = 27
+_MIN_GROUP = 27
 _WIDEST_BAR = 36
-_LEAST_HEIGHT = 16
+_MIN_HEIGHT = 16
 """Lines without which there is no room for details."""
-MOST_ESCS = 8
+MAX_ESCS = 8
 """On one page."""
 
 
@@ -97,7 +97,7 @@ def screen(
     body_height = height - len(head) - 1
     shown, pages = _shown(monitor, choice, body_height)
     group = (width - _LABEL) // max(1, len(shown))
-    if len(shown) == 1 or (group >= _LEAST_GROUP and body_height >= _LEAST_HEIGHT):
+    if len(shown) == 1 or (group >= _MIN_GROUP and body_height >= _MIN_HEIGHT):
         body = _details(shown, (width, body_height), glyphs)
     else:
         body = _table(shown, (width, body_height), glyphs)
@@ -235,7 +235,7 @@ def _shown(monitor: Monitor, choice: Choice, height: int) -> tuple[Sequence[EscM
         choice.esc = choice.esc if choice.esc < len(escs) else None
     if choice.esc is not None:
         return escs[choice.esc : choice.esc + 1], 1
-    share = max(1, min(MOST_ESCS, height - 2))
+    share = max(1, min(MAX_ESCS, height - 2))
     pages = max(1, -(-len(escs) // share))
     choice.page %= pages
     return escs[choice.page * share : (choice.page + 1) * share], pages

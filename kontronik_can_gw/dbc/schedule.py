@@ -12,7 +12,7 @@ from kontronik_can_gw.signals.plan import MessagePlan
 _NEVER = -(1 << 62)
 
 
-LEAST_DISTANCE_NS = 1_000_000
+MIN_DISTANCE_NS = 1_000_000
 """Between frames that follow each other without an event."""
 
 
@@ -42,7 +42,7 @@ class Schedule:
 
     def wait(self, index: int, now: int) -> None:
         """Let the message come out of ``due`` again, as soon as it may after a frame sent now."""
-        self._put_off(index, now + max(self._delay[index], LEAST_DISTANCE_NS))
+        self._put_off(index, now + max(self._delay[index], MIN_DISTANCE_NS))
 
     def sent(self, index: int, now: int) -> None:
         """A frame of the message went out: it is the one that was waited for."""

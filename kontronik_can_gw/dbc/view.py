@@ -10,9 +10,9 @@ from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import SendType
 from kontronik_can_gw.signals.unpacker import Chunk, Part, SignalReader, Value
 
-_LEAST_NS = 250 * MS
+_MIN_NS = 250 * MS
 _CYCLES = 3
-_LEAST_SILENCE_NS = 3 * SECOND
+_MIN_SILENCE_NS = 3 * SECOND
 
 
 class View:
@@ -30,7 +30,7 @@ class View:
         self._seen: list[int | None] = [None] * len(reader.parts)
         self._next_expiry: int | None = None
         cycles = [part.plan.cycle_ns * len(part.plan.pages) for part in reader.parts if part.plan.cycle_ns]
-        self._silence_ns = max(_LEAST_SILENCE_NS, _CYCLES * min(cycles)) if cycles else None
+        self._silence_ns = max(_MIN_SILENCE_NS, _CYCLES * min(cycles)) if cycles else None
 
     @property
     def next_expiry(self) -> int | None:
@@ -87,7 +87,7 @@ def _life(part: Part) -> int | None:
     """How long a part's values hold without a new frame; None: as long as anything of the gateway's comes."""
     plan = part.plan
     if plan.cycle_ns:
-        return max(_LEAST_NS, _CYCLES * plan.cycle_ns * len(plan.pages))
+        return max(_MIN_NS, _CYCLES * plan.cycle_ns * len(plan.pages))
     if SendType.EVENT in plan.send_type and Group.LIVE in plan.paces:
         return SECOND
     return None

@@ -16,7 +16,7 @@ from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, fault_of, 
 
 RETRY_S = 0.5
 """Between two looks at an interface that does not work, and at whether one that works is still up."""
-_MOST_AT_ONCE = 4096
+_MAX_AT_ONCE = 4096
 _BUS_OFF = (
     "CAN interface {name}: is bus-off: look at bit rate, wiring and termination. "
     "Start it anew: sudo ip link set {name} down && sudo ip link set {name} up type can restart-ms 100"
@@ -95,7 +95,7 @@ class BusListener:
         if self._port is None:
             return []
         frames: list[CanFrame] = []
-        while len(frames) < _MOST_AT_ONCE:
+        while len(frames) < _MAX_AT_ONCE:
             new = self._port.receive()
             frames += [frame for frame, _ in new]
             if len(new) < RECEIVE_LIMIT:

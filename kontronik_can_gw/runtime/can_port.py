@@ -44,7 +44,7 @@ _REMOTE = 0x40000000
 _ERROR_FLAG = 0x20000000
 _STANDARD_ID, _EXTENDED_ID = 0x7FF, 0x1FFFFFFF
 _FILTER = struct.Struct("=II")
-_MOST_FILTERS = 512
+_MAX_FILTERS = 512
 """CAN_RAW_FILTER_MAX: the kernel takes no more for one socket."""
 _ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
 _CTRL_RX_OVERFLOW, _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x01, 0x0C, 0x30, 0x40
@@ -339,7 +339,7 @@ def _kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:
     The flags are part of the mask, so that remote frames, and those of the other length, with the same number stay out.
     """
     step = 1
-    while len({can_id // step for can_id in ids}) > _MOST_FILTERS:
+    while len({can_id // step for can_id in ids}) > _MAX_FILTERS:
         step *= 2
     blocks = sorted({can_id // step * step for can_id in ids})
     flags, low = EXTENDED | _REMOTE, step - 1

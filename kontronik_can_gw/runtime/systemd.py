@@ -9,7 +9,7 @@ import socket
 from collections.abc import Mapping
 from typing import TextIO
 
-_MOST_CHARACTERS = 800
+_MAX_CHARACTERS = 800
 """Of a status line: systemd reads 4096 bytes of a datagram, and a character has up to 4."""
 
 
@@ -66,7 +66,7 @@ class Notifier:
 
     def _news(self, text: str) -> dict[str, str]:
         """The line, if it is new. It can hold nothing that would be read as a message of its own."""
-        line = " ".join("".join(c if c.isprintable() else " " for c in text).split())[:_MOST_CHARACTERS]
+        line = " ".join("".join(c if c.isprintable() else " " for c in text).split())[:_MAX_CHARACTERS]
         if not line or line == self._status:
             return {}
         self._status = line

@@ -61,7 +61,7 @@ def test_rows_are_the_frames_that_brute_force_finds(
     """However the file is read: small reads put every limit of a read anywhere in a frame and in rubbish."""
     source = random.Random(f"{kind} {seed}")
     monkeypatch.setattr(inputs, "CHUNK", source.choice([1, 7, 44, 100, 5000, inputs.CHUNK]))
-    monkeypatch.setattr(inputs, "_MOST_WAITING", source.choice([64, 300, inputs._MOST_WAITING]))
+    monkeypatch.setattr(inputs, "_MAX_WAITING", source.choice([64, 300, inputs._MAX_WAITING]))
     stream = STREAMS[kind](source)
     dump = recording(tmp_path, stream, live_rate=1e9 / PERIOD_NS)
     found = frames_of(stream)

@@ -13,7 +13,7 @@ from slcan_adapters import Adapter, Bus
 LIMIT_S = 1.0
 ACTIVE, PASSIVE = 1, 3
 BUS_OFF_LEFT = 0x8140
-MOST_IN_CONTROLLER = 6
+MAX_IN_CONTROLLER = 6
 """Frames that the kernel has taken and that nobody can take back: as many as the smallest send buffer that it grants holds."""
 
 
@@ -132,7 +132,7 @@ def loaded(bench: Bench, fault: Fault, times: int) -> None:
             with RawBus(bench.interface) as near:  # the limiter only looks at its queue when something comes
                 near.send(0x7F0, wait=False)
             injection.cleared()
-            injection.in_the_controller = MOST_IN_CONTROLLER, time.monotonic_ns() + SECOND
+            injection.in_the_controller = MAX_IN_CONTROLLER, time.monotonic_ns() + SECOND
             injection.wait_recovery()
             unlimit(bench.interface)
 

@@ -15,8 +15,8 @@ from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of
 
 from kontronik_can_gw.desk.mqtt.messages import (
     IDENTITY_NS,
-    LEAST_PAUSE_NS,
-    MOST_CHANGES,
+    MAX_CHANGES,
+    MIN_PAUSE_NS,
     Message,
     Publisher,
     Topics,
@@ -188,8 +188,8 @@ def test_what_comes_and_goes_is_bounded() -> None:
     frames = flight(layout_of(["esc1"]), 60, [options])
     times = [now for now, _ in states(run(publisher("esc1", rate=0.01), frames, 60))]
     gaps = [b - a for a, b in pairwise(times)]
-    assert min(gaps) >= LEAST_PAUSE_NS
-    assert MOST_CHANGES <= len(times) <= MOST_CHANGES + 60 + 2
+    assert min(gaps) >= MIN_PAUSE_NS
+    assert MAX_CHANGES <= len(times) <= MAX_CHANGES + 60 + 2
     assert max(gaps) <= 1.3 * SECOND_NS
 
 

@@ -29,7 +29,7 @@ from mutations import Mutation, mutations, noting_lines
 
 PROJECT = Path(__file__).resolve().parents[2]
 SAMPLE, EXAMPLES = 100, 25
-LIMIT_FACTOR, LEAST_LIMIT_S, COLLECTION_LIMIT_S = 20, 2.0, 60.0  # CPU time
+LIMIT_FACTOR, MIN_LIMIT_S, COLLECTION_LIMIT_S = 20, 2.0, 60.0  # CPU time
 BLOCKED_S = 900  # wall time after which a mutant that waits is given up, undecided
 MEMORY = 6 << 30
 NOT_DECIDED = (70, -signal.SIGALRM)
@@ -182,7 +182,7 @@ def is_killed(mutant: Mutation, known: Result) -> bool:
     # what a fixture or a cache executes is noted for the first test only: the others of these files follow
     chosen = [test for test in seconds if test.partition("::")[0] in files]
     chosen.sort(key=lambda test: (test not in seeing, seconds[test]))
-    limits = {test: max(LEAST_LIMIT_S, LIMIT_FACTOR * seconds[test]) for test in chosen}
+    limits = {test: max(MIN_LIMIT_S, LIMIT_FACTOR * seconds[test]) for test in chosen}
     if not limits:
         return False
     status, _ = in_child(Watch(limits), files, mutant)

@@ -22,7 +22,7 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("faults.toml")
 NOT_COPIED = (".git", ".venv", ".cache", ".*_cache", ".hypothesis", "__pycache__", "node_modules", "build", "dist")
-LIMIT_FACTOR, LEAST_LIMIT_S = 20, 60
+LIMIT_FACTOR, MIN_LIMIT_S = 20, 60
 """CPU time for tests with a fault, in proportion to that without."""
 BLOCKED_S = 900
 FAILED, BROKEN_AT_IMPORT = 1, 2  # pytest's
@@ -107,7 +107,7 @@ class Copy:
             return str(error)
         if fault.seen_by not in self._limits:
             status, seconds = run(fault.seen_by, self.folder, BLOCKED_S)
-            self._limits[fault.seen_by] = 0 if status else max(LEAST_LIMIT_S, LIMIT_FACTOR * seconds)
+            self._limits[fault.seen_by] = 0 if status else max(MIN_LIMIT_S, LIMIT_FACTOR * seconds)
         if not (limit := self._limits[fault.seen_by]):
             return f"{' '.join(fault.seen_by)}: the tests fail without it"
         whole = file.read_text()

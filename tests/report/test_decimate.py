@@ -6,7 +6,7 @@ from itertools import accumulate, pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.desk.report.decimate import LEAST_POINTS, Decimator, Number, Points
+from kontronik_can_gw.desk.report.decimate import MIN_POINTS, Decimator, Number, Points
 
 NUMBERS = st.one_of(st.none(), st.integers(-50, 50))
 ROWS = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=300)
@@ -54,7 +54,7 @@ def test_gaps_and_extremes_are_kept_however_the_rows_are_cut(
     assert_gaps_are_kept(rows, times, found)
     assert all(a <= b for a, b in pairwise(found.times))
     assert (found.times[0], found.times[-1]) == (times[0], times[-1])
-    assert len(found.times) <= max(points, LEAST_POINTS) + 5 * most
+    assert len(found.times) <= max(points, MIN_POINTS) + 5 * most
 
 
 @settings(max_examples=40, deadline=None)
@@ -76,4 +76,4 @@ def test_a_single_row_without_a_value_is_a_gap_among_thousands(
         decimator.feed(times[at : at + chunk], [column[at : at + chunk] for column in columns])
     found = decimator.finish()
     assert_gaps_are_kept(list(zip(*columns, strict=True)), times, found)
-    assert len(found.times) <= max(points, LEAST_POINTS) + 4 * len(gaps) + 2
+    assert len(found.times) <= max(points, MIN_POINTS) + 4 * len(gaps) + 2

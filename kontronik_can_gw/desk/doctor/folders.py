@@ -7,7 +7,7 @@ from kontronik_can_gw.desk.doctor.findings import Findings
 from kontronik_can_gw.desk.doctor.service import Unit
 from kontronik_can_gw.desk.doctor.system import System
 
-_LEAST_BYTES = 64 * 1024
+_MIN_BYTES = 64 * 1024
 _LOW_BYTES = 16 * 1024 * 1024
 
 
@@ -58,7 +58,7 @@ def check_folder(
         text = f"{what}: {folder}: the file system is read-only"
         findings.error(check, text, "Make it writable, or choose another folder:", f"findmnt --target {there}")
         return
-    if left is not None and (left.free_bytes < _LEAST_BYTES or left.free_files == 0):
+    if left is not None and (left.free_bytes < _MIN_BYTES or left.free_files == 0):
         text = f"{what}: {folder}: the file system is full"
         findings.error(check, text, "Make room:", f"df -h {there}; df -i {there}")
         return

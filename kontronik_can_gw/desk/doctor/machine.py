@@ -12,7 +12,7 @@ from kontronik_can_gw.desk.doctor.system import System
 
 _PACKAGES = ("python-can", "canopen", "pyserial", "cantools", "rich")
 _FIRST_YEAR = 2024
-_LEAST_MEMORY_KB = 64 * 1024
+_MIN_MEMORY_KB = 64 * 1024
 _SLOW_CLOCKS = ("acpi_pm", "hpet", "jiffies", "pit")
 
 
@@ -65,7 +65,7 @@ def _memory(system: System, findings: Findings) -> None:
     free = kilobytes.get("MemAvailable:")
     if free is None:
         return
-    if free < _LEAST_MEMORY_KB:
+    if free < _MIN_MEMORY_KB:
         findings.warning(
             "machine.memory", f"{free // 1024} MB of memory are free; a gateway needs about 40", "", "free -h"
         )

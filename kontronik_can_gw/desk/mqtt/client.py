@@ -35,9 +35,9 @@ TAKEN_OVER_PAUSE_NS = 60 * SECOND
 """Two programs with one client id throw each other out: not several times a second."""
 SLOW_NS = 2 * SECOND
 _SEND_BUFFER = 1 << 15
-_MOST_UNACKNOWLEDGED = 10
+_MAX_UNACKNOWLEDGED = 10
 _SHORT_NS = 5 * SECOND
-_MOST_SHORT = 3
+_MAX_SHORT = 3
 """So many connections in a row, each ended by the broker within ``_SHORT_NS``, are no accident."""
 # Reason codes of MQTT 5, to which paho translates those of MQTT 3.
 _UNSUPPORTED_VERSION, _BAD_CLIENT_ID, _TAKEN_OVER = 132, 133, 142
@@ -233,7 +233,7 @@ class _Link:
         return (
             self._client.socket() is not None
             and not self._client.want_write()
-            and len(self.unacknowledged) < _MOST_UNACKNOWLEDGED
+            and len(self.unacknowledged) < _MAX_UNACKNOWLEDGED
         )
 
     @property
@@ -456,7 +456,7 @@ class MqttClient:
             self._taken_over(f"another program took over the client id {self.broker.client_id!r}")
             return
         self._short = self._short + 1 if lasted < _SHORT_NS else 0
-        if self._short >= _MOST_SHORT:
+        if self._short >= _MAX_SHORT:
             who = f"maybe another program uses the client id {self.broker.client_id!r}"
             self._taken_over(f"ends each connection at once: {who}")
             return

@@ -39,8 +39,8 @@ PROGRAM = "kontronik-can-gw"
 MAKER = "KONTRONIK"
 SILENCE_NS = 3 * SECOND
 """Without any frame of the gateway for so long it is not available."""
-LEAST_PAUSE_NS = 200 * MS
-MOST_CHANGES = 30
+MIN_PAUSE_NS = 200 * MS
+MAX_CHANGES = 30
 IDENTITY_NS = 6 * SECOND
 """An ESC that is heard tells its device and firmware about every second, some every five."""
 _CHANGE_EVERY_NS = SECOND
@@ -150,7 +150,7 @@ class _Member:
         self.due: int | None = None
         self.heard_ns: int | None = None
         self.first_heard_ns: int | None = None
-        self.budget, self.budget_ns = float(MOST_CHANGES), 0
+        self.budget, self.budget_ns = float(MAX_CHANGES), 0
 
 
 def _kinds(view: View, columns: Mapping[str, int]) -> dict[Value, str]:
@@ -221,8 +221,8 @@ class Publisher:
         for member in self._members:
             times.append(now if member.due is None else member.due)
             if member.changed and member.published_ns is not None:
-                pause = member.published_ns + LEAST_PAUSE_NS
-                times.append(pause if pause > now else now + LEAST_PAUSE_NS)
+                pause = member.published_ns + MIN_PAUSE_NS
+                times.append(pause if pause > now else now + MIN_PAUSE_NS)
         return min(times)
 
     def messages(self, now: int, wall_ns: int) -> list[Message]:
@@ -297,9 +297,9 @@ class Publisher:
 
     def _may_tell(self, member: _Member, now: int) -> bool:
         """Whether a change may go now: the first ones of a row, and with a pause behind what went before."""
-        if member.published_ns is not None and now - member.published_ns < LEAST_PAUSE_NS:
+        if member.published_ns is not None and now - member.published_ns < MIN_PAUSE_NS:
             return False
-        member.budget = min(MOST_CHANGES, member.budget + (now - member.budget_ns) / _CHANGE_EVERY_NS)
+        member.budget = min(MAX_CHANGES, member.budget + (now - member.budget_ns) / _CHANGE_EVERY_NS)
         member.budget_ns = now
         if member.budget < 1:
             return False

@@ -47,11 +47,11 @@ LIVE_RATE = 100.0
 """Live frames a second that plain bytes are taken to have come at."""
 _LOOK = 1 << 16
 _LOOK_FOR_HEADER = 1 << 25
-_MOST_DAMAGE = 50
+_MAX_DAMAGE = 50
 _LATEST_NS = 1 << 62
-_MOST_WAITING = 1 << 16
+_MAX_WAITING = 1 << 16
 _LONGEST_FRAME = 64
-_MOST_IDS = 4096
+_MAX_IDS = 4096
 
 
 class Input(Protocol):
@@ -344,9 +344,9 @@ class CaptureInput(_Base):
             self._tell_damage(f"{path.name}: was not closed: up to the last second before its end may be missing")
 
     def _tell_damage(self, text: str) -> None:
-        if len(self.damage) < _MOST_DAMAGE:
+        if len(self.damage) < _MAX_DAMAGE:
             self.damage.append(text)
-        elif len(self.damage) == _MOST_DAMAGE:
+        elif len(self.damage) == _MAX_DAMAGE:
             self.damage.append("and more of that kind")
 
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
@@ -435,7 +435,7 @@ class DumpInput(_Base):
         for data in chain(self._read(), (None,)):
             if data is not None:
                 waiting += data
-            if len(waiting) > _MOST_WAITING:  # no frame for long: what can belong to none any more goes
+            if len(waiting) > _MAX_WAITING:  # no frame for long: what can belong to none any more goes
                 keep = len(data or b"") + _LONGEST_FRAME
                 if (gone := len(waiting) - keep) > 0:
                     yield now, bytes(waiting[:gone])
@@ -485,7 +485,7 @@ class CanLogInput(_Base):
                 seen.add(key)
             else:
                 self.others += 1
-                if key in others or len(others) < _MOST_IDS:
+                if key in others or len(others) < _MAX_IDS:
                     others[key] = others.get(key, 0) + 1
             yield TimedFrame(time_ns, frame, received)
         self.position = self.size

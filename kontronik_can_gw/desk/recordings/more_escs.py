@@ -9,7 +9,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED
 
-MOST_ESCS = 8
+MAX_ESCS = 8
 
 
 def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
@@ -20,7 +20,7 @@ def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
     if len(bus.escs) != 1 or not ours or not others:
         return ""
     found, frames = 1, 0
-    for count in range(2, MOST_ESCS + 1):
+    for count in range(2, MAX_ESCS + 1):
         by_esc: list[set[int]] = []
         with suppress(UserError):  # so many do not fit
             by_esc = _ids(bus, count)

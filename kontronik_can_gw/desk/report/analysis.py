@@ -41,9 +41,9 @@ from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
 CHUNK = 4096
 """Rows that are looked at together."""
-MOST_EVENTS = 5000
+MAX_EVENTS = 5000
 """Of one kind (errors, states, link): more are only counted."""
-MOST_SEGMENTS = 4000
+MAX_SEGMENTS = 4000
 """Of one ESC's band of states: beyond it, the shorter of two neighbours is left out."""
 
 
@@ -205,7 +205,7 @@ class Analysis:
 
 
 class _Events:
-    """Events of all ESCs; each kind up to MOST_EVENTS."""
+    """Events of all ESCs; each kind up to MAX_EVENTS."""
 
     def __init__(self) -> None:
         self._kept: dict[Kind, list[Event]] = {"error": [], "state": [], "link": [], "device": []}
@@ -213,7 +213,7 @@ class _Events:
 
     def add(self, event: Event) -> Event:
         kept = self._kept[event.kind]
-        if len(kept) < MOST_EVENTS:
+        if len(kept) < MAX_EVENTS:
             kept.append(event)
         else:
             self.left_out[event.kind] = self.left_out.get(event.kind, 0) + 1
@@ -473,7 +473,7 @@ class _Esc:
             self.facts.variant = variant if isinstance(variant, int) else None
             self.facts.firmware = f"{main}.{sub}" if isinstance(main, int) and isinstance(sub, int) else None
             self.facts.devices.append((time_ns, _device_words(self.facts)))
-            del self.facts.devices[MOST_EVENTS:]
+            del self.facts.devices[MAX_EVENTS:]
             if was is not None:
                 text = f"Device changed from {before} to {_device_words(self.facts)}"
                 self._events.add(Event("device", self.index, time_ns, None, "device", text, momentary=True))
@@ -520,7 +520,7 @@ class _Esc:
         if segment.end_ns - segment.begin_ns < self._shortest_ns:
             return
         self.segments.append(segment)
-        while len(self.segments) > MOST_SEGMENTS:
+        while len(self.segments) > MAX_SEGMENTS:
             self._shortest_ns = max(MS, 2 * self._shortest_ns)
             self.segments = [s for s in self.segments if s.end_ns - s.begin_ns >= self._shortest_ns]
 

@@ -6,7 +6,7 @@ to within a bucket, and as long as there are not more rows than points nothing i
 
 A bucket never holds rows of which a column has a value in one and none in another: where a column begins or ceases to be available a new
 bucket begins, however few rows that leaves in one. So each line ends at its last value in front of a gap and begins again at its first
-behind it, and a gap of one row is as safe as a long one. Only beyond MOST_RUNS such places the closest of them are blurred: merged into
+behind it, and a gap of one row is as safe as a long one. Only beyond MAX_RUNS such places the closest of them are blurred: merged into
 mixed buckets, in which the values of a column that has gaps stand alone, joined with nothing.
 """
 
@@ -15,11 +15,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 Number = int | float | None
-LEAST_POINTS = 8
-MOST_RUNS = 4000
+MIN_POINTS = 8
+MAX_RUNS = 4000
 """Stretches of rows with the same columns available that are told apart, whatever the number of points."""
 _MIXED = -1
-_LEAST_BLUR_NS = 1_000_000
+_MIN_BLUR_NS = 1_000_000
 
 
 class Points:
@@ -33,12 +33,12 @@ class Points:
 class Decimator:
     """Rows of ``width`` columns in, at most ``points`` points out, and a few more for each gap."""
 
-    def __init__(self, width: int, points: int, most_runs: int = MOST_RUNS) -> None:
-        self._points = max(points, LEAST_POINTS) // 4 * 4
+    def __init__(self, width: int, points: int, most_runs: int = MAX_RUNS) -> None:
+        self._points = max(points, MIN_POINTS) // 4 * 4
         self._most_runs = max(most_runs, 2)
         self._rows = 1  # of a full bucket
         self._runs = 0
-        self._blur_ns = _LEAST_BLUR_NS
+        self._blur_ns = _MIN_BLUR_NS
         self._begin = array("q")
         self._end = array("q")
         self._count = array("q")  # rows in it

@@ -10,10 +10,10 @@ from typing import NamedTuple
 from kontronik_can_gw.esc.telemetry import SECOND
 
 STRETCH_NS = 10 * SECOND
-LEAST_PAIRS = 20
-LEAST_SPREAD = 2.0
+MIN_PAIRS = 20
+MIN_SPREAD = 2.0
 """A: standard deviation of the current that a stretch needs."""
-LEAST_STRETCHES = 3
+MIN_STRETCHES = 3
 
 
 class Resistance(NamedTuple):
@@ -50,7 +50,7 @@ class ResistanceFit:
         self._close()
         self._restart(0.0, 0.0)
         slopes = sorted(self._slopes)
-        if len(slopes) < LEAST_STRETCHES:
+        if len(slopes) < MIN_STRETCHES:
             return None
         middle = _quantile(slopes, 0.5)
         if middle <= 0:
@@ -64,10 +64,10 @@ class ResistanceFit:
 
     def _close(self) -> None:
         n = self._n
-        if n < LEAST_PAIRS:
+        if n < MIN_PAIRS:
             return
         moved = self._xx - self._x * self._x / n
-        if moved >= n * LEAST_SPREAD**2:
+        if moved >= n * MIN_SPREAD**2:
             self._slopes.append(-(self._xy - self._x * self._y / n) / moved)
 
 

@@ -17,7 +17,7 @@ from kontronik_can_gw.desk.report.quantities import PLOTS, STATE_CLASSES, STYLES
 from kontronik_can_gw.esc.telemetry import SECOND
 
 HERE = Path(__file__).parent
-MOST_DEVICES = 8
+MAX_DEVICES = 8
 """Of one ESC, that the head names."""
 Json = dict[str, "Json"] | list["Json"] | str | int | float | bool | None
 
@@ -208,7 +208,7 @@ def fact_words(facts: Facts, origin_ns: int) -> str:
     """What an ESC is, in a few words; where it was changed all that there were, with their times; empty where nothing is known."""
     words = []
     if len(facts.devices) > 1:
-        shown = facts.devices[:MOST_DEVICES]
+        shown = facts.devices[:MAX_DEVICES]
         first, *others = (text for _, text in shown)
         since = [clock(time_ns - origin_ns) for time_ns, _ in shown[1:]]
         words.append("; ".join([first, *(f"from {at}: {text}" for at, text in zip(since, others, strict=True))]))
