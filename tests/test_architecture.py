@@ -1,4 +1,4 @@
-"""The structure that the README promises: imports run one way, and only the edge touches time, files and threads."""
+"""The structure that docs/design.md promises: imports run one way, and only the edge touches time, files and threads."""
 
 import ast
 import subprocess

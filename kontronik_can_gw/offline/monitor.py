@@ -230,11 +230,6 @@ class EscMonitor:
             self._told += 1
 
     @property
-    def is_link_ok(self) -> bool:
-        """True where the link is known to be good; without a word of the DBC on it: where there are values."""
-        return normalize(self.link or "") == "ok" if self.has("link_state") else self.is_fresh
-
-    @property
     def device(self) -> str:
         """Device, variant and firmware; empty where not available."""
         value = self.value("device")

@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.cli.common import assemble
 from kontronik_can_gw.config import CanConfig, parse
-from kontronik_can_gw.dbc_output.layout import Layout
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.mailboxes import Sent
@@ -33,7 +32,6 @@ from kontronik_can_gw.sources import CanState
 from kontronik_can_gw.telemetry import MS, SECOND
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
-NO_MESSAGES = Layout("x", "Gw", ())
 _numbers = itertools.count()
 
 
