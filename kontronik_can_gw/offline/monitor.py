@@ -142,7 +142,6 @@ class EscMonitor:
         self.name = settings.name
         self.spreads = {quantity.source: Spread() for quantity in QUANTITIES}
         self._settings = settings
-        self._index = index
         self._view = view
         known = sources(settings)
         columns = [(name, view.reader.column_of(name, index)) for name in known]
