@@ -158,9 +158,6 @@ class DbcOutput:
 
     def advance(self, now: int) -> None:
         """Send what is due."""
-        heap = self._schedule.heap
-        if not heap or now < heap[0][0]:
-            return
         for index, cyclic in self._schedule.due(now):
             message = self._messages[index]
             if cyclic and len(message.pages) > 1:

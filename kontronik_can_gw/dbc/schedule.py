@@ -30,8 +30,6 @@ class Schedule:
         ]
         """(when, message, True for one that had to wait): of one instant and message the cycle comes first."""
         heapq.heapify(self._heap)
-        self.heap = self._heap
-        """Its first entry's time is ``next_deadline``."""
 
     def request(self, index: int, now: int) -> bool:
         """True if the message may be sent now; otherwise it comes out of ``due`` when it may."""

@@ -68,9 +68,9 @@ class CanPort:
         self.bus_off_count = 0
         """How often the controller went to bus-off; who counts them may set it back to 0."""
         self.overruns = 0
+        """How often received frames were lost, in the controller or because we were late; who counts them may set it back to 0."""
         self.drained = True
         """Whether the last ``receive`` left nothing: what it did not return may have been taken, as error frames are."""
-        """How often received frames were lost, in the controller or because we were late; who counts them may set it back to 0."""
         self._known_drops = 0
         self._bus: Any = _open(config)
         self._ids: frozenset[int] = frozenset()

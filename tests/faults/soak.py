@@ -22,7 +22,7 @@ from harness import Bench, growth
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.states import Device
 
-NEW_PROCESS = ("missing at start", "kill -9", "SIGTERM", "frozen", "conf")
+NEW_PROCESS = ("missing at start", "kill -9", "SIGTERM", "frozen")
 """Faults that end the gateway: its memory could not be followed over them."""
 IDENTITIES = (
     *benches.IDENTITIES,

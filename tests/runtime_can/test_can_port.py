@@ -29,11 +29,9 @@ from kontronik_can_gw.runtime import can_port
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
-NO_MESSAGES = Layout("x", "Gw", ())
 _numbers = itertools.count()
 
 

@@ -78,7 +78,6 @@ class Wire:
         """When each byte was in the kernel's buffer."""
         self.frames: list[int] = []
         """When each frame was there whole."""
-        self.discarded = False
         self._world = world
         self._number = number
         self._bytes = bytearray()

@@ -142,7 +142,6 @@ class EscMonitor:
         self.name = settings.name
         self.spreads = {quantity.source: Spread() for quantity in QUANTITIES}
         self._settings = settings
-        self._index = index
         self._view = view
         known = sources(settings)
         columns = [(name, view.reader.column_of(name, index)) for name in known]
@@ -228,11 +227,6 @@ class EscMonitor:
             self._told = 0
         elif self._link_part is not None and self._link_part in firsts:
             self._told += 1
-
-    @property
-    def is_link_ok(self) -> bool:
-        """True where the link is known to be good; without a word of the DBC on it: where there are values."""
-        return normalize(self.link or "") == "ok" if self.has("link_state") else self.is_fresh
 
     @property
     def device(self) -> str:

@@ -273,11 +273,6 @@ class Publisher:
             made["firmware"] = self._firmware(member)
         return made
 
-    def discovery_topics(self) -> list[str]:
-        """Where the devices are told of; none without discovery."""
-        prefix = self._discovery
-        return [] if prefix is None else [self.topics.discovery(prefix, member.name) for member in self._members]
-
     # --- what counts as a change
 
     def _notable(self, member: _Member, now: int) -> tuple[object, ...]:

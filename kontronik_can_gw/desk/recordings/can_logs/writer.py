@@ -16,7 +16,6 @@ from kontronik_can_gw.lean import without_asammdf
 if TYPE_CHECKING:
     from can import Message
 
-TEXT_FORMATS = ("candump", "asc", "trc")
 _MS = 1_000_000
 
 
