@@ -270,6 +270,43 @@ def test_a_disk_that_stands_still_holds_nobody_up(tmp_path: Path, monkeypatch: p
     assert sum(read_number(e.data) for e in found if e.kind == Kind.LOST) == 500
 
 
+def test_the_end_waits_for_a_stuck_disk_but_not_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder, "_CLOSE_S", 0.1)
+    go_on = threading.Event()
+    monkeypatch.setattr(os, "fdatasync", lambda _fd: go_on.wait(600))
+    it = begun(tmp_path)
+    put(it, entries(3))
+    until(lambda: it._busy_since is not None)
+    it.close()
+    assert it._busy_since is not None, "the disk has not answered yet"
+    go_on.set()
+
+
+def test_a_part_that_could_not_be_begun_does_not_stand_in_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 10 * SECOND
+    full = True
+    real = os.write
+
+    def write(fd: int, data: bytes) -> int:
+        if full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(fd, data)
+
+    monkeypatch.setattr(os, "write", write)
+    it = begun(tmp_path, clock=lambda: now)
+    put(it, entries(3))
+    until(lambda: it.facts.problem != "")
+    assert list(tmp_path.iterdir()) == []
+    full = False
+    now += 6 * SECOND
+    until(lambda: it._file is not None)
+    put(it, entries(3, 3))
+    it.close()
+    assert [e for e in recorded(tmp_path) if e.kind == Kind.BYTES] == entries(3, 3)
+
+
 def test_a_folder_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match=r"record\.directory"):

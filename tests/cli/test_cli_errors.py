@@ -127,6 +127,41 @@ def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
     assert ("usermod" in done.stderr) == (mode == 0o660)
 
 
+def test_a_second_gateway_on_a_port_is_told_who_has_it(tmp_path: Path, terminal: PtyEsc) -> None:
+    file = configuration(tmp_path, terminal.path)
+    first = subprocess.Popen([*PROGRAM, "run", "-c", str(file)], stderr=subprocess.PIPE, text=True)
+    try:
+        assert first.stderr is not None
+        while line := first.stderr.readline():
+            if f"{terminal.path} is open" in line:
+                break
+        assert first.poll() is None
+        said = refused(1, "run", "-c", file)
+        assert f"esc1: {terminal.path}: is in use by another program" in said
+        assert f"(pid {first.pid})" in said
+        assert first.poll() is None
+    finally:
+        first.terminate()
+        assert first.wait(60) == 0
+        if first.stderr is not None:
+            first.stderr.close()
+
+
+def test_one_device_by_two_names_is_refused(tmp_path: Path, terminal: PtyEsc) -> None:
+    link = tmp_path / "by-id"
+    link.symlink_to(terminal.path)
+    file = configuration(tmp_path, terminal.path)
+    file.write_text(file.read_text() + f'[[esc]]\nport = "{link}"\n')
+    device = os.path.realpath(terminal.path)
+    for command in ("check", "run"):
+        assert refused(2, command, "-c", file) == f"{file}: the ports of esc1 and esc2 are one device, {device}"
+
+
+def test_only_a_configuration_that_is_not_there_is_answered_with_init(tmp_path: Path) -> None:
+    assert "init" in refused(2, "check", "-c", tmp_path / "none.toml")
+    assert "init" not in refused(2, "check", "-c", tmp_path)
+
+
 # --- CAN interface
 
 

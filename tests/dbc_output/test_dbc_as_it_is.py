@@ -50,6 +50,29 @@ def refused(text: str, **settings: Any) -> list[str]:
 
 
 @pytest.mark.parametrize(
+    ("comment", "read"),
+    [
+        (
+            'CM_ BO_ 256 "first\nVAL_ 256 OperatingState States ;\nBA_ ";',
+            "first\nVAL_ 256 OperatingState States ;\nBA_ ",
+        ),
+        ('CM_ BO_ 256 "one; two\nVAL_TABLE_ States 1 fake ;";', "one; two\nVAL_TABLE_ States 1 fake ;"),
+    ],
+)
+def test_comments_and_value_texts_are_not_touched(comment: str, read: str) -> None:
+    text = f'VAL_TABLE_ States 21 "Forward; bad" 12 "MotorOff" ;\n{STATE}{comment}\nVAL_ 256 OperatingState States ;\n'
+    (message,) = parse_database((HEAD + text).encode(), "my.dbc").messages
+    assert dict(message.signals[0].choices or {}) == {21: "Forward; bad", 12: "MotorOff"}
+    assert message.comment == read
+
+
+def test_an_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> None:
+    text = 'BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event";\nBA_ "GenMsgSendType" BO_ 256 "Sometimes";\n'
+    with pytest.raises(UserError, match='"GenMsgSendType": "Sometimes" is none of'):
+        parse_database((HEAD + STATE + text).encode(), "my.dbc")
+
+
+@pytest.mark.parametrize(
     "table", ['VAL_TABLE_ States 21 "Forward" 12 "MotorOff" ;', 'VAL_TABLE_ States\n21 "Forward"\n12 "MotorOff";']
 )
 def test_a_value_table_may_be_named_although_ns_lists_its_keyword(table: str) -> None:

@@ -73,3 +73,16 @@ def test_no_module_of_doctor_can_write_to_a_device() -> None:
         assert not names & {"O_RDWR", "O_WRONLY", "O_CREAT"}, path.name
         if "open" in methods or any(isinstance(call, ast.Name) and call.id == "open" for call in calls):
             assert path.name == "line.py"
+
+
+def test_even_parity_is_known_by_what_is_read_back() -> None:
+    eight_even = termios.CS8 | termios.PARENB | termios.CREAD
+    wrong = (
+        (termios.CS8, termios.B115200),
+        (termios.CS7 | termios.PARENB, termios.B115200),
+        (eight_even | termios.PARODD, termios.B115200),
+        (eight_even | termios.CSTOPB, termios.B115200),
+        (eight_even, termios.B9600),
+    )
+    assert line._is_ours([0, 0, eight_even, 0, termios.B115200, termios.B115200])
+    assert not any(line._is_ours([0, 0, flags, 0, speed, speed]) for flags, speed in wrong)

@@ -101,18 +101,19 @@ def second(bench: Bench, fault: Fault, times: int) -> None:
     extra = PtyPort(bench.folder / "second", bench.fed[0].identity)
     parts = own.split("[[esc]]")
     others = {
-        "the same port": own.replace("enabled = true", "enabled = false"),
-        "the same nodes": parts[0] + "[[esc]]" + parts[1].replace(bench.ports[0].path, extra.path),
+        "is in use by another program": own.replace("enabled = true", "enabled = false"),
+        "another gateway on this machine": parts[0] + "[[esc]]" + parts[1].replace(bench.ports[0].path, extra.path),
     }
+    """What is said of the same port, and of the same nodes."""
     try:
-        for what, text in [*others.items()] * max(1, times // 2):
+        for reason, text in [*others.items()] * max(1, times // 2):
             with bench.injection(fault, []) as injection:
                 other.write_text(text)
                 command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(other)]
                 done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
                 said = done.stderr.strip()
-                injection.expect(done.returncode == 1, f"with {what} it ended with {done.returncode}: {said}")
-                injection.expect(len(said.splitlines()) == 1, f"with {what} it said: {said}")
+                injection.expect(done.returncode == 1, f"it ended with {done.returncode}, not by {reason!r}: {said}")
+                injection.expect(len(said.splitlines()) == 1 and reason in said, f"not {reason!r} was said: {said}")
                 injection.cleared()
     finally:
         extra.close()

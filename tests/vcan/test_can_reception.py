@@ -114,6 +114,20 @@ def test_exactly_the_wanted_frames_come_and_nothing_else_makes_the_socket_readab
         assert not readable(port, 0.2)
 
 
+def test_600_ids_are_merged_and_still_exactly_they_come(vcan: str) -> None:
+    wanted = set(range(0x081, 0x081 + 3 * 600, 3))
+    with port_on(vcan, sorted(wanted)) as port, Peer(vcan) as peer:
+        came: list[int] = []
+        for can_id in range(0x800):
+            peer.send(can_id)
+            peer.send(can_id | EXTENDED)
+            peer.send(can_id | REMOTE)
+            if can_id % 64 == 63:
+                came += [frame.can_id for frame in all_of(port)]
+        assert came == sorted(wanted)
+        assert port.overruns == 0
+
+
 def test_on_a_bus_with_can_fd_frames_are_told_apart(vcan: str) -> None:
     with port_on(vcan, [0x601], fd=True) as port, Peer(vcan) as peer:
         peer.send_fd(0x601, b"12345678")
