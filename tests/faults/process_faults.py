@@ -102,7 +102,9 @@ def second(bench: Bench, fault: Fault, times: int) -> None:
     parts = own.split("[[esc]]")
     others = {
         "is in use by another program": own.replace("enabled = true", "enabled = false"),
-        "another gateway on this machine": parts[0] + "[[esc]]" + parts[1].replace(bench.ports[0].path, extra.path),
+        "another gateway on this machine": parts[0].replace('/store"', '/store2"')
+        + "[[esc]]"
+        + parts[1].replace(bench.ports[0].path, extra.path),
     }
     """What is said of the same port, and of the same nodes."""
     try:
