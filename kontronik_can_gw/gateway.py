@@ -59,7 +59,8 @@ class Gateway:
             ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
             self.nodes = Nodes(canopen, self.escs, self.status, self._apply, ids)
         self._message_ids = {
-            m.can_id | (EXTENDED if m.extended else 0): (None, f"message {m.name}") for m in layout.messages
+            m.can_id | (EXTENDED if m.extended else 0): (None, f"message {m.name}")
+            for m in layout.messages
         }
         self._own_ids: Mapping[int, tuple[int | None, str]] = {}
         self._receive_ids: frozenset[int] = frozenset()
@@ -191,9 +192,11 @@ class Gateway:
             self._output.on_gateway_change(now)
             if self.nodes is not None:
                 self.nodes.on_can_state(state, now)
-            if was_off and state is not CanState.DOWN:  # what was handed over meanwhile never reached the bus
+            if was_off and state is not CanState.DOWN:
+                # what was handed over meanwhile never reached the bus
                 self._output.start(now)
-        elif state is CanState.DOWN and self.nodes is not None:  # down again before a frame was sent
+        elif state is CanState.DOWN and self.nodes is not None:
+            # down again before a frame was sent
             self.nodes.on_can_state(state, now)
 
     def advance(self, now: int) -> None:
@@ -257,7 +260,10 @@ class Gateway:
         """Of each ESC's CANopen node: node-ID, NMT state, PDOs sent so far. Empty without nodes."""
         if self.nodes is None:
             return []
-        return [(node.claimed_node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos)) for node in self.nodes.nodes]
+        return [
+            (node.claimed_node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos))
+            for node in self.nodes.nodes
+        ]
 
     def _expire(self, now: int, but: int | None = None) -> None:
         """What is too old by now goes before anything is sent."""

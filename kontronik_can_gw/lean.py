@@ -24,7 +24,10 @@ def without_asammdf() -> Iterator[None]:
     finally:
         if hide:
             del sys.modules["asammdf"]
-        if isinstance(sys.modules.get("cantools"), _Package) and "cantools.database" not in sys.modules:
+        if (
+            isinstance(sys.modules.get("cantools"), _Package)
+            and "cantools.database" not in sys.modules
+        ):
             del sys.modules["cantools"]
 
 

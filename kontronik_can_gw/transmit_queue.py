@@ -87,7 +87,9 @@ class TransmitQueue:
         slots = list(self._slots.values())
         if not self._queue:
             return slots
-        first, second = (list(self._queue), slots) if self._queue_has_turn else (slots, list(self._queue))
+        first, second = (
+            (list(self._queue), slots) if self._queue_has_turn else (slots, list(self._queue))
+        )
         by_turns = [frame for pair in zip(first, second, strict=False) for frame in pair]
         both = len(by_turns) // 2
         return by_turns + first[both:] + second[both:]

@@ -11,7 +11,9 @@ if not os.environ.get("KCG_VCAN"):
     from hypothesis import HealthCheck, settings
 
     # the same examples in every run, and none is judged by how long it took
-    settings.register_profile("suite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+    settings.register_profile(
+        "suite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+    )
     settings.load_profile("suite")
 
 

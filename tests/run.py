@@ -33,7 +33,9 @@ from typing import NoReturn
 from xml.etree import ElementTree as ET
 
 PROJECT = Path(__file__).resolve().parent.parent
-PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"])
+PATH = os.pathsep.join(
+    [str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"]
+)
 NOT_JUDGED = "not judged"
 
 PYTEST = "python -m pytest -q --junitxml={report}"
@@ -62,7 +64,9 @@ TIERS = {
 LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
 """Of one step: the two that CI runs end within its 90 minutes whatever happens."""
 ENABLE_UML = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static"
-ENABLE_VCAN = f"{ENABLE_UML}  (or, on Ubuntu, linux-modules-extra-{platform.release()} can-utils iproute2)"
+ENABLE_VCAN = (
+    f"{ENABLE_UML}  (or, on Ubuntu, linux-modules-extra-{platform.release()} can-utils iproute2)"
+)
 NEEDS = {
     **dict.fromkeys(("vcan", "masters"), (("ip", "candump", "vcan"), ENABLE_VCAN)),
     **dict.fromkeys(("faults", "soak"), (("linux.uml",), ENABLE_UML)),
@@ -100,7 +104,9 @@ def read_report(report: Path, result: Result) -> None:
         elif skipped is None or skipped.get("type") == "pytest.xfail":
             result.passed += 1
         else:
-            result.skipped.append(f"{case.get('classname', '')}.{case.get('name', '')}: {skipped.get('message', '')}")
+            result.skipped.append(
+                f"{case.get('classname', '')}.{case.get('name', '')}: {skipped.get('message', '')}"
+            )
 
 
 def missing(step: str) -> str:
@@ -116,7 +122,9 @@ def missing(step: str) -> str:
     return ""
 
 
-def run(step: str, limit_s: float, scratch: Path, keep: Path, arguments: Sequence[str], live: bool) -> Result:
+def run(
+    step: str, limit_s: float, scratch: Path, keep: Path, arguments: Sequence[str], live: bool
+) -> Result:
     """Run a step; its output comes at once if ``live``, else as a whole at its end."""
     result = Result(step)
     if lacking := missing(step):
@@ -132,7 +140,13 @@ def run(step: str, limit_s: float, scratch: Path, keep: Path, arguments: Sequenc
     with (scratch / f"{step}.log").open("w+b") as log:
         out = None if live else log
         process = subprocess.Popen(
-            command, shell=True, cwd=PROJECT, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True
+            command,
+            shell=True,
+            cwd=PROJECT,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=out,
+            start_new_session=True,
         )
         running.add(process)
         try:
@@ -180,7 +194,9 @@ def summarize(results: Sequence[Result], strict: bool) -> int:
     print("\n== summary")
     for result in results:
         counts = f"{result.passed} passed, {result.failed} failed, {len(result.skipped)} skipped"
-        print(f"{result.step:8}{result.state:8} {result.seconds:7.1f} s  {counts}  {result.note}".rstrip())
+        print(
+            f"{result.step:8}{result.state:8} {result.seconds:7.1f} s  {counts}  {result.note}".rstrip()
+        )
     skipped = [each for result in results for each in result.skipped]
     unrun = [result for result in results if result.enable]
     for result in unrun:
@@ -191,7 +207,10 @@ def summarize(results: Sequence[Result], strict: bool) -> int:
     if strict and (unrun or avoidable):
         print("CI=true: what was not run is a failure")
     failed = sum(result.failed for result in results)
-    print(f"{sum(result.passed for result in results)} passed, {failed} failed, {len(skipped)} skipped", flush=True)
+    print(
+        f"{sum(result.passed for result in results)} passed, {failed} failed, {len(skipped)} skipped",
+        flush=True,
+    )
     return int(bool(failed or (strict and (unrun or avoidable))))
 
 
@@ -200,15 +219,22 @@ def main() -> int:
     if "--" in own:
         at = own.index("--")
         own, arguments = own[:at], own[at + 1 :]
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("tier", choices=TIERS)
     parser.add_argument("--only", action="append", choices=STEPS, metavar="STEP")
     parser.add_argument("--keep", type=Path, metavar="FOLDER")
     args = parser.parse_args(own)
-    lanes = [[step for step in lane if args.only is None or step in args.only] for lane in TIERS[args.tier]]
+    lanes = [
+        [step for step in lane if args.only is None or step in args.only]
+        for lane in TIERS[args.tier]
+    ]
     lanes = [lane for lane in lanes if lane]
     if not lanes:
-        parser.error(f"{args.tier} has the steps {', '.join(step for lane in TIERS[args.tier] for step in lane)}")
+        parser.error(
+            f"{args.tier} has the steps {', '.join(step for lane in TIERS[args.tier] for step in lane)}"
+        )
     os.environ["PATH"] = PATH
     with tempfile.TemporaryDirectory(prefix="kcg-test.", ignore_cleanup_errors=True) as folder:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -218,7 +244,10 @@ def main() -> int:
         keep.mkdir(parents=True, exist_ok=True)
 
         def run_lane(lane: Sequence[str]) -> list[Result]:
-            return [run(step, LIMIT_S[args.tier], scratch, keep, arguments, len(lanes) == 1) for step in lane]
+            return [
+                run(step, LIMIT_S[args.tier], scratch, keep, arguments, len(lanes) == 1)
+                for step in lane
+            ]
 
         with ThreadPoolExecutor(len(lanes)) as pool:
             results = [result for found in pool.map(run_lane, lanes) for result in found]

@@ -29,7 +29,17 @@ ORDER = (
     ("cli",),
 )
 EDGE = ("runtime", "config", "desk", "cli")
-BLOCKING = {"time", "asyncio", "threading", "socket", "selectors", "select", "subprocess", "os", "signal"}
+BLOCKING = {
+    "time",
+    "asyncio",
+    "threading",
+    "socket",
+    "selectors",
+    "select",
+    "subprocess",
+    "os",
+    "signal",
+}
 ONLY_IN = {
     "cantools": (
         "dbc/",
@@ -122,7 +132,9 @@ def test_no_serial_port_is_ever_written() -> None:
     """No call of a write method, and no way to one, in the module that owns the port."""
     tree = ast.parse((PACKAGE / "runtime" / "serial_port.py").read_text(encoding="utf-8"))
     called = {
-        node.func.attr for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+        node.func.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
     }
     assert not called & {"write", "writelines", "send_break", "sendBreak"}
     defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}

@@ -17,7 +17,9 @@ DATABASE = f"{LEAN}with without_asammdf(): import cantools.database\n"
 
 def test_the_database_of_cantools_comes_without_python_can() -> None:
     assert (
-        result(f"{DATABASE}print([m for m in ('can', 'asammdf', 'asyncio', 'cantools.tester') if m in sys.modules])")
+        result(
+            f"{DATABASE}print([m for m in ('can', 'asammdf', 'asyncio', 'cantools.tester') if m in sys.modules])"
+        )
         == "[]"
     )
 
@@ -33,7 +35,10 @@ def test_cantools_is_whole_for_who_asks_for_more() -> None:
 
 def test_a_cantools_that_is_there_already_stays() -> None:
     code = "import cantools; before = cantools\nfrom kontronik_can_gw.lean import without_asammdf\n"
-    assert result(f"{code}with without_asammdf(): import cantools.database\nprint(before is cantools)") == "True"
+    assert (
+        result(f"{code}with without_asammdf(): import cantools.database\nprint(before is cantools)")
+        == "True"
+    )
 
 
 def test_a_database_is_read_as_ever() -> None:
@@ -46,5 +51,8 @@ def test_a_database_is_read_as_ever() -> None:
 
 def test_asammdf_can_be_imported_afterwards() -> None:
     assert (
-        result(f"{LEAN}with without_asammdf(): import can\nprint('asammdf' in sys.modules); import asammdf") == "False"
+        result(
+            f"{LEAN}with without_asammdf(): import can\nprint('asammdf' in sys.modules); import asammdf"
+        )
+        == "False"
     )

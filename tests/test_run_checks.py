@@ -64,7 +64,9 @@ def test_a_step_without_tests_is_one_check(
     assert (result.passed + result.failed, result.state) == (1, state)
 
 
-def test_a_step_that_does_not_end_is_ended_and_has_failed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_step_that_does_not_end_is_ended_and_has_failed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setitem(checks.STEPS, "lint", "sleep 600")
     result = checks.run("lint", 0.1, tmp_path, tmp_path, (), False)
     assert (result.state, result.note) == ("FAILED", "no end within 0.1 s")

@@ -64,9 +64,15 @@ CONFIGURATIONS = {
         '[dbc]\nenabled = false\n[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\nself_start = true\n',
         CANOPEN,
     ),
-    "DBC and CANopen": ('[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\n', CANTOOLS | CANOPEN),
+    "DBC and CANopen": (
+        '[canopen]\nenabled = true\nnode_id = 1\nstore = "store"\n',
+        CANTOOLS | CANOPEN,
+    ),
     "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS),
-    "status and Prometheus": ('[statistics]\nfile = "status.json"\nprometheus = "127.0.0.1:{port}"\n', CANTOOLS),
+    "status and Prometheus": (
+        '[statistics]\nfile = "status.json"\nprometheus = "127.0.0.1:{port}"\n',
+        CANTOOLS,
+    ),
 }
 
 AT_THE_END = """
@@ -144,7 +150,11 @@ def _until_values(peer: socket.socket, esc: PtyEsc) -> None:
 def surplus(modules: set[str], allowed: set[str]) -> set[str]:
     """Modules that are neither of the standard library nor allowed."""
     libraries = {name.partition(".")[0] for name in modules}
-    found = {name for name in libraries - allowed if name not in sys.stdlib_module_names and not name.startswith("_")}
+    found = {
+        name
+        for name in libraries - allowed
+        if name not in sys.stdlib_module_names and not name.startswith("_")
+    }
     for room, may in OWN.items():
         of_room = {name for name in modules if name.startswith(f"kontronik_can_gw.{room}.")}
         found |= {name for name in of_room if name.split(".")[2] not in may}

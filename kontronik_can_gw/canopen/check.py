@@ -46,7 +46,9 @@ _SHOWN = (
 _SERVER = {1: SDO_REQUEST, 2: SDO_ANSWER}
 
 
-def check_eds(eds: Eds, escs: EscSettings | Sequence[EscSettings], node_ids: Iterable[int] = (1,)) -> None:
+def check_eds(
+    eds: Eds, escs: EscSettings | Sequence[EscSettings], node_ids: Iterable[int] = (1,)
+) -> None:
     """Whether nodes with these node-IDs, for these ESCs, can be built from an EDS. UserError with every mistake."""
     all_escs = [escs] if isinstance(escs, EscSettings) else escs
     settings = all_escs[0]
@@ -92,14 +94,21 @@ def _objects(dictionary: Dictionary, settings: EscSettings) -> Iterator[tuple[Va
     for index, sub in _SHOWN:
         variable = dictionary.get(index, sub)
         if variable is not None and (variable.writable or not variable.readable):
-            yield variable, "is shown by the node, so it must be read only (AccessType=ro or const)."
+            yield (
+                variable,
+                "is shown by the node, so it must be read only (AccessType=ro or const).",
+            )
     for sub, first in _SERVER.items():
         variable = dictionary.get(0x1200, sub)
-        if variable is not None and (variable.entry.default != first or not variable.entry.relative):
+        if variable is not None and (
+            variable.entry.default != first or not variable.entry.relative
+        ):
             yield variable, f"must be $NODEID+0x{first:X}: the SDO server has no other."
 
 
-def _settings(dictionary: Dictionary, escs: Sequence[EscSettings]) -> Iterator[tuple[Variable, str]]:
+def _settings(
+    dictionary: Dictionary, escs: Sequence[EscSettings]
+) -> Iterator[tuple[Variable, str]]:
     """Settings of the configuration that their objects cannot hold."""
     for esc in escs:
         for sub, value in configured_settings(esc).items():
@@ -119,13 +128,18 @@ def _store_objects(dictionary: Dictionary) -> Iterator[tuple[Variable, str]]:
     for index in (0x1010, 0x1011):
         for variable in dictionary.subs(index):
             if variable.entry.sub > 3:
-                yield variable, "this node stores all, communication and application parameters, sub-index 1 to 3."
+                yield (
+                    variable,
+                    "this node stores all, communication and application parameters, sub-index 1 to 3.",
+                )
 
 
 def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     """Defaults that a download would be refused: of single services, then of the PDOs."""
     setup = CanopenSetup(eds, (NodeSettings(node_id),), (Stored(),))
-    (node,) = Nodes(setup, [EscTelemetry(settings, 0)], GatewayStatus(), lambda _esc, _settings: None).nodes
+    (node,) = Nodes(
+        setup, [EscTelemetry(settings, 0)], GatewayStatus(), lambda _esc, _settings: None
+    ).nodes
     dictionary = node.dictionary
     dictionary.reset(*COMMUNICATION_PROFILE, node_id, {})
     for variable in dictionary.variables.values():
@@ -150,7 +164,14 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
 
 def without_objects(nodes: Nodes) -> list[str]:
     """A line for each TPDO that is valid by its defaults and maps nothing, of all nodes: none of them is ever sent."""
-    numbers = sorted({tpdo.number for node in nodes.nodes for tpdo in node.tpdos if tpdo.valid and not tpdo.mapped})
+    numbers = sorted(
+        {
+            tpdo.number
+            for node in nodes.nodes
+            for tpdo in node.tpdos
+            if tpdo.valid and not tpdo.mapped
+        }
+    )
     return [
         f"TPDO {number + 1} is never sent: {MAPPING + number:04X}h maps nothing, so {COMMUNICATION + number:04X}h:01 cannot be valid. "
         "Map objects, or set bit 31 of its DefaultValue."

@@ -21,7 +21,13 @@ from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Mapped, Tpdo, message_plan
 from kontronik_can_gw.dbc.expand import esc_prefix
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.kontronik.states import Device, ErrorBit, OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    ErrorBit,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+)
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, LinkState
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.lean import without_asammdf
@@ -148,12 +154,19 @@ def database(nodes: Nodes, escs: Sequence[EscSettings]) -> "Database":
 
 def waiting_for_lss(nodes: Nodes, escs: Sequence[EscSettings]) -> list[str]:
     """Names of the ESCs whose nodes have no node-ID, and so no frames."""
-    return [esc.name for node, esc in zip(nodes.nodes, escs, strict=True) if node.node_id == UNCONFIGURED]
+    return [
+        esc.name
+        for node, esc in zip(nodes.nodes, escs, strict=True)
+        if node.node_id == UNCONFIGURED
+    ]
 
 
 def pascal_case(text: str) -> str:
     """A name in any spelling as DBC files have it: ``bec_voltage``, ``BEC voltage`` and ``BecVoltage`` become ``BecVoltage``."""
-    words = (re.sub("[A-Z]+(?=[A-Z][a-z]|[^a-z]*$)", _capitalized, word) for word in re.split("[^A-Za-z0-9]+", text))
+    words = (
+        re.sub("[A-Z]+(?=[A-Z][a-z]|[^a-z]*$)", _capitalized, word)
+        for word in re.split("[^A-Za-z0-9]+", text)
+    )
     return "".join(word[:1].upper() + word[1:] for word in words)
 
 
@@ -162,14 +175,18 @@ def emergency_names() -> dict[int, str]:
     named = {int(bit): pascal_case(bit.name) for bit in OperatingError}
     found = {0: "NoError"} | {code_of_bit(bit): named.get(bit, f"Bit{bit}") for bit in range(32)}
     found |= {error.value[0]: pascal_case(error.name) for error in GatewayError}
-    found[GatewayError.TELEMETRY_LOST.value[0]] = "TelemetryFault"  # several findings share this code
+    found[GatewayError.TELEMETRY_LOST.value[0]] = (
+        "TelemetryFault"  # several findings share this code
+    )
     return found
 
 
 class _NodeMessages:
     """The messages of one node."""
 
-    def __init__(self, node: Node, prefix: str, message_names: _Names, signal_names: _Names) -> None:
+    def __init__(
+        self, node: Node, prefix: str, message_names: _Names, signal_names: _Names
+    ) -> None:
         self._node = node
         self._who = f"CANopen node {node.node_id}"
         self._message_prefix = prefix or "Esc"
@@ -207,11 +224,15 @@ class _NodeMessages:
                 NmtState.PRE_OPERATIONAL: "PreOperational",
             },
         )
-        told = f"every {period} ms" if period else "off (1017h is 0), only the boot-up message is sent"
+        told = (
+            f"every {period} ms" if period else "off (1017h is 0), only the boot-up message is sent"
+        )
         name = self._message_names.take(self._message_prefix, "Heartbeat")
         cob_id = heartbeat.COB_ID + self._node.node_id
         comment = f"Heartbeat of {self._who}, {told}."
-        return _Message(cob_id, name, 1, comment, "Cyclic" if period else "Event", period, 0, [state])
+        return _Message(
+            cob_id, name, 1, comment, "Cyclic" if period else "Event", period, 0, [state]
+        )
 
     def _emergency(self, cob_id: int) -> _Message:
         bits = {int(bit): pascal_case(bit.name) for bit in OperatingError}
@@ -285,7 +306,9 @@ class _NodeMessages:
         own_stem = _stem(item)
         length, signed = place.length, place.signed
         start = place.pieces[0].at
-        lowest, highest = (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        lowest, highest = (
+            (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        )
         plain = _Signal("", start, length, where, signed, place.is_float, low=lowest, high=highest)
         if bound is None:
             is_code = (item.index, item.sub, length, signed) == (at.ERROR_CODE, 0, 16, False)
@@ -300,9 +323,16 @@ class _NodeMessages:
         unit = _ASCII_UNITS.get(source.unit, source.unit)
         end = "Percent" if unit == "%" else ""
         comment = " ".join(filter(None, (where, _NOTES.get(source.name))))
-        scaled = replace(plain, name=self._name(stem.removesuffix(end), end), factor=1 / bound.steps, unit=unit)
+        scaled = replace(
+            plain, name=self._name(stem.removesuffix(end), end), factor=1 / bound.steps, unit=unit
+        )
         if source.rolls:
-            return [replace(scaled, comment=f"{comment} Starts again at 0 after {_number(highest / bound.steps)}.")]
+            return [
+                replace(
+                    scaled,
+                    comment=f"{comment} Starts again at 0 after {_number(highest / bound.steps)}.",
+                )
+            ]
         not_available = lowest if signed else highest
         lowest, highest = (lowest + 1, highest) if signed else (lowest, highest - 1)
         names = {number: text for number, text in names.items() if lowest <= number <= highest}
@@ -323,12 +353,21 @@ class _NodeMessages:
         replay = "The values come from a recording, not from an ESC."
         info = "The information of the ESC (its info frame) is fresh."
         return [
-            _Signal(self._name("LinkState"), start, _LINK_BITS, f"{where} {told}", high=max(states), names=states),
+            _Signal(
+                self._name("LinkState"),
+                start,
+                _LINK_BITS,
+                f"{where} {told}",
+                high=max(states),
+                names=states,
+            ),
             _Signal(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
             _Signal(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
         ]
 
-    def _flags(self, entry: Mapped, place: SignalPlan, bits: type[ErrorBit], state_name: str) -> list[_Signal]:
+    def _flags(
+        self, entry: Mapped, place: SignalPlan, bits: type[ErrorBit], state_name: str
+    ) -> list[_Signal]:
         then = f" and {state_name} is NotAvailable" if state_name else ""
         lost = f"While the word is not available all its bits are set{then}."
         where = _where(entry.variable.entry)
@@ -365,12 +404,17 @@ def _where(item: Entry) -> str:
 def _stem(item: Entry) -> str:
     """A signal's name from an object's, which can be of any characters."""
     stem = pascal_case(item.name)
-    return stem if re.fullmatch("[A-Z].*[a-z].*", stem) else f"Object{item.index:04X}Sub{item.sub:02X}"
+    return (
+        stem if re.fullmatch("[A-Z].*[a-z].*", stem) else f"Object{item.index:04X}Sub{item.sub:02X}"
+    )
 
 
 def _error_bits(entry: Mapped, place: SignalPlan) -> type[ErrorBit] | None:
     """The bits of an error word that is shown unsigned; None for every other object."""
-    words: dict[str, type[ErrorBit]] = {"operating_errors": OperatingError, "selftest_errors": SelfTestError}
+    words: dict[str, type[ErrorBit]] = {
+        "operating_errors": OperatingError,
+        "selftest_errors": SelfTestError,
+    }
     return None if entry.bound is None or place.signed else words.get(entry.bound.source.name)
 
 
@@ -379,7 +423,9 @@ def _table(name: str, names: Mapping[int, str]) -> tuple[dict[int, str], str]:
     names by one sample that has none."""
     if name == "operating_state_raw":
         known = {int(state): pascal_case(state.text) for state in OperatingState}
-        return {number: known.get(number, f"State{number}") for number in range(0x100)}, "OperatingState"
+        return {
+            number: known.get(number, f"State{number}") for number in range(0x100)
+        }, "OperatingState"
     if name == "device_raw":
         known = {int(device): pascal_case(device.text) for device in Device}
         return {number: known.get(number, f"Device{number}") for number in range(0x40)}, "Device"
@@ -392,24 +438,41 @@ def _schedule(tpdo: Tpdo) -> tuple[str, int, int]:
         return "None", 0, 0
     delay = tpdo.inhibit_ns // MS
     if tpdo.event_ns:
-        return "CyclicAndOnChange" if tpdo.on_change else "CyclicAndEvent", tpdo.event_ns // MS, delay
+        return (
+            "CyclicAndOnChange" if tpdo.on_change else "CyclicAndEvent",
+            tpdo.event_ns // MS,
+            delay,
+        )
     return "OnChange" if tpdo.on_change else "Event", 0, delay
 
 
 def _when(tpdo: Tpdo) -> str:
     """When a PDO is sent, in words."""
     if tpdo.type not in EVENT_TYPES:
-        text = "Sent at a SYNC when there is news" if tpdo.type == 0 else f"Sent at every SYNC number {tpdo.type}"
+        text = (
+            "Sent at a SYNC when there is news"
+            if tpdo.type == 0
+            else f"Sent at every SYNC number {tpdo.type}"
+        )
     else:
         text = "Sent when its status changes" if tpdo.on_change else "Sent when its values are new"
         if tpdo.inhibit_ns:
             text += f", no closer than {_number(Fraction(tpdo.inhibit_ns, MS))} ms"
         if tpdo.event_ns:
             text += f", at the latest after {tpdo.event_ns // MS} ms"
-    live = any(entry.bound is not None and entry.bound.source.group is Group.LIVE for entry in tpdo.mapped)
-    link = any(entry.bound is not None and entry.bound.source.name == "link_status" for entry in tpdo.mapped)
+    live = any(
+        entry.bound is not None and entry.bound.source.group is Group.LIVE for entry in tpdo.mapped
+    )
+    link = any(
+        entry.bound is not None and entry.bound.source.name == "link_status"
+        for entry in tpdo.mapped
+    )
     if live:
-        text += ". Goes on while the telemetry is lost" if link else ". Not sent while the telemetry is lost"
+        text += (
+            ". Goes on while the telemetry is lost"
+            if link
+            else ". Not sent while the telemetry is lost"
+        )
     return f"{text}."
 
 
@@ -453,7 +516,10 @@ def _lines(messages: Sequence[_Message], about: str) -> Iterator[str]:
     yield f'CM_ BU_ {_GATEWAY} "Gateway that is a CANopen node for each KONTRONIK ESC. It sends every message of this file.";'
     yield f'CM_ BU_ {_LOGGER} "Any receiver: logger, display or controller.";'
     yield from (f'CM_ BO_ {message.cob_id} "{_plain(message.comment)}";' for message in messages)
-    yield from (f'CM_ SG_ {message.cob_id} {signal.name} "{_plain(signal.comment)}";' for message, signal in pairs)
+    yield from (
+        f'CM_ SG_ {message.cob_id} {signal.name} "{_plain(signal.comment)}";'
+        for message, signal in pairs
+    )
     yield _DEFINITIONS
     attributes: tuple[tuple[str, Callable[[_Message], int]], ...] = (
         ("GenMsgCycleTime", lambda message: message.cycle),
@@ -461,7 +527,9 @@ def _lines(messages: Sequence[_Message], about: str) -> Iterator[str]:
         ("GenMsgDelayTime", lambda message: message.delay),
     )
     for message in messages:
-        yield from (f'BA_ "{name}" BO_ {message.cob_id} {value(message)};' for name, value in attributes)
+        yield from (
+            f'BA_ "{name}" BO_ {message.cob_id} {value(message)};' for name, value in attributes
+        )
     for message, signal in pairs:
         yield f'BA_ "GenSigStartValue" SG_ {message.cob_id} {signal.name} {signal.start_value};'
     for message, signal in pairs:

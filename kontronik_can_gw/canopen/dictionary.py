@@ -205,7 +205,9 @@ class Dictionary:
             value = variable.decode(data)
             entry = variable.entry
             low, high = entry.low, entry.high
-            if not isinstance(value, bytes) and not (low is None or value >= low) & (high is None or value <= high):
+            if not isinstance(value, bytes) and not (low is None or value >= low) & (
+                high is None or value <= high
+            ):
                 misfits.append(number)
                 continue
             variable.value = value

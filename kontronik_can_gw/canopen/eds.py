@@ -26,7 +26,19 @@ _U8, _U16, _U32 = 0x05, 0x06, 0x07
 _VISIBLE_STRING, _OCTET_STRING, _UNICODE_STRING, _DOMAIN_TYPE = 0x09, 0x0A, 0x0B, 0x0F
 _FLOATS = (0x08, 0x11)
 _SIGNED = (0x02, 0x03, 0x04, 0x15)
-_BITS = {0x01: 1, 0x02: 8, 0x03: 16, 0x04: 32, _U8: 8, _U16: 16, _U32: 32, 0x08: 32, 0x11: 64, 0x15: 64, 0x1B: 64}
+_BITS = {
+    0x01: 1,
+    0x02: 8,
+    0x03: 16,
+    0x04: 32,
+    _U8: 8,
+    _U16: 16,
+    _U32: 32,
+    0x08: 32,
+    0x11: 64,
+    0x15: 64,
+    0x1B: 64,
+}
 _TYPE_NAMES = {
     0x01: "BOOLEAN",
     0x02: "INTEGER8",
@@ -63,9 +75,13 @@ _PDO_BITS = 64
 _HEADING = re.compile(r"\s*\[([^\]]*)\]")
 _COMMENT = re.compile(r"(?:^|\s);.*")
 _OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
-_OF_OBJECT = re.compile(r"([0-9a-f]{4})(sub[0-9a-f]+|name|value|denotation|objectlinks)?$", re.IGNORECASE)
+_OF_OBJECT = re.compile(
+    r"([0-9a-f]{4})(sub[0-9a-f]+|name|value|denotation|objectlinks)?$", re.IGNORECASE
+)
 _NUMBER = re.compile(r"-?(?:0x[0-9a-f]{1,20}|0|[1-9][0-9]{0,20})$", re.IGNORECASE)
-_NODE_ID = re.compile(r"\$NODEID(?:\+(?P<after>[^+]+))?$|(?P<before>[^+]+)\+\$NODEID$", re.IGNORECASE)
+_NODE_ID = re.compile(
+    r"\$NODEID(?:\+(?P<after>[^+]+))?$|(?P<before>[^+]+)\+\$NODEID$", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +171,9 @@ _COMMUNICATION: Mapping[int, _Shape] = {
     0x1F80: _var(_U32),
 }
 # Sub-index 4 is reserved.
-_PDO_COMMUNICATION = _Shape((RECORD,), {0: (_U8,), 1: (_U32,), 2: (_U8,), 3: (_U16,), 5: (_U16,), 6: (_U8,)}, (1, 2))
+_PDO_COMMUNICATION = _Shape(
+    (RECORD,), {0: (_U8,), 1: (_U32,), 2: (_U8,), 3: (_U16,), 5: (_U16,), 6: (_U8,)}, (1, 2)
+)
 _PDO_MAPPING = _Shape((RECORD, ARRAY), _list(RECORD, _U32, 0x40).types)
 _PDO_COMMUNICATIONS, _PDO_MAPPINGS = range(0x1800, 0x1A00), range(0x1A00, 0x1C00)
 
@@ -211,10 +229,17 @@ class _Object:
 
 def load(data: bytes, name: str) -> Eds:
     """Check and read an EDS by CiA 306. UserError with every mistake at once: file, section, key, what is wrong and what to do."""
-    if not any(section in data.lower() for section in (b"[fileinfo]", b"[deviceinfo]", b"[mandatoryobjects]")):
-        raise UserError(f"{name}: is no EDS: it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects].")
+    if not any(
+        section in data.lower()
+        for section in (b"[fileinfo]", b"[deviceinfo]", b"[mandatoryobjects]")
+    ):
+        raise UserError(
+            f"{name}: is no EDS: it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects]."
+        )
     if len(data) > MAX_BYTES or data.count(b"\n") > _MAX_LINES:
-        raise UserError(f"{name}: is larger than {MAX_BYTES // 1_000_000} MB or {_MAX_LINES} lines. Is it an EDS?")
+        raise UserError(
+            f"{name}: is larger than {MAX_BYTES // 1_000_000} MB or {_MAX_LINES} lines. Is it an EDS?"
+        )
     checker = _Checker(name)
     checker.read(data)
     if len(checker.problems) > _MAX_PROBLEMS:
@@ -275,7 +300,9 @@ class _Checker:
         section = section[:_MAX_SAID]
         if len(text) > _MAX_SAID:  # what is wrong and the remedy stand at its ends
             text = f"{text[: _MAX_SAID // 2]} ... {text[-_MAX_SAID // 2 :]}"
-        self.problems.append(f"{self._name}: [{section}] {text}" if section else f"{self._name}: {text}")
+        self.problems.append(
+            f"{self._name}: [{section}] {text}" if section else f"{self._name}: {text}"
+        )
 
     def _decode(self, data: bytes) -> str:
         if data.startswith(codecs.BOM_UTF8):
@@ -296,7 +323,9 @@ class _Checker:
                 continue
             match = _OBJECT.match(name)
             same = (
-                _spelling(int(match[1], 16), int(match[2], 16) if match[2] else None).lower() if match else name.lower()
+                _spelling(int(match[1], 16), int(match[2], 16) if match[2] else None).lower()
+                if match
+                else name.lower()
             )
             if same in self._sections:
                 self._say(name, "this section is there twice. Remove one.")
@@ -309,7 +338,10 @@ class _Checker:
             return
         key, equals, value = (part.strip() for part in bare.partition("="))
         if not equals or not key or not section.name:
-            self._say(section.name, f"'{bare}' is neither a section, nor key=value, nor a comment behind ';'.")
+            self._say(
+                section.name,
+                f"'{bare}' is neither a section, nor key=value, nor a comment behind ';'.",
+            )
         elif line[0].isspace():
             self._say(section.name, f"'{bare}' begins with a blank. Remove the blank.")
         elif key.lower() in section.values:
@@ -334,23 +366,44 @@ class _Checker:
             if name.lower() not in self._sections:
                 self._say(name, "this section is mandatory and is not there. Add it.")
         if "devicecomissioning" in self._sections:
-            self._say("DeviceComissioning", "this is a DCF, the file of one node. Give the EDS it was made from.")
+            self._say(
+                "DeviceComissioning",
+                "this is a DCF, the file of one node. Give the EDS it was made from.",
+            )
         section = self._sections.get("deviceinfo")
         if section is None:
             return
-        numbers = ("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO", "LSS_Supported", "Granularity")
+        numbers = (
+            "VendorNumber",
+            "ProductNumber",
+            "RevisionNumber",
+            "NrOfRXPDO",
+            "LSS_Supported",
+            "Granularity",
+        )
         for key in (*numbers, *(f"BaudRate_{rate}" for rate in _BIT_RATES)):
             self._number(section, key)
         if self._number(section, "CompactPDO"):
-            self._say("DeviceInfo", "CompactPDO: not supported. Describe each PDO by its own sections and write 0.")
-        given = sum(_OBJECT.match(name) is not None and int(name, 16) in _PDO_COMMUNICATIONS for name in self._plain())
+            self._say(
+                "DeviceInfo",
+                "CompactPDO: not supported. Describe each PDO by its own sections and write 0.",
+            )
+        given = sum(
+            _OBJECT.match(name) is not None and int(name, 16) in _PDO_COMMUNICATIONS
+            for name in self._plain()
+        )
         stated = self._number(section, "NrOfTXPDO")
         if stated is not None and stated != given:
-            self._say("DeviceInfo", f"NrOfTXPDO={stated}, but {given} of 1800h to 19FFh are there. Write {given}.")
+            self._say(
+                "DeviceInfo",
+                f"NrOfTXPDO={stated}, but {given} of 1800h to 19FFh are there. Write {given}.",
+            )
 
     def _plain(self) -> list[str]:
         """Names of the sections of objects, without those of their sub-indices."""
-        return [name for name in self._sections if (match := _OBJECT.match(name)) and match[2] is None]
+        return [
+            name for name in self._sections if (match := _OBJECT.match(name)) and match[2] is None
+        ]
 
     def _check_lists(self) -> None:
         listed: dict[int, str] = {}
@@ -361,7 +414,9 @@ class _Checker:
         for index, item in self.objects.items():
             if index not in listed:
                 right = _right_list(index)
-                self._say(f"{index:04X}", f"{item.name} is in none of the lists. Add it to [{right}].")
+                self._say(
+                    f"{index:04X}", f"{item.name} is in none of the lists. Add it to [{right}]."
+                )
 
     def _check_list(self, name: str, section: _Section, listed: dict[int, str]) -> None:
         count = self._number(section, "SupportedObjects")
@@ -370,21 +425,30 @@ class _Checker:
         numbers = [key for key in section.values if key != "supportedobjects"]
         for key in numbers:
             if not key.isdigit() or not section.get(key):
-                self._say(name, f"{key}={section.get(key)}: not an entry of a list. Write 1=0x1000.")
+                self._say(
+                    name, f"{key}={section.get(key)}: not an entry of a list. Write 1=0x1000."
+                )
                 continue
             index = self._number(section, key)
             if index is None:
                 continue
             if index in listed:
-                self._say(name, f"{key}=0x{index:04X}: listed before, in [{listed[index]}]. Remove one.")
+                self._say(
+                    name, f"{key}=0x{index:04X}: listed before, in [{listed[index]}]. Remove one."
+                )
             listed[index] = name
             if index not in self.objects:
-                self._say(name, f"{key}=0x{index:04X}: there is no section [{index:04X}]. Add it or remove this line.")
+                self._say(
+                    name,
+                    f"{key}=0x{index:04X}: there is no section [{index:04X}]. Add it or remove this line.",
+                )
             right = _right_list(index)
             if right != name and (right == _LISTS[2] or name != _LISTS[1]):
                 self._say(name, f"{key}=0x{index:04X}: belongs into [{right}].")
         digits = sorted(number for key in numbers if (number := _place(key)) is not None)
-        if count is not None and (count != len(digits) or digits != list(range(1, len(digits) + 1))):
+        if count is not None and (
+            count != len(digits) or digits != list(range(1, len(digits) + 1))
+        ):
             self._say(
                 name,
                 f"SupportedObjects={count}, but {len(digits)} are listed, or their numbers have gaps. "
@@ -402,18 +466,25 @@ class _Checker:
                 if match[2] is not None:
                     of_object[int(match[2], 16)] = section
             elif (match := _OF_OBJECT.match(section.name)) and match[2].lower() == "value":
-                self._say(section.name, "values belong in a DCF. Write DefaultValue in the object's section.")
+                self._say(
+                    section.name,
+                    "values belong in a DCF. Write DefaultValue in the object's section.",
+                )
         count = 0
         for index, subs in members.items():
             section_of_index = self._sections.get(f"{index:04x}")
             if section_of_index is None:
                 for sub in subs.values():
-                    self._say(sub.name, f"there is no section [{index:04X}]. Add it or remove this one.")
+                    self._say(
+                        sub.name, f"there is no section [{index:04X}]. Add it or remove this one."
+                    )
                 continue
             self._read_object(index, section_of_index, subs)
             count += len(self.objects[index].subs)
             if count > _MAX_ENTRIES:
-                raise UserError(f"{self._name}: has more than {_MAX_ENTRIES} objects and sub-indices. Remove some.")
+                raise UserError(
+                    f"{self._name}: has more than {_MAX_ENTRIES} objects and sub-indices. Remove some."
+                )
 
     def _read_object(self, index: int, section: _Section, subs: Mapping[int, _Section]) -> None:
         kind = self._number(section, "ObjectType", VAR)
@@ -421,7 +492,10 @@ class _Checker:
         variables: dict[int, _Variable] = {}
         if kind in (DOMAIN, VAR):
             for sub in subs.values():
-                self._say(sub.name, f"[{index:04X}] is a {_KINDS[kind]} and has no sub-indices. Remove this section.")
+                self._say(
+                    sub.name,
+                    f"[{index:04X}] is a {_KINDS[kind]} and has no sub-indices. Remove this section.",
+                )
             variables = {0: self._variable(section, name, kind, index)}
         elif kind in (ARRAY, RECORD):
             variables = self._members(index, name, section, subs)
@@ -429,15 +503,23 @@ class _Checker:
             self._say(section.name, f"ObjectType=0x{kind:X}: not one of {_choices(_KINDS)}.")
         self.objects[index] = _Object(index, kind or 0, name, variables)
 
-    def _members(self, index: int, name: str, section: _Section, subs: Mapping[int, _Section]) -> dict[int, _Variable]:
+    def _members(
+        self, index: int, name: str, section: _Section, subs: Mapping[int, _Section]
+    ) -> dict[int, _Variable]:
         compact = self._number(section, "CompactSubObj", 0)
         count = self._number(section, "SubNumber", 0)
         if compact:
             if not subs and not count:
                 return self._compact(index, name, section, compact)
-            self._say(section.name, "CompactSubObj excludes SubNumber and sections of sub-indices. Keep one way.")
+            self._say(
+                section.name,
+                "CompactSubObj excludes SubNumber and sections of sub-indices. Keep one way.",
+            )
         if count is not None and count != len(subs):
-            self._say(section.name, f"SubNumber={count}, but {len(subs)} sub-indices are there. Write {len(subs)}.")
+            self._say(
+                section.name,
+                f"SubNumber={count}, but {len(subs)} sub-indices are there. Write {len(subs)}.",
+            )
         variables = {}
         for sub in sorted(subs):
             member = subs[sub]
@@ -446,25 +528,41 @@ class _Checker:
                 self._say(member.name, f"ObjectType=0x{kind:X}: a sub-index is a VAR, 0x7.")
             if sub > 0xFE:
                 self._say(member.name, "sub-indices end at FE. Remove this section.")
-            variables[sub] = self._variable(member, self._parameter_name(member), kind or VAR, index)
+            variables[sub] = self._variable(
+                member, self._parameter_name(member), kind or VAR, index
+            )
         self._check_sub0(index, variables)
         return variables
 
     def _check_sub0(self, index: int, variables: Mapping[int, _Variable]) -> None:
         first = variables.get(0)
         if first is None:
-            self._say(f"{index:04X}", "sub-index 0 is missing. Add it with the highest sub-index as DefaultValue.")
+            self._say(
+                f"{index:04X}",
+                "sub-index 0 is missing. Add it with the highest sub-index as DefaultValue.",
+            )
             return
         highest = max(variables)
         if first.data_type != _U8:
-            self._say(first.section, f"DataType=0x{first.data_type:04X}: sub-index 0 is an UNSIGNED8, 0x0005.")
+            self._say(
+                first.section,
+                f"DataType=0x{first.data_type:04X}: sub-index 0 is an UNSIGNED8, 0x0005.",
+            )
         elif _counts(index):
             if isinstance(first.default, int) and first.default > highest:
-                self._say(first.section, f"DefaultValue: the highest sub-index is {highest}. Write that or less.")
+                self._say(
+                    first.section,
+                    f"DefaultValue: the highest sub-index is {highest}. Write that or less.",
+                )
         elif first.default != highest:
-            self._say(first.section, f"DefaultValue: the highest sub-index is {highest}. Write 0x{highest:02X}.")
+            self._say(
+                first.section,
+                f"DefaultValue: the highest sub-index is {highest}. Write 0x{highest:02X}.",
+            )
 
-    def _compact(self, index: int, name: str, section: _Section, count: int) -> dict[int, _Variable]:
+    def _compact(
+        self, index: int, name: str, section: _Section, count: int
+    ) -> dict[int, _Variable]:
         """CiA 306, CompactSubObj: sub-index 0 and ``count`` alike ones. Their names are the object's and a number, or in [xxxxName]."""
         if not 1 <= count <= 0xFE:
             self._say(section.name, f"CompactSubObj={count}: not 1 to 254.")
@@ -472,7 +570,9 @@ class _Checker:
         variable = self._variable(section, name, VAR, index)
         count_name = f"{name} highest sub-index"
         access, highest = ("rw", 0) if _counts(index) else ("const", count)
-        variables = {0: _Variable(section.name, count_name, _U8, access, False, None, None, highest, False)}
+        variables = {
+            0: _Variable(section.name, count_name, _U8, access, False, None, None, highest, False)
+        }
         for sub in range(1, count + 1):
             variables[sub] = _Variable(**{**vars(variable), "name": f"{name}{sub}"})
         names = self._sections.get(f"{index:04x}name")
@@ -481,7 +581,10 @@ class _Checker:
         given = [key for key in names.values if key != "nrofentries"]
         stated = self._number(names, "NrOfEntries", 0)
         if stated is not None and stated != len(given):
-            self._say(names.name, f"NrOfEntries={stated}, but {len(given)} names are there. Write {len(given)}.")
+            self._say(
+                names.name,
+                f"NrOfEntries={stated}, but {len(given)} names are there. Write {len(given)}.",
+            )
         for key in given:
             number = _place(key)
             if number is None or not 1 <= number <= count:
@@ -495,7 +598,9 @@ class _Checker:
         if not name:
             self._say(section.name, "ParameterName: missing. Name it.")
         elif len(name) > _LONGEST_NAME:
-            self._say(section.name, f"ParameterName: longer than {_LONGEST_NAME} characters. Shorten it.")
+            self._say(
+                section.name, f"ParameterName: longer than {_LONGEST_NAME} characters. Shorten it."
+            )
         return name
 
     def _variable(self, section: _Section, name: str, kind: int, index: int) -> _Variable:
@@ -503,26 +608,39 @@ class _Checker:
         data_type = self._data_type(section, kind, index)
         access = section.get("AccessType").lower() or ("rw" if kind == DOMAIN else "")
         if access not in _ACCESS:
-            self._say(where, f"AccessType={section.get('AccessType')}: not one of {', '.join(_ACCESS)}.")
+            self._say(
+                where, f"AccessType={section.get('AccessType')}: not one of {', '.join(_ACCESS)}."
+            )
         mappable = bool(self._number(section, "PDOMapping", 0))
         if mappable and (access == "wo" or (data_type and data_type not in _BITS)):
             what = "a write-only object" if access == "wo" else f"a {_TYPE_NAMES[data_type]}"
-            self._say(where, f"PDOMapping={section.get('PDOMapping')}: {what} has no place in a TPDO. Write 0.")
+            self._say(
+                where,
+                f"PDOMapping={section.get('PDOMapping')}: {what} has no place in a TPDO. Write 0.",
+            )
         if section.get("ParameterValue"):
             self._say(where, "ParameterValue: values belong in a DCF. Write DefaultValue.")
-        low, high = self._limit(section, "LowLimit", data_type), self._limit(section, "HighLimit", data_type)
+        low, high = (
+            self._limit(section, "LowLimit", data_type),
+            self._limit(section, "HighLimit", data_type),
+        )
         if low is not None and high is not None and low > high:
-            self._say(where, f"LowLimit={section.get('LowLimit')}: above HighLimit={section.get('HighLimit')}.")
+            self._say(
+                where,
+                f"LowLimit={section.get('LowLimit')}: above HighLimit={section.get('HighLimit')}.",
+            )
             low = high = None
         default, relative = self._default(section, data_type)
         if isinstance(default, int) and not relative:
             if low is not None and default < low:
                 self._say(
-                    where, f"DefaultValue={section.get('DefaultValue')}: below LowLimit={section.get('LowLimit')}."
+                    where,
+                    f"DefaultValue={section.get('DefaultValue')}: below LowLimit={section.get('LowLimit')}.",
                 )
             if high is not None and default > high:
                 self._say(
-                    where, f"DefaultValue={section.get('DefaultValue')}: above HighLimit={section.get('HighLimit')}."
+                    where,
+                    f"DefaultValue={section.get('DefaultValue')}: above HighLimit={section.get('HighLimit')}.",
                 )
         return _Variable(where, name, data_type, access, mappable, low, high, default, relative)
 
@@ -537,10 +655,15 @@ class _Checker:
             self._say(section.name, f"DataType=0x{data_type:04X}: the type of a DOMAIN is 0x000F.")
             return 0
         if data_type not in _TYPE_NAMES:
-            self._say(section.name, f"DataType=0x{data_type:04X}: not supported. Take one of {_choices(_TYPE_NAMES)}.")
+            self._say(
+                section.name,
+                f"DataType=0x{data_type:04X}: not supported. Take one of {_choices(_TYPE_NAMES)}.",
+            )
             return 0
         if _BITS.get(data_type, 0) > 32 and index < 0x2000:
-            self._say(section.name, f"DataType=0x{data_type:04X}: 64 bits are for objects from 2000h on.")
+            self._say(
+                section.name, f"DataType=0x{data_type:04X}: 64 bits are for objects from 2000h on."
+            )
             return 0
         return data_type
 
@@ -549,23 +672,34 @@ class _Checker:
         if not text or not data_type:
             return None
         if data_type not in _BITS or data_type in _FLOATS:
-            self._say(section.name, f"{key}={text}: only whole numbers have limits. Leave it empty.")
+            self._say(
+                section.name, f"{key}={text}: only whole numbers have limits. Leave it empty."
+            )
             return None
         return self._fitting(section, key, text, data_type)
 
-    def _fitting(self, section: _Section, key: str, text: str, data_type: int, room: int = 0) -> int | None:
+    def _fitting(
+        self, section: _Section, key: str, text: str, data_type: int, room: int = 0
+    ) -> int | None:
         """A whole number that fits its type with ``room`` above it. Signed ones may be hexadecimal in two's complement."""
         number = _integer(text)
         if number is None:
             self._say(section.name, f"{key}={section.get(key)}: not a number. Write 0x1F or 31.")
             return None
         bits = _BITS[data_type]
-        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if data_type in _SIGNED else (0, (1 << bits) - 1)
+        low, high = (
+            (-(1 << bits - 1), (1 << bits - 1) - 1)
+            if data_type in _SIGNED
+            else (0, (1 << bits) - 1)
+        )
         if data_type in _SIGNED and "x" in text.lower() and high < number < 1 << bits:
             number -= 1 << bits
         if low <= number <= high - room:
             return number
-        self._say(section.name, f"{key}={section.get(key)}: does not fit {_TYPE_NAMES[data_type]}, {low} to {high}.")
+        self._say(
+            section.name,
+            f"{key}={section.get(key)}: does not fit {_TYPE_NAMES[data_type]}, {low} to {high}.",
+        )
         return None
 
     def _default(self, section: _Section, data_type: int) -> tuple[int | float | str | None, bool]:
@@ -580,7 +714,8 @@ class _Checker:
                 bytes.fromhex(text)
             except ValueError:
                 self._say(
-                    section.name, f"DefaultValue={text}: not bytes. Write pairs of hexadecimal digits, or nothing."
+                    section.name,
+                    f"DefaultValue={text}: not bytes. Write pairs of hexadecimal digits, or nothing.",
                 )
                 return None, False
             return text, False
@@ -611,22 +746,33 @@ class _Checker:
             return
         shape = _shape(index)
         if shape is None:
-            self._say(f"{index:04X}", f"{item.name}: this node has no such service. Remove the object.")
+            self._say(
+                f"{index:04X}", f"{item.name}: this node has no such service. Remove the object."
+            )
             return
         if item.kind not in _KINDS:
             return
         if item.kind not in shape.kinds:
             kind = shape.kinds[0]
-            self._say(f"{index:04X}", f"ObjectType=0x{item.kind:X}: this object is of type {_KINDS[kind]}, 0x{kind:X}.")
+            self._say(
+                f"{index:04X}",
+                f"ObjectType=0x{item.kind:X}: this object is of type {_KINDS[kind]}, 0x{kind:X}.",
+            )
             return
         for sub in shape.needed:
             if sub not in item.subs:
-                self._say(f"{index:04X}", f"sub-index {sub:X} is mandatory and is not there. Add it.")
+                self._say(
+                    f"{index:04X}", f"sub-index {sub:X} is mandatory and is not there. Add it."
+                )
         for sub, variable in item.subs.items():
             types = shape.types.get(sub)
             if types is None:
                 self._say(variable.section, f"{index:04X}h has no sub-index {sub:X}. Remove it.")
-            elif variable.data_type and variable.data_type not in types and (sub or item.kind in (VAR, DOMAIN)):
+            elif (
+                variable.data_type
+                and variable.data_type not in types
+                and (sub or item.kind in (VAR, DOMAIN))
+            ):
                 name = _TYPE_NAMES[types[0]]
                 self._say(
                     variable.section,
@@ -638,7 +784,8 @@ class _Checker:
             partner = index + 0x200 if index in _PDO_COMMUNICATIONS else index - 0x200
             if index in range(0x1800, 0x1C00) and partner not in self.objects:
                 self._say(
-                    f"{index:04X}", f"[{partner:04X}] of the same PDO is not there. Add it or remove this object."
+                    f"{index:04X}",
+                    f"[{partner:04X}] of the same PDO is not there. Add it or remove this object.",
                 )
             if index in _PDO_MAPPINGS:
                 self._check_mapping(self.objects[index])
@@ -650,13 +797,19 @@ class _Checker:
             mapping = item.subs.get(sub)
             value = mapping.default if mapping else None
             if mapping is None or not isinstance(value, int) or mapping.relative:
-                self._say(f"{item.index:04X}sub{sub:X}", "DefaultValue: this part of the mapping is not there.")
+                self._say(
+                    f"{item.index:04X}sub{sub:X}",
+                    "DefaultValue: this part of the mapping is not there.",
+                )
                 continue
             bits += value & 0xFF
             if problem := self._mapping_problem(value):
                 self._say(mapping.section, f"DefaultValue=0x{value:08X}: {problem}")
         if bits > _PDO_BITS:
-            self._say(f"{item.index:04X}", f"{bits} bits are mapped, a PDO has {_PDO_BITS}. Map fewer objects.")
+            self._say(
+                f"{item.index:04X}",
+                f"{bits} bits are mapped, a PDO has {_PDO_BITS}. Map fewer objects.",
+            )
 
     def _mapping_problem(self, value: int) -> str | None:
         index, sub, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
@@ -665,7 +818,9 @@ class _Checker:
         if target is None:
             return f"there is no {index:04X}h:{sub:02X}. Add it or map another."
         if not target.mappable or target.access == "rww":
-            return f"{index:04X}h:{sub:02X} is not for TPDOs. Write PDOMapping=1 there or map another."
+            return (
+                f"{index:04X}h:{sub:02X} is not for TPDOs. Write PDOMapping=1 there or map another."
+            )
         length = _BITS.get(target.data_type)
         if target.data_type and length != bits:
             return f"{index:04X}h:{sub:02X} has {length} bits. Write 0x{value & ~0xFF | (length or 0):08X}."
@@ -685,7 +840,9 @@ def _entries(objects: Mapping[int, _Object]) -> Iterator[Entry]:
             assert variable is not None
             default = variable.default
             if isinstance(default, str):
-                default = default.encode("utf-16-le" if variable.data_type == _UNICODE_STRING else "ascii")
+                default = default.encode(
+                    "utf-16-le" if variable.data_type == _UNICODE_STRING else "ascii"
+                )
             yield Entry(
                 index,
                 sub,
@@ -706,9 +863,16 @@ def _one_spelling(objects: Iterable[_Object]) -> str:
     for item in objects:
         lists = item.kind in (ARRAY, RECORD)
         if lists:
-            lines += [f"[{item.index:04X}]", f"ParameterName={item.name}", f"ObjectType={item.kind}"]
+            lines += [
+                f"[{item.index:04X}]",
+                f"ParameterName={item.name}",
+                f"ObjectType={item.kind}",
+            ]
         for sub, variable in item.subs.items():
-            lines += [f"[{_spelling(item.index, sub if lists else None)}]", f"ParameterName={variable.name}"]
+            lines += [
+                f"[{_spelling(item.index, sub if lists else None)}]",
+                f"ParameterName={variable.name}",
+            ]
             lines += [f"ObjectType={VAR if lists else item.kind}", f"DataType={variable.data_type}"]
             lines += [f"AccessType={variable.access}", f"PDOMapping={int(variable.mappable)}"]
             lines += [f"LowLimit={variable.low}"] * (variable.low is not None)
@@ -797,7 +961,9 @@ def _shorter_list(lines: list[str], indices: Container[int]) -> list[str]:
             continue
         count += 1
         kept.append(f"{count}={_value(line)}")
-    return [f"SupportedObjects={count}" if _key(line) == "supportedobjects" else line for line in kept]
+    return [
+        f"SupportedObjects={count}" if _key(line) == "supportedobjects" else line for line in kept
+    ]
 
 
 def dcf(
@@ -831,7 +997,9 @@ def dcf(
             added = _commissioning(node_id, bitrate, values.get((0x1018, 4)), node_name)
         elif match := _OBJECT.match(name):
             index, sub = int(match[1], 16), int(match[2] or "0", 16)
-            if any(_key(line) == "compactsubobj" and _value(line) not in ("", "0") for line in lines):
+            if any(
+                _key(line) == "compactsubobj" and _value(line) not in ("", "0") for line in lines
+            ):
                 added = _compact_values(index, texts)
             elif (index, sub) in texts:
                 added = [f"ParameterValue={texts[index, sub]}"]
@@ -840,7 +1008,9 @@ def dcf(
     return "\r\n".join(result)
 
 
-def _commissioning(node_id: int, bitrate: int, serial: float | bytes | None, node_name: str) -> list[str]:
+def _commissioning(
+    node_id: int, bitrate: int, serial: float | bytes | None, node_name: str
+) -> list[str]:
     """[DeviceComissioning]: CiA 306 spells it so."""
     lines = [
         "",
@@ -852,7 +1022,11 @@ def _commissioning(node_id: int, bitrate: int, serial: float | bytes | None, nod
         "CANopenManager=0",
     ]
     # 0: not known, so nothing that an LSS master could look for
-    return [*lines, f"LSS_SerialNumber=0x{serial:08X}"] if isinstance(serial, int) and serial else lines
+    return (
+        [*lines, f"LSS_SerialNumber=0x{serial:08X}"]
+        if isinstance(serial, int) and serial
+        else lines
+    )
 
 
 def _compact_values(index: int, texts: Mapping[tuple[int, int], str]) -> list[str]:
@@ -876,5 +1050,7 @@ def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
         or _bare(f"={text}") != f"={text}"
     ):
         where = _spelling(entry.index, entry.sub)
-        raise UserError(f"{name}: [{where}] the text {text!r} of {entry.name} cannot stand in a DCF.")
+        raise UserError(
+            f"{name}: [{where}] the text {text!r} of {entry.name} cannot stand in a DCF."
+        )
     return text

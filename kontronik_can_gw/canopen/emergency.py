@@ -14,8 +14,21 @@ from typing import NamedTuple, Self
 from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.esc.kontronik.states import OperatingError, Severity
 
-GENERIC, CURRENT, VOLTAGE, TEMPERATURE, COMMUNICATION, MANUFACTURER = 0x01, 0x02, 0x04, 0x08, 0x10, 0x80
-_REGISTER_OF_CLASS = {0x2: CURRENT, 0x3: VOLTAGE, 0x4: TEMPERATURE, 0x8: COMMUNICATION, 0xF: MANUFACTURER}
+GENERIC, CURRENT, VOLTAGE, TEMPERATURE, COMMUNICATION, MANUFACTURER = (
+    0x01,
+    0x02,
+    0x04,
+    0x08,
+    0x10,
+    0x80,
+)
+_REGISTER_OF_CLASS = {
+    0x2: CURRENT,
+    0x3: VOLTAGE,
+    0x4: TEMPERATURE,
+    0x8: COMMUNICATION,
+    0xF: MANUFACTURER,
+}
 _FROM_GATEWAY = 0xFF
 _MAX_PENDING = 64
 
@@ -83,7 +96,9 @@ class GatewayError(Enum):
     # fmt: on
 
 
-_OF_COMMUNICATION = frozenset(error.value[0] for error in (GatewayError.HEARTBEAT_LOST, GatewayError.SYNC_LENGTH))
+_OF_COMMUNICATION = frozenset(
+    error.value[0] for error in (GatewayError.HEARTBEAT_LOST, GatewayError.SYNC_LENGTH)
+)
 
 
 class Condition(NamedTuple):
@@ -206,7 +221,9 @@ class Emergencies:
     def reset(self) -> None:
         """Reset communication: what is wrong counts as untold and is all that the history holds; heartbeats and SYNC are watched anew."""
         self.close()
-        self._active = {condition: None for condition in self._active if condition.code not in _OF_COMMUNICATION}
+        self._active = {
+            condition: None for condition in self._active if condition.code not in _OF_COMMUNICATION
+        }
         self.history.clear()
         for condition in self._active:
             self._note(condition)
@@ -259,4 +276,5 @@ class Emergencies:
             head = condition.code.to_bytes(2, "little") + bytes((self.register, condition.source))
             from_gateway = condition.source == _FROM_GATEWAY
             tail = (condition.detail if from_gateway else self.word).to_bytes(4, "little")
-        self._pending.append((condition, head + tail))  # the newest is never the one that finds no room
+        # the newest is never the one that finds no room
+        self._pending.append((condition, head + tail))

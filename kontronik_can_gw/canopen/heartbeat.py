@@ -98,5 +98,9 @@ def check_consumer(value: int, others: Iterable[int]) -> None:
     node_id = value >> 16 & 0xFF
     if value >> 24:
         raise SdoAbort(Abort.VALUE)  # reserved bits
-    if value & 0xFFFF and 1 <= node_id <= 127 and any(o & 0xFFFF and o >> 16 & 0xFF == node_id for o in others):
+    if (
+        value & 0xFFFF
+        and 1 <= node_id <= 127
+        and any(o & 0xFFFF and o >> 16 & 0xFF == node_id for o in others)
+    ):
         raise SdoAbort(Abort.INCOMPATIBLE)

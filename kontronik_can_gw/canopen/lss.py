@@ -153,7 +153,9 @@ class LssSlave:
 
     @property
     def _unconfigured(self) -> bool:
-        return self._host.active_node_id == UNCONFIGURED and self._host.pending_node_id == UNCONFIGURED
+        return (
+            self._host.active_node_id == UNCONFIGURED and self._host.pending_node_id == UNCONFIGURED
+        )
 
     def _enter(self, configuring: bool) -> None:
         self._configuring = configuring
@@ -232,7 +234,10 @@ class LssSlave:
                 self._stores.pop()
                 self._answer(service, STORE_NOT_SUPPORTED)
         elif Service.INQUIRE_VENDOR <= service <= Service.INQUIRE_SERIAL:
-            self._answer(service, *self._host.identity[service - Service.INQUIRE_VENDOR].to_bytes(4, "little"))
+            self._answer(
+                service,
+                *self._host.identity[service - Service.INQUIRE_VENDOR].to_bytes(4, "little"),
+            )
         elif service == Service.INQUIRE_NODE_ID:
             self._answer(service, self._host.active_node_id)
 

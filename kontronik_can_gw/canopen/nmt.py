@@ -43,4 +43,8 @@ def command(data: bytes, node_id: int) -> Command | None:
 
 def is_reset_of_all(data: bytes) -> bool:
     """True for a reset of every node on the bus."""
-    return len(data) == 2 and data[1] == 0 and data[0] in (Command.RESET_NODE, Command.RESET_COMMUNICATION)
+    return (
+        len(data) == 2
+        and data[1] == 0
+        and data[0] in (Command.RESET_NODE, Command.RESET_COMMUNICATION)
+    )

@@ -21,7 +21,15 @@ from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.lss import UNCONFIGURED, LssSlave
 from kontronik_can_gw.canopen.nmt import Command, NmtState
 from kontronik_can_gw.canopen.objects import Bound, bindings, reader_text
-from kontronik_can_gw.canopen.pdo import COB_ID, COMMUNICATION, INVALID_BIT, MAPPING, MOST, Tpdo, restricted
+from kontronik_can_gw.canopen.pdo import (
+    COB_ID,
+    COMMUNICATION,
+    INVALID_BIT,
+    MAPPING,
+    MOST,
+    Tpdo,
+    restricted,
+)
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import VERIFY, Stored
 from kontronik_can_gw.esc.kontronik.states import Device, device_text
@@ -105,7 +113,10 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
         base,
         pole_pairs=max(1, number(at.SETTINGS, 1, base.pole_pairs)),
         gear=gear,
-        timeout_ns=min(max(_MIN_TIMEOUT_MS, number(at.SETTINGS, 4, base.timeout_ns // MS)), _MAX_TIMEOUT_MS) * MS,
+        timeout_ns=min(
+            max(_MIN_TIMEOUT_MS, number(at.SETTINGS, 4, base.timeout_ns // MS)), _MAX_TIMEOUT_MS
+        )
+        * MS,
         cell_count=number(at.SETTINGS, 7, base.cell_count),
         crc_error_threshold=number(at.SETTINGS, 8, base.crc_error_threshold),
     )
@@ -136,7 +147,9 @@ def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int
                 yield index, sub, cob_id & 0x7FF
 
 
-def make_dictionary(eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored) -> Dictionary:
+def make_dictionary(
+    eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored
+) -> Dictionary:
     """The dictionary of a node before its first reset, the configuration's values as power-on values and the stored ones in place.
 
     Where the configuration leaves a setting at its default, the EDS's default holds.
@@ -184,7 +197,8 @@ class Node:
         self._stored = stored
         self._wanted = stored
         self._bus_node_id = stored.node_id
-        self._waiting_saves: deque[tuple[int | None, Stored]] = deque()  # the SDO server's ticket, None for LSS
+        # the SDO server's ticket, None for LSS
+        self._waiting_saves: deque[tuple[int | None, Stored]] = deque()
         self._next_overrun = 0
         self._off_bus = False
         self._outage = False
@@ -218,7 +232,9 @@ class Node:
         self._stop_pdos()
         self.emergencies.close()  # nothing is said before the boot-up message
         node_id = self.pending_node_id
-        self.misfits = self.dictionary.reset(*APPLICATION_PROFILE, node_id, self._stored.application)
+        self.misfits = self.dictionary.reset(
+            *APPLICATION_PROFILE, node_id, self._stored.application
+        )
         self._apply_settings(now)
         self.reset_communication(now, keep_misfits=True)
 
@@ -231,7 +247,9 @@ class Node:
         self.lss.reset()
         self.emergencies.reset()
         self.node_id = self.pending_node_id
-        self.misfits += self.dictionary.reset(*COMMUNICATION_PROFILE, self.node_id, self._stored.communication)
+        self.misfits += self.dictionary.reset(
+            *COMMUNICATION_PROFILE, self.node_id, self._stored.communication
+        )
         self.release_ids()
         self._drop_what_breaks_rules()
         for tpdo in self.tpdos:
@@ -249,7 +267,11 @@ class Node:
                 self._enter(NmtState.OPERATIONAL, now)
         if self.misfits:
             self._around.passed_over(self, self.misfits)
-        if self.misfits or self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id) != self._stored.application:
+        if (
+            self.misfits
+            or self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id)
+            != self._stored.application
+        ):
             self._configuration_changed()  # 1020h was stored with other application parameters
         self._around.routes_changed()
         self._around.state_changed()
@@ -418,7 +440,9 @@ class Node:
 
     def configure_node_id(self, node_id: int) -> bool:
         """A new node-ID for the next reset communication. False where writing is switched off or another node of ours has it."""
-        if self.settings.read_only or (node_id != UNCONFIGURED and self._around.node_id_taken(node_id, self)):
+        if self.settings.read_only or (
+            node_id != UNCONFIGURED and self._around.node_id_taken(node_id, self)
+        ):
             return False
         self._set_pending(node_id)
         return True
@@ -628,7 +652,9 @@ class Node:
     def _configure_heartbeat(self, now: int) -> None:
         self.producer.configure(self.dictionary.number(0x1017), now)
         self.consumer = heartbeat.Consumer()
-        self.consumer.configure(v.value for v in self.dictionary.subs(0x1016) if isinstance(v.value, int))
+        self.consumer.configure(
+            v.value for v in self.dictionary.subs(0x1016) if isinstance(v.value, int)
+        )
 
     def _apply_settings(self, now: int) -> None:
         settings = esc_settings(self.dictionary, self._base)
@@ -656,7 +682,9 @@ class Node:
         """1010h: sub-index 1 all, 2 communication, 3 application parameters."""
         stored = self._wanted
         if part in (1, 2):
-            stored = replace(stored, communication=self.dictionary.to_store(*COMMUNICATION_PROFILE, self.node_id))
+            stored = replace(
+                stored, communication=self.dictionary.to_store(*COMMUNICATION_PROFILE, self.node_id)
+            )
         application = self.dictionary.to_store(*APPLICATION_PROFILE, self.node_id)
         if part in (1, 3):
             stored = replace(stored, application=application, node_id=self._bus_node_id)
@@ -831,12 +859,18 @@ class Node:
         return True
 
     def _check_watch(self, me: Variable, value: int) -> None:
-        others = [v.value for v in self.dictionary.subs(0x1016) if v is not me and isinstance(v.value, int)]
+        others = [
+            v.value
+            for v in self.dictionary.subs(0x1016)
+            if v is not me and isinstance(v.value, int)
+        ]
         heartbeat.check_consumer(value, others)
 
     def _watches_changed(self, now: int) -> bool:
         lost = self.consumer.lost
-        self.consumer.configure(v.value for v in self.dictionary.subs(0x1016) if isinstance(v.value, int))
+        self.consumer.configure(
+            v.value for v in self.dictionary.subs(0x1016) if isinstance(v.value, int)
+        )
         for node_id in set(lost).difference(self.consumer.lost):
             self.emergencies.set(GatewayError.HEARTBEAT_LOST, False, now, node_id)
         self._around.routes_changed()
@@ -910,4 +944,6 @@ def range_of(variable: Variable) -> tuple[int, int]:
     if size is None:
         return 0, -1
     bits = 8 * size
-    return (-(1 << bits - 1), (1 << bits - 1) - 1) if fits(variable, -1, 1) else (0, (1 << bits) - 1)
+    return (
+        (-(1 << bits - 1), (1 << bits - 1) - 1) if fits(variable, -1, 1) else (0, (1 << bits) - 1)
+    )

@@ -49,7 +49,9 @@ class CanopenSetup:
             for esc, node, stored in zip(escs, self.settings, self.stored, strict=True)
         ]
 
-    def nodes(self, escs: Sequence[EscSettings], foreign_ids: Mapping[int, str] | None = None) -> "Nodes":
+    def nodes(
+        self, escs: Sequence[EscSettings], foreign_ids: Mapping[int, str] | None = None
+    ) -> "Nodes":
         """The nodes as they are after power-on, without a gateway around them: to see their COB-IDs and objects."""
         telemetry = [EscTelemetry(settings, 0) for settings in escs]
         nodes = Nodes(self, telemetry, GatewayStatus(), lambda _esc, _settings: None, foreign_ids)
@@ -92,7 +94,9 @@ class Nodes:
         self._started = False
         self.nodes: list[Node] = []
         bases = setup.escs or tuple(esc.settings for esc in escs)
-        for esc, base, settings, stored in zip(escs, bases, setup.settings, setup.stored, strict=True):
+        for esc, base, settings, stored in zip(
+            escs, bases, setup.settings, setup.stored, strict=True
+        ):
             dictionary = make_dictionary(setup.eds, base, settings, stored)
             self.nodes.append(Node(setup.eds, dictionary, esc, gateway, settings, stored, self))
 
@@ -164,7 +168,11 @@ class Nodes:
 
     def own_ids(self) -> dict[int, tuple[int, str]]:
         """COB-IDs that only our nodes send with: which node (0 ...), and what for."""
-        return {cob_id: (index, what) for index, node in enumerate(self.nodes) for cob_id, what in node.transmit_ids()}
+        return {
+            cob_id: (index, what)
+            for index, node in enumerate(self.nodes)
+            for cob_id, what in node.transmit_ids()
+        }
 
     def overrun(self, now: int) -> None:
         """The CAN controller lost received frames."""
@@ -247,20 +255,25 @@ class Nodes:
         if any(first + node_id in self._foreign_ids for first in _FIRST_IDS):
             return True
         others = [other for other in self.nodes if other is not node]
-        used = {cob_id for other in others for _, cob_id in other.chosen_ids()} | set(self._foreign_ids)
+        used = {cob_id for other in others for _, cob_id in other.chosen_ids()} | set(
+            self._foreign_ids
+        )
         if node.future_ids(node_id) & used:
             return True
         return any(node_id in (other.node_id, other.pending_node_id) for other in others)
 
     def _after(self, now: int) -> None:
-        while self._to_watchers:  # what we send does not come back from the bus: one of our nodes may watch another
+        while self._to_watchers:
+            # what we send does not come back from the bus: one of our nodes may watch another
             frame = self._to_watchers.popleft()
             for taker in self._routes.get(frame.can_id, ()):
                 taker(frame.data, now, now)
         if self._rerouted:
             self._rerouted = False
             self._watched = frozenset(
-                heartbeat.COB_ID + node_id for node in self.nodes for node_id in node.consumer.node_ids
+                heartbeat.COB_ID + node_id
+                for node in self.nodes
+                for node_id in node.consumer.node_ids
             )
             self._routes = {}
             for node in self.nodes:

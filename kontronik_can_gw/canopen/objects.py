@@ -60,11 +60,20 @@ def bindings(settings: EscSettings) -> dict[tuple[int, int], Bound]:
     for sub, (name, steps) in enumerate(derived, 1):
         source = replace(known[name], rolls=name in ("energy_used", "motor_run_time"))
         if name == "mean_cell_voltage":
-            source = replace(source, expression=source.expression.replace("esc.cells", _CELLS), supplied=_CELLS)
+            source = replace(
+                source, expression=source.expression.replace("esc.cells", _CELLS), supplied=_CELLS
+            )
         bind(DERIVED, sub, source, steps)
     firmware = Source("firmware", "", Group.INFO, "info[1]", low=0, high=U16)
     for sub, source in enumerate(
-        (known["device_raw"], known["variant"], firmware, known["selftest_errors"], known["cell_count"]), 1
+        (
+            known["device_raw"],
+            known["variant"],
+            firmware,
+            known["selftest_errors"],
+            known["cell_count"],
+        ),
+        1,
     ):
         bind(INFO, sub, source)
     extremes = list(rows(InfoData).items())[InfoData._fields.index("max_electrical_speed") :]
@@ -109,7 +118,9 @@ def _kept(source: Source) -> Source:
     if source.supplied is not None:
         supplied += f" and {_of_last_info(source.supplied)}"
     expression = _of_last_info(source.expression)
-    return replace(source, group=Group.LINK, expression=expression, supplied=supplied, pace=Group.INFO)
+    return replace(
+        source, group=Group.LINK, expression=expression, supplied=supplied, pace=Group.INFO
+    )
 
 
 def _of_last_info(expression: str) -> str:

@@ -18,7 +18,14 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND, EscTelemetry, Event
 from kontronik_can_gw.esc.values import GatewayStatus, Group, Source
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.packer import Pack, compile_pack, place
-from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ, MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.signals.plan import (
+    EXPECTED_LIVE_HZ,
+    MessagePlan,
+    Piece,
+    Role,
+    SendType,
+    SignalPlan,
+)
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
 MOST = 512
@@ -73,7 +80,9 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePla
         signed = variable.entry.data_type in _SIGNED
         if bound is None:
             number = f"{variable.entry.index << 8 | variable.entry.sub:#x}"
-            storage = f"storage[{number}].value" if variable.read is None else f"shown({number}, now)"
+            storage = (
+                f"storage[{number}].value" if variable.read is None else f"shown({number}, now)"
+            )
             source = Source(variable.entry.name, "", Group.GATEWAY, storage)
         else:
             source = bound.source
@@ -227,7 +236,8 @@ class Tpdo:
         self._event_ns = number(index, EVENT_TIMER) * MS
         self._sync_start = number(index, SYNC_START)
         self._mapped = [
-            self.resolve(number(MAPPING + self.number, sub)) for sub in range(1, number(MAPPING + self.number) + 1)
+            self.resolve(number(MAPPING + self.number, sub))
+            for sub in range(1, number(MAPPING + self.number) + 1)
         ]
         self._compile()
         if self._started and self._running:
@@ -246,7 +256,12 @@ class Tpdo:
         """The object of a mapping entry (index, sub-index, bits). SdoAbort where it cannot be mapped."""
         index, sub, bits = mapping >> 16, mapping >> 8 & 0xFF, mapping & 0xFF
         variable = self._dictionary.find(index, sub)
-        if not variable.entry.mappable or not variable.readable or not bits_of(variable) or bits_of(variable) != bits:
+        if (
+            not variable.entry.mappable
+            or not variable.readable
+            or not bits_of(variable)
+            or bits_of(variable) != bits
+        ):
             raise SdoAbort(Abort.NOT_MAPPABLE)
         return Mapped(variable, self.bound.get((index, sub)))
 
@@ -265,7 +280,9 @@ class Tpdo:
         SdoAbort 06090030h for 29 bits, restricted ids, a change while the PDO exists, and a PDO with nothing mapped;
         06040043h for an id in use.
         """
-        if not value & INVALID_BIT and (not self._mapped or (self.valid and value & 0x7FF != self.cob_id)):
+        if not value & INVALID_BIT and (
+            not self._mapped or (self.valid and value & 0x7FF != self.cob_id)
+        ):
             raise SdoAbort(Abort.VALUE)
         _check_cob_id(value, taken)
 
@@ -347,7 +364,11 @@ class Tpdo:
 
     def on_download(self, variable: Variable, now: int) -> None:
         """An object was written over the bus."""
-        if self._started and self._running and any(entry.variable is variable for entry in self._mapped):
+        if (
+            self._started
+            and self._running
+            and any(entry.variable is variable for entry in self._mapped)
+        ):
             self._news(now)
 
     def tell_again(self, now: int) -> None:
@@ -436,7 +457,8 @@ class Tpdo:
         status = []
         for entry, signal in zip(self._mapped, plan.signals, strict=True):
             if entry.bound is None:
-                if entry.variable.read is not None:  # of a service: the error register, the error code
+                if entry.variable.read is not None:
+                    # of a service: the error register, the error code
                     status.append(signal)
                 continue
             carries_link |= entry.variable.entry.index == LINK and entry.bound.status

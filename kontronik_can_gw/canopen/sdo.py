@@ -80,7 +80,9 @@ class SdoServer:
     sub-block at once. No input raises.
     """
 
-    def __init__(self, objects: Objects, send: Callable[[bytes], None], segment_ns: int = 0) -> None:
+    def __init__(
+        self, objects: Objects, send: Callable[[bytes], None], segment_ns: int = 0
+    ) -> None:
         self._objects = objects
         self._send = send
         self._segment_ns = segment_ns
@@ -193,9 +195,12 @@ class SdoServer:
                 self._end()
                 self._in_flight = 0  # whoever aborts sends no more segments
             case 5:
-                (self._initiate_block_upload, self._end_block_upload, self._acknowledge, self._start_block_upload)[
-                    command & 3
-                ](data, now)
+                (
+                    self._initiate_block_upload,
+                    self._end_block_upload,
+                    self._acknowledge,
+                    self._start_block_upload,
+                )[command & 3](data, now)
             case 6:
                 (self._initiate_block_download, self._end_block_download)[command & 1](data, now)
             case _:
@@ -223,7 +228,11 @@ class SdoServer:
             size = 4 - (command >> 2 & 3) if indicated else None
             self._prepare_download(size)
             # without a size the object's own length counts (e = 1, s = 0: "unspecified number of bytes")
-            self._store(data[4 : 4 + (min(4, self._limit) if size is None else size)], self._initiated(0x60), now)
+            self._store(
+                data[4 : 4 + (min(4, self._limit) if size is None else size)],
+                self._initiated(0x60),
+                now,
+            )
             return
         self._prepare_download(int.from_bytes(data[4:8], "little") if indicated else None)
         self._toggle = 0
@@ -298,7 +307,9 @@ class SdoServer:
         segment = self._data[self._offset : self._offset + 7]
         self._offset += 7
         last = self._offset >= len(self._data)
-        self._send(bytes((self._toggle | (7 - len(segment)) << 1 | last,)) + segment.ljust(7, b"\0"))
+        self._send(
+            bytes((self._toggle | (7 - len(segment)) << 1 | last,)) + segment.ljust(7, b"\0")
+        )
         self._toggle ^= _TOGGLE
         if last:
             self._end()
@@ -379,7 +390,8 @@ class SdoServer:
             return
         self._data = value
         self._crc = bool(data[0] & 4)
-        self._segments = max(1, -(-len(value) // 7))  # no bytes still need one segment to say that it is the last
+        # no bytes still need one segment to say that it is the last
+        self._segments = max(1, -(-len(value) // 7))
         self._confirmed = self._sent = 0
         self._sub_block = min(block_size, self._segments)
         self._state = _State.BLOCK_UPLOAD_START
@@ -434,7 +446,9 @@ class SdoServer:
             at = self._confirmed + self._sent
             self._sent += 1
             last = _LAST_SEGMENT if at + 1 == self._segments else 0
-            self._send(bytes((last | self._sent,)) + self._data[7 * at : 7 * at + 7].ljust(7, b"\0"))
+            self._send(
+                bytes((last | self._sent,)) + self._data[7 * at : 7 * at + 7].ljust(7, b"\0")
+            )
         self._next_burst = now + count * self._segment_ns
         self._restart_timeout(now)
 

@@ -40,7 +40,9 @@ class Stored:
 
     def unverified(self) -> "Stored":
         """Without 1020h: these parameters are not, or no longer, all of the configuration that it names."""
-        left = {number: data for number, data in self.communication.items() if number >> 8 != VERIFY}
+        left = {
+            number: data for number, data in self.communication.items() if number >> 8 != VERIFY
+        }
         return replace(self, communication=left)
 
 
@@ -53,7 +55,11 @@ def encode(stored: Stored) -> bytes:
         "application": _texts(stored.application, APPLICATION),
     }
     body = _line(content)
-    header = {"format": "kontronik-can-gw parameters", "version": VERSION, "crc32": f"{zlib.crc32(body):08X}"}
+    header = {
+        "format": "kontronik-can-gw parameters",
+        "version": VERSION,
+        "crc32": f"{zlib.crc32(body):08X}",
+    }
     return _line(header) + body
 
 
@@ -65,7 +71,9 @@ def decode(data: bytes) -> Stored:
     if start is None:
         raise ValueError("the first line is not that of a parameter file")
     if int(start[1]) != VERSION:
-        raise ValueError(f"format version {int(start[1])} is unknown, this program knows version {VERSION}")
+        raise ValueError(
+            f"format version {int(start[1])} is unknown, this program knows version {VERSION}"
+        )
     header, _, body = data.partition(b"\n")
     crc = _CRC.fullmatch(header, start.end())
     if crc is None:
@@ -101,7 +109,9 @@ def _check_node_id(node_id: object) -> None:
 
 def _check_key(key: int, indices: range) -> None:
     if key >> 8 not in indices:
-        raise ValueError(f"object {key >> 8:04X}h is not one of {indices[0]:04X}h to {indices[-1]:04X}h")
+        raise ValueError(
+            f"object {key >> 8:04X}h is not one of {indices[0]:04X}h to {indices[-1]:04X}h"
+        )
 
 
 def _texts(values: Mapping[int, bytes], indices: range) -> dict[str, str]:

@@ -188,7 +188,10 @@ def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
 
 def frame_data(frame: CanFrame) -> bytes:
     """A CAN frame as the data of an entry: u32 id (bit 31: 29 bits), u8 flags (1 FD, 2 remote), its bytes."""
-    return _FRAME.pack(frame.key, (_FD if frame.fd else 0) | (_REMOTE if frame.remote else 0)) + frame.data
+    return (
+        _FRAME.pack(frame.key, (_FD if frame.fd else 0) | (_REMOTE if frame.remote else 0))
+        + frame.data
+    )
 
 
 def read_frame(data: bytes) -> CanFrame:
@@ -197,7 +200,13 @@ def read_frame(data: bytes) -> CanFrame:
         raise ValueError("is no CAN frame")
     key, flags = _FRAME.unpack_from(data)
     extended = bool(key & EXTENDED)
-    return CanFrame(key & ~EXTENDED, data[_FRAME.size :], extended, bool(flags & _FD), remote=bool(flags & _REMOTE))
+    return CanFrame(
+        key & ~EXTENDED,
+        data[_FRAME.size :],
+        extended,
+        bool(flags & _FD),
+        remote=bool(flags & _REMOTE),
+    )
 
 
 def counters_data(counters: tuple[int, ...]) -> bytes:

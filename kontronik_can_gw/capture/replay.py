@@ -7,7 +7,15 @@ entry is missing. Nothing here waits or sends.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.capture.format import COUNTERS, Entry, Kind, read_counters, read_frame, read_json, read_number
+from kontronik_can_gw.capture.format import (
+    COUNTERS,
+    Entry,
+    Kind,
+    read_counters,
+    read_frame,
+    read_json,
+    read_number,
+)
 from kontronik_can_gw.esc.values import CanState, GatewayState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
@@ -29,7 +37,9 @@ class Replay:
     starts with the first entry and takes up what the next STATE entry tells.
     """
 
-    def __init__(self, gateway: Gateway, state: Mapping[str, Any] | None = None, marked: bool = False) -> None:
+    def __init__(
+        self, gateway: Gateway, state: Mapping[str, Any] | None = None, marked: bool = False
+    ) -> None:
         self.gateway = gateway
         self.lost = 0
         """Entries that the recorder could not record."""
@@ -57,7 +67,8 @@ class Replay:
         found, self._taken = self._taken, []
         try:
             found += self._play(entry)
-        except Exception:  # a damaged or hostile capture: what no gateway was ever given may raise anything
+        except Exception:
+            # a damaged or hostile capture: what no gateway was ever given may raise anything
             self.passed_over += 1
         return found
 
@@ -150,7 +161,9 @@ class Replay:
     def _take_up(self, state: Mapping[str, Any]) -> None:
         """Go on with what was counted before recording began."""
         for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
-            esc.energy, esc.run_time, esc.losses = (found[name] for name in ("energy", "run_time", "losses"))
+            esc.energy, esc.run_time, esc.losses = (
+                found[name] for name in ("energy", "run_time", "losses")
+            )
         if "started_ns" in state:
             self.gateway.status.started_ns = state["started_ns"]
         if "can_state" in state:

@@ -58,21 +58,33 @@ class CaptureSetup:
         dbc: dict[str, Any] | None = None
         if self.dbc is not None:
             name, data = self.dbc
-            dbc = {"file": name, "text": data.decode("latin-1"), "fd": self.fd, "silent_on_loss": self.silent_on_loss}
+            dbc = {
+                "file": name,
+                "text": data.decode("latin-1"),
+                "fd": self.fd,
+                "silent_on_loss": self.silent_on_loss,
+            }
             dbc |= asdict(self.dbc_settings)
         canopen: dict[str, Any] | None = None
         if self.canopen is not None:
             setup = self.canopen
             canopen = {
                 "eds": {"file": setup.eds.name, "text": setup.eds.data.decode("latin-1")},
-                "nodes": [asdict(node) | {"device": node.device and int(node.device)} for node in setup.settings],
+                "nodes": [
+                    asdict(node) | {"device": node.device and int(node.device)}
+                    for node in setup.settings
+                ],
                 "stored": [encode(stored).decode("ascii") for stored in setup.stored],
                 "escs": [_esc_json(esc) for esc in setup.escs],
             }
         return {
             "format": FORMAT,
             "version": VERSION,
-            "program": {"version": __version__, "python": platform.python_version(), "machine": platform.machine()},
+            "program": {
+                "version": __version__,
+                "python": platform.python_version(),
+                "machine": platform.machine(),
+            },
             "configuration": self.configuration,
             "file": self.file,
             "escs": [_esc_json(esc) for esc in self.escs],
@@ -93,7 +105,14 @@ class CaptureSetup:
         try:
             _check(header)
             return cls._of(header)
-        except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, UserError) as error:
+        except (
+            LookupError,
+            TypeError,
+            AttributeError,
+            ValueError,
+            ArithmeticError,
+            UserError,
+        ) as error:
             raise ValueError(f"the header cannot be used: {error}") from None
 
     @classmethod
@@ -189,7 +208,13 @@ def _check(header: Header) -> None:
     for name in ("run", "file"):
         _text(header.get(name, ""), 4096)
     _number(header.get("part", 0), 0, 1 << 32)
-    for name, kind in (("program", dict), ("devices", list), ("escs", list), ("ports", list), ("state", dict)):
+    for name, kind in (
+        ("program", dict),
+        ("devices", list),
+        ("escs", list),
+        ("ports", list),
+        ("state", dict),
+    ):
         if not isinstance(header.get(name, kind()), kind):
             raise ValueError(f"{name} is not as a recorder writes it")
     if not 1 <= len(header["escs"]) <= 1000 or not isinstance(header["configuration"], str):

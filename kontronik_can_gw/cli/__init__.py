@@ -85,7 +85,10 @@ def _main(words: list[str], command: str | None) -> int:
 
 def say(text: str, command: str | None = None) -> None:
     """One line of talk on standard error."""
-    print(printable(f"kontronik-can-gw{'' if command is None else f' {command}'}: {text}"), file=sys.stderr)
+    print(
+        printable(f"kontronik-can-gw{'' if command is None else f' {command}'}: {text}"),
+        file=sys.stderr,
+    )
 
 
 def show(text: str = "") -> None:

@@ -11,7 +11,10 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "describe",
         "--format html",
     ): "Type kontronik-can-gw describe -o bus.md; pandoc -s bus.md -o bus.html makes a page of it.",
-    ("describe", "--format man"): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
+    (
+        "describe",
+        "--format man",
+    ): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
 }
 """Command and option of earlier versions, as ("report", "--png"), and what to type instead, as a sentence.
@@ -38,7 +41,11 @@ def number_from(low: float, high: float, what: str = "number of seconds") -> Cal
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
     """UserError with what to type instead, where a command line has an option that was removed."""
     options = words[: words.index("--")] if "--" in words else words
-    parts = [part for word in options for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    parts = [
+        part
+        for word in options
+        for part in (word.split("=", 1) if word.startswith("--") else [word])
+    ]
     for part, value in pairwise([*parts, ""]):
         for option in (part, f"{part} {value}"):
             if advice := REMOVED_OPTIONS.get((command or "", option)):

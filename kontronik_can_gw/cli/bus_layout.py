@@ -12,10 +12,17 @@ def add_layout_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare -c and --dbc."""
     group = parser.add_mutually_exclusive_group()
     group.add_argument(
-        "-c", "--config", type=Path, metavar="FILE", help="TOML configuration of the gateway whose frames they are"
+        "-c",
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="TOML configuration of the gateway whose frames they are",
     )
     group.add_argument(
-        "--dbc", type=Path, metavar="FILE", help="DBC of the frames (default: the shipped one, for one ESC)"
+        "--dbc",
+        type=Path,
+        metavar="FILE",
+        help="DBC of the frames (default: the shipped one, for one ESC)",
     )
 
 
@@ -26,6 +33,8 @@ def bus_layout(config: Path | None, dbc: Path | None) -> BusLayout:
 
         loaded = load_all(config)
         if loaded.database is None:
-            raise UserError(f"{config}: dbc.enabled is false: no messages of a DBC are sent. Give --dbc instead.")
+            raise UserError(
+                f"{config}: dbc.enabled is false: no messages of a DBC are sent. Give --dbc instead."
+            )
         return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
     return layout_of_dbc(dbc or shipped("dbc/kontronik_esc.dbc"))

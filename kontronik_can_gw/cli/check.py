@@ -18,7 +18,9 @@ from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, S
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration")
+    parser.add_argument(
+        "-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration"
+    )
     parser.epilog = (
         "Prints the effective configuration, each message and signal with its source, what is lost, and the bus load. "
         "Opens no port and no interface. Exit code: 0 it can be used (there may be warnings), 2 it cannot."
@@ -65,11 +67,17 @@ def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
             continue
         for cob_id, what in dict(node.cob_ids()).items():
             tpdo = next((t for t in node.tpdos if t.valid and t.cob_id == cob_id), None)
-            objects = "" if tpdo is None else ", ".join(entry.variable.entry.name for entry in tpdo.mapped)
+            objects = (
+                ""
+                if tpdo is None
+                else ", ".join(entry.variable.entry.name for entry in tpdo.mapped)
+            )
             what = what.removesuffix(f" of CANopen node {node.node_id}").removesuffix(
                 f" to CANopen node {node.node_id}"
             )
-            rows.append((first, f"{cob_id:03X}h", what, "" if tpdo is None else pdo_timing(tpdo), objects))
+            rows.append(
+                (first, f"{cob_id:03X}h", what, "" if tpdo is None else pdo_timing(tpdo), objects)
+            )
             first = ""
     return columns(rows)
 
@@ -103,7 +111,9 @@ def unbound(layout: Layout) -> list[str]:
     lines = []
     for message in layout.messages:
         if found := [signal for signal in message.signals if signal.unbound]:
-            held = ", ".join(f"{signal.name} = {shown(signal, signal.constant)}" for signal in found)
+            held = ", ".join(
+                f"{signal.name} = {shown(signal, signal.constant)}" for signal in found
+            )
             lines.append(f"#   {message.name}: {held}")
     return ["# bound to nothing, so they hold these values for ever:", *lines, ""] if lines else []
 
@@ -111,9 +121,14 @@ def unbound(layout: Layout) -> list[str]:
 def shown(signal: SignalPlan, raw: int) -> str:
     """The physical value of raw bits, or their text."""
     if signal.is_float:
-        (value,) = struct.unpack("<f" if signal.length == 32 else "<d", raw.to_bytes(signal.length // 8, "little"))
+        (value,) = struct.unpack(
+            "<f" if signal.length == 32 else "<d", raw.to_bytes(signal.length // 8, "little")
+        )
         return f"{value * float(signal.factor) + float(signal.offset):g} {signal.unit}".rstrip()
-    return signal.texts.get(raw) or f"{float(raw * signal.factor + signal.offset):.10g} {signal.unit}".rstrip()
+    return (
+        signal.texts.get(raw)
+        or f"{float(raw * signal.factor + signal.offset):.10g} {signal.unit}".rstrip()
+    )
 
 
 def _lost(message: MessagePlan, signal: SignalPlan) -> str:
@@ -127,7 +142,10 @@ def _lost(message: MessagePlan, signal: SignalPlan) -> str:
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines with the cells of each column one under the other."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
 
 
 def can_id(message: MessagePlan) -> str:

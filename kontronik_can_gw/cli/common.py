@@ -35,7 +35,9 @@ def logging_to_stderr() -> Iterator[None]:
     from kontronik_can_gw.runtime.systemd import log_formatter
 
     handler = BackgroundHandler(sys.stderr)
-    handler.setFormatter(log_formatter(sys.stderr) or logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
+    handler.setFormatter(
+        log_formatter(sys.stderr) or logging.Formatter("%(asctime)s %(levelname)-7s %(message)s")
+    )
     # what python-can says is said again by us, with the remedy
     logging.getLogger("can").addHandler(logging.NullHandler())
     logger = logging.getLogger("kontronik_can_gw")
@@ -51,7 +53,8 @@ def logging_to_stderr() -> Iterator[None]:
 @contextmanager
 def stopping_on_signals(stop: Callable[[], None], is_service: bool = False) -> Iterator[None]:
     """SIGTERM and SIGINT call ``stop``, once more end the process at once. SIGHUP ends a service only if its terminal has gone."""
-    has_terminal = _has_terminal() and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN  # ignored: as by nohup
+    # ignored: as by nohup
+    has_terminal = _has_terminal() and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
 
     def end(_number: int, _frame: object) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -63,7 +66,9 @@ def stopping_on_signals(stop: Callable[[], None], is_service: bool = False) -> I
             log.warning("the terminal was closed: ending (nohup, setsid or a service goes on)")
             stop()
         else:
-            log.warning("SIGHUP is ignored: the configuration is read at the start only. Restart for another one.")
+            log.warning(
+                "SIGHUP is ignored: the configuration is read at the start only. Restart for another one."
+            )
 
     handlers = {signal.SIGTERM: end, signal.SIGINT: end}
     if is_service:
@@ -88,7 +93,9 @@ def _has_terminal() -> bool:
 def canopen_of(loaded: Loaded) -> CanopenSetup:
     """The nodes of a configuration. UserError where it has none."""
     if loaded.canopen is None:
-        raise UserError(f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. Set it to true.")
+        raise UserError(
+            f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. Set it to true."
+        )
     return loaded.canopen
 
 
@@ -116,7 +123,9 @@ def write_file(path: Path, data: bytes) -> None:
         if target.exists() and not target.is_file():
             target.write_bytes(data)
             return
-        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{path.name}.", delete=False) as file:
+        with tempfile.NamedTemporaryFile(
+            dir=target.parent, prefix=f".{path.name}.", delete=False
+        ) as file:
             beside = Path(file.name)
             file.write(data)
         beside.chmod(0o644)

@@ -35,7 +35,9 @@ def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.cli import make_parser
 
     if args.shell not in shtab.SUPPORTED_SHELLS:
-        raise RunError(f"{args.shell}: needs a newer shtab than {shtab.__version__}: pip install --upgrade shtab")
+        raise RunError(
+            f"{args.shell}: needs a newer shtab than {shtab.__version__}: pip install --upgrade shtab"
+        )
     parser = make_parser()
     for action in _actions(parser):
         names = {action.metavar} if isinstance(action.metavar, str) else set(action.metavar or ())

@@ -5,7 +5,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.desk.recordings.convert import BYTES, FORMATS, LOGS, ON_SCREEN, STREAMS, TABLES
+from kontronik_can_gw.desk.recordings.convert import (
+    BYTES,
+    FORMATS,
+    LOGS,
+    ON_SCREEN,
+    STREAMS,
+    TABLES,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -56,15 +63,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
-    parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes; - for standard input")
+    parser.add_argument(
+        "input", metavar="IN", help="capture, CAN log or UART bytes; - for standard input"
+    )
     parser.add_argument("output", metavar="OUT", help="file to write, or - for standard output")
     parser.add_argument("--to", metavar="FORMAT", choices=FORMATS, help=", ".join(FORMATS))
     parser.add_argument("--force", action="store_true", help="write over OUT if it is there")
     parser.add_argument("-q", "--quiet", action="store_true", help="no summary")
     add_layout_arguments(parser)
     part = parser.add_argument_group("a part of it")
-    part.add_argument("--from", dest="start", metavar="S", type=_seconds, help="from so many seconds after the start")
-    part.add_argument("--until", dest="end", metavar="S", type=_seconds, help="up to so many seconds after the start")
+    part.add_argument(
+        "--from",
+        dest="start",
+        metavar="S",
+        type=_seconds,
+        help="from so many seconds after the start",
+    )
+    part.add_argument(
+        "--until",
+        dest="end",
+        metavar="S",
+        type=_seconds,
+        help="up to so many seconds after the start",
+    )
     part.add_argument("--esc", metavar="NAME", help="only the signals (or bytes) of this ESC")
     table = parser.add_argument_group("tables")
     table.add_argument(
@@ -75,10 +96,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="only these signals, in this order; * and ? stand for others",
     )
     table.add_argument(
-        "--rate", metavar="HZ", type=_rate, help="at most so many rows a second, the newest of each period"
+        "--rate",
+        metavar="HZ",
+        type=_rate,
+        help="at most so many rows a second, the newest of each period",
     )
-    table.add_argument("--frames", action="store_true", help="a row for each CAN frame, with its own signals only")
-    table.add_argument("--units-line", action="store_true", help="jsonl: a first line with the units")
+    table.add_argument(
+        "--frames", action="store_true", help="a row for each CAN frame, with its own signals only"
+    )
+    table.add_argument(
+        "--units-line", action="store_true", help="jsonl: a first line with the units"
+    )
     parser.add_argument(
         "--live-rate",
         metavar="HZ",
@@ -114,7 +142,11 @@ def _ended_by_signals() -> Iterator[None]:
     def end(_number: int, _frame: object) -> None:
         raise _Ended
 
-    numbers = (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ()
+    numbers = (
+        (signal.SIGTERM, signal.SIGHUP)
+        if threading.current_thread() is threading.main_thread()
+        else ()
+    )
     changed = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
     for number in changed:
         signal.signal(number, end)
@@ -146,7 +178,9 @@ def _convert(args: argparse.Namespace, form: str) -> None:
         conversion = _conversion(args, form, recording)
         try:
             with (
-                Progress(source.name or recording.name, recording.size or None, args.output == "-") as progress,
+                Progress(
+                    source.name or recording.name, recording.size or None, args.output == "-"
+                ) as progress,
                 Output(None if args.output == "-" else target, form) as out,
             ):
                 told = conversion(recording, out, progress.reach)
@@ -160,13 +194,20 @@ def _convert(args: argparse.Namespace, form: str) -> None:
             raise RunError(*_nothing(args, recording, damage))
         notes = recording.notes if form in TABLES else []
         if not args.quiet:
-            if form in TABLES and not notes and isinstance(recording, CanLogInput) and recording.others:
+            if (
+                form in TABLES
+                and not notes
+                and isinstance(recording, CanLogInput)
+                and recording.others
+            ):
                 told += f", {recording.others} other frames passed over"
             _say(
                 f"{'standard output' if args.output == '-' else args.output}: {told}, in {time.monotonic() - begun:.1f} s"
             )
             if recording.times_assumed and form != BYTES:
-                _say(f"times are assumed: {args.live_rate or LIVE_RATE:g} live frames a second (--live-rate)")
+                _say(
+                    f"times are assumed: {args.live_rate or LIVE_RATE:g} live frames a second (--live-rate)"
+                )
         for line in notes:
             _say(f"{args.input}: {line}")
         for line in damage:
@@ -188,7 +229,11 @@ def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None"
 
 def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Conversion":
     """What is to be done. UserError for what the recording has not."""
-    from kontronik_can_gw.desk.recordings.convert import BytesConversion, LogConversion, TableConversion
+    from kontronik_can_gw.desk.recordings.convert import (
+        BytesConversion,
+        LogConversion,
+        TableConversion,
+    )
     from kontronik_can_gw.desk.recordings.tables import Choice
 
     if form == BYTES:
@@ -208,7 +253,9 @@ def _format(args: argparse.Namespace) -> str:
     if args.to:
         return str(args.to)
     if args.output == "-":
-        raise UserError(f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}; bin through a pipe")
+        raise UserError(
+            f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}; bin through a pipe"
+        )
     if Path(args.output).is_dir():
         raise UserError(f"{args.output}: is a directory. Give a file.")
     suffix = Path(args.output).suffix.lower()
@@ -227,7 +274,9 @@ def _check(args: argparse.Namespace, form: str) -> None:
     from kontronik_can_gw.errors import UserError
 
     if args.output == "-" and form not in STREAMS:
-        raise UserError(f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}")
+        raise UserError(
+            f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}"
+        )
     if args.output == "-" and form == BYTES and sys.stdout.isatty():
         raise UserError("bin cannot go to a terminal. Give a file, or a pipe behind it.")
     given = {"--signals": args.signals, "--rate": args.rate, "--frames": args.frames}
@@ -262,7 +311,9 @@ def _check(args: argparse.Namespace, form: str) -> None:
         elif form not in (*ON_SCREEN, BYTES):
             raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
     except (OSError, ValueError) as error:
-        raise UserError(f"{target}: cannot be written: {getattr(error, 'strerror', None) or error}.") from None
+        raise UserError(
+            f"{target}: cannot be written: {getattr(error, 'strerror', None) or error}."
+        ) from None
 
 
 def _esc(args: argparse.Namespace, recording: "Input", needed: bool = False) -> int | None:

@@ -21,7 +21,11 @@ _MAX_NODES = 127
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "-c", "--config", type=Path, metavar="FILE", help="write the DBC of what this configuration sends"
+        "-c",
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="write the DBC of what this configuration sends",
     )
     parser.add_argument(
         "--canopen",
@@ -29,9 +33,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="describe what the CANopen nodes send: PDOs as they are mapped now, heartbeats, emergencies",
     )
     parser.add_argument(
-        "--from", type=Path, dest="source", metavar="DBC", help="one-ESC DBC to start from (default: the shipped one)"
+        "--from",
+        type=Path,
+        dest="source",
+        metavar="DBC",
+        help="one-ESC DBC to start from (default: the shipped one)",
     )
-    parser.add_argument("--esc", type=_count, metavar="N", help="number of ESCs (default 1, or the number of names)")
+    parser.add_argument(
+        "--esc", type=_count, metavar="N", help="number of ESCs (default 1, or the number of names)"
+    )
     parser.add_argument(
         "--name",
         action="append",
@@ -47,9 +57,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="distance of the ids from ESC to ESC (default: the smallest without a clash)",
     )
     parser.add_argument(
-        "--node", metavar="NODE", help="transmitter node of our messages (default: the only one that sends)"
+        "--node",
+        metavar="NODE",
+        help="transmitter node of our messages (default: the only one that sends)",
     )
-    parser.add_argument("-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)"
+    )
     parser.epilog = (
         "Prints a DBC that every tool reads; what should be known about it goes to standard error. "
         "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or DBC."
@@ -74,7 +88,11 @@ def main(args: argparse.Namespace) -> int:
 
 def _canopen(args: argparse.Namespace) -> "Database":
     """The DBC of the configured nodes, or of as many by the shipped EDS, node-IDs from 1 on."""
-    _refuse(args, ("from", "base_id", "id_step", "node"), "--canopen, which describes the nodes as they are")
+    _refuse(
+        args,
+        ("from", "base_id", "id_step", "node"),
+        "--canopen, which describes the nodes as they are",
+    )
     if args.config is not None:
         _refuse(args, ("esc", "name"), "--config, which says all that")
         loaded = load_all(args.config)
@@ -82,12 +100,16 @@ def _canopen(args: argparse.Namespace) -> "Database":
     else:
         escs = _escs(args)
         if len(escs) > _MAX_NODES:
-            raise UserError(f"--esc: {len(escs)} are more than the {_MAX_NODES} nodes that a CANopen bus has")
+            raise UserError(
+                f"--esc: {len(escs)} are more than the {_MAX_NODES} nodes that a CANopen bus has"
+            )
         setup = shipped_canopen(range(1, len(escs) + 1))
         escs = setup.esc_settings(escs)
     nodes = setup.nodes(escs)
     if waiting := waiting_for_lss(nodes, escs):
-        say(f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to describe")
+        say(
+            f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to describe"
+        )
     return canopen_database(nodes, escs)
 
 
@@ -98,7 +120,11 @@ def _database(args: argparse.Namespace) -> "Database":
     from kontronik_can_gw.dbc.reader import choose_node, load_database
 
     if args.config is not None:
-        _refuse(args, ("esc", "name", "base_id", "id_step", "node", "from"), "--config, which says all that")
+        _refuse(
+            args,
+            ("esc", "name", "base_id", "id_step", "node", "from"),
+            "--config, which says all that",
+        )
         database = load_all(args.config).database
         if database is None:
             raise UserError(

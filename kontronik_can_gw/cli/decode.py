@@ -18,8 +18,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
     parser.add_argument("file", metavar="FILE", help="file of UART bytes, or - for standard input")
-    parser.add_argument("--csv", action="store_true", help="CSV with a header instead of JSON lines")
-    parser.add_argument("--stats", metavar="FILE", help="write the counters to FILE as JSON when done")
+    parser.add_argument(
+        "--csv", action="store_true", help="CSV with a header instead of JSON lines"
+    )
+    parser.add_argument(
+        "--stats", metavar="FILE", help="write the counters to FILE as JSON when done"
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -44,7 +48,9 @@ def main(args: argparse.Namespace) -> int:
                 stack.callback(os.close, fd)
             status = os.fstat(fd)
         except (OSError, ValueError) as error:
-            raise RunError(f"{name}: cannot be opened: {_reason(error)}. Give a file of recorded UART bytes.") from None
+            raise RunError(
+                f"{name}: cannot be opened: {_reason(error)}. Give a file of recorded UART bytes."
+            ) from None
         if stat.S_ISDIR(status.st_mode):
             raise RunError(f"{name}: is a directory. Give a file of recorded UART bytes.")
         is_file = stat.S_ISREG(status.st_mode)
@@ -57,7 +63,9 @@ def main(args: argparse.Namespace) -> int:
                     raise UserError(f"--stats {args.stats}: is the input. Give another file.")
                 stats = stack.enter_context(target.open("w", encoding="utf-8"))
             except (OSError, ValueError) as error:
-                raise RunError(f"--stats {args.stats}: cannot be written: {_reason(error)}.") from None
+                raise RunError(
+                    f"--stats {args.stats}: cannot be written: {_reason(error)}."
+                ) from None
 
         out = sys.stdout
 
@@ -69,7 +77,8 @@ def main(args: argparse.Namespace) -> int:
             except BrokenPipeError:
                 raise
             except OSError as error:
-                os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())  # what is buffered has nowhere to go
+                # what is buffered has nowhere to go
+                os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
                 raise RunError(f"standard output: cannot be written: {_reason(error)}.") from None
 
         decoder = decode.Decoder()
@@ -96,7 +105,9 @@ def main(args: argparse.Namespace) -> int:
                 stats.write(json.dumps(decoder.counters.as_dict(), indent=2) + "\n")
                 stats.flush()
             except OSError as error:
-                raise RunError(f"--stats {args.stats}: cannot be written: {_reason(error)}.") from None
+                raise RunError(
+                    f"--stats {args.stats}: cannot be written: {_reason(error)}."
+                ) from None
         if failure is not None:
             raise failure
     return code

@@ -61,9 +61,14 @@ _SHOWN = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--seconds", type=number_from(0.001, 1e6), metavar="N", help="end after N seconds (default: Ctrl-C)"
+        "--seconds",
+        type=number_from(0.001, 1e6),
+        metavar="N",
+        help="end after N seconds (default: Ctrl-C)",
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulated faults (default 1)")
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="N", help="seed of the simulated faults (default 1)"
+    )
     parser.epilog = (
         "A simulated ESC on a pseudo terminal, the real gateway, python-can's in-process bus, "
         "and on the screen what a logger with the DBC and a CANopen master see. "
@@ -81,8 +86,15 @@ class Logger:
 
     def __post_init__(self) -> None:
         self._messages = {message.frame_id: message for message in self.database.messages}
-        self.units = {signal.name: signal.unit or "" for m in self.database.messages for signal in m.signals}
-        self.flags = [s.name for m in self.database.messages for s in m.signals if s.length == 1 and not s.choices]
+        self.units = {
+            signal.name: signal.unit or "" for m in self.database.messages for signal in m.signals
+        }
+        self.flags = [
+            s.name
+            for m in self.database.messages
+            for s in m.signals
+            if s.length == 1 and not s.choices
+        ]
 
     def take(self, message: "can.Message") -> None:
         """Decode a frame."""
@@ -101,7 +113,11 @@ class Logger:
         """Flags that are set while the flags mean anything."""
         if self.text("OperatingState") == "-":
             return []
-        return [name for name in self.flags if self.values.get(name) == 1 and name != "ProgrammingAllowed"]
+        return [
+            name
+            for name in self.flags
+            if self.values.get(name) == 1 and name != "ProgrammingAllowed"
+        ]
 
 
 @dataclass
@@ -130,7 +146,11 @@ class Master:
                 self.emergency = f"{code:04X}h {what}" if code else "0000h no error any more"
             case node.SDO_ANSWER:
                 known = data[0] == 0x4B
-                self.cell_voltage = f"{int.from_bytes(data[4:6], 'little') / 1000:.3f} V" if known else "not available"
+                self.cell_voltage = (
+                    f"{int.from_bytes(data[4:6], 'little') / 1000:.3f} V"
+                    if known
+                    else "not available"
+                )
             case base if base & 0x7F == 0 and 0x180 <= base <= 0x500:
                 number = (base >> 8) & 7
                 self.counts[number] = self.counts.get(number, 0) + 1
@@ -140,7 +160,10 @@ class Master:
 
     def line(self) -> str:
         """What the master knows."""
-        pdos = " ".join(f"TPDO{number} {count}" for number, count in sorted(self.counts.items())) or "no PDO yet"
+        pdos = (
+            " ".join(f"TPDO{number} {count}" for number, count in sorted(self.counts.items()))
+            or "no PDO yet"
+        )
         # no-break spaces: on a narrow terminal the line is broken in front of SDO, not behind it
         return f"node {self.node_id} {self.state}  {pdos}  SDO\N{NO-BREAK SPACE}2001h:5 {self.cell_voltage}  EMCY {self.emergency}"
 
@@ -160,7 +183,8 @@ def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.gateway import Gateway
     from kontronik_can_gw.runtime.loop import Loop
 
-    logging.getLogger("kontronik_can_gw").addHandler(logging.NullHandler())  # the screen tells what the log would
+    # the screen tells what the log would
+    logging.getLogger("kontronik_can_gw").addHandler(logging.NullHandler())
     channel = f"demo-{os.getpid()}"
     stop = threading.Event()
     failures: list[BaseException] = []
@@ -204,14 +228,27 @@ def main(args: argparse.Namespace) -> int:
         if failures:
             raise RunError(f"the demonstration failed: {failures[0]!r}")
         if esc.received:
-            raise RunError(f"the gateway sent {esc.received} bytes to the ESC; it must never send any")
-    print(f"kontronik-can-gw: {logger.frames} CAN frames decoded, 0 bytes sent to the ESC", file=sys.stderr)
+            raise RunError(
+                f"the gateway sent {esc.received} bytes to the ESC; it must never send any"
+            )
+    print(
+        f"kontronik-can-gw: {logger.frames} CAN frames decoded, 0 bytes sent to the ESC",
+        file=sys.stderr,
+    )
     return 0
 
 
 def _feed(esc: object, seed: int, stop: threading.Event) -> None:
     from kontronik_can_gw.desk import pty
-    from kontronik_can_gw.esc.simulator import FLIGHT, SECOND_NS, Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc
+    from kontronik_can_gw.esc.simulator import (
+        FLIGHT,
+        SECOND_NS,
+        Dropout,
+        ErrorWindow,
+        EscOptions,
+        Faults,
+        SimulatedEsc,
+    )
 
     thrown_in = (
         OperatingError.POWER_STAGE_OVERTEMP_WARNING,
@@ -219,14 +256,24 @@ def _feed(esc: object, seed: int, stop: threading.Event) -> None:
         OperatingError.UNDERVOLTAGE,
         OperatingError.LIMIT_DISCHARGED_CAPACITY,
     )
-    windows = [ErrorWindow(thrown_in[n % len(thrown_in)], (6 + 13 * n) * SECOND_NS, 3 * SECOND_NS) for n in range(1000)]
-    faults = Faults(noise=0.02, flipped_bits=1e-5, dropout=Dropout(SECOND_NS, 17 * SECOND_NS), errors=tuple(windows))
+    windows = [
+        ErrorWindow(thrown_in[n % len(thrown_in)], (6 + 13 * n) * SECOND_NS, 3 * SECOND_NS)
+        for n in range(1000)
+    ]
+    faults = Faults(
+        noise=0.02,
+        flipped_bits=1e-5,
+        dropout=Dropout(SECOND_NS, 17 * SECOND_NS),
+        errors=tuple(windows),
+    )
     profile = tuple(phase._replace(duration_s=max(1.5, phase.duration_s * 0.4)) for phase in FLIGHT)
     simulated = SimulatedEsc(EscOptions(profile=profile, faults=faults), seed=seed)
     pty.run([(simulated, esc)], stop=stop.is_set)  # type: ignore[list-item]
 
 
-def _show(logger: Logger, master: Master, bus: "can.BusABC", seconds: float | None, stop: threading.Event) -> None:
+def _show(
+    logger: Logger, master: Master, bus: "can.BusABC", seconds: float | None, stop: threading.Event
+) -> None:
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -297,14 +344,22 @@ def _screen(logger: Logger, master: Master, seconds: float) -> "Group":
         cells: list[str | Text] = []
         for name, digits in (left, right):
             value = logger.text(name, digits)
-            cells += [name, Text(value, "dim" if value == "-" else "bold"), logger.units.get(name, "")]
+            cells += [
+                name,
+                Text(value, "dim" if value == "-" else "bold"),
+                logger.units.get(name, ""),
+            ]
         body.add_row(*cells)
     active = logger.active()
-    faults = Text("faults: " + (", ".join(active) if active else "none"), "bold red" if active else "green")
+    faults = Text(
+        "faults: " + (", ".join(active) if active else "none"), "bold red" if active else "green"
+    )
     foot = Text(
         f"{seconds:.0f} s, {logger.frames} CAN frames on the bus, uptime {logger.text('Uptime')} s. Ctrl-C ends.",
         "dim",
     )
     title = "demo: simulated ESC -> UART -> gateway -> CAN -> logger, CANopen master"
     canopen = Text(f"CANopen: {master.line()}", "cyan")
-    return Group(Panel(Group(head, "", body, "", faults, "", canopen), title=title, title_align="left"), foot)
+    return Group(
+        Panel(Group(head, "", body, "", faults, "", canopen), title=title, title_align="left"), foot
+    )

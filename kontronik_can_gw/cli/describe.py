@@ -25,11 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     group = parser.add_mutually_exclusive_group()
     group.add_argument(
-        "-c", "--config", type=Path, metavar="FILE", help="what the gateway with this TOML configuration sends"
+        "-c",
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="what the gateway with this TOML configuration sends",
     )
     group.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the shipped one")
     parser.add_argument("--format", choices=("md", "json"), default="md", help="default: md")
-    parser.add_argument("-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)"
+    )
 
 
 def main(args: argparse.Namespace) -> int:

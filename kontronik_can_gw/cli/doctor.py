@@ -36,7 +36,9 @@ _WIDTHS = (40, 100)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration")
+    parser.add_argument(
+        "-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
     parser.epilog = (
         "Changes nothing and sends nothing, neither to the bus nor to an ESC; may be called while the gateway runs. "
@@ -71,7 +73,9 @@ def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
     if refused is not None:
         code = refused.exit_code
         for problem in refused.problems:
-            about.error("config", problem, "", "" if config is None else f"kontronik-can-gw check -c {path}")
+            about.error(
+                "config", problem, "", "" if config is None else f"kontronik-can-gw check -c {path}"
+            )
     if config is not None:
         _configuration(system, about, config, loaded, unit)
         found += about.found
@@ -129,20 +133,33 @@ def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
         words.append(f"{len(loaded.layout.messages)} messages of {config.dbc_path.name}")
     if loaded.canopen is not None:
         nodes = loaded.canopen.nodes(loaded.escs)
-        words.append(f"{len(nodes.nodes)} CANopen node{'s' * (number > 1)} of {config.eds_path.name}")
+        words.append(
+            f"{len(nodes.nodes)} CANopen node{'s' * (number > 1)} of {config.eds_path.name}"
+        )
         load += nodes.bits_per_second() / config.can.bitrate
     findings.ok("config", f"{config.file}: {', '.join(words)}")
-    findings.ok("config.bus_load", f"needs {load:.1%} of {config.can.bitrate // 1000} kbit/s at most")
-    damaged = {f"{loaded.escs[esc].name}: stored parameters: {reason}": esc for esc, reason in loaded.damaged}
+    findings.ok(
+        "config.bus_load", f"needs {load:.1%} of {config.can.bitrate // 1000} kbit/s at most"
+    )
+    damaged = {
+        f"{loaded.escs[esc].name}: stored parameters: {reason}": esc
+        for esc, reason in loaded.damaged
+    }
     for warning in (*loaded.layout.warnings, *loaded.warnings):
         if warning not in damaged:
             findings.warning("config.warning", warning)
     for text, esc in damaged.items():
         if os.access(parameter_file(parameter_folder(config), loaded.escs[esc].name), os.R_OK):
-            remedy = "The gateway runs on defaults. Let the master store them anew, or restore the file"
+            remedy = (
+                "The gateway runs on defaults. Let the master store them anew, or restore the file"
+            )
             findings.warning("config.parameters", text, remedy)
         else:
-            findings.note("config.parameters", text, "Only the gateway's user and root can: run doctor with sudo")
+            findings.note(
+                "config.parameters",
+                text,
+                "Only the gateway's user and root can: run doctor with sudo",
+            )
 
 
 class _Piece(NamedTuple):
@@ -177,7 +194,9 @@ def _lines(findings: list[Finding], width: int) -> Iterator[_Piece]:
                 yield _Piece("", "", "")
             group = finding.group
             yield _Piece(group, "bold", "")
-        first, *more = textwrap.wrap(finding.text, width - len(_INDENT), break_on_hyphens=False) or [""]
+        first, *more = textwrap.wrap(
+            finding.text, width - len(_INDENT), break_on_hyphens=False
+        ) or [""]
         yield _Piece(f"  {finding.severity:<9}", _STYLES[finding.severity], first)
         for line in more:
             yield _Piece("", "", _INDENT + line)

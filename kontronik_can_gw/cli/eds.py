@@ -37,7 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="write the DCF of the node with this node-ID: the EDS and its values",
     )
-    parser.add_argument("-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)"
+    )
     parser.epilog = (
         "Prints the EDS as it is in use, byte by byte, or a DCF by CiA 306. "
         "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or EDS."
@@ -62,12 +64,23 @@ def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, file_name: 
     nodes = setup.nodes(escs).nodes
     for node, esc in zip(nodes, escs, strict=True):
         if node.node_id == node_id:
-            if file_name == "-" or not file_name.isascii() or not file_name.isprintable() or ";" in file_name:
+            if (
+                file_name == "-"
+                or not file_name.isascii()
+                or not file_name.isprintable()
+                or ";" in file_name
+            ):
                 file_name = f"{Path(setup.eds.name).stem}_{node_id}.dcf"
-            return dcf(setup.eds, node_id, node.settings.bitrate, active_values(node), esc.name, file_name)
+            return dcf(
+                setup.eds, node_id, node.settings.bitrate, active_values(node), esc.name, file_name
+            )
     there = [str(node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
     known = (
-        f"There are {', '.join(there)}" if len(there) > 1 else f"There is {there[0]}" if there else "All wait for LSS"
+        f"There are {', '.join(there)}"
+        if len(there) > 1
+        else f"There is {there[0]}"
+        if there
+        else "All wait for LSS"
     )
     raise UserError(f"--node-id {node_id}: no node of the configuration has it. {known}.")
 
@@ -78,7 +91,11 @@ def active_values(node: Node) -> dict[tuple[int, int], Value]:
     values: dict[tuple[int, int], Value] = {}
     for variable in node.dictionary.variables.values():
         key = variable.entry.index, variable.entry.sub
-        if not variable.readable or key in telemetry or variable.entry.index in _STATES_AND_COMMANDS:
+        if (
+            not variable.readable
+            or key in telemetry
+            or variable.entry.index in _STATES_AND_COMMANDS
+        ):
             continue
         try:
             values[key] = node.dictionary.value(variable, 0)

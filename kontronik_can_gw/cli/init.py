@@ -18,7 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="where to (default gateway.toml; - for standard output)",
     )
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
-    parser.epilog = "Exit code: 0 written, 1 it cannot be written, 2 the file exists, or wrong usage."
+    parser.epilog = (
+        "Exit code: 0 written, 1 it cannot be written, 2 the file exists, or wrong usage."
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -31,7 +33,9 @@ def main(args: argparse.Namespace) -> int:
         with os.fdopen(os.open(args.file, flags, 0o644), "w", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise UserError(f"{args.file}: exists. Give another name, or --force to replace it.") from None
+        raise UserError(
+            f"{args.file}: exists. Give another name, or --force to replace it."
+        ) from None
     except OSError as error:
         raise RunError(f"{args.file}: cannot be written: {error.strerror}") from None
     say(f"{args.file} written. Edit it, then: kontronik-can-gw check -c {args.file}")

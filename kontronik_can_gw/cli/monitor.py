@@ -62,9 +62,13 @@ exit codes: 0 ended by the person, end of FILE, or --once with values; 1 no fram
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
-    parser.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a recording instead of the bus")
+    parser.add_argument(
+        "file", nargs="?", type=Path, metavar="FILE", help="a recording instead of the bus"
+    )
     add_layout_arguments(parser)
-    parser.add_argument("--interface", metavar="NAME", help="python-can interface (default socketcan)")
+    parser.add_argument(
+        "--interface", metavar="NAME", help="python-can interface (default socketcan)"
+    )
     parser.add_argument("--channel", metavar="NAME", help="channel of the interface (default can0)")
     parser.add_argument(
         "--speed",
@@ -72,7 +76,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FACTOR",
         help="play FILE so many times as fast (0.01 to 1000, default 1)",
     )
-    parser.add_argument("--once", action="store_true", help="one line of JSON with everything, then end")
+    parser.add_argument(
+        "--once", action="store_true", help="one line of JSON with everything, then end"
+    )
     parser.add_argument(
         "--timeout",
         type=number_from(0.1, 3600),
@@ -102,7 +108,9 @@ def _check_usage(args: argparse.Namespace) -> None:
     if args.file is None and args.speed is not None:
         raise UserError("--speed: is for a FILE; the bus comes as it comes. Leave it out.")
     if args.file is not None and (args.interface is not None or args.channel is not None):
-        raise UserError(f"{args.file}: is played, so --interface and --channel mean nothing. Leave them out.")
+        raise UserError(
+            f"{args.file}: is played, so --interface and --channel mean nothing. Leave them out."
+        )
     if args.timeout is not None and not args.once:
         raise UserError("--timeout: is for --once. Leave it out.")
 
@@ -151,10 +159,16 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
         return
     from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 
-    given = bus_layout(args.config, args.dbc) if args.config is not None or args.dbc is not None else None
+    given = (
+        bus_layout(args.config, args.dbc)
+        if args.config is not None or args.dbc is not None
+        else None
+    )
     with open_input(args.file, given) as opened:
         if given is not None and isinstance(opened, CaptureInput):
-            raise UserError(f"{args.file}: is a capture, which holds its own DBC. Leave -c and --dbc out.")
+            raise UserError(
+                f"{args.file}: is a capture, which holds its own DBC. Leave -c and --dbc out."
+            )
         yield Recording(opened, args.speed or 1.0, at_once=args.once)
         for line in dict.fromkeys([*opened.damage, *opened.notes]):
             say(f"warning: {line}")
@@ -176,7 +190,11 @@ def last_ns(opened: "Input") -> int | None:
         for found in (*scanner.feed(data), *scanner.flush()):
             if isinstance(found, Block) and found.kind == b"D":
                 last = max(
-                    (entry.time_ns for entry in read_entries(found.payload, opened.header["version"])), default=last
+                    (
+                        entry.time_ns
+                        for entry in read_entries(found.payload, opened.header["version"])
+                    ),
+                    default=last,
                 )
     return last
 
@@ -189,7 +207,11 @@ def can_config(bus: "BusLayout", interface: str | None, channel: str | None) -> 
         is_fd = any(message.fd for message in bus.layout.messages)
         return CanConfig(interface=interface or "socketcan", channel=channel or "can0", fd=is_fd)
     can = bus.config.can
-    if interface not in (None, can.interface):  # options and a channel of another kind of interface mean nothing to it
+    if interface not in (
+        None,
+        can.interface,
+    ):
+        # options and a channel of another kind of interface mean nothing to it
         can = replace(can, interface=interface, options={})
     can = replace(can, channel=channel or can.channel)
     check_devices(replace(bus.config, can=can))
@@ -276,7 +298,11 @@ class Recording:
         self._last_pump = begin
         if not self.paused and not self.ended:
             self._clock += round(passed * self._speed * SECOND)
-        while not self.paused and self._next is not None and (self._at_once or self._next.time_ns <= self._clock):
+        while (
+            not self.paused
+            and self._next is not None
+            and (self._at_once or self._next.time_ns <= self._clock)
+        ):
             timed = self._next
             take(timed.frame, timed.time_ns)
             self._ended_at = timed.time_ns
@@ -306,7 +332,9 @@ class Recording:
         if self.ended:
             parts.append("END OF FILE")
         elif self._last_ns is not None and self._last_ns > self._first_ns:
-            parts.append(f"{min(99, 100 * (self._clock - self._first_ns) // (self._last_ns - self._first_ns))} %")
+            parts.append(
+                f"{min(99, 100 * (self._clock - self._first_ns) // (self._last_ns - self._first_ns))} %"
+            )
         if self.paused:
             parts.append("PAUSED")
         return Where(self.name, is_file=True, progress="  ".join(parts), ended=self.ended)
@@ -317,7 +345,11 @@ class Recording:
         wall = self._input.wall_ns(self._clock)
         if wall is None:
             return None
-        return datetime.fromtimestamp(wall / SECOND, UTC).astimezone().isoformat(timespec="milliseconds")
+        return (
+            datetime.fromtimestamp(wall / SECOND, UTC)
+            .astimezone()
+            .isoformat(timespec="milliseconds")
+        )
 
 
 # --- one line
@@ -345,8 +377,12 @@ def _once(source: Source, monitor: "Monitor", timeout: float) -> int:
     if not monitor.frames:
         where = source.where()
         if source.is_file:
-            raise RunError(f"{source.name}: holds no frame of {_file_of(monitor)}. Give its DBC (--dbc).")
-        said = source.problem or f"no frame of {_file_of(monitor)} on {source.name} for {timeout:g} s."
+            raise RunError(
+                f"{source.name}: holds no frame of {_file_of(monitor)}. Give its DBC (--dbc)."
+            )
+        said = (
+            source.problem or f"no frame of {_file_of(monitor)} on {source.name} for {timeout:g} s."
+        )
         raise RunError(said if source.problem else " ".join([said, *where.hints]))
     head: dict[str, Any] = {
         "time": source.wall_time(),
@@ -390,7 +426,9 @@ def _watch(source: Source, monitor: "Monitor", interval: float | None) -> int:
     return 0
 
 
-def _lines(source: Source, monitor: "Monitor", interval: float, stopped: Callable[[], bool]) -> None:
+def _lines(
+    source: Source, monitor: "Monitor", interval: float, stopped: Callable[[], bool]
+) -> None:
     """Lines without any control of a terminal, until the end of a file or a signal."""
     from kontronik_can_gw.cli.monitor_screen import notices, plain_lines
 
@@ -421,19 +459,29 @@ def _news_of(text: str) -> str:
     return text.rpartition(" for ")[0] if text.startswith("no frames") else text
 
 
-def _live(console: "Console", source: Source, monitor: "Monitor", interval: float, stopped: Callable[[], bool]) -> None:
+def _live(
+    console: "Console",
+    source: Source,
+    monitor: "Monitor",
+    interval: float,
+    stopped: Callable[[], bool],
+) -> None:
     from rich.live import Live
     from rich.text import Text
 
     from kontronik_can_gw.cli.monitor_screen import ASCII, UNICODE, Choice, screen
 
-    glyphs: Glyphs = UNICODE if _is_utf8(console.encoding) and not is_c_locale(_environment()) else ASCII
+    glyphs: Glyphs = (
+        UNICODE if _is_utf8(console.encoding) and not is_c_locale(_environment()) else ASCII
+    )
     choice = Choice()
     with Keys() as keys:
 
         def drawn() -> Text:
             where = source.where()._replace(keys=keys.work)
-            lines = screen(monitor, where, (console.size.width, console.size.height), choice, glyphs)
+            lines = screen(
+                monitor, where, (console.size.width, console.size.height), choice, glyphs
+            )
             text = Text(no_wrap=True, overflow="crop", end="")
             for index, line in enumerate(lines):
                 if index:
@@ -463,7 +511,9 @@ def _live(console: "Console", source: Source, monitor: "Monitor", interval: floa
 
 def is_c_locale(environment: Mapping[str, str]) -> bool:
     """True where the person's locale has ASCII alone, though Python itself then works in UTF-8."""
-    name = next((environment[key] for key in ("LC_ALL", "LC_CTYPE", "LANG") if environment.get(key)), "C")
+    name = next(
+        (environment[key] for key in ("LC_ALL", "LC_CTYPE", "LANG") if environment.get(key)), "C"
+    )
     return name in ("C", "POSIX")
 
 
@@ -514,7 +564,9 @@ class Keys:
         import signal
         import termios
 
-        with contextlib.suppress(OSError, ValueError, AttributeError, io.UnsupportedOperation, termios.error):
+        with contextlib.suppress(
+            OSError, ValueError, AttributeError, io.UnsupportedOperation, termios.error
+        ):
             fd = sys.stdin.fileno()
             if os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp():
                 self._fd = fd

@@ -26,7 +26,14 @@ from kontronik_can_gw.esc.kontronik.states import Severity
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
 
-GOOD, POOR, BAD, FAINT, TITLE, MARKED = "green", "yellow", "bold red", "dim", "bold", "bold black on yellow"
+GOOD, POOR, BAD, FAINT, TITLE, MARKED = (
+    "green",
+    "yellow",
+    "bold red",
+    "dim",
+    "bold",
+    "bold black on yellow",
+)
 _ZONES = {Zone.GOOD: GOOD, Zone.WARNING: POOR, Zone.ALARM: "red"}
 _MARKS = {Zone.GOOD: "", Zone.WARNING: "!", Zone.ALARM: "!!"}
 _SEVERITIES = {Severity.ERROR: BAD, Severity.WARNING: POOR, Severity.STATUS: ""}
@@ -93,7 +100,9 @@ def screen(
     width, height = max(20, size[0]), max(4, size[1])
     head = [_title(monitor, where, width)]
     for text, style in notices(monitor, where):
-        head += [[Piece(line, style)] for line in textwrap.wrap(text, width, break_on_hyphens=False)]
+        head += [
+            [Piece(line, style)] for line in textwrap.wrap(text, width, break_on_hyphens=False)
+        ]
     body_height = height - len(head) - 1
     shown, pages = _shown(monitor, choice, body_height)
     group = (width - _LABEL) // max(1, len(shown))
@@ -110,8 +119,15 @@ def plain_lines(monitor: Monitor) -> Iterator[str]:
     """A line for each ESC where there is no screen to draw on."""
     mark = "REPLAY  " if monitor.is_replay else ""
     for esc in monitor.escs:
-        parts = [f"{mark}{monitor.watched_s:6.1f} s  {esc.name}  link {_link(esc)}  state {_state(esc)}"]
-        for source in (*_speeds(esc)[:1], "battery_voltage", "battery_current", "power_stage_temperature"):
+        parts = [
+            f"{mark}{monitor.watched_s:6.1f} s  {esc.name}  link {_link(esc)}  state {_state(esc)}"
+        ]
+        for source in (
+            *_speeds(esc)[:1],
+            "battery_voltage",
+            "battery_current",
+            "power_stage_temperature",
+        ):
             quantity = QUANTITY[source]
             parts.append(f"{source} {number(esc.number(source), quantity.digits)} {quantity.unit}")
         parts += [f"{active.severity.value.upper()} {active.meaning}" for active in esc.alarms]
@@ -197,7 +213,10 @@ def _title(monitor: Monitor, where: Where, width: int) -> Line:
     if state is not None:
         style = {"running": GOOD, "replay": MARKED}.get(normalize(state), POOR)
         right += [Piece("gateway "), Piece(words(state), style), Piece("  ")]
-    if monitor.can_state is not None and normalize(monitor.can_state) not in ("unknown", "erroractive"):
+    if monitor.can_state is not None and normalize(monitor.can_state) not in (
+        "unknown",
+        "erroractive",
+    ):
         right += [Piece(f"CAN {words(monitor.can_state)}", POOR), Piece("  ")]
     rate = monitor.frame_rate
     right.append(Piece(f"{'-' if rate is None else f'{rate:.0f}'} frames/s"))
@@ -252,7 +271,11 @@ def _state(esc: EscMonitor) -> str:
 def _short_state(esc: EscMonitor, width: int) -> str:
     """The state without what it can be understood without, where there is no room for all of it."""
     state = _state(esc)
-    return state if len(state) <= width else " ".join(word for word in state.split() if word not in _FILLERS)
+    return (
+        state
+        if len(state) <= width
+        else " ".join(word for word in state.split() if word not in _FILLERS)
+    )
 
 
 def _link(esc: EscMonitor) -> str:
@@ -268,7 +291,9 @@ def _link_style(esc: EscMonitor) -> str:
 
 def _speeds(esc: EscMonitor) -> list[str]:
     """The speeds that the DBC has, the one that tells most first."""
-    return [name for name in ("motor_speed", "electrical_speed", "output_speed") if esc.has(name)] or ["motor_speed"]
+    return [
+        name for name in ("motor_speed", "electrical_speed", "output_speed") if esc.has(name)
+    ] or ["motor_speed"]
 
 
 def _name_style(esc: EscMonitor) -> str:
@@ -302,7 +327,13 @@ def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool)
         if trouble := _trouble(esc):
             told.append((Severity.ERROR, f"{name}LINK: ", trouble))
         elif normalize(esc.link or "") == "degraded":
-            told.append((Severity.WARNING, f"{name}LINK: ", "degraded, frames are damaged: look at cable and ground"))
+            told.append(
+                (
+                    Severity.WARNING,
+                    f"{name}LINK: ",
+                    "degraded, frames are damaged: look at cable and ground",
+                )
+            )
         for active in esc.alarms:
             kind = {Severity.STATUS: "note"}.get(active.severity, active.severity.value.upper())
             told.append((active.severity, f"{name}{kind}: ", active.meaning))
@@ -312,10 +343,16 @@ def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool)
         joined: dict[tuple[Severity, str], list[str]] = {}
         for severity, head, meaning in told:
             joined.setdefault((severity, head), []).append(meaning)
-        lines = _wrapped([(severity, head, "; ".join(texts)) for (severity, head), texts in joined.items()], width)
+        lines = _wrapped(
+            [(severity, head, "; ".join(texts)) for (severity, head), texts in joined.items()],
+            width,
+        )
     if len(lines) > room > 0:
         rest = len(lines) - room + 1
-        lines = [*lines[: room - 1], [Piece(f"... and {rest} lines more of errors and warnings", BAD)]]
+        lines = [
+            *lines[: room - 1],
+            [Piece(f"... and {rest} lines more of errors and warnings", BAD)],
+        ]
     return lines[: max(0, room)]
 
 
@@ -400,7 +437,11 @@ def _rows(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Row]:
 
     def charge(esc: EscMonitor, _width: int) -> Line:
         parts = [(esc.number("consumed_charge"), 0, "mAh"), (esc.number("energy_used"), 1, "Wh")]
-        return [Piece("  ".join(f"{number(value, digits)} {unit}" for value, digits, unit in parts), TITLE)]
+        return [
+            Piece(
+                "  ".join(f"{number(value, digits)} {unit}" for value, digits, unit in parts), TITLE
+            )
+        ]
 
     def link(esc: EscMonitor, _width: int) -> Line:
         rate, age = esc.number("frame_rate"), esc.number("data_age")
@@ -420,7 +461,9 @@ def _rows(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Row]:
     rows.append(_Row("", "", heads, -1))
     for quantity in QUANTITIES:
         if has(quantity.source) or any(esc.number(quantity.source) is not None for esc in escs):
-            rows.append(_Row(quantity.label, quantity.unit, _cell_of(quantity, glyphs), quantity.rank))
+            rows.append(
+                _Row(quantity.label, quantity.unit, _cell_of(quantity, glyphs), quantity.rank)
+            )
     if has("consumed_charge", "energy_used"):
         rows.append(_Row("charge, energy", "", charge, 2))
     rows.append(_Row("link", "", link, 1))
@@ -439,7 +482,12 @@ def _cell_of(quantity: Quantity, glyphs: Glyphs) -> Callable[[EscMonitor, int], 
         line = [Piece(text.rjust(now), style)]
         spread = esc.spreads[quantity.source]
         for end in (spread.low, spread.high) if ends else ():
-            line.append(Piece(f" {number(end, quantity.digits, ends):>{ends}}", "" if end is not None else FAINT))
+            line.append(
+                Piece(
+                    f" {number(end, quantity.digits, ends):>{ends}}",
+                    "" if end is not None else FAINT,
+                )
+            )
         value = esc.number(quantity.source)
         if quantity.scale is None or bars < 4:
             return line
@@ -490,12 +538,17 @@ def _table(escs: Sequence[EscMonitor], size: tuple[int, int], glyphs: Glyphs) ->
     while sum(column.width + 1 for column in columns) - 1 > width and len(columns) > 1:
         columns.remove(max(columns, key=lambda column: column.rank))
     spare = width + 1 - sum(column.width + 1 for column in columns)
-    columns = [column._replace(width=column.width + min(spare, 8)) if column.grows else column for column in columns]
+    columns = [
+        column._replace(width=column.width + min(spare, 8)) if column.grows else column
+        for column in columns
+    ]
     alarms = _alarm_lines(escs, (width, 99), True)
     least = 2 if alarms else 1
     two = 2 + 2 * len(escs) + least <= height
     spare = height - 2 - 2 * len(escs) - least - 1
-    lines: list[Line] = [_table_line([[Piece(c.heads[0], FAINT)] for c in columns], columns, glyphs)]
+    lines: list[Line] = [
+        _table_line([[Piece(c.heads[0], FAINT)] for c in columns], columns, glyphs)
+    ]
     if two:
         lines.append(_table_line([[Piece(c.heads[1], FAINT)] for c in columns], columns, glyphs))
     for esc in escs:
@@ -530,7 +583,11 @@ def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
     def link(esc: EscMonitor) -> Line:
         rate = esc.number("frame_rate")
         text = _link(esc)
-        return [Piece(text if rate is None or text != "ok" else f"{text} {rate:.0f} Hz", _link_style(esc))]
+        return [
+            Piece(
+                text if rate is None or text != "ok" else f"{text} {rate:.0f} Hz", _link_style(esc)
+            )
+        ]
 
     def state(esc: EscMonitor) -> Line:
         if _trouble(esc):
@@ -543,7 +600,10 @@ def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
         if value is not None and value < 0:
             return [Piece(f"brake {-value:.0f} %".rjust(16), "cyan")]
         percent = number(value, 0)
-        return [*bar(value, PERCENT, 10, glyphs), Piece(f"{percent} %".rjust(6), "" if value is not None else FAINT)]
+        return [
+            *bar(value, PERCENT, 10, glyphs),
+            Piece(f"{percent} %".rjust(6), "" if value is not None else FAINT),
+        ]
 
     def measured(source: str, head: str, width: int, rank: int, least: bool = False) -> _Column:
         quantity = QUANTITY[source]
@@ -565,7 +625,11 @@ def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
 
         return cell
 
-    speeds = {"motor_speed": "motor/min", "electrical_speed": "elec./min", "output_speed": "outp./min"}
+    speeds = {
+        "motor_speed": "motor/min",
+        "electrical_speed": "elec./min",
+        "output_speed": "outp./min",
+    }
     first_speed = _speeds(escs[0])[0] if escs else "motor_speed"
     longest = max((len(esc.name) for esc in escs), default=0)
     columns = [
@@ -592,5 +656,8 @@ def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
         column
         for column in columns
         if (source := wanted.get(column.heads[0])) is None
-        or any(esc.has(source) or (source in esc.spreads and esc.number(source) is not None) for esc in escs)
+        or any(
+            esc.has(source) or (source in esc.spreads and esc.number(source) is not None)
+            for esc in escs
+        )
     ]

@@ -39,26 +39,58 @@ _DEFAULT_DISCOVERY = "homeassistant"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "file", type=Path, nargs="?", metavar="FILE", help="publish a recording, in its own time, instead of the bus"
+        "file",
+        type=Path,
+        nargs="?",
+        metavar="FILE",
+        help="publish a recording, in its own time, instead of the bus",
     )
     add_layout_arguments(parser)
-    parser.add_argument("--interface", metavar="NAME", help="python-can interface (default: can.interface, socketcan)")
-    parser.add_argument("--channel", metavar="NAME", help="its channel (default: can.channel, can0)")
+    parser.add_argument(
+        "--interface",
+        metavar="NAME",
+        help="python-can interface (default: can.interface, socketcan)",
+    )
+    parser.add_argument(
+        "--channel", metavar="NAME", help="its channel (default: can.channel, can0)"
+    )
     where = parser.add_argument_group("broker (defaults: table [mqtt] of the configuration)")
-    where.add_argument("--broker", metavar="HOST[:PORT]", help="the MQTT broker (port 1883, with TLS 8883)")
-    where.add_argument("--tls", action="store_true", default=None, help="encrypt, and check the broker's certificate")
-    where.add_argument("--ca-file", metavar="FILE", help="certificate of the authority that signed the broker's")
+    where.add_argument(
+        "--broker", metavar="HOST[:PORT]", help="the MQTT broker (port 1883, with TLS 8883)"
+    )
+    where.add_argument(
+        "--tls",
+        action="store_true",
+        default=None,
+        help="encrypt, and check the broker's certificate",
+    )
+    where.add_argument(
+        "--ca-file", metavar="FILE", help="certificate of the authority that signed the broker's"
+    )
     where.add_argument("--cert-file", metavar="FILE", help="certificate to show to the broker")
     where.add_argument("--key-file", metavar="FILE", help="key of that certificate")
     where.add_argument("--username", metavar="NAME", help="user name at the broker")
-    where.add_argument("--password-file", metavar="FILE", help="file with the password on its first line")
-    what = parser.add_argument_group("topics")
-    what.add_argument("--gateway", metavar="NAME", help="name of this gateway in the topics (default: the host name)")
-    what.add_argument("--topic", metavar="PREFIX", help="what all topics begin with (default kontronik)")
-    what.add_argument(
-        "--rate", type=_number, metavar="HZ", help="states of each ESC in a second, 0.01 to 20 (default 1)"
+    where.add_argument(
+        "--password-file", metavar="FILE", help="file with the password on its first line"
     )
-    what.add_argument("--retain", action="store_true", default=None, help="let the broker keep the last states")
+    what = parser.add_argument_group("topics")
+    what.add_argument(
+        "--gateway",
+        metavar="NAME",
+        help="name of this gateway in the topics (default: the host name)",
+    )
+    what.add_argument(
+        "--topic", metavar="PREFIX", help="what all topics begin with (default kontronik)"
+    )
+    what.add_argument(
+        "--rate",
+        type=_number,
+        metavar="HZ",
+        help="states of each ESC in a second, 0.01 to 20 (default 1)",
+    )
+    what.add_argument(
+        "--retain", action="store_true", default=None, help="let the broker keep the last states"
+    )
     what.add_argument(
         "--discovery",
         nargs="?",
@@ -115,7 +147,9 @@ def _main(args: argparse.Namespace, notifier: "Notifier") -> int:
         raise UserError(f"--discovery {args.discovery}: is a file. Give FILE before the options.")
     if args.file is not None and (args.interface or args.channel):
         raise UserError("--interface, --channel: are for the bus, not for a recording")
-    given = bus_layout(args.config, args.dbc) if args.file is None or args.config or args.dbc else None
+    given = (
+        bus_layout(args.config, args.dbc) if args.file is None or args.config or args.dbc else None
+    )
     settings = _settings(args, given)
     topics = Topics(settings.topic, settings.gateway or host_name())
     broker = _broker(settings, topics)
@@ -149,14 +183,30 @@ def _settings(args: argparse.Namespace, bus: "BusLayout | None") -> MqttConfig:
         table = bus.config.mqtt
         folder = Path(bus.config.file).parent
         files: dict[str, Any] = {
-            name: str(folder / value) for name in _FILES if (value := getattr(table, name)) is not None
+            name: str(folder / value)
+            for name in _FILES
+            if (value := getattr(table, name)) is not None
         }
         table = replace(table, **files)
-    names = ("broker", "tls", *_FILES, "username", "gateway", "topic", "rate", "retain", "discovery")
-    options: Mapping[str, Any] = {name: value for name in names if (value := getattr(args, name)) is not None}
+    names = (
+        "broker",
+        "tls",
+        *_FILES,
+        "username",
+        "gateway",
+        "topic",
+        "rate",
+        "retain",
+        "discovery",
+    )
+    options: Mapping[str, Any] = {
+        name: value for name in names if (value := getattr(args, name)) is not None
+    }
     settings = mqtt_with(table, options)
     if settings.broker is None:
-        raise UserError("no broker is given: --broker HOST, or broker in the table [mqtt] of the configuration")
+        raise UserError(
+            "no broker is given: --broker HOST, or broker in the table [mqtt] of the configuration"
+        )
     return settings
 
 
@@ -165,9 +215,16 @@ def _broker(settings: MqttConfig, topics: "Topics") -> "Broker":
 
     assert settings.address is not None
     host, port = settings.address
-    files = {name: None if (value := getattr(settings, name)) is None else Path(value) for name in _FILES}
+    files = {
+        name: None if (value := getattr(settings, name)) is None else Path(value) for name in _FILES
+    }
     return Broker(
-        host, port, f"kontronik-can-gw-{topics.gateway}", tls=settings.tls, username=settings.username, **files
+        host,
+        port,
+        f"kontronik-can-gw-{topics.gateway}",
+        tls=settings.tls,
+        username=settings.username,
+        **files,
     )
 
 
@@ -228,7 +285,11 @@ def _source(args: argparse.Namespace, bus: "BusLayout | None") -> _Source:
         return _Recording(open_input(args.file, bus))
     assert bus is not None
     can = bus.config.can if bus.config is not None else CanConfig()
-    given = {name: getattr(args, name) for name in ("interface", "channel") if getattr(args, name) is not None}
+    given = {
+        name: getattr(args, name)
+        for name in ("interface", "channel")
+        if getattr(args, name) is not None
+    }
     can = replace(can, **given)
     from kontronik_can_gw.runtime.can_port import check_interface
 
@@ -304,7 +365,9 @@ class _Recording:
 
     def __init__(self, recorded: "Input") -> None:
         self._input = recorded
-        self._frames: Iterator[tuple[int, CanFrame]] = ((entry.time_ns, entry.frame) for entry in recorded.frames())
+        self._frames: Iterator[tuple[int, CanFrame]] = (
+            (entry.time_ns, entry.frame) for entry in recorded.frames()
+        )
         self._next: tuple[int, CanFrame] | None = None
         self._ahead = 0
         """What the recording's clock shows more than ours."""
@@ -350,7 +413,12 @@ class _Run:
     """From the source to the broker, until a signal or the end of the source."""
 
     def __init__(
-        self, source: _Source, settings: MqttConfig, topics: "Topics", broker: "Broker", notifier: "Notifier"
+        self,
+        source: _Source,
+        settings: MqttConfig,
+        topics: "Topics",
+        broker: "Broker",
+        notifier: "Notifier",
     ) -> None:
         from kontronik_can_gw.desk.mqtt.client import MqttClient
         from kontronik_can_gw.desk.mqtt.messages import Publisher
@@ -416,7 +484,9 @@ class _Run:
         return min(max(0, self._publisher.due(self._now) - self._now) / SECOND, _TURN_S)
 
     def _offer(self, message: "Message") -> None:
-        self._client.offer(message.topic, message.payload, lasting=message.lasting, retain=message.retain)
+        self._client.offer(
+            message.topic, message.payload, lasting=message.lasting, retain=message.retain
+        )
 
     def _supervise(self) -> None:
         """What is wrong with the bus, the sign of life, and whether the other thread lives."""

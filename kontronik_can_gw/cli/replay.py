@@ -53,10 +53,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FACTOR",
         help="times real time, 0.01 to 1000, or max: as fast as possible (default 1; --to log is always max)",
     )
-    parser.add_argument("--interface", metavar="NAME", help="--to can: python-can interface (default socketcan)")
-    parser.add_argument("--channel", metavar="NAME", help="--to can: its channel, as vcan0 (default: that of -c)")
-    parser.add_argument("--unmarked", action="store_true", help="--to can: do not mark the frames as replay")
-    parser.add_argument("--link", metavar="PATH", help="--to pty: symbolic link; {n} is the ESC's number, from 1")
+    parser.add_argument(
+        "--interface", metavar="NAME", help="--to can: python-can interface (default socketcan)"
+    )
+    parser.add_argument(
+        "--channel", metavar="NAME", help="--to can: its channel, as vcan0 (default: that of -c)"
+    )
+    parser.add_argument(
+        "--unmarked", action="store_true", help="--to can: do not mark the frames as replay"
+    )
+    parser.add_argument(
+        "--link", metavar="PATH", help="--to pty: symbolic link; {n} is the ESC's number, from 1"
+    )
     parser.add_argument(
         "--delay",
         type=number_from(0, 3600),
@@ -65,7 +73,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="--to pty: time for a gateway to open them (default 1)",
     )
     parser.add_argument(
-        "-o", "--output", default="-", metavar="FILE", help="--to log: file (default -: standard output)"
+        "-o",
+        "--output",
+        default="-",
+        metavar="FILE",
+        help="--to log: file (default -: standard output)",
     )
     parser.add_argument("--force", action="store_true", help="--to log: replace FILE if it exists")
 
@@ -100,7 +112,9 @@ def main(args: argparse.Namespace) -> int:
         play = {"can": _to_can, "pty": _to_pty, "log": _to_log}[args.to]
         text = play(args, recording, pace)
         if recording.times_assumed:
-            text += f"; times are assumed: {recording.provenance['times'].removeprefix('assumed: ')}"
+            text += (
+                f"; times are assumed: {recording.provenance['times'].removeprefix('assumed: ')}"
+            )
         say(f"{text}{', stopped' if pace.stopped else ''}")
         for line in recording.damage:
             say(f"warning: {line}")
@@ -118,7 +132,9 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     name = args.output
     suffix = Path(name).suffix
     if name != "-" and suffix not in SUFFIXES:
-        raise UserError(f"{name}: what log it is to be is told by its ending: {', '.join(SUFFIXES)}")
+        raise UserError(
+            f"{name}: what log it is to be is told by its ending: {', '.join(SUFFIXES)}"
+        )
     target = Path(name)
     if name != "-" and target.exists():
         if target.resolve() == args.file.resolve():
@@ -137,7 +153,9 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
         kind = "candump" if part is None else SUFFIXES[suffix]
         channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
         place = part.path if part is not None and kind == "mf4" else file
-        writer = CanLogWriter(place, kind, None if wall is None else wall - start, start, channel, name)
+        writer = CanLogWriter(
+            place, kind, None if wall is None else wall - start, start, channel, name
+        )
         count, last = 0, start
         with Progress(recording.name, recording.size, name == "-") as progress:
             for item in chain((first,), frames):
@@ -176,7 +194,9 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     config = recording.bus.config.can if args.config and recording.bus.config else None
     channel = args.channel or (config.channel if config else None)
     if channel is None:
-        raise UserError("--to can needs --channel, as vcan0, or a configuration (-c) that names one")
+        raise UserError(
+            "--to can needs --channel, as vcan0, or a configuration (-c) that names one"
+        )
     interface = args.interface or (config.interface if config else "socketcan")
     capture = recording if isinstance(recording, CaptureInput) else None
     layout = recording.bus.layout if capture is None else capture.sent_layout
@@ -184,12 +204,18 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     check_interface(can)
     marker = Marker(layout)
     if not args.unmarked and not marker.can_mark:
-        say("warning: no message of this DBC tells the gateway's state: nobody can see that it is a replay")
+        say(
+            "warning: no message of this DBC tells the gateway's state: nobody can see that it is a replay"
+        )
     locks = Locks()
     if interface != "virtual":
         names = [messages_lock(channel, key) for key in sorted(SignalReader(layout).keys)[:1]]
-        nodes = capture.setup.canopen.settings if capture is not None and capture.setup.canopen else ()
-        names += [node_lock(channel, node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
+        nodes = (
+            capture.setup.canopen.settings if capture is not None and capture.setup.canopen else ()
+        )
+        names += [
+            node_lock(channel, node.node_id) for node in nodes if node.node_id != UNCONFIGURED
+        ]
         for taken in locks.hold(names):
             raise in_use(taken)
     port = CanPort(can)
@@ -242,7 +268,11 @@ def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput
 
     chunks = _chunks(recording)
-    names = [esc.name for esc in recording.setup.escs] if isinstance(recording, (CaptureInput, DumpInput)) else []
+    names = (
+        [esc.name for esc in recording.setup.escs]
+        if isinstance(recording, (CaptureInput, DumpInput))
+        else []
+    )
     total = 0
     with ExitStack() as stack:
         terminals = [
@@ -263,9 +293,13 @@ def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
         for terminal in terminals:
             terminal.check()
         dropped = sum(terminal.dropped_bytes for terminal in terminals)
-        received = [name for name, terminal in zip(names, terminals, strict=True) if terminal.received]
+        received = [
+            name for name, terminal in zip(names, terminals, strict=True) if terminal.received
+        ]
     if received:
-        raise RunError(f"{', '.join(received)}: the gateway transmits to the ESC, which could take it for a command")
+        raise RunError(
+            f"{', '.join(received)}: the gateway transmits to the ESC, which could take it for a command"
+        )
     return f"{total} bytes to {len(names)} pseudo terminals{f', {dropped} of them dropped (nobody read)' if dropped else ''}"
 
 

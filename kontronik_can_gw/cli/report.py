@@ -33,16 +33,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
     parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes")
-    parser.add_argument("-o", "--output", metavar="FILE", required=True, help="page to write, or - for standard output")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        required=True,
+        help="page to write, or - for standard output",
+    )
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
     add_layout_arguments(parser)
     parser.add_argument(
-        "--points", type=_points, default=20_000, metavar="N", help="points of a line, 100 to 1000000 (default 20000)"
+        "--points",
+        type=_points,
+        default=20_000,
+        metavar="N",
+        help="points of a line, 100 to 1000000 (default 20000)",
     )
-    parser.add_argument("--title", metavar="TEXT", help="the page's title (default: the name of IN)")
-    parser.add_argument("--from", dest="start", type=_seconds, metavar="S", help="from so many seconds after the start")
     parser.add_argument(
-        "--to", "--until", dest="end", type=_seconds, metavar="S", help="up to so many seconds after the start"
+        "--title", metavar="TEXT", help="the page's title (default: the name of IN)"
+    )
+    parser.add_argument(
+        "--from",
+        dest="start",
+        type=_seconds,
+        metavar="S",
+        help="from so many seconds after the start",
+    )
+    parser.add_argument(
+        "--to",
+        "--until",
+        dest="end",
+        type=_seconds,
+        metavar="S",
+        help="up to so many seconds after the start",
     )
 
 
@@ -64,14 +87,21 @@ def main(args: argparse.Namespace) -> int:
     with open_input(source, layout) as recording:
         analysis = Analysis(recording.bus, args.points, (args.start, args.end))
         if not analysis.has_anything:
-            raise UserError(f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc.")
+            raise UserError(
+                f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
+            )
         if not _read(recording, analysis, source.name, args.output == "-"):
             return 130
         flight = analysis.finish()
         if not flight.rows:
-            where = "in this part of it" if args.start or args.end else "by this DBC. Is -c or --dbc the right one?"
+            where = (
+                "in this part of it"
+                if args.start or args.end
+                else "by this DBC. Is -c or --dbc the right one?"
+            )
             raise RunError(
-                *(f"{args.input}: damaged: {line}" for line in recording.damage), f"{args.input}: no values {where}"
+                *(f"{args.input}: damaged: {line}" for line in recording.damage),
+                f"{args.input}: no values {where}",
             )
         title = args.title if args.title is not None else source.name
         damage = list(recording.damage)
@@ -106,7 +136,9 @@ def _check_target(source: Path, output: str, *, force: bool) -> None:
             if target.is_file() and not force:
                 raise UserError(f"{output}: exists. Give another -o, or --force.")
     except (OSError, ValueError) as error:  # a name too long, or with a null byte
-        raise UserError(f"{output}: cannot be written: {getattr(error, 'strerror', None) or error}.") from None
+        raise UserError(
+            f"{output}: cannot be written: {getattr(error, 'strerror', None) or error}."
+        ) from None
 
 
 def _read(recording: "Input", analysis: "Analysis", name: str, data_on_screen: bool) -> bool:

@@ -29,7 +29,9 @@ _PAUSE_S = 5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration")
+    parser.add_argument(
+        "-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration"
+    )
     parser.add_argument(
         "--wait",
         action="store_true",
@@ -138,7 +140,9 @@ class _Run:
         recorder = recorder_of(config, self._record)
         gateway = Gateway(*parts) if recorder is None else RecordedGateway(recorder.put, *parts)
         try:
-            statistics = Statistics(config.statistics_path or default_file(), config.statistics.address)
+            statistics = Statistics(
+                config.statistics_path or default_file(), config.statistics.address
+            )
         except UserError:
             if loaded.store is not None:
                 loaded.store.close(0)
@@ -155,11 +159,15 @@ class _Run:
             program=self._program,
             recorder=recorder,
         )
-        _say_parameters(loaded)  # first: a damaged file is moved aside by now, and must not go unsaid
+        # first: a damaged file is moved aside by now, and must not go unsaid
+        _say_parameters(loaded)
         folder = record_folder(config, self._record)
         if recorder is not None and folder is not None:
             recorder.words = in_words(config, folder)
-            recorder.header = setup_of(loaded).header() | {"created_ns": created_ns, "state": state_of(gateway)}
+            recorder.header = setup_of(loaded).header() | {
+                "created_ns": created_ns,
+                "state": state_of(gateway),
+            }
         loop.open()
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
@@ -190,5 +198,8 @@ def _say_parameters(loaded: Loaded) -> None:
         for name in ("pole_pairs", "gear", "cell_count", "timeout_ns"):
             if getattr(configured, name) != getattr(holds, name):
                 log.info(
-                    "%s: %s is %s, by what a master stored or the EDS's default", holds.name, name, getattr(holds, name)
+                    "%s: %s is %s, by what a master stored or the EDS's default",
+                    holds.name,
+                    name,
+                    getattr(holds, name),
                 )

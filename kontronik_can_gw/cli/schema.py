@@ -7,9 +7,7 @@ from kontronik_can_gw.config.keys import schema
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "Editors with TOML support (taplo, Even Better TOML) check and complete gateway.toml with it. Exit code: 0."
-    )
+    parser.epilog = "Editors with TOML support (taplo, Even Better TOML) check and complete gateway.toml with it. Exit code: 0."
 
 
 def main(_args: argparse.Namespace) -> int:

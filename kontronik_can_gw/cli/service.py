@@ -42,7 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     status_parser = actions.add_parser(
         "status", help="state, configuration and last log lines; exit code 0 running, 3 not"
     )
-    uninstall_parser = actions.add_parser("uninstall", help="stop, disable, and remove what install wrote")
+    uninstall_parser = actions.add_parser(
+        "uninstall", help="stop, disable, and remove what install wrote"
+    )
     for sub in (install_parser, status_parser, uninstall_parser):
         sub.add_argument(
             "--instance",
@@ -51,27 +53,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help="one of several gateways: NAME.toml, kontronik-can-gw@NAME",
         )
     for sub in (install_parser, uninstall_parser):
-        sub.add_argument("--root", type=Path, metavar="DIR", help="only write below DIR, as for an image; call nothing")
-        sub.add_argument("--dry-run", "--print", action="store_true", help="only show what would be done")
+        sub.add_argument(
+            "--root",
+            type=Path,
+            metavar="DIR",
+            help="only write below DIR, as for an image; call nothing",
+        )
+        sub.add_argument(
+            "--dry-run", "--print", action="store_true", help="only show what would be done"
+        )
     install_parser.add_argument("--now", action="store_true", help="start it too, or restart it")
-    install_parser.add_argument("--executable", metavar="PATH", help="the program (default: this one)")
     install_parser.add_argument(
-        "--force", action="store_true", help="replace files that were changed by hand; they are kept as .bak"
+        "--executable", metavar="PATH", help="the program (default: this one)"
     )
     install_parser.add_argument(
-        "--network", type=_bitrate, metavar="BITRATE", help="let systemd-networkd set up the CAN interface"
+        "--force",
+        action="store_true",
+        help="replace files that were changed by hand; they are kept as .bak",
     )
     install_parser.add_argument(
-        "--channel", type=_channel, default="can0", metavar="NAME", help="the CAN interface (default can0)"
+        "--network",
+        type=_bitrate,
+        metavar="BITRATE",
+        help="let systemd-networkd set up the CAN interface",
     )
     install_parser.add_argument(
-        "--prometheus", action="store_true", help="allow the service loopback IP, for statistics.prometheus"
+        "--channel",
+        type=_channel,
+        default="can0",
+        metavar="NAME",
+        help="the CAN interface (default can0)",
     )
     install_parser.add_argument(
-        "--mqtt", action="store_true", help="a second service that publishes to the broker of the table [mqtt]"
+        "--prometheus",
+        action="store_true",
+        help="allow the service loopback IP, for statistics.prometheus",
+    )
+    install_parser.add_argument(
+        "--mqtt",
+        action="store_true",
+        help="a second service that publishes to the broker of the table [mqtt]",
     )
     uninstall_parser.add_argument(
-        "--purge", action="store_true", help="remove configurations, stored parameters and the user too"
+        "--purge",
+        action="store_true",
+        help="remove configurations, stored parameters and the user too",
     )
     status_parser.add_argument(
         "-n", "--lines", type=_lines, default=10, metavar="N", help="lines of the log (default 10)"
@@ -85,7 +111,11 @@ def main(args: argparse.Namespace) -> int:
 
 def _instance(text: str) -> str:
     if not _INSTANCE.fullmatch(text) or text == "gateway":
-        reason = "is the plain service's configuration" if text == "gateway" else "is no name: letters, digits, _ . -"
+        reason = (
+            "is the plain service's configuration"
+            if text == "gateway"
+            else "is no name: letters, digits, _ . -"
+        )
         raise argparse.ArgumentTypeError(f"{text!r} {reason}")
     return text
 
@@ -135,7 +165,10 @@ def _install(args: argparse.Namespace) -> int:
     changed = [root / file.path for file, state in plan if state is State.CHANGED]
     if changed and not args.force:
         raise UserError(
-            *(f"{path}: was changed by hand. --force replaces it and keeps it as {path.name}.bak." for path in changed)
+            *(
+                f"{path}: was changed by hand. --force replaces it and keeps it as {path.name}.bak."
+                for path in changed
+            )
         )
     for file, state in plan:
         path = root / file.path
@@ -164,7 +197,10 @@ def _enable(args: argparse.Namespace, own: Path, live: bool, root: Path) -> int:
     unit = files.unit(args.instance)
     if problems := _not_ready(own):
         then = f" When it is right: sudo systemctl enable --now {unit}" if live else ""
-        text = [*problems, f"{unit} was not {'enabled and started' if args.now else 'enabled'}.{then}"]
+        text = [
+            *problems,
+            f"{unit} was not {'enabled and started' if args.now else 'enabled'}.{then}",
+        ]
         if args.now:
             raise RunError(*text)
         for line in text:
@@ -216,14 +252,19 @@ def _not_ready(own: Path) -> list[str]:
     return []
 
 
-def _show(plan: Sequence[tuple[files.PlannedFile, State]], root: Path, args: argparse.Namespace) -> int:
+def _show(
+    plan: Sequence[tuple[files.PlannedFile, State]], root: Path, args: argparse.Namespace
+) -> int:
     for file, state in plan:
         print(f"##### {root / file.path}: {state.value}")
         print(file.text)
     own = root / files.configuration(args.instance)
     print(f"##### {own}: {'new, an example' if files.read(own) is None else 'kept'}")
     if args.root is None:
-        print(f"##### user {NAME}; systemctl daemon-reload; systemctl enable {files.unit(args.instance)}", end="")
+        print(
+            f"##### user {NAME}; systemctl daemon-reload; systemctl enable {files.unit(args.instance)}",
+            end="",
+        )
         print(f"; systemctl restart {files.unit(args.instance)}" if args.now else "")
     return 0
 

@@ -91,7 +91,11 @@ def configuration(instance: str | None) -> str:
 
 def planned(choices: Choices, root: Path) -> list[PlannedFile]:
     """All files, in the order in which they are written. An active network file is not joined by an example."""
-    common = {"EXECUTABLE": choices.executable, "GROUP": choices.group, "HOME": _home(choices.home_visible)}
+    common = {
+        "EXECUTABLE": choices.executable,
+        "GROUP": choices.group,
+        "HOME": _home(choices.home_visible),
+    }
     plain = common | {
         "DESCRIPTION": "KONTRONIK ESC telemetry to CAN",
         "CONFIGURATION": "gateway",
@@ -110,10 +114,15 @@ def planned(choices: Choices, root: Path) -> list[PlannedFile]:
         _made(f"etc/udev/rules.d/70-{NAME}.rules", "udev.rules", {}),
     ]
     if choices.prometheus:
-        files += [_made(f"{UNITS}/{NAME}{kind}.service.d/prometheus.conf", "prometheus.conf", {}) for kind in ("", "@")]
+        files += [
+            _made(f"{UNITS}/{NAME}{kind}.service.d/prometheus.conf", "prometheus.conf", {})
+            for kind in ("", "@")
+        ]
     if choices.mqtt:
         files += [
-            _made(f"{UNITS}/{NAME}-mqtt{kind}.service", "mqtt.service", words | {"DESCRIPTION": text})
+            _made(
+                f"{UNITS}/{NAME}-mqtt{kind}.service", "mqtt.service", words | {"DESCRIPTION": text}
+            )
             for kind, words, text in (
                 ("", plain, "KONTRONIK ESC telemetry to MQTT"),
                 ("@", template, "KONTRONIK ESC telemetry to MQTT, %i"),
@@ -142,7 +151,11 @@ def installed(root: Path) -> list[Path]:
         f"{UNITS}/{NAME}-mqtt.service",
         f"{UNITS}/{NAME}-mqtt@.service",
         f"etc/udev/rules.d/70-{NAME}.rules",
-        *(f"{NETWORK}/{_NETWORK_PREFIX}*.{kind}{end}" for kind in ("network", "link") for end in ("", f".{EXAMPLE}")),
+        *(
+            f"{NETWORK}/{_NETWORK_PREFIX}*.{kind}{end}"
+            for kind in ("network", "link")
+            for end in ("", f".{EXAMPLE}")
+        ),
     )
     return [path for pattern in patterns for path in sorted(root.glob(pattern))]
 
@@ -233,7 +246,8 @@ def _home(visible: bool) -> str:
 def _made(path: str, name: str, words: dict[str, str]) -> PlannedFile:
     body = _PLACEHOLDER.sub(lambda found: words[found[0].strip("@")], template(name))
     return PlannedFile(
-        path, f'# Written by "{NAME} service install" {__version__}, checksum {_checksum(body)}.\n{body}'
+        path,
+        f'# Written by "{NAME} service install" {__version__}, checksum {_checksum(body)}.\n{body}',
     )
 
 

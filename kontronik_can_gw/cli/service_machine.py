@@ -33,7 +33,9 @@ def check_rights(live: bool, root: Path, action: str) -> None:
 
 def check_systemd() -> None:
     if not _BOOTED.is_dir():
-        raise RunError("this system does not run systemd. Files for an image: --root DIR. Without systemd: run --wait")
+        raise RunError(
+            "this system does not run systemd. Files for an image: --root DIR. Without systemd: run --wait"
+        )
 
 
 def run(*words: str) -> "subprocess.CompletedProcess[str]":
@@ -52,7 +54,9 @@ def run(*words: str) -> "subprocess.CompletedProcess[str]":
     except OSError as error:
         raise RunError(f"{words[0]}: cannot be started: {error.strerror}") from None
     except subprocess.TimeoutExpired:
-        raise RunError(f"`{' '.join(words)}` does not end. It was given up after two minutes.") from None
+        raise RunError(
+            f"`{' '.join(words)}` does not end. It was given up after two minutes."
+        ) from None
 
 
 def output(*words: str) -> str:
@@ -63,7 +67,9 @@ def call(*words: str) -> None:
     """Call a tool that must do its work. RunError with what it said."""
     done = run(*words)
     if done.returncode:
-        said = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [f"exit code {done.returncode}"]
+        said = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [
+            f"exit code {done.returncode}"
+        ]
         raise RunError(f"`{' '.join(words)}` failed: {said[0]}")
 
 
@@ -105,7 +111,9 @@ def reload_network(channel: str) -> None:
     if output("systemctl", "is-active", "systemd-networkd.service").strip() == "active":
         call("networkctl", "reload")
     else:
-        say(f"systemd-networkd does not run here. For {channel}: sudo systemctl enable --now systemd-networkd")
+        say(
+            f"systemd-networkd does not run here. For {channel}: sudo systemctl enable --now systemd-networkd"
+        )
     say(
         f"the queue length of {channel} holds from the next start of the machine; now: sudo ip link set {channel} txqueuelen 128"
     )
@@ -128,7 +136,9 @@ def own_executable() -> str:
 def check_executable(executable: str, root: Path) -> bool:
     """True if it is below a home folder. UserError where the service could not run it."""
     if not _EXECUTABLE.fullmatch(executable) or ".." in Path(executable).parts:
-        raise UserError(f"{executable}: must be an absolute path without spaces, quotes, % and the like: --executable")
+        raise UserError(
+            f"{executable}: must be an absolute path without spaces, quotes, % and the like: --executable"
+        )
     program = root / executable.lstrip("/")
     if root != Path("/") and not program.exists():
         say(f"warning: {program}: is not there yet")
@@ -156,7 +166,9 @@ def _needed(program: Path) -> list[Path]:
     needed = [program, program.resolve()]
     with contextlib.suppress(OSError):
         first = program.open("rb").readline(4096).decode(errors="replace")
-        if first.startswith("#!/") and (interpreter := Path(first[2:].split()[0])).name.startswith("python"):
+        if first.startswith("#!/") and (interpreter := Path(first[2:].split()[0])).name.startswith(
+            "python"
+        ):
             needed += [interpreter, interpreter.resolve()]
             if interpreter.parent == Path(sys.executable).parent:
                 needed.append(Path(__file__).resolve())

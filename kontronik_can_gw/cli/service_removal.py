@@ -38,7 +38,9 @@ def uninstall(args: argparse.Namespace) -> int:
     if not found and not links and not doomed:
         say("nothing is installed")
         return 0
-    _disable(args, [*_running(), files.unit(None), files.mqtt_unit(None)] if live else [], links, live)
+    _disable(
+        args, [*_running(), files.unit(None), files.mqtt_unit(None)] if live else [], links, live
+    )
     for path in found:
         _remove_file(path)
     for kind in ("", "@"):
@@ -59,7 +61,9 @@ def uninstall(args: argparse.Namespace) -> int:
     return 0
 
 
-def _disable(args: argparse.Namespace, units: Sequence[str], links: Sequence[Path], live: bool) -> int:
+def _disable(
+    args: argparse.Namespace, units: Sequence[str], links: Sequence[Path], live: bool
+) -> int:
     for unit in dict.fromkeys(units) if live else ():
         if args.dry_run:
             print(f"systemctl disable --now {unit}")
@@ -75,13 +79,21 @@ def _disable(args: argparse.Namespace, units: Sequence[str], links: Sequence[Pat
 
 def _running() -> list[str]:
     listed = output(
-        "systemctl", "list-units", "--all", "--plain", "--no-legend", f"{NAME}@*.service", f"{NAME}-mqtt@*.service"
+        "systemctl",
+        "list-units",
+        "--all",
+        "--plain",
+        "--no-legend",
+        f"{NAME}@*.service",
+        f"{NAME}-mqtt@*.service",
     )
     return [line.split()[0] for line in listed.splitlines() if line.strip()]
 
 
 def _kept_data(root: Path) -> list[Path]:
-    states = (p for p in root.glob(f"var/lib/{NAME}*") if p.name == NAME or p.name.startswith(f"{NAME}-"))
+    states = (
+        p for p in root.glob(f"var/lib/{NAME}*") if p.name == NAME or p.name.startswith(f"{NAME}-")
+    )
     return [path for path in (root / files.CONFIGURATIONS, *sorted(states)) if path.exists()]
 
 

@@ -40,10 +40,14 @@ def status(args: argparse.Namespace) -> int:
 
 def _known_units() -> list[str]:
     """The services that are loaded or enabled; the plain one is among them if there is no instance."""
-    listed = output("systemctl", "list-units", "--all", "--plain", "--no-legend", f"{NAME}@*.service")
+    listed = output(
+        "systemctl", "list-units", "--all", "--plain", "--no-legend", f"{NAME}@*.service"
+    )
     enabled = output("systemctl", "list-unit-files", "--plain", "--no-legend", f"{NAME}@*.service")
     rows = [line.split()[0] for line in (listed + "\n" + enabled).splitlines() if line.strip()]
-    instances = sorted({row for row in rows if row.startswith(f"{NAME}@") and row != f"{NAME}@.service"})
+    instances = sorted(
+        {row for row in rows if row.startswith(f"{NAME}@") and row != f"{NAME}@.service"}
+    )
     plain = files.unit(None)
     shown = properties(plain)
     unused = shown.get("ActiveState") == "inactive" and shown.get("UnitFileState") != "enabled"
@@ -52,7 +56,11 @@ def _known_units() -> list[str]:
 
 def properties(unit: str) -> dict[str, str]:
     shown = output("systemctl", "show", "--property", ",".join(_WANTED), unit)
-    return {name: value for name, found, value in (line.partition("=") for line in shown.splitlines()) if found}
+    return {
+        name: value
+        for name, found, value in (line.partition("=") for line in shown.splitlines())
+        if found
+    }
 
 
 def _show_unit(unit: str, lines: int) -> bool:
@@ -64,7 +72,9 @@ def _show_unit(unit: str, lines: int) -> bool:
         return False
     since = f" since {shown['StateChangeTimestamp']}" if shown.get("StateChangeTimestamp") else ""
     at_start = (
-        "starts with the machine" if shown.get("UnitFileState") == "enabled" else "does not start with the machine"
+        "starts with the machine"
+        if shown.get("UnitFileState") == "enabled"
+        else "does not start with the machine"
     )
     show(f"{unit}: {state} ({shown.get('SubState', '')}){since}; {at_start}")
     if text := shown.get("StatusText"):
@@ -97,9 +107,21 @@ def _judge(own: Path) -> list[str]:
 def _log(unit: str, lines: int) -> list[str]:
     if not lines:
         return []
-    done = run("journalctl", "--unit", unit, "--lines", str(lines), "--no-pager", "--quiet", "--output", "json")
+    done = run(
+        "journalctl",
+        "--unit",
+        unit,
+        "--lines",
+        str(lines),
+        "--no-pager",
+        "--quiet",
+        "--output",
+        "json",
+    )
     found = [line for text in done.stdout.splitlines() if (line := _entry(text))]
-    return found or ["nothing that this user may read (sudo shows all)" if os.geteuid() else "empty"]
+    return found or [
+        "nothing that this user may read (sudo shows all)" if os.geteuid() else "empty"
+    ]
 
 
 def _entry(text: str) -> str:

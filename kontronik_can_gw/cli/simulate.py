@@ -48,22 +48,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="v4, legacy, or mixed: odd ESCs v4, even ones legacy (default: legacy for jivepro, else v4)",
     )
     what.add_argument("--variant", metavar="N", default="120", help="device variant (default 120)")
-    what.add_argument("--firmware", metavar="MAIN.SUB", default="4.17", help="firmware version (default 4.17)")
+    what.add_argument(
+        "--firmware", metavar="MAIN.SUB", default="4.17", help="firmware version (default 4.17)"
+    )
     what.add_argument("--cells", metavar="N", default="6", help="cell count (default 6)")
     how = parser.add_argument_group("how it sends")
-    how.add_argument("--rate", metavar="HZ", default="100", help="live frames a second, 0.1..10000 (default 100)")
     how.add_argument(
-        "--info-every", metavar="N", default="100", help="an info frame each N frames, 0 never (default 100)"
+        "--rate", metavar="HZ", default="100", help="live frames a second, 0.1..10000 (default 100)"
     )
     how.add_argument(
-        "--info-replaces", action="store_true", help="info frames replace live frames (default: they follow them)"
+        "--info-every",
+        metavar="N",
+        default="100",
+        help="an info frame each N frames, 0 never (default 100)",
     )
-    how.add_argument("--idle", action="store_true", help="the motor never runs (default: a repeating flight of 50 s)")
+    how.add_argument(
+        "--info-replaces",
+        action="store_true",
+        help="info frames replace live frames (default: they follow them)",
+    )
+    how.add_argument(
+        "--idle",
+        action="store_true",
+        help="the motor never runs (default: a repeating flight of 50 s)",
+    )
     how.add_argument("--seconds", metavar="S", help="stop after so long (a TIME)")
-    how.add_argument("--seed", metavar="N", default="0", help="seed of all that is random (default 0)")
+    how.add_argument(
+        "--seed", metavar="N", default="0", help="seed of all that is random (default 0)"
+    )
     where = parser.add_argument_group("where to")
     where.add_argument(
-        "--link", metavar="PATH", help="symbolic link to the pseudo terminal; {n} is the ESC's number, from 1"
+        "--link",
+        metavar="PATH",
+        help="symbolic link to the pseudo terminal; {n} is the ESC's number, from 1",
     )
     where.add_argument(
         "--out",
@@ -71,10 +88,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the bytes to FILE (- for standard output) as fast as can be, no pseudo terminal; {n} as for --link",
     )
     faults = parser.add_argument_group("misbehaviour")
-    faults.add_argument("--noise", metavar="MEAN", default="0", help="mean number of random bytes before a frame")
-    faults.add_argument("--lose-bytes", metavar="SHARE", default="0", help="share of bytes that get lost")
-    faults.add_argument("--flip-bits", metavar="SHARE", default="0", help="share of bits that are flipped")
-    faults.add_argument("--dropout", metavar="TIME/TIME", help="silence of so long in every so long: 2s/10s")
+    faults.add_argument(
+        "--noise", metavar="MEAN", default="0", help="mean number of random bytes before a frame"
+    )
+    faults.add_argument(
+        "--lose-bytes", metavar="SHARE", default="0", help="share of bytes that get lost"
+    )
+    faults.add_argument(
+        "--flip-bits", metavar="SHARE", default="0", help="share of bits that are flipped"
+    )
+    faults.add_argument(
+        "--dropout", metavar="TIME/TIME", help="silence of so long in every so long: 2s/10s"
+    )
     faults.add_argument(
         "--error",
         metavar="NAME@TIME[+TIME]",
@@ -99,7 +124,11 @@ def main(args: argparse.Namespace) -> int:
     read = _Options(args)
     count = read("--esc", args.esc, lambda text: _integer(text, 1, 1000)) or 1
     seed = read("--seed", args.seed, _integer) or 0
-    seconds = None if args.seconds is None else read("--seconds", args.seconds, lambda text: _time(text) / 1e9)
+    seconds = (
+        None
+        if args.seconds is None
+        else read("--seconds", args.seconds, lambda text: _time(text) / 1e9)
+    )
     options = [read.esc_options(number) for number in range(1, min(count, 2) + 1)]
     for option, path in (("--link", args.link), ("--out", args.out)):
         if path is not None and count > 1 and "{n}" not in path:
@@ -118,7 +147,9 @@ def main(args: argparse.Namespace) -> int:
         chosen = options[index % len(options)]
         assert chosen is not None
         # Spread over the period, as ESCs know nothing of each other.
-        escs.append(SimulatedEsc(chosen, seed=seed + index, start_ns=chosen.period_ns * index // count))
+        escs.append(
+            SimulatedEsc(chosen, seed=seed + index, start_ns=chosen.period_ns * index // count)
+        )
     if args.out is not None:
         assert seconds is not None
         return _to_files(escs, args.out, seconds)
@@ -184,14 +215,18 @@ def _to_terminals(escs: "list[SimulatedEsc]", link: str | None, seconds: float |
         if index not in complained:
             complained.add(index)
             first = terminal.first_received.hex(" ")
-            print(f"ERROR: esc{index + 1} {terminal.path}: the gateway transmits to the ESC: {first}", file=sys.stderr)
+            print(
+                f"ERROR: esc{index + 1} {terminal.path}: the gateway transmits to the ESC: {first}",
+                file=sys.stderr,
+            )
 
     complained: set[int] = set()
     with ExitStack() as stack:
         for number in (signal.SIGINT, signal.SIGTERM):
             stack.callback(signal.signal, number, signal.signal(number, stop))
         terminals = [
-            stack.enter_context(PtyEsc(link and link.replace("{n}", str(index + 1)))) for index in range(len(escs))
+            stack.enter_context(PtyEsc(link and link.replace("{n}", str(index + 1))))
+            for index in range(len(escs))
         ]
         for index, terminal in enumerate(terminals):
             print(f"esc{index + 1} {terminal.path}")
@@ -204,7 +239,11 @@ def _to_terminals(escs: "list[SimulatedEsc]", link: str | None, seconds: float |
             on_received=complain,
         )
         for index, terminal in enumerate(terminals):
-            dropped = f", {terminal.dropped_bytes} bytes dropped (nobody read)" if terminal.dropped_bytes else ""
+            dropped = (
+                f", {terminal.dropped_bytes} bytes dropped (nobody read)"
+                if terminal.dropped_bytes
+                else ""
+            )
             print(
                 f"esc{index + 1}: {sent_frames[index]} frames, {intact_frames[index]} of them intact{dropped}",
                 file=sys.stderr,
@@ -240,7 +279,9 @@ class _Options:
         try:
             return parse(text)
         except ValueError as error:
-            self.problems.append(f"{option} {text}: {error}" + ("" if str(error).endswith("?") else "."))
+            self.problems.append(
+                f"{option} {text}: {error}" + ("" if str(error).endswith("?") else ".")
+            )
             return None
 
     def esc_options(self, number: int) -> "EscOptions | None":
@@ -261,8 +302,12 @@ class _Options:
             "variant": self("--variant", args.variant, lambda text: _integer(text, 0, 1023)),
             "firmware": self("--firmware", args.firmware, _firmware),
             "cell_count": self("--cells", args.cells, lambda text: _integer(text, 1, 100)),
-            "period_ns": self("--rate", args.rate, lambda text: round(1e9 / _number(text, 0.1, 10_000))),
-            "info_every": self("--info-every", args.info_every, lambda text: _integer(text, 0, 1_000_000)),
+            "period_ns": self(
+                "--rate", args.rate, lambda text: round(1e9 / _number(text, 0.1, 10_000))
+            ),
+            "info_every": self(
+                "--info-every", args.info_every, lambda text: _integer(text, 0, 1_000_000)
+            ),
         }
         faults: dict[str, Any] = {
             "noise": self("--noise", args.noise, lambda text: _number(text, 0, 1000)),
@@ -271,7 +316,11 @@ class _Options:
             "dropout": None if args.dropout is None else self("--dropout", args.dropout, _dropout),
             "errors": tuple(self("--error", text, _error) for text in args.error),
         }
-        swaps = [swap for text in args.swap_device if (swap := self("--swap-device", text, _swap)) is not None]
+        swaps = [
+            swap
+            for text in args.swap_device
+            if (swap := self("--swap-device", text, _swap)) is not None
+        ]
         swaps.sort(key=lambda swap: swap.time_ns)
         if self.problems:
             return None
@@ -306,7 +355,11 @@ def _number(text: str, low: float, high: float) -> float:
 
 def _share(text: str) -> float:
     try:
-        return _number(text.removesuffix("%"), 0, 100) / 100 if text.endswith("%") else _number(text, 0, 1)
+        return (
+            _number(text.removesuffix("%"), 0, 100) / 100
+            if text.endswith("%")
+            else _number(text, 0, 1)
+        )
     except ValueError as error:
         raise ValueError(f"{error}. Give a share such as 0.001 or 0.1%") from None
 
@@ -361,7 +414,9 @@ def _dropout(text: str) -> "Dropout":
 
     duration, slash, interval = text.partition("/")
     if not slash:
-        raise ValueError("the interval is missing. Give for example 2s/10s: 2 s of silence in every 10 s")
+        raise ValueError(
+            "the interval is missing. Give for example 2s/10s: 2 s of silence in every 10 s"
+        )
     dropout = Dropout(_time(duration), _time(interval))
     if dropout.duration_ns >= dropout.interval_ns:
         raise ValueError("the silence must be shorter than the interval. Give for example 2s/10s")

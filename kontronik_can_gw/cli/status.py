@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3
 RUN_FOLDER = Path("/run")
 _LARGEST_FILE = 1 << 22
-_SUMMARY_BITS = {OperatingError.OPERATING_ERROR_FOUND.text, OperatingError.OPERATING_WARNING_FOUND.text}
+_SUMMARY_BITS = {
+    OperatingError.OPERATING_ERROR_FOUND.text,
+    OperatingError.OPERATING_WARNING_FOUND.text,
+}
 _MEANINGS = {bit.text: bit.meaning for bits in (OperatingError, SelfTestError) for bit in bits}
 _GOOD, _POOR, _BAD, _FAINT = "green", "yellow", "bold red", "dim"
 _CAN_STYLES = {"error-active": _GOOD, "unknown": "", "error-warning": _POOR, "error-passive": _POOR}
@@ -60,9 +63,17 @@ Line = list[Piece]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("-c", "--config", type=Path, metavar="FILE", help="the gateway with this TOML configuration")
-    where.add_argument("--file", type=Path, metavar="FILE", help="the gateway with this statistics file")
-    parser.add_argument("--once", action="store_true", help="show it once, as in a pipe (default on a terminal: live)")
+    where.add_argument(
+        "-c", "--config", type=Path, metavar="FILE", help="the gateway with this TOML configuration"
+    )
+    where.add_argument(
+        "--file", type=Path, metavar="FILE", help="the gateway with this statistics file"
+    )
+    parser.add_argument(
+        "--once",
+        action="store_true",
+        help="show it once, as in a pipe (default on a terminal: live)",
+    )
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
     parser.add_argument(
         "--interval",
@@ -115,7 +126,11 @@ class Node:
 
     def texts(self, key: str) -> list[str]:
         found = self._value.get(key)
-        return [printable(text) for text in found if isinstance(text, str)] if isinstance(found, list) else []
+        return (
+            [printable(text) for text in found if isinstance(text, str)]
+            if isinstance(found, list)
+            else []
+        )
 
     def numbers(self, key: str) -> list[float]:
         found = self._value.get(key)
@@ -149,7 +164,11 @@ def main(args: argparse.Namespace) -> int:
         seen = [look_at(file, now) for file in _service_files()]
         if configuration is not None:
             wanted = printable(str(Path(configuration.file).absolute()))
-            seen = [s for s in seen if s.document is not None and s.document.text("configuration") == wanted]
+            seen = [
+                s
+                for s in seen
+                if s.document is not None and s.document.text("configuration") == wanted
+            ]
         return seen
 
     seen = look()
@@ -210,14 +229,28 @@ def look_at(file: Path, now: int) -> Seen:
             f"{file}: not running: there is no such file. Start the gateway whose statistics.file it is.",
         )
     except OSError as error:
-        return Seen(file, NOT_RUNNING, f"{file}: cannot be read: {error.strerror}. Try it with sudo.")
+        return Seen(
+            file, NOT_RUNNING, f"{file}: cannot be read: {error.strerror}. Try it with sudo."
+        )
     except (ValueError, RecursionError):
-        return Seen(file, NOT_RUNNING, f"{file}: is not a statistics file of {PROGRAM}. Look at statistics.file.")
+        return Seen(
+            file,
+            NOT_RUNNING,
+            f"{file}: is not a statistics file of {PROGRAM}. Look at statistics.file.",
+        )
     document = Node(value)
     if document.text("program") != PROGRAM:
-        return Seen(file, NOT_RUNNING, f"{file}: is not a statistics file of {PROGRAM}. Look at statistics.file.")
+        return Seen(
+            file,
+            NOT_RUNNING,
+            f"{file}: is not a statistics file of {PROGRAM}. Look at statistics.file.",
+        )
     if document.number("format") != FORMAT:
-        return Seen(file, NOT_RUNNING, f"{file}: is of another version of {PROGRAM} ({document.text('version')}).")
+        return Seen(
+            file,
+            NOT_RUNNING,
+            f"{file}: is of another version of {PROGRAM} ({document.text('version')}).",
+        )
     return judge(file, document, now, _is_alive(document.part("process")))
 
 
@@ -340,7 +373,9 @@ def screen(seen: Seen, size: tuple[int, int] | None = None) -> list[Line]:
 
 
 def _wrapped(text: str, style: str, width: int | None) -> list[Line]:
-    parts = [text] if width is None else textwrap.wrap(text, max(20, width), subsequent_indent="    ")
+    parts = (
+        [text] if width is None else textwrap.wrap(text, max(20, width), subsequent_indent="    ")
+    )
     return [[Piece(part, style)] for part in parts]
 
 
@@ -359,14 +394,27 @@ def _head(seen: Seen, document: Node) -> list[Line]:
     pid = process.count("pid")
     if seen.code == NOT_RUNNING:
         first.append(Piece(f", last heard of {document.text('time')}"))
-        return [first, [Piece(where, _FAINT)], [Piece(f"Why? journalctl -e -u '{PROGRAM}*'", _FAINT)]]
+        return [
+            first,
+            [Piece(where, _FAINT)],
+            [Piece(f"Why? journalctl -e -u '{PROGRAM}*'", _FAINT)],
+        ]
     up = duration(process.number("uptime_s") or 0)
-    first.append(Piece(f"  {escs.count('escs_ok')} of {escs.count('esc_count')} ESCs heard, up {up}"))
-    return [first, [Piece(f"process {pid}, {process.count('rss_bytes') // 1_000_000} MB, {where}", _FAINT)]]
+    first.append(
+        Piece(f"  {escs.count('escs_ok')} of {escs.count('esc_count')} ESCs heard, up {up}")
+    )
+    return [
+        first,
+        [Piece(f"process {pid}, {process.count('rss_bytes') // 1_000_000} MB, {where}", _FAINT)],
+    ]
 
 
 def _can_lines(document: Node) -> list[Line]:
-    can, counters, rates = document.part("can"), document.part("can").part("counters"), document.part("rates")
+    can, counters, rates = (
+        document.part("can"),
+        document.part("can").part("counters"),
+        document.part("rates"),
+    )
     state = can.text("state")
     bitrate = can.number("bitrate")
     words = f", {bitrate / 1000:g} kbit/s" if bitrate else ""
@@ -375,7 +423,11 @@ def _can_lines(document: Node) -> list[Line]:
         words += f", {what} {'-' if rate is None else f'{rate:.0f}'}/s"
     if len(errors := can.numbers("error_counters")) == 2:
         words += f", error counters {errors[0]:.0f}/{errors[1]:.0f}"
-    line = [Piece(f"CAN {can.text('channel')}: "), Piece(state, _CAN_STYLES.get(state, _BAD)), Piece(words)]
+    line = [
+        Piece(f"CAN {can.text('channel')}: "),
+        Piece(state, _CAN_STYLES.get(state, _BAD)),
+        Piece(words),
+    ]
     shown = (
         ("dropped_frames", "dropped"),
         ("send_failures", "send failures"),
@@ -383,7 +435,10 @@ def _can_lines(document: Node) -> list[Line]:
         ("id_conflicts", "id conflicts"),
     )
     counts = ", ".join(f"{compact(counters.count(key))} {what}" for key, what in shown)
-    return [line, [Piece(f"     in all: {compact(counters.count('sent_frames'))} sent, {counts}", _FAINT)]]
+    return [
+        line,
+        [Piece(f"     in all: {compact(counters.count('sent_frames'))} sent, {counts}", _FAINT)],
+    ]
 
 
 def _esc_lines(document: Node) -> list[Line]:
@@ -405,12 +460,16 @@ def _esc_lines(document: Node) -> list[Line]:
                 *(_value(values, key, digits) for key, digits in measured),
                 _value(values, "power_stage_temperature", "0"),
                 compact(counters.count("crc_errors")),
-                compact(esc.part("port").part("line_errors").sum() or counters.count("line_errors")),
+                compact(
+                    esc.part("port").part("line_errors").sum() or counters.count("line_errors")
+                ),
                 compact(esc.count("losses")),
             ]
         )
         styles.append(_LINK_STYLES.get(link, "") if fresh else _BAD)
-    widths = [max(least, *(len(row[column]) for row in rows)) for column, least in enumerate(_WIDTHS)]
+    widths = [
+        max(least, *(len(row[column]) for row in rows)) for column, least in enumerate(_WIDTHS)
+    ]
     lines: list[Line] = []
     for row, style in zip(rows, styles, strict=True):
         cells = [
@@ -420,7 +479,9 @@ def _esc_lines(document: Node) -> list[Line]:
         if row is rows[0]:
             lines.append([Piece(" ".join(cells), style)])
         else:
-            lines.append([Piece(f"{cells[0]} "), Piece(cells[1], style), Piece(" " + " ".join(cells[2:]))])
+            lines.append(
+                [Piece(f"{cells[0]} "), Piece(cells[1], style), Piece(" " + " ".join(cells[2:]))]
+            )
     return lines
 
 
@@ -428,7 +489,9 @@ def _age(milliseconds: float | None) -> str:
     if milliseconds is None:
         return "-"
     return (
-        f"{milliseconds:.0f}" if milliseconds < 100_000 else duration(milliseconds * MS / SECOND).replace(" ", "")[:6]
+        f"{milliseconds:.0f}"
+        if milliseconds < 100_000
+        else duration(milliseconds * MS / SECOND).replace(" ", "")[:6]
     )
 
 
@@ -439,13 +502,20 @@ def _value(values: Node, key: str, digits: str) -> str:
 
 def _errors(document: Node) -> Iterator[tuple[str, str]]:
     """What the ESCs themselves report, in words, and the style of it."""
-    shown = (("errors", "error", _BAD), ("selftest_errors", "self-test error", _BAD), ("warnings", "warning", _POOR))
+    shown = (
+        ("errors", "error", _BAD),
+        ("selftest_errors", "self-test error", _BAD),
+        ("warnings", "warning", _POOR),
+    )
     for esc in document.parts("escs"):
         for key, what, style in shown:
             found = esc.texts(key)
             found = [name for name in found if name not in _SUMMARY_BITS] or found
             if found:
-                yield f"{esc.text('name')} {what}: {'; '.join(_MEANINGS.get(name, name) for name in found)}", style
+                yield (
+                    f"{esc.text('name')} {what}: {'; '.join(_MEANINGS.get(name, name) for name in found)}",
+                    style,
+                )
 
 
 def _node_lines(document: Node, width: int | None) -> list[Line]:
@@ -475,7 +545,11 @@ def _recording_lines(document: Node) -> list[Line]:
 
 def _log_lines(document: Node) -> list[Line]:
     lines = document.texts("log")
-    return [[Piece("last events:", _FAINT)], *([Piece(f"  {line}", _FAINT)] for line in lines)] if lines else []
+    return (
+        [[Piece("last events:", _FAINT)], *([Piece(f"  {line}", _FAINT)] for line in lines)]
+        if lines
+        else []
+    )
 
 
 def _joined(parts: Sequence[list[Line]]) -> list[Line]:
@@ -492,7 +566,9 @@ def _joined(parts: Sequence[list[Line]]) -> list[Line]:
 def _rich(line: Line) -> "Text":
     from rich.text import Text
 
-    return Text.assemble(*((piece.text, piece.style) for piece in line), no_wrap=True, overflow="ellipsis")
+    return Text.assemble(
+        *((piece.text, piece.style) for piece in line), no_wrap=True, overflow="ellipsis"
+    )
 
 
 def _live(console: Any, look: Any, interval: float) -> None:
@@ -507,7 +583,9 @@ def _live(console: Any, look: Any, interval: float) -> None:
         seen: list[Seen] = look()
         width, height = console.size
         share = max(3, (height - 1 - len(seen)) // max(1, len(seen)))
-        lines = _joined([screen(each, (width, share)) for each in seen]) or [[Piece(_no_file(None), _BAD)]]
+        lines = _joined([screen(each, (width, share)) for each in seen]) or [
+            [Piece(_no_file(None), _BAD)]
+        ]
         return Group(*map(_rich, lines), _rich([Piece("Ctrl-C ends.", _FAINT)]))
 
     try:

@@ -87,7 +87,9 @@ def load_configuration(path: Path, store: Callable[[Path], ParameterStore] | Non
         with collecting(problems):
             assemble(told_apart(config))
         raise UserError(*problems)
-    return assemble(config, store(parameter_folder(config)) if store and config.canopen.enabled else None)
+    return assemble(
+        config, store(parameter_folder(config)) if store and config.canopen.enabled else None
+    )
 
 
 def check_devices(config: Config) -> None:
@@ -97,7 +99,9 @@ def check_devices(config: Config) -> None:
     for esc in config.esc:
         real = os.path.realpath(esc.port)
         if (other := ports.setdefault(real, esc.name)) != esc.name:
-            problems.append(f"{config.file}: the ports of {other} and {esc.name} are one device, {real}")
+            problems.append(
+                f"{config.file}: the ports of {other} and {esc.name} are one device, {real}"
+            )
     channel = os.path.realpath(config.can.channel.partition("@")[0])
     if "/" in config.can.channel and channel in ports:
         problems.append(
@@ -141,11 +145,17 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     warnings = [check_load(layout, bitrate, data_bitrate, bits)]
     canopen = None
     if plain is not None and kept is not None:
-        foreign = {message.can_id: message.name for message in layout.messages if not message.extended}
+        foreign = {
+            message.can_id: message.name for message in layout.messages if not message.extended
+        }
         canopen, given_way = with_stored(plain, kept.stored, config, escs, foreign)
         if canopen is not plain:
             bits = canopen.nodes(escs).bits_per_second()
-        warnings += [*given_way, *kept.warnings, *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits)]
+        warnings += [
+            *given_way,
+            *kept.warnings,
+            *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits),
+        ]
     damaged = () if kept is None else tuple(kept.damaged)
     mute = unreported(layout, config.dbc.on_loss == "silent")
     said = tuple(warning for warning in (*config.warnings, *ignored, *mute, *warnings) if warning)

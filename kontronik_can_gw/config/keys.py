@@ -35,13 +35,18 @@ _TEXT = r"^[^\x00]*[^\x00\s][^\x00]*$"
 _BYTE = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
 _PORT = "(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5][0-9]{4}|[1-9][0-9]{0,3})"
 _LOOPBACK = rf"(localhost|127(\.{_BYTE}){{3}}|\[::1\]):{_PORT}"
-_BROKER = rf"([A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*\])(:{_PORT})?"
+_BROKER = (
+    rf"([A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*\])(:{_PORT})?"
+)
 _TOPIC = r"[^\s\x00+#/$][^\x00-\x1f\x7f+#/]*(/[^\x00-\x1f\x7f+#/]+){0,7}"
 _LEVEL = "[A-Za-z0-9_-]{1,64}"
 _LONGEST_TOPIC = 200
 _FORMS = {
     "broker": (_BROKER, "a broker, as broker.example, 192.168.1.5:1883 or [fe80::1]:1883"),
-    "topic": (_TOPIC, "the beginning of topics, as kontronik or fleet/north: no + and #, no / at the ends"),
+    "topic": (
+        _TOPIC,
+        "the beginning of topics, as kontronik or fleet/north: no + and #, no / at the ends",
+    ),
     "level": (_LEVEL, "a name of 1 to 64 letters, digits, _ and -"),
 }
 
@@ -54,7 +59,11 @@ def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
     metadata = {"doc": doc, "kind": kind} | limits
     if isinstance(default, dict):
         return field(default_factory=lambda: dict(default), metadata=metadata)
-    return field(metadata=metadata) if default is MISSING else field(default=default, metadata=metadata)
+    return (
+        field(metadata=metadata)
+        if default is MISSING
+        else field(default=default, metadata=metadata)
+    )
 
 
 @dataclass(frozen=True)
@@ -62,7 +71,9 @@ class CanConfig:
     """The CAN interface."""
 
     interface: str = _key(
-        "python-can interface name: socketcan, virtual, pcan, kvaser, slcan ...", "string", "socketcan"
+        "python-can interface name: socketcan, virtual, pcan, kvaser, slcan ...",
+        "string",
+        "socketcan",
     )
     channel: str = _key("channel of that interface, as can0", "string", "can0")
     bitrate: int = _key(
@@ -74,7 +85,11 @@ class CanConfig:
     )
     fd: bool = _key("allow CAN FD messages (longer than 8 bytes)", "boolean", False)
     data_bitrate: int = _key(
-        "bit rate of the CAN FD data phase in bit/s", "integer", 2_000_000, low=10_000, high=8_000_000
+        "bit rate of the CAN FD data phase in bit/s",
+        "integer",
+        2_000_000,
+        low=10_000,
+        high=8_000_000,
     )
 
     options: Mapping[str, str | float] = _key(
@@ -88,7 +103,9 @@ class DbcConfig:
 
     enabled: bool = _key("send the messages of a DBC", "boolean", True)
     file: str = _key(
-        "DBC file, relative to this configuration; 'shipped' is the one of this package", "string", SHIPPED
+        "DBC file, relative to this configuration; 'shipped' is the one of this package",
+        "string",
+        SHIPPED,
     )
     node: str | None = _key("transmitter node in the DBC whose messages are sent", "string", None)
     messages: Sequence[str] = _key(
@@ -119,14 +136,20 @@ class DbcConfig:
         "move the messages so that the lowest id is this", "integer", None, low=0, high=0x1FFFFFFF
     )
     id_step: int | None = _key(
-        "distance of the ids from ESC to ESC when a one-ESC DBC serves several", "integer", None, low=1, high=0x1FFFFFFF
+        "distance of the ids from ESC to ESC when a one-ESC DBC serves several",
+        "integer",
+        None,
+        low=1,
+        high=0x1FFFFFFF,
     )
     bind: Mapping[str, str | float] = _key(
         "'Message.Signal' or 'Signal' = a source ('battery_voltage', 'left.battery_voltage') or a constant number",
         "bindings",
         {},
     )
-    e2e_data_ids: Mapping[str, int] = _key("message name = AUTOSAR E2E data id", "ids", {}, low=0, high=0xFFFF)
+    e2e_data_ids: Mapping[str, int] = _key(
+        "message name = AUTOSAR E2E data id", "ids", {}, low=0, high=0xFFFF
+    )
     units: Mapping[str, str] = _key(
         "unit text of the DBC = the unit that it means", "meanings", {}, values=units.names()
     )
@@ -141,7 +164,12 @@ class CanopenConfig:
 
     enabled: bool = _key("be a CANopen node for each ESC", "boolean", False)
     node_id: int = _key(
-        "node-ID of the first ESC, the others follow; 255: all wait for LSS", "integer", 1, low=1, high=127, also=255
+        "node-ID of the first ESC, the others follow; 255: all wait for LSS",
+        "integer",
+        1,
+        low=1,
+        high=127,
+        also=255,
     )
     eds: str = _key(
         "EDS file the nodes are built from, relative to this configuration; 'shipped' is the one of this package",
@@ -163,7 +191,9 @@ class CanopenConfig:
         high=0xFFFFFFFF,
     )
     self_start: bool = _key(
-        "go OPERATIONAL after boot-up without a master (1F80h); otherwise as the EDS says", "boolean", False
+        "go OPERATIONAL after boot-up without a master (1F80h); otherwise as the EDS says",
+        "boolean",
+        False,
     )
     read_only: bool = _key("refuse every write over the bus, and LSS", "boolean", False)
     cia402_mirrors: bool = _key(
@@ -190,11 +220,17 @@ class EscConfig:
         "",
         pattern="[A-Za-z][A-Za-z0-9_]{0,11}",
     )
-    pole_pairs: int = _key("pole pairs of the motor (half the number of magnets)", "integer", 1, low=1, high=100)
-    gear: Fraction = _key(
-        "motor revolutions per output revolution: a number or 'numerator/denominator'", "ratio", Fraction(1)
+    pole_pairs: int = _key(
+        "pole pairs of the motor (half the number of magnets)", "integer", 1, low=1, high=100
     )
-    cell_count: int = _key("cells of the battery; 0: as the ESC tells", "integer", 0, low=0, high=255)
+    gear: Fraction = _key(
+        "motor revolutions per output revolution: a number or 'numerator/denominator'",
+        "ratio",
+        Fraction(1),
+    )
+    cell_count: int = _key(
+        "cells of the battery; 0: as the ESC tells", "integer", 0, low=0, high=255
+    )
     telemetry_timeout_ms: int = _key(
         "live values older than this are not available", "integer", 250, low=20, high=60_000
     )
@@ -217,7 +253,11 @@ class EscConfig:
     @property
     def settings(self) -> EscSettings:
         return EscSettings(
-            self.name, self.pole_pairs, self.gear, self.cell_count, timeout_ns=self.telemetry_timeout_ms * MS
+            self.name,
+            self.pole_pairs,
+            self.gear,
+            self.cell_count,
+            timeout_ns=self.telemetry_timeout_ms * MS,
         )
 
 
@@ -226,7 +266,9 @@ class RunConfig:
     """How the gateway runs."""
 
     wait_for_devices: bool = _key(
-        "at start: wait for ports and interfaces that are missing instead of ending with an error", "boolean", False
+        "at start: wait for ports and interfaces that are missing instead of ending with an error",
+        "boolean",
+        False,
     )
     realtime_priority: int | None = _key(
         "real-time priority (SCHED_FIFO) and memory that is never given away, so that no other program's load delays a frame "
@@ -268,7 +310,9 @@ class MqttConfig:
     """What ``kontronik-can-gw mqtt`` publishes, and where."""
 
     broker: str | None = _key(
-        "MQTT broker, as broker.example or 192.168.1.5:1883 (default port 1883, with TLS 8883)", "broker", None
+        "MQTT broker, as broker.example or 192.168.1.5:1883 (default port 1883, with TLS 8883)",
+        "broker",
+        None,
     )
     tls: bool = _key("encrypt, and check the broker's certificate and name", "boolean", False)
     ca_file: str | None = _key(
@@ -276,13 +320,19 @@ class MqttConfig:
         "string",
         None,
     )
-    cert_file: str | None = _key("certificate to show to the broker, relative to this configuration", "string", None)
-    key_file: str | None = _key("key of that certificate, relative to this configuration", "string", None)
+    cert_file: str | None = _key(
+        "certificate to show to the broker, relative to this configuration", "string", None
+    )
+    key_file: str | None = _key(
+        "key of that certificate, relative to this configuration", "string", None
+    )
     username: str | None = _key("user name at the broker", "string", None)
     password_file: str | None = _key(
         "file with the password on its first line, relative to this configuration", "string", None
     )
-    gateway: str | None = _key("name of this gateway in the topics (default: the host name)", "level", None)
+    gateway: str | None = _key(
+        "name of this gateway in the topics (default: the host name)", "level", None
+    )
     topic: str = _key("what all topics begin with", "topic", "kontronik")
     rate: float = _key("state messages of each ESC in a second", "number", 1.0, low=0.01, high=20)
     retain: bool = _key("let the broker keep the last state message of each ESC", "boolean", False)
@@ -312,8 +362,12 @@ class RecordConfig:
         "string",
         None,
     )
-    part_mb: int = _key("begin another file when one has so many megabytes", "integer", 64, low=1, high=4000)
-    part_minutes: int = _key("begin another file after so many minutes", "integer", 60, low=1, high=10_000)
+    part_mb: int = _key(
+        "begin another file when one has so many megabytes", "integer", 64, low=1, high=4000
+    )
+    part_minutes: int = _key(
+        "begin another file after so many minutes", "integer", 60, low=1, high=10_000
+    )
     keep_mb: int = _key(
         "remove the oldest captures of the folder when all together have more megabytes; 0: remove nothing",
         "integer",
@@ -322,7 +376,11 @@ class RecordConfig:
         high=10_000_000,
     )
     min_free_mb: int = _key(
-        "record nothing while fewer megabytes are free on the file system", "integer", 100, low=0, high=10_000_000
+        "record nothing while fewer megabytes are free on the file system",
+        "integer",
+        100,
+        low=0,
+        high=10_000_000,
     )
 
 
@@ -379,14 +437,21 @@ class Config:
     @property
     def statistics_path(self) -> Path | None:
         """The statistics file, relative to the configuration; None where it does not say."""
-        return None if self.statistics.file is None else Path(self.file).parent / self.statistics.file
+        return (
+            None if self.statistics.file is None else Path(self.file).parent / self.statistics.file
+        )
 
     @property
     def node_ids(self) -> list[int]:
         """CANopen node-IDs of the ESCs, in their order."""
         base = self.canopen.node_id
-        counted = [base if base == UNCONFIGURED else base + number for number in range(len(self.esc))]
-        return [own if esc.node_id is None else esc.node_id for esc, own in zip(self.esc, counted, strict=True)]
+        counted = [
+            base if base == UNCONFIGURED else base + number for number in range(len(self.esc))
+        ]
+        return [
+            own if esc.node_id is None else esc.node_id
+            for esc, own in zip(self.esc, counted, strict=True)
+        ]
 
 
 _TABLES: dict[str, type[Any]] = {
@@ -428,13 +493,21 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
     try:
         text = path.read_bytes().decode("utf-8-sig")  # Windows' editors put a mark in front
     except OSError as error:
-        advice = " `kontronik-can-gw init` writes an example." if isinstance(error, FileNotFoundError) else ""
+        advice = (
+            " `kontronik-can-gw init` writes an example."
+            if isinstance(error, FileNotFoundError)
+            else ""
+        )
         raise UserError(f"{path}: cannot be read: {error.strerror}.{advice}") from None
     except UnicodeDecodeError:
         raise UserError(f"{path}: is not a text file in UTF-8, so no TOML configuration") from None
     try:
         tables = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # beside TOMLDecodeError: numbers of 5000 digits, 1000 brackets
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:
+        # beside TOMLDecodeError: numbers of 5000 digits, 1000 brackets
         raise UserError(f"{path}: is not valid TOML: {error}") from None
     return _parsed(tables, str(path))
 
@@ -476,12 +549,16 @@ def _parsed(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[s
     _check_escs(escs, file, problems)
     if not is_whole:
         return None, problems
-    config = Config(**cast(Any, made), esc=tuple(escs.values()), file=file, warnings=tuple(warnings))
+    config = Config(
+        **cast(Any, made), esc=tuple(escs.values()), file=file, warnings=tuple(warnings)
+    )
     _check_outputs(config, problems)
     return config, problems
 
 
-def _without_removed_keys(tables: Mapping[str, Any], file: str, warnings: list[str]) -> dict[str, Any]:
+def _without_removed_keys(
+    tables: Mapping[str, Any], file: str, warnings: list[str]
+) -> dict[str, Any]:
     """The tables without keys in ``REMOVED_KEYS``; each of those adds a warning."""
 
     def kept(name: str, place: str, table: Any) -> Any:
@@ -489,12 +566,16 @@ def _without_removed_keys(tables: Mapping[str, Any], file: str, warnings: list[s
             return table
         removed = [key for key in table if f"{name}.{key}" in REMOVED_KEYS]
         for key in removed:
-            warnings.append(f"{file}: {place}.{key}: was removed and is ignored. {REMOVED_KEYS[f'{name}.{key}']}")
+            warnings.append(
+                f"{file}: {place}.{key}: was removed and is ignored. {REMOVED_KEYS[f'{name}.{key}']}"
+            )
         return {key: value for key, value in table.items() if key not in removed}
 
     found = {name: kept(name, name, table) for name, table in tables.items()}
     if isinstance(found.get("esc"), list):
-        found["esc"] = [kept("esc", f"esc[{number}]", entry) for number, entry in enumerate(found["esc"], 1)]
+        found["esc"] = [
+            kept("esc", f"esc[{number}]", entry) for number, entry in enumerate(found["esc"], 1)
+        ]
     return found
 
 
@@ -502,7 +583,9 @@ def schema() -> dict[str, Any]:
     """The JSON Schema (draft 2020-12) of the configuration, for editors."""
     properties: dict[str, Any] = {}
     for name, kind in _TABLES.items():
-        required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]
+        required = [
+            f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING
+        ]
         removed = {
             key.removeprefix(f"{name}."): {"description": f"removed: {advice}", "deprecated": True}
             for key, advice in REMOVED_KEYS.items()
@@ -516,7 +599,9 @@ def schema() -> dict[str, Any]:
         }
         if required:
             table["required"] = required
-        properties[name] = {"type": "array", "minItems": 1, "items": table} if name == "esc" else table
+        properties[name] = (
+            {"type": "array", "minItems": 1, "items": table} if name == "esc" else table
+        )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "kontronik-can-gw configuration",
@@ -577,11 +662,15 @@ def _value(value: Any, f: Field[Any]) -> Any:
             flat = _flat(value) if limits["kind"] == "bindings" else value
             return {name: _entry(name, entry, limits) for name, entry in flat.items()}
         case "names":
-            if not isinstance(value, list) or not all(isinstance(entry, str) and entry.strip() for entry in value):
+            if not isinstance(value, list) or not all(
+                isinstance(entry, str) and entry.strip() for entry in value
+            ):
                 raise ValueError(f'{value!r} is not a list of names, as ["Motor_*"]')
             return tuple(value)
         case "options":
-            if not isinstance(value, dict) or not all(isinstance(entry, (str, int, float)) for entry in value.values()):
+            if not isinstance(value, dict) or not all(
+                isinstance(entry, (str, int, float)) for entry in value.values()
+            ):
                 raise ValueError(f"{value!r} is not a table of texts, numbers and booleans")
             if own := sorted(_OWN_OPTIONS & set(value)):
                 raise ValueError(f"{own[0]} has its own key: can.{own[0]}")
@@ -611,7 +700,11 @@ def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
     """``Message.Signal = x`` without quotes is a nested table in TOML: taken as meant."""
     found: dict[str, Any] = {}
     for name, value in table.items():
-        found |= {f"{name}.{key}": inner for key, inner in value.items()} if isinstance(value, dict) else {name: value}
+        found |= (
+            {f"{name}.{key}": inner for key, inner in value.items()}
+            if isinstance(value, dict)
+            else {name: value}
+        )
     return found
 
 
@@ -679,14 +772,22 @@ def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -
             text = getattr(esc, what)
             key = normalize(text) if what == "name" else text
             if key in seen:
-                problems.append(f"{file}: esc[{number}].{what}: {text!r} is also that of esc[{seen[key]}]")
+                problems.append(
+                    f"{file}: esc[{number}].{what}: {text!r} is also that of esc[{seen[key]}]"
+                )
             seen.setdefault(key, number)
     for number, esc in escs.items():
         key = normalize(esc.name)
         # "max" and "electrical_speed" is "max_electrical_speed"; so is "a_max" beside "a"
         starts = {"", *(normalize(other.name) for other in escs.values())}
-        rests = {key.removeprefix(start) for start in starts if key.startswith(start) and key != start}
-        if any(other.startswith(rest) and other.removeprefix(rest) in names for rest in rests for other in names):
+        rests = {
+            key.removeprefix(start) for start in starts if key.startswith(start) and key != start
+        }
+        if any(
+            other.startswith(rest) and other.removeprefix(rest) in names
+            for rest in rests
+            for other in names
+        ):
             problems.append(
                 f"{file}: esc[{number}].name: {esc.name!r} makes signal names ambiguous. Choose another name."
             )
@@ -716,7 +817,9 @@ def _mqtt_problems(mqtt: MqttConfig) -> list[str]:
         if getattr(mqtt, name) is not None and not mqtt.tls:
             problems.append(f"{name}: is for TLS, which is off. Switch mqtt.tls on (--tls).")
     if mqtt.key_file is not None and mqtt.cert_file is None:
-        problems.append("key_file: needs the certificate that it belongs to. Set mqtt.cert_file (--cert-file).")
+        problems.append(
+            "key_file: needs the certificate that it belongs to. Set mqtt.cert_file (--cert-file)."
+        )
     if mqtt.password_file is not None and mqtt.username is None:
         problems.append("password_file: needs a user name. Set mqtt.username (--username).")
     return problems
@@ -725,12 +828,20 @@ def _mqtt_problems(mqtt: MqttConfig) -> list[str]:
 def _check_outputs(config: Config, problems: list[str]) -> None:
     file, canopen = config.file, config.canopen
     if (path := config.statistics_path) is not None:
-        read = {"the configuration": Path(file), "the DBC": config.dbc_path, "the EDS": config.eds_path}
+        read = {
+            "the configuration": Path(file),
+            "the DBC": config.dbc_path,
+            "the EDS": config.eds_path,
+        }
         for what, other in read.items():
             if normpath(path) == normpath(other):
-                problems.append(f"{file}: statistics.file: {str(path)!r} is {what}, which would be overwritten")
+                problems.append(
+                    f"{file}: statistics.file: {str(path)!r} is {what}, which would be overwritten"
+                )
     if not config.dbc.enabled and not canopen.enabled:
-        problems.append(f"{file}: dbc.enabled, canopen.enabled: both are false, so nothing would be sent. Enable one.")
+        problems.append(
+            f"{file}: dbc.enabled, canopen.enabled: both are false, so nothing would be sent. Enable one."
+        )
     if not canopen.enabled:
         return
     seen: dict[int, int] = {}
@@ -746,14 +857,18 @@ def _check_outputs(config: Config, problems: list[str]) -> None:
                 f"{file}: esc[{number}]: its node-ID would be {node_id}. Choose a smaller canopen.node_id, or a node_id for it."
             )
         elif node_id in seen:
-            problems.append(f"{file}: esc[{number}].node_id: {node_id} is also that of esc[{seen[node_id]}]")
+            problems.append(
+                f"{file}: esc[{number}].node_id: {node_id} is also that of esc[{seen[node_id]}]"
+            )
         seen.setdefault(node_id, number)
 
 
 def name_problem(names: Sequence[str]) -> str | None:
     """Why ESCs with these names cannot be told apart; None where they can."""
     problems: list[str] = []
-    _check_escs({n: EscConfig(port=str(n), name=name) for n, name in enumerate(names, 1)}, "", problems)
+    _check_escs(
+        {n: EscConfig(port=str(n), name=name) for n, name in enumerate(names, 1)}, "", problems
+    )
     return problems[0].partition(".name: ")[2] if problems else None
 
 
@@ -769,9 +884,16 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
     entry: dict[str, Any] = {"description": limits["doc"]}
     match limits["kind"]:
         case "integer":
-            entry |= {"type": "integer", "minimum": limits["low"], "maximum": limits.get("also", limits["high"])}
+            entry |= {
+                "type": "integer",
+                "minimum": limits["low"],
+                "maximum": limits.get("also", limits["high"]),
+            }
             if "also" in limits:
-                entry["not"] = {"exclusiveMinimum": limits["high"], "exclusiveMaximum": limits["also"]}
+                entry["not"] = {
+                    "exclusiveMinimum": limits["high"],
+                    "exclusiveMaximum": limits["also"],
+                }
         case "ratio":
             entry |= {
                 "anyOf": [
@@ -783,7 +905,9 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
             value = {"anyOf": [{"type": "string", "pattern": _NOT_BLANK}, {"type": "number"}]}
             entry |= {
                 "type": "object",
-                "additionalProperties": {"anyOf": [value, {"type": "object", "additionalProperties": value}]},
+                "additionalProperties": {
+                    "anyOf": [value, {"type": "object", "additionalProperties": value}]
+                },
             }
         case "options":
             scalar = {"type": ["string", "number", "boolean"]}
@@ -801,7 +925,11 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
         case "loopback":
             entry |= {"type": "string", "pattern": f"^{_LOOPBACK}$"}
         case "broker" | "topic" | "level" as kind:
-            entry |= {"type": "string", "pattern": f"^{_FORMS[kind][0]}$", "maxLength": _LONGEST_TOPIC}
+            entry |= {
+                "type": "string",
+                "pattern": f"^{_FORMS[kind][0]}$",
+                "maxLength": _LONGEST_TOPIC,
+            }
         case kind:
             entry["type"] = kind
             if kind == "string":
@@ -822,7 +950,11 @@ def _toml_table(head: str, table: Any) -> list[str]:
         value = getattr(table, f.name)
         if isinstance(value, Mapping):
             if value:
-                nested += ["", f"{head[:-1]}.{f.name}]", *(f"{_toml(k)} = {_toml(v)}" for k, v in value.items())]
+                nested += [
+                    "",
+                    f"{head[:-1]}.{f.name}]",
+                    *(f"{_toml(k)} = {_toml(v)}" for k, v in value.items()),
+                ]
         elif value is not None:
             lines.append(f"{f.name} = {_toml(value)}")
     return [*lines, *nested, ""]

@@ -42,7 +42,9 @@ def load_eds(config: Config) -> Eds:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)  # no more is needed to see that it is too large
     except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file.") from None
+        raise UserError(
+            f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file."
+        ) from None
     eds = eds_of(data, str(path))
     if not config.canopen.cia402_mirrors:
         eds = eds_of(without(data, range(0x6000, 0x6800)), str(path))
@@ -81,7 +83,9 @@ def plain_setup(config: Config) -> CanopenSetup:
                 device=next((device for device in Device if device.text == esc.device), None),
             )
         )
-    return CanopenSetup(load_eds(config), tuple(settings), (Stored(),) * len(settings), tuple(config.escs))
+    return CanopenSetup(
+        load_eds(config), tuple(settings), (Stored(),) * len(settings), tuple(config.escs)
+    )
 
 
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:
@@ -139,13 +143,21 @@ def with_stored(
             )
             kept[number] = replace(kept[number], node_id=None).unverified()
     setup = replace(plain, stored=tuple(kept))
-    while clash := [n for n in _clashing_nodes(setup.nodes(escs, foreign), foreign) if kept[n] != Stored()]:
+    while clash := [
+        n for n in _clashing_nodes(setup.nodes(escs, foreign), foreign) if kept[n] != Stored()
+    ]:
         for number in clash:
             ids = {key for key in kept[number].communication if key >> 8 in _WITH_COB_ID}
             if ids:
-                left = {key: value for key, value in kept[number].communication.items() if key not in ids}
+                left = {
+                    key: value
+                    for key, value in kept[number].communication.items()
+                    if key not in ids
+                }
                 kept[number] = replace(kept[number], communication=left).unverified()
-                said.append(f"{names[number]}: the stored COB-IDs are passed over: one is used otherwise now")
+                said.append(
+                    f"{names[number]}: the stored COB-IDs are passed over: one is used otherwise now"
+                )
             elif kept[number].node_id is not None:
                 said.append(
                     f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: its COB-IDs are used otherwise"
@@ -162,12 +174,18 @@ _WITH_COB_ID = frozenset({0x1005, 0x1014, *range(0x1800, 0x1A00)})
 
 def _clashing_node_ids(settings: Sequence[NodeSettings], kept: Sequence[Stored]) -> list[int]:
     """Nodes whose stored node-ID is that of another, or none where LSS is refused."""
-    ids = [own.node_id if s.node_id is None else s.node_id for own, s in zip(settings, kept, strict=True)]
+    ids = [
+        own.node_id if s.node_id is None else s.node_id
+        for own, s in zip(settings, kept, strict=True)
+    ]
     return [
         number
         for number, (own, node_id) in enumerate(zip(settings, ids, strict=True))
         if kept[number].node_id is not None
-        and ((node_id != UNCONFIGURED and ids.count(node_id) > 1) or (node_id == UNCONFIGURED and own.read_only))
+        and (
+            (node_id != UNCONFIGURED and ids.count(node_id) > 1)
+            or (node_id == UNCONFIGURED and own.read_only)
+        )
     ]
 
 
@@ -186,12 +204,16 @@ def _clashing_nodes(nodes: Nodes, foreign: Mapping[int, str]) -> list[int]:
     return sorted(found)
 
 
-def load_of_stored(before: str | None, layout: Layout, bitrate: int, data_bitrate: int, bits: float) -> list[str]:
+def load_of_stored(
+    before: str | None, layout: Layout, bitrate: int, data_bitrate: int, bits: float
+) -> list[str]:
     """A warning where it is what masters stored that fills the bus; such a gateway runs all the same."""
     load = layout.bus_load(bitrate, data_bitrate) + bits / bitrate
     if before is not None or load <= WARN_LOAD:
         return []
-    return [f"with what masters stored, {load:.0%} of {bitrate // 1000} kbit/s are needed; other nodes get little"]
+    return [
+        f"with what masters stored, {load:.0%} of {bitrate // 1000} kbit/s are needed; other nodes get little"
+    ]
 
 
 def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:

@@ -21,7 +21,9 @@ class Binder:
         self.used: set[str] = set()
         self._sources = [sources(esc) for esc in escs]
         self._by_key = {normalize(name): name for name in self._sources[0]}
-        self._prefixes = sorted(((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0]))
+        self._prefixes = sorted(
+            ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
+        )
 
     def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Source, int | None] | None:
         """The source of a normalized name, ``percent`` at its end ignored; ``esc`` None: unprefixed."""

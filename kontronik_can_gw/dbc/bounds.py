@@ -75,12 +75,18 @@ def check_bounds(text: str, path: str) -> None:
     """UserError with the first number of a DBC that is out of all bounds: where it is, what it is, what it may be."""
     text = _TEXT.sub(_masked, text)
     if len(text) > _MAX_TOKENS and next(islice(_TOKEN.finditer(text), _MAX_TOKENS, None), None):
-        raise UserError(f"{path}: has more than {_MAX_TOKENS} words and numbers. Remove messages that are not needed.")
+        raise UserError(
+            f"{path}: has more than {_MAX_TOKENS} words and numbers. Remove messages that are not needed."
+        )
     if found := _MANY_DIGITS.search(text):
-        raise UserError(f"{path}: line {_line(text, found)}: a number of more than {_MAX_DIGITS} digits. Correct it.")
+        raise UserError(
+            f"{path}: line {_line(text, found)}: a number of more than {_MAX_DIGITS} digits. Correct it."
+        )
     for bound, number, where in _numbers(text):
         if not bound.low <= number <= bound.high:
-            raise UserError(f"{path}: {where}{bound.what} is {number}, not {bound.low} to {bound.high}. Correct it.")
+            raise UserError(
+                f"{path}: {where}{bound.what} is {number}, not {bound.low} to {bound.high}. Correct it."
+            )
 
 
 def _masked(found: re.Match[str]) -> str:
@@ -117,7 +123,10 @@ class _Message:
             inner[self._parent(name)].append(name)
 
         def size(name: str, depth: int) -> tuple[int, int]:
-            deepest, total = depth, self.texts[name] + sum(self.values[child] for child in children[name])
+            deepest, total = (
+                depth,
+                self.texts[name] + sum(self.values[child] for child in children[name]),
+            )
             for child in inner[name] if depth <= _NESTING.high else ():
                 nested, more = size(child, depth + 1)
                 deepest, total = max(deepest, nested), total + self.values[child] * (1 + more)
@@ -187,9 +196,13 @@ def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> Iterator[tuple
             message.parents[name] = parent
 
 
-def _value_tables(text: str, messages: Mapping[int, list[_Message]]) -> Iterator[tuple[_Bound, int, str]]:
+def _value_tables(
+    text: str, messages: Mapping[int, list[_Message]]
+) -> Iterator[tuple[_Bound, int, str]]:
     """A table that many signals name takes as much as if it were written for each."""
-    tables = {found[1]: (len(found[2]), found[2].count('"') // 2) for found in _VALUE_TABLE.finditer(text)}
+    tables = {
+        found[1]: (len(found[2]), found[2].count('"') // 2) for found in _VALUE_TABLE.finditer(text)
+    }
     size = 0
     for found in _VALUES.finditer(text):
         named = _TABLE_NAME.match(found[3])

@@ -21,7 +21,15 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.esc.values import Group, Source
 from kontronik_can_gw.signals import units
-from kontronik_can_gw.signals.plan import FD_LENGTHS, Layout, MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.signals.plan import (
+    FD_LENGTHS,
+    Layout,
+    MessagePlan,
+    Piece,
+    Role,
+    SendType,
+    SignalPlan,
+)
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
@@ -89,10 +97,17 @@ def compile_layout(
         known = [m.name for m in ours] + [f"{m.name}.{s.name}" for m in ours for s in m.signals]
         near = difflib.get_close_matches(key, known, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
-        compiler.problems.append(f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{hint}")
+        compiler.problems.append(
+            f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{hint}"
+        )
     for table, given, met, what in (
         ("units", settings.units, compiler.units, "signal of {} has this unit"),
-        ("send_type", settings.send_types, compiler.send_types, "message of {} has this GenMsgSendType"),
+        (
+            "send_type",
+            settings.send_types,
+            compiler.send_types,
+            "message of {} has this GenMsgSendType",
+        ),
     ):
         for text in sorted(set(given) - met):
             near = difflib.get_close_matches(text, met, n=1, cutoff=0.3)
@@ -113,13 +128,20 @@ def compile_layout(
             f"{file}: sent once at the start, without a cycle and a value that changes: {listed(once)}"
         )
     if names := compiler.while_active:
-        compiler.warnings.append(f"{file}: sent all the time, not only while something is active: {listed(names)}")
+        compiler.warnings.append(
+            f"{file}: sent all the time, not only while something is active: {listed(names)}"
+        )
     return Layout(file, node, tuple(plans), tuple(compiler.warnings))
 
 
 class _Compiler:
     def __init__(
-        self, database: "Database", file: str, escs: Sequence[EscSettings], settings: DbcSettings, fd_allowed: bool
+        self,
+        database: "Database",
+        file: str,
+        escs: Sequence[EscSettings],
+        settings: DbcSettings,
+        fd_allowed: bool,
     ) -> None:
         self.database = database
         self.file = file
@@ -147,11 +169,15 @@ class _Compiler:
                 )
             other = names.setdefault(message.name, message)
             if other is not message and mine & {id(message), id(other)}:
-                self.problems.append(f"{self.file}: {message.name}: two messages have this name. Rename one of them.")
+                self.problems.append(
+                    f"{self.file}: {message.name}: two messages have this name. Rename one of them."
+                )
             if id(message) in mine:
                 counted = Counter(signal.name for signal in message.signals)
                 for name in (name for name, count in counted.items() if count > 1):
-                    self.problems.append(f"{self.file}: {message.name}.{name}: two signals have this name. Rename one.")
+                    self.problems.append(
+                        f"{self.file}: {message.name}.{name}: two signals have this name. Rename one."
+                    )
         for message in ours:
             if not message.is_extended_frame and message.frame_id in taken:
                 self.problems.append(
@@ -180,12 +206,18 @@ class _Compiler:
             return None
         send_type, cycle_ms, delay_ms = self._timing(message, where)
         multiplexers = [s for s in message.signals if s.is_multiplexer]
-        if len(multiplexers) > 1 or any(s.is_multiplexer and s.multiplexer_ids for s in message.signals):
-            self.problems.append(f"{where}: has more than one level of multiplexing; one is supported.")
+        if len(multiplexers) > 1 or any(
+            s.is_multiplexer and s.multiplexer_ids for s in message.signals
+        ):
+            self.problems.append(
+                f"{where}: has more than one level of multiplexing; one is supported."
+            )
             return None
         pages: set[int] = {page for s in message.signals for page in s.multiplexer_ids or ()}
         if len(pages) > _MAX_PAGES:
-            self.problems.append(f"{where}: has {len(pages)} multiplexer values; {_MAX_PAGES} are supported.")
+            self.problems.append(
+                f"{where}: has {len(pages)} multiplexer values; {_MAX_PAGES} are supported."
+            )
             return None
         signals: list[SignalPlan] = []
         for signal in message.signals:
@@ -194,9 +226,15 @@ class _Compiler:
                     signals.append(plan)
         self._check_overlap(message, where)
         for multiplexer in multiplexers:
-            room = (1 << multiplexer.length - (1 if multiplexer.is_signed else 0)) if not multiplexer.is_float else 0
+            room = (
+                (1 << multiplexer.length - (1 if multiplexer.is_signed else 0))
+                if not multiplexer.is_float
+                else 0
+            )
             for page in sorted(p for p in pages if p >= room):
-                self.problems.append(f"{where}.{multiplexer.name}: cannot hold the multiplexer value {page} (m{page}).")
+                self.problems.append(
+                    f"{where}.{multiplexer.name}: cannot hold the multiplexer value {page} (m{page})."
+                )
         for paged in signals:
             if paged.page is not None and paged.role in (Role.ALIVE, Role.CRC):
                 self.problems.append(
@@ -228,9 +266,14 @@ class _Compiler:
             data_id=self.settings.data_ids.get(message.name, message.frame_id & 0xFFFF),
         )
 
-    def _check_e2e(self, message: "Message", where: str, crc: SignalPlan, alive: Sequence[SignalPlan]) -> None:
+    def _check_e2e(
+        self, message: "Message", where: str, crc: SignalPlan, alive: Sequence[SignalPlan]
+    ) -> None:
         """A checksum is sent only as AUTOSAR E2E profile 1, and only where that is said or its names are those of always."""
-        asked = message.name in self.settings.data_ids or self.binder.bound(message.name, crc.name) is not None
+        asked = (
+            message.name in self.settings.data_ids
+            or self.binder.bound(message.name, crc.name) is not None
+        )
         fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
         one = len(alive) == 1 and alive[0].high >= 14
         key = f"dbc.e2e_data_ids.{message.name} = 0x{message.frame_id & 0xFFFF:X}"
@@ -245,13 +288,17 @@ class _Compiler:
             )
             return
         if not fits:
-            self.problems.append(f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte border.")
+            self.problems.append(
+                f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte border."
+            )
         if not one:
             self.problems.append(
                 f"{where}: {crc.name}: E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
             )
         if not asked:
-            self.warnings.append(f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. If that is right, say so: {key}")
+            self.warnings.append(
+                f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. If that is right, say so: {key}"
+            )
 
     def _timing(self, message: "Message", where: str) -> tuple[SendType, int, int]:
         def number(name: str) -> int:
@@ -263,7 +310,9 @@ class _Compiler:
                     raise ValueError
                 return round(float(value))
             except (ValueError, OverflowError):
-                self.problems.append(f"{where}: {name} is {str(value)[:40]!r}, which is no time in ms.")
+                self.problems.append(
+                    f"{where}: {name} is {str(value)[:40]!r}, which is no time in ms."
+                )
                 return 0
 
         cycle, delay = number("GenMsgCycleTime"), number("GenMsgDelayTime")
@@ -292,19 +341,29 @@ class _Compiler:
         used: Counter[int | None] = Counter()
         """Bits in use, as a mask for each page."""
         placed: list[tuple[str, int, set[int | None]]] = []
-        every: set[int | None] = {None} | {page for s in message.signals for page in s.multiplexer_ids or ()}
+        every: set[int | None] = {None} | {
+            page for s in message.signals for page in s.multiplexer_ids or ()
+        }
         for signal in message.signals:
-            mask = sum(1 << bit for bit in _bits(signal)) if signal.length <= message.length * 8 else -1
+            mask = (
+                sum(1 << bit for bit in _bits(signal))
+                if signal.length <= message.length * 8
+                else -1
+            )
             if mask < 0 or mask.bit_length() > message.length * 8:
                 self.problems.append(
                     f"{where}.{signal.name}: lies outside the message's {message.length} bytes. Move or shorten it."
                 )
                 continue
-            pages: set[int | None] = set(signal.multiplexer_ids) if signal.multiplexer_ids else every
+            pages: set[int | None] = (
+                set(signal.multiplexer_ids) if signal.multiplexer_ids else every
+            )
             left = mask if any(used[page] & mask for page in pages) else 0
             for other, others_mask, others_pages in placed if left else ():
                 if others_mask & left and others_pages & pages and other != signal.name:
-                    self.problems.append(f"{where}.{signal.name}: overlaps {other}. Move one of them.")
+                    self.problems.append(
+                        f"{where}.{signal.name}: overlaps {other}. Move one of them."
+                    )
                     left &= ~others_mask
             for page in pages:
                 used[page] |= mask
@@ -323,26 +382,42 @@ class _Compiler:
         if length > message.length * 8:
             return None  # which _check_overlap reports
         if is_float and length not in (32, 64):
-            self.problems.append(f"{where}: a float of {length} bits cannot be sent; 32 and 64 can.")
+            self.problems.append(
+                f"{where}: a float of {length} bits cannot be sent; 32 and 64 can."
+            )
             return None
         told = (signal.scale, signal.offset, signal.minimum or 0, signal.maximum or 0)
         if not all(math.isfinite(number) for number in told):
-            self.problems.append(f"{where}: has a factor, offset or limit that is no finite number.")
+            self.problems.append(
+                f"{where}: has a factor, offset or limit that is no finite number."
+            )
             return None
         factor, offset = _exact(signal.scale), _exact(signal.offset)
         if factor == 0:
             self.problems.append(f"{where}: has factor 0.")
             return None
         codes = {normalize(str(text)): int(raw) for raw, text in (signal.choices or {}).items()}
-        low, high = (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
-        wide = [f"{raw} {str(text)!r}" for raw, text in (signal.choices or {}).items() if not low <= int(raw) <= high]
+        low, high = (
+            (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        )
+        wide = [
+            f"{raw} {str(text)!r}"
+            for raw, text in (signal.choices or {}).items()
+            if not low <= int(raw) <= high
+        ]
         if wide and not is_float:
             self.problems.append(
                 f"{where}: cannot hold {', '.join(wide)} of its value table; its values are {low} to {high}."
             )
             return None
-        if is_float and length == 32 and any(abs(int(raw)) > _LARGEST_FLOAT for raw in signal.choices or {}):
-            self.problems.append(f"{where}: has a value table with numbers that no 32-bit float holds.")
+        if (
+            is_float
+            and length == 32
+            and any(abs(int(raw)) > _LARGEST_FLOAT for raw in signal.choices or {})
+        ):
+            self.problems.append(
+                f"{where}: has a value table with numbers that no 32-bit float holds."
+            )
             return None
         start = attribute(signal, "GenSigStartValue", self.database)
         not_available = next((codes[t] for t in codes if t in _NOT_AVAILABLE_TEXTS), None)
@@ -368,13 +443,17 @@ class _Compiler:
             "offset": offset,
             "texts": _value_texts(signal),
         }
-        special = [code for name, code in codes.items() if name in _NOT_AVAILABLE_TEXTS | _ERROR_TEXTS]
+        special = [
+            code for name, code in codes.items() if name in _NOT_AVAILABLE_TEXTS | _ERROR_TEXTS
+        ]
         limits_set = not (signal.minimum is None and signal.maximum is None) and not (
             signal.minimum == 0 and signal.maximum == 0
         )
         if limits_set:
             ends = sorted(
-                (_exact(end) - offset) / factor for end in (signal.minimum, signal.maximum) if end is not None
+                (_exact(end) - offset) / factor
+                for end in (signal.minimum, signal.maximum)
+                if end is not None
             )
             if signal.minimum is not None and signal.maximum is not None:
                 low, high = max(low, math.ceil(ends[0])), min(high, math.floor(ends[1]))
@@ -391,7 +470,9 @@ class _Compiler:
         if isinstance(bound, (int, float)):
             constant = _constant(bound, factor, offset, length, signed, is_float)
             if constant is None:
-                self.problems.append(f"{where}: the constant {bound} bound to it cannot be sent exactly.")
+                self.problems.append(
+                    f"{where}: the constant {bound} bound to it cannot be sent exactly."
+                )
                 return None
             return SignalPlan(role=Role.CONSTANT, constant=constant, **base)
         name = signal.name if bound is None else bound
@@ -408,7 +489,11 @@ class _Compiler:
             return SignalPlan(role=Role.CRC, **base)
         if found is None and bound is None and self.settings.unbound == "start_value":
             constant = self._start_value(where, signal, base, codes)
-            return None if constant is None else SignalPlan(role=Role.CONSTANT, constant=constant, unbound=True, **base)
+            return (
+                None
+                if constant is None
+                else SignalPlan(role=Role.CONSTANT, constant=constant, unbound=True, **base)
+            )
         if found is None:
             self.unbound += bound is None
             via = f" (bound by dbc.bind to {bound!r})" if bound is not None else ""
@@ -420,7 +505,9 @@ class _Compiler:
         source, esc = found
         if esc is None and source.group is not Group.GATEWAY:
             names = " or ".join(f"{e.name}.{source.name}" for e in self.binder.escs[:2])
-            self.problems.append(f"{where}: does not say of which ESC. Prefix it or bind it: {names}.")
+            self.problems.append(
+                f"{where}: does not say of which ESC. Prefix it or bind it: {names}."
+            )
             return None
         return self._bound_signal(where, signal, source, esc, base, codes)
 
@@ -435,7 +522,10 @@ class _Compiler:
         length, signed = signal.length, signal.is_signed
         if signal.is_float and isinstance(start, (int, float)):
             raw = _constant(start, Fraction(1), Fraction(0), length, signed, is_float=True)
-        elif _is_raw(start, *((-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1))):
+        elif _is_raw(
+            start,
+            *((-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)),
+        ):
             raw = int(start)
         else:
             raw = None
@@ -473,7 +563,9 @@ class _Compiler:
         notes: list[str] = []
         if source.names:
             by_text = {
-                number: codes[normalize(text)] for number, text in source.names.items() if normalize(text) in codes
+                number: codes[normalize(text)]
+                for number, text in source.names.items()
+                if normalize(text) in codes
             }
             if by_text:
                 numbers = by_text
@@ -501,8 +593,11 @@ class _Compiler:
             if step > 1 and source.whole:
                 notes.append(f"resolution {_number(abs(factor))} {unit or source.unit}".rstrip())
             if not source.rolls:
-                ends = [end * slope + intercept for end in (source.low, source.high) if end is not None]
-                if ends and (min(ends) < low - 2 or max(ends) > high + 2):  # more than NotAvailable and Error cost
+                ends = [
+                    end * slope + intercept for end in (source.low, source.high) if end is not None
+                ]
+                if ends and (min(ends) < low - 2 or max(ends) > high + 2):
+                    # more than NotAvailable and Error cost
                     first, last = sorted(end * factor + offset for end in (low, high))
                     text = f"{_number(first)} to {_number(last)} {unit or source.unit}".rstrip()
                     notes.append(f"range {text}, beyond it Error")
@@ -514,7 +609,11 @@ class _Compiler:
                 return None
             if (on_loss := self._flag_on_loss(signal, codes)) is not None:
                 base |= {"not_available": raws[on_loss], "error": raws[on_loss]}
-                base |= {"low": min(raws), "high": max(raws)}  # a text "Error" at one of them is no code
+                # a text "Error" at one of them is no code
+                base |= {
+                    "low": min(raws),
+                    "high": max(raws),
+                }
         if source.rolls:
             if slope != 1 or intercept != 0 or low != 0 or high < 1 or signal.is_float:
                 self.problems.append(
@@ -522,8 +621,14 @@ class _Compiler:
                 )
                 return None
             notes.append(f"starts again at 0 after {high}")
-        if not signal.is_float and not _NOT_AVAILABLE_TEXTS & set(codes) and low <= base["not_available"] <= high:
-            notes.append(f"not available is sent as {_number(base['not_available'] * factor + offset)}")
+        if (
+            not signal.is_float
+            and not _NOT_AVAILABLE_TEXTS & set(codes)
+            and low <= base["not_available"] <= high
+        ):
+            notes.append(
+                f"not available is sent as {_number(base['not_available'] * factor + offset)}"
+            )
         return SignalPlan(
             role=Role.SOURCE,
             source=source,
@@ -538,16 +643,27 @@ class _Compiler:
 
 def _is_raw(value: Any, low: int, high: int) -> bool:
     """True for a number that is a raw value."""
-    return isinstance(value, (int, float)) and math.isfinite(value) and value == int(value) and low <= value <= high
+    return (
+        isinstance(value, (int, float))
+        and math.isfinite(value)
+        and value == int(value)
+        and low <= value <= high
+    )
 
 
 def _value_texts(signal: "Signal") -> dict[int, str]:
     """The value table without its codes."""
     table = {int(raw): str(text) for raw, text in (signal.choices or {}).items()}
-    return {raw: text for raw, text in table.items() if normalize(text) not in _NOT_AVAILABLE_TEXTS | _ERROR_TEXTS}
+    return {
+        raw: text
+        for raw, text in table.items()
+        if normalize(text) not in _NOT_AVAILABLE_TEXTS | _ERROR_TEXTS
+    }
 
 
-def _float_codes(signal: "Signal", factor: Fraction, offset: Fraction, codes: Mapping[str, int]) -> dict[str, Any]:
+def _float_codes(
+    signal: "Signal", factor: Fraction, offset: Fraction, codes: Mapping[str, int]
+) -> dict[str, Any]:
     """Limits and codes of a float signal: those of its value table as floats, else NaN."""
     code = "<f" if signal.length == 32 else "<d"
 
@@ -555,9 +671,18 @@ def _float_codes(signal: "Signal", factor: Fraction, offset: Fraction, codes: Ma
         number = next((float(codes[text]) for text in codes if text in texts), math.nan)
         return int.from_bytes(struct.pack(code, number), "little")
 
-    found: dict[str, Any] = {"not_available": pattern(_NOT_AVAILABLE_TEXTS), "error": pattern(_ERROR_TEXTS)}
-    if signal.minimum is not None and signal.maximum is not None and (signal.minimum, signal.maximum) != (0, 0):
-        ends = sorted(float((_exact(end) - offset) / factor) for end in (signal.minimum, signal.maximum))
+    found: dict[str, Any] = {
+        "not_available": pattern(_NOT_AVAILABLE_TEXTS),
+        "error": pattern(_ERROR_TEXTS),
+    }
+    if (
+        signal.minimum is not None
+        and signal.maximum is not None
+        and (signal.minimum, signal.maximum) != (0, 0)
+    ):
+        ends = sorted(
+            float((_exact(end) - offset) / factor) for end in (signal.minimum, signal.maximum)
+        )
         found["limits"] = (ends[0], ends[1])
     return found
 

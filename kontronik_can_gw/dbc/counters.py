@@ -15,14 +15,30 @@ class Kind(Enum):
 
 
 _E2E_COUNTERS = (
-    *("alive", "alivecounter", "alivecount", "livecounter", "messagecounter", "rollingcounter", "sequencecounter"),
+    *(
+        "alive",
+        "alivecounter",
+        "alivecount",
+        "livecounter",
+        "messagecounter",
+        "rollingcounter",
+        "sequencecounter",
+    ),
 )
 _E2E_CHECKSUMS = ("crc", "crc8", "checksum")
 """Beside each other they mean AUTOSAR E2E profile 1 without being asked, as they did in the first versions."""
 _ENDINGS = {
     Kind.COUNTER: (
         *(*_E2E_COUNTERS, "alivecnt", "alivecntr", "alivectr", "livecnt", "livecntr"),
-        *("messagecount", "msgcounter", "msgcount", "msgcntr", "msgcnt", "msgctr", "botschaftszaehler"),
+        *(
+            "messagecount",
+            "msgcounter",
+            "msgcount",
+            "msgcntr",
+            "msgcnt",
+            "msgctr",
+            "botschaftszaehler",
+        ),
         *("rollingcount", "rollingcnt", "rollcounter", "rollcnt", "rollctr"),
         *("sequencecount", "seqcounter", "seqcnt", "seqctr"),
     ),
@@ -50,7 +66,9 @@ def kind(name: str) -> Kind | None:
 
 def is_e2e(checksum: str, counter: str) -> bool:
     """True for two names that mean AUTOSAR E2E profile 1."""
-    return normalize(checksum).endswith(_E2E_CHECKSUMS) and normalize(counter).endswith(_E2E_COUNTERS)
+    return normalize(checksum).endswith(_E2E_CHECKSUMS) and normalize(counter).endswith(
+        _E2E_COUNTERS
+    )
 
 
 def suspect(name: str) -> Kind | None:

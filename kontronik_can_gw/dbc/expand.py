@@ -28,7 +28,10 @@ def esc_prefix(name: str) -> str:
 
 
 def needs_expansion(
-    database: "Database", node: str, escs: Sequence[EscSettings], bind: Mapping[str, str | float] | None = None
+    database: "Database",
+    node: str,
+    escs: Sequence[EscSettings],
+    bind: Mapping[str, str | float] | None = None,
 ) -> bool:
     """True for several ESCs and a DBC that describes one."""
     return len(escs) > 1 and is_one_esc_layout(database, node, Binder(escs, bind or {}))
@@ -53,11 +56,19 @@ def expand(
 
     bind = dict(bind or {})
     ours = [message for message in database.messages if node in message.senders]
-    per_esc = [message for message in ours if _speaks_of_an_esc(message, bind)] if len(escs) > 1 else []
+    per_esc = (
+        [message for message in ours if _speaks_of_an_esc(message, bind)] if len(escs) > 1 else []
+    )
     shift = 0 if base_id is None else base_id - min(message.frame_id for message in ours)
     once = [message for message in database.messages if message not in per_esc]
     taken = {(m.frame_id + (shift if m in ours else 0), m.is_extended_frame) for m in once}
-    step = _step([(m.frame_id + shift, m.is_extended_frame) for m in per_esc], taken, len(escs), id_step, file)
+    step = _step(
+        [(m.frame_id + shift, m.is_extended_frame) for m in per_esc],
+        taken,
+        len(escs),
+        id_step,
+        file,
+    )
     messages: list[Message] = []
     moved: dict[int, list[tuple[int, dict[str, str]]]] = {}
     moves: list[tuple[int, int, bool]] = []
@@ -81,7 +92,9 @@ def expand(
                         out_bind[f"{made.name}.{new.name}"] = value
                         break
             messages.append(made)
-            names = {old.name: new.name for old, new in zip(message.signals, made.signals, strict=True)}
+            names = {
+                old.name: new.name for old, new in zip(message.signals, made.signals, strict=True)
+            }
             moved.setdefault(frame_id(message), []).append((frame_id(made), names))
     problems = [f"{file}: {problem}" for problem in _id_problems(moves, len(escs), base_id)]
     _check_lengths(messages, per_esc, escs, problems, file)
@@ -116,7 +129,9 @@ def among_canopen(database: "Database", expanded: "Database", node: str) -> str:
     )
 
 
-def _id_problems(moves: Sequence[tuple[int, int, bool]], count: int, base_id: int | None) -> list[str]:
+def _id_problems(
+    moves: Sequence[tuple[int, int, bool]], count: int, base_id: int | None
+) -> list[str]:
     """A line for ids that no frame can have. ``moves``: from, to, 29 bits."""
     problems = []
     why = f"for {count} ESCs" if base_id is None else f"with {base_id:X}h as the lowest id"
@@ -139,8 +154,14 @@ def _check_lengths(
     file: str,
 ) -> None:
     """One line for names that become too long, however many they are."""
-    longest = max((signal.name for message in per_esc for signal in message.signals), key=len, default="")
-    if any(len(name) > _NAME_LIMIT for m in messages for name in (m.name, *(signal.name for signal in m.signals))):
+    longest = max(
+        (signal.name for message in per_esc for signal in message.signals), key=len, default=""
+    )
+    if any(
+        len(name) > _NAME_LIMIT
+        for m in messages
+        for name in (m.name, *(signal.name for signal in m.signals))
+    ):
         room = _NAME_LIMIT - len(longest)
         long = [esc.name for esc in escs if len(esc_prefix(esc.name)) > room]
         problems.append(
@@ -162,7 +183,9 @@ def _relations(
         messages.clear()
         for number, by_signal in old_signals.items():
             for new, names in moved.get(number, [(number, {})]):
-                signals[new] = OrderedDict((names.get(name, name), nodes) for name, nodes in by_signal.items())
+                signals[new] = OrderedDict(
+                    (names.get(name, name), nodes) for name, nodes in by_signal.items()
+                )
         for number, by_node in old_messages.items():
             for new, _ in moved.get(number, [(number, {})]):
                 messages[new] = by_node
@@ -180,7 +203,11 @@ def _speaks_of_an_esc(message: "Message", bind: dict[str, str | float]) -> bool:
 
 
 def _step(
-    ids: Sequence[tuple[int, bool]], taken: set[tuple[int, bool]], count: int, wanted: int | None, file: str
+    ids: Sequence[tuple[int, bool]],
+    taken: set[tuple[int, bool]],
+    count: int,
+    wanted: int | None,
+    file: str,
 ) -> int:
     if not ids:
         return 0
@@ -190,8 +217,12 @@ def _step(
         if len(set(moved)) == len(moved) and not taken & set(moved):
             return step
     if wanted is not None:
-        raise UserError(f"{file}: with ids moved by {wanted} an ESC, ids of {count} ESCs clash. Take another step.")
-    raise UserError(f"{file}: no step moves the ids for {count} ESCs without a clash. Give the messages other ids.")
+        raise UserError(
+            f"{file}: with ids moved by {wanted} an ESC, ids of {count} ESCs clash. Take another step."
+        )
+    raise UserError(
+        f"{file}: no step moves the ids for {count} ESCs without a clash. Give the messages other ids."
+    )
 
 
 def _copy(message: "Message") -> "Message":

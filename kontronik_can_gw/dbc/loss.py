@@ -12,7 +12,12 @@ _OF_LINK = frozenset({"link_state", "data_age"})
 def is_mute(signal: SignalPlan) -> bool:
     """True for a flag that holds one of its two values without telemetry."""
     source = signal.source
-    if source is None or source.bit is None or source.group not in (Group.LIVE, Group.INFO) or signal.is_float:
+    if (
+        source is None
+        or source.bit is None
+        or source.group not in (Group.LIVE, Group.INFO)
+        or signal.is_float
+    ):
         return False
     return signal.not_available in {value * signal.slope + signal.intercept for value in (0, 1)}
 
@@ -47,10 +52,16 @@ def unreported(layout: Layout, silent: bool) -> list[str]:
     found = []
     for message in layout.messages:
         stops = bool(message.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in message.paces
-        flags = [signal for signal in message.signals if is_mute(signal) and reporter(message, signal) is None]
+        flags = [
+            signal
+            for signal in message.signals
+            if is_mute(signal) and reporter(message, signal) is None
+        ]
         if not flags or (silent and stops):
             continue
-        names = ", ".join(flag.name for flag in flags[:3]) + (f" and {len(flags) - 3} more" if len(flags) > 3 else "")
+        names = ", ".join(flag.name for flag in flags[:3]) + (
+            f" and {len(flags) - 3} more" if len(flags) > 3 else ""
+        )
         remedy = ', or set dbc.on_loss = "silent"' if stops else ""
         found.append(
             f"{layout.file}: {message.name}: without telemetry {names} are sent as if they were known, and no signal of the message "

@@ -12,7 +12,12 @@ from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 _new = tuple.__new__
-_EVENT_OF_PACE = {Group.LIVE: Event.LIVE, Group.INFO: Event.INFO, Group.LINK: Event.LINK, Group.GATEWAY: Event.NONE}
+_EVENT_OF_PACE = {
+    Group.LIVE: Event.LIVE,
+    Group.INFO: Event.INFO,
+    Group.LINK: Event.LINK,
+    Group.GATEWAY: Event.NONE,
+}
 
 
 class _Message:
@@ -46,7 +51,12 @@ class _Message:
 
     def __init__(self, plan: MessagePlan, silent: bool) -> None:
         self.plan = plan
-        self.can_id, self.length, self.extended, self.fd = plan.can_id, plan.length, plan.extended, plan.fd
+        self.can_id, self.length, self.extended, self.fd = (
+            plan.can_id,
+            plan.length,
+            plan.extended,
+            plan.fd,
+        )
         self.pages = [page or 0 for page in plan.pages]
         self.is_paged = plan.pages != (None,)
         # no cycle, no minimum distance, nothing that follows by itself: the schedule never has to know of it
@@ -61,14 +71,20 @@ class _Message:
         self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 0
         self.last: dict[int | None, int] = {}
         # what also tells of the link always goes on
-        self.silent_able = silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
+        self.silent_able = (
+            silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
+        )
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
             for pace in plan.paces:
                 self.triggers |= _EVENT_OF_PACE[pace]
-            if self.triggers & Event.LINK and not plan.cycle_ns and not (self.by_event and self.triggers & Event.LIVE):
+            if (
+                self.triggers & Event.LINK
+                and not plan.cycle_ns
+                and not (self.by_event and self.triggers & Event.LIVE)
+            ):
                 self.triggers |= Event.SECOND  # counters, rates and ages change all the time
 
     def follows(self, events: int, up: bool) -> bool:
@@ -85,22 +101,36 @@ class DbcOutput:
     """
 
     def __init__(
-        self, layout: Layout, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int, silent: bool = False
+        self,
+        layout: Layout,
+        escs: Sequence[EscTelemetry],
+        gateway: GatewayStatus,
+        now: int,
+        silent: bool = False,
     ) -> None:
         self.frames: list[CanFrame] = []
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
-        self._of_gateway = [(i, m) for i, m in enumerate(self._messages) if Group.GATEWAY in m.plan.paces]
+        self._of_gateway = [
+            (i, m) for i, m in enumerate(self._messages) if Group.GATEWAY in m.plan.paces
+        ]
         self._schedule = Schedule(layout.messages, now)
         self._listeners = [
-            [[self._listeners_of(esc, up, events) for events in range(Event.ALL + 1)] for up in (False, True)]
+            [
+                [self._listeners_of(esc, up, events) for events in range(Event.ALL + 1)]
+                for up in (False, True)
+            ]
             for esc in range(len(escs))
         ]
         """The messages that follow: by ESC, whether its live data is fresh, and combination of events."""
 
     def _listeners_of(self, esc: int, up: bool, events: int) -> list[tuple[int, _Message]]:
-        return [(i, m) for i, m in enumerate(self._messages) if esc in m.plan.escs and m.follows(events, up)]
+        return [
+            (i, m)
+            for i, m in enumerate(self._messages)
+            if esc in m.plan.escs and m.follows(events, up)
+        ]
 
     def start(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
@@ -115,7 +145,8 @@ class DbcOutput:
         known = sources(settings)
         for message in self._messages:
             signals = tuple(
-                _rescaled(signal, known) if signal.esc == esc else signal for signal in message.plan.signals
+                _rescaled(signal, known) if signal.esc == esc else signal
+                for signal in message.plan.signals
             )
             if signals != message.plan.signals:
                 message.plan = replace(message.plan, signals=signals)
@@ -210,15 +241,23 @@ class DbcOutput:
             page = message.pages[place]
             message.page = (place + 1) % len(message.pages)
         alive = message.alive
-        data = message.pack(self._escs, self._gateway, now, alive, page).to_bytes(message.length, "little")
+        data = message.pack(self._escs, self._gateway, now, alive, page).to_bytes(
+            message.length, "little"
+        )
         if message.alive_modulus:
             message.alive = (alive + 1) % message.alive_modulus
         if message.on_change:
-            message.last[message.plan.pages[place]] = message.pack(self._escs, self._gateway, now, 0, page)
+            message.last[message.plan.pages[place]] = message.pack(
+                self._escs, self._gateway, now, 0, page
+            )
         if message.crc_at is not None:
             at = message.crc_at
             data = data[:at] + bytes((e2e.crc(data, at, message.plan.data_id),)) + data[at + 1 :]
-        self.frames.append(_new(CanFrame, (message.can_id, data, message.extended, message.fd, place, False, False)))
+        self.frames.append(
+            _new(
+                CanFrame, (message.can_id, data, message.extended, message.fd, place, False, False)
+            )
+        )
         if not message.is_free:
             self._schedule.sent(index, now)
             if message.owed:

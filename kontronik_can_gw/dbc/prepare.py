@@ -34,7 +34,9 @@ def prepare(
     warnings: tuple[str, ...] = ()
     if needs_expansion(database, node, escs, settings.bind) or settings.base_id is not None:
         plain = database
-        database, bind = expand(plain, node, escs, file, dict(settings.bind), settings.base_id, settings.id_step)
+        database, bind = expand(
+            plain, node, escs, file, dict(settings.bind), settings.base_id, settings.id_step
+        )
         settings = replace(settings, bind=bind)
         if settings.base_id is None and (reason := among_canopen(plain, database, node)):
             warnings = (f"{file}: for {len(escs)} ESCs, {reason}",)
@@ -50,16 +52,30 @@ def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file:
     problems = []
     for pattern in patterns:
         if not fnmatch.filter(ours, pattern):
-            others = [m for m in database.messages if m.name not in ours and fnmatch.fnmatchcase(m.name, pattern)]
-            sender = f" {others[0].name} is sent by {', '.join(others[0].senders) or 'nobody'}." if others else ""
+            others = [
+                m
+                for m in database.messages
+                if m.name not in ours and fnmatch.fnmatchcase(m.name, pattern)
+            ]
+            sender = (
+                f" {others[0].name} is sent by {', '.join(others[0].senders) or 'nobody'}."
+                if others
+                else ""
+            )
             near = difflib.get_close_matches(pattern, ours, n=1)
             hint = f" Did you mean {near[0]}?" if near and not others else ""
-            problems.append(f"dbc.messages: {pattern!r} is no message of {node} in {file}.{sender}{hint}")
+            problems.append(
+                f"dbc.messages: {pattern!r} is no message of {node} in {file}.{sender}{hint}"
+            )
     if problems:
         raise UserError(*problems)
     chosen = {name for pattern in patterns for name in fnmatch.filter(ours, pattern)}
     return cantools.database.can.Database(
-        messages=[message for message in database.messages if message.name in chosen or message.name not in ours],
+        messages=[
+            message
+            for message in database.messages
+            if message.name in chosen or message.name not in ours
+        ],
         nodes=database.nodes,
         buses=database.buses,
         version=database.version,
@@ -69,7 +85,9 @@ def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file:
     )
 
 
-def check_load(layout: Layout, bitrate: int, data_bitrate: int = 2_000_000, further_bits: float = 0) -> str | None:
+def check_load(
+    layout: Layout, bitrate: int, data_bitrate: int = 2_000_000, further_bits: float = 0
+) -> str | None:
     """A warning above 50 % computed bus load, UserError above 100 %, else None. ``further_bits``: of CANopen nodes, in a second."""
     load = layout.bus_load(bitrate, data_bitrate) + further_bits / bitrate
     what = "the CANopen nodes" if not layout.messages else f"{layout.file}: the messages"

@@ -53,7 +53,9 @@ def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> 
     if warnings is not None:
         warnings += ignored
     try:
-        database = cantools.database.load_string(text, database_format="dbc", strict=False, sort_signals=None)
+        database = cantools.database.load_string(
+            text, database_format="dbc", strict=False, sort_signals=None
+        )
     except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
         reason = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
         raise UserError(f"{path}: is not a DBC that can be read: {reason}") from None
@@ -102,14 +104,21 @@ def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
         signals.add((message, found[2]))
 
     def of_signal(found: re.Match[str]) -> str:
-        keyword, number, name, body = found["keyword"], found["message"], found["signal"], found["body"]
+        keyword, number, name, body = (
+            found["keyword"],
+            found["message"],
+            found["signal"],
+            found["body"],
+        )
         what = f"{keyword} {number or ''} {name}".replace("  ", " ")
         if number is not None and (number.lstrip("0") or "0", name) not in signals:
             return without(found, "for signals that are not in the file", what)
         if keyword != "VAL_" or not re.fullmatch(r"[A-Za-z_]\w*", body.strip()):
             return found[0]
         if (table := tables.get(body.strip())) is None:
-            return without(found, "naming a VAL_TABLE_ that is not in the file", f"{what} {body.strip()}")
+            return without(
+                found, "naming a VAL_TABLE_ that is not in the file", f"{what} {body.strip()}"
+            )
         return f"{found['head']}{table};"
 
     text = re.sub(
@@ -119,7 +128,9 @@ def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
         text,
         flags=re.MULTILINE,
     )
-    defined = set(map(shown, re.findall(r"^[ \t]*BA_DEF_\s+(?:\w+\s+)?(\"\0\d+\0\")", text, re.MULTILINE)))
+    defined = set(
+        map(shown, re.findall(r"^[ \t]*BA_DEF_\s+(?:\w+\s+)?(\"\0\d+\0\")", text, re.MULTILINE))
+    )
     text = re.sub(
         r"^[ \t]*(BA_|BA_DEF_DEF_)\s+(\"\0\d+\0\")[^;\n]*;",
         lambda found: (
@@ -131,21 +142,36 @@ def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
         flags=re.MULTILINE,
     )
     enumerations = re.findall(
-        r"^[ \t]*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?(\"\0\d+\0\")\s+ENUM\s+([^;]*)", text, re.MULTILINE
+        r"^[ \t]*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?(\"\0\d+\0\")\s+ENUM\s+([^;]*)",
+        text,
+        re.MULTILINE,
     )
     numbers = {
-        shown(name): {shown(value[0]): str(n) for n, value in enumerate(re.finditer(_MASKED, values))}
+        shown(name): {
+            shown(value[0]): str(n) for n, value in enumerate(re.finditer(_MASKED, values))
+        }
         for name, values in enumerations
     }
 
     def number(found: re.Match[str]) -> str:
         name, value = shown(found[2]), shown(found[4])
         if name in numbers and value not in numbers[name]:
-            raise UserError(f"{path}: attribute {name}: {value} is none of its values {', '.join(numbers[name])}")
-        return f"{found[1]}{found[2]}{found[3]}{numbers.get(name, {}).get(value, found[4])}{found[5]}"
+            raise UserError(
+                f"{path}: attribute {name}: {value} is none of its values {', '.join(numbers[name])}"
+            )
+        return (
+            f"{found[1]}{found[2]}{found[3]}{numbers.get(name, {}).get(value, found[4])}{found[5]}"
+        )
 
-    text = re.sub(r"^([ \t]*BA_\s+)(\"\0\d+\0\")(\s[^\";]*)(\"\0\d+\0\")(\s*;)", number, text, flags=re.MULTILINE)
-    return shown(text), [f"{path}: ignored, {reason}: {listed(found)}" for reason, found in ignored.items()]
+    text = re.sub(
+        r"^([ \t]*BA_\s+)(\"\0\d+\0\")(\s[^\";]*)(\"\0\d+\0\")(\s*;)",
+        number,
+        text,
+        flags=re.MULTILINE,
+    )
+    return shown(text), [
+        f"{path}: ignored, {reason}: {listed(found)}" for reason, found in ignored.items()
+    ]
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
@@ -171,8 +197,12 @@ def choose_node(database: "Database", wanted: str | None, file: str) -> str:
     if gateways:
         return gateways[0]
     if not senders:
-        raise UserError(f"{file}: no message has a transmitter, so none is ours. Name one in the DBC (BU_ and BO_).")
-    raise UserError(f"{file}: several nodes send: {', '.join(senders)}. Set dbc.node to the gateway's.")
+        raise UserError(
+            f"{file}: no message has a transmitter, so none is ours. Name one in the DBC (BU_ and BO_)."
+        )
+    raise UserError(
+        f"{file}: several nodes send: {', '.join(senders)}. Set dbc.node to the gateway's."
+    )
 
 
 def attribute(owner: Any, name: str, database: "Database") -> Any:

@@ -26,7 +26,9 @@ class Schedule:
         self._waiting = [False] * len(plans)
         self._cycle_waits = [False] * len(plans)
         self._heap = [
-            (now + phase, index, False) for index, phase in enumerate(phases(self._cycle)) if self._cycle[index]
+            (now + phase, index, False)
+            for index, phase in enumerate(phases(self._cycle))
+            if self._cycle[index]
         ]
         """(when, message, True for one that had to wait): of one instant and message the cycle comes first."""
         heapq.heapify(self._heap)

@@ -47,7 +47,11 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
         *("vector_leerstring", "Unknown", "NA", "Reserved", "Default"),
     ),
 }  # fmt: skip
-_WHILE_ACTIVE = {"IfActive": "Cyclic", "IfActiveAndEvent": "CyclicAndEvent", "IfActiveAndOnChange": "CyclicAndOnChange"}
+_WHILE_ACTIVE = {
+    "IfActive": "Cyclic",
+    "IfActiveAndEvent": "CyclicAndEvent",
+    "IfActiveAndOnChange": "CyclicAndOnChange",
+}
 
 
 _BY_KEY = {normalize(text): name for name, texts in _SPELLINGS.items() for text in texts}

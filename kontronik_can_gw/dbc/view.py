@@ -29,7 +29,9 @@ class View:
         self._life = [_life(part) for part in reader.parts]
         self._seen: list[int | None] = [None] * len(reader.parts)
         self._next_expiry: int | None = None
-        cycles = [part.plan.cycle_ns * len(part.plan.pages) for part in reader.parts if part.plan.cycle_ns]
+        cycles = [
+            part.plan.cycle_ns * len(part.plan.pages) for part in reader.parts if part.plan.cycle_ns
+        ]
         self._silence_ns = max(_MIN_SILENCE_NS, _CYCLES * min(cycles)) if cycles else None
 
     @property
@@ -65,7 +67,9 @@ class View:
                 self._seen[index] = None
                 self.values[part.first : part.first + part.count] = [None] * part.count
                 forgotten = True
-        self._next_expiry = min((due for due in dues if due is not None and due >= now), default=None)
+        self._next_expiry = min(
+            (due for due in dues if due is not None and due >= now), default=None
+        )
         return forgotten
 
     def _due(self, index: int) -> int | None:
@@ -75,7 +79,11 @@ class View:
             return None
         if life is not None:
             return seen + life
-        return None if self._silence_ns is None or self.last_ns is None else self.last_ns + self._silence_ns
+        return (
+            None
+            if self._silence_ns is None or self.last_ns is None
+            else self.last_ns + self._silence_ns
+        )
 
     def value(self, source: str, esc: int | None = None) -> Value:
         """The value of the signal that is bound to a source; None where the layout has none too."""

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
 
-_LONG_NAMES = frozenset({f"System{kind}LongSymbol" for kind in ("Node", "Message", "Signal", "EnvVar")})
+_LONG_NAMES = frozenset(
+    {f"System{kind}LongSymbol" for kind in ("Node", "Message", "Signal", "EnvVar")}
+)
 """cantools has put the long names in their place already."""
 
 
@@ -21,11 +23,21 @@ def dbc_text(database: "Database") -> str:
         ["NS_ :"],
         ["BS_:"],
         [" ".join(["BU_:", *(node.name for node in database.nodes)])],
-        [f"VAL_TABLE_ {name} {_texts(table)} ;" for name, table in database.dbc.value_tables.items()]
+        [
+            f"VAL_TABLE_ {name} {_texts(table)} ;"
+            for name, table in database.dbc.value_tables.items()
+        ]
         if database.dbc
         else [],
-        *([_head(message), *(_signal(signal) for signal in _sorted(message))] for message in database.messages),
-        [f"BO_TX_BU_ {frame_id(m)} : {','.join(m.senders)};" for m in database.messages if len(m.senders) > 1],
+        *(
+            [_head(message), *(_signal(signal) for signal in _sorted(message))]
+            for message in database.messages
+        ),
+        [
+            f"BO_TX_BU_ {frame_id(m)} : {','.join(m.senders)};"
+            for m in database.messages
+            if len(m.senders) > 1
+        ],
         list(_environment(database)),
         list(_comments(database)),
         list(_definitions(database)),
@@ -103,7 +115,9 @@ def _environment(database: "Database") -> Iterator[str]:
             f'EV_ {v.name}: {v.env_type} [{_number(v.minimum)}|{_number(v.maximum)}] "{_escaped(v.unit)}" '
             f"{_number(v.initial_value)} {v.env_id} {v.access_type} {','.join(v.access_nodes)};"
         )
-    yield from (f"ENVVAR_DATA_ {v.name}: {v.data_size};" for v in variables if v.data_size is not None)
+    yield from (
+        f"ENVVAR_DATA_ {v.name}: {v.data_size};" for v in variables if v.data_size is not None
+    )
 
 
 def _owners(database: "Database") -> Iterator[tuple[str, Any]]:
@@ -138,7 +152,11 @@ def _definitions(database: "Database") -> Iterator[str]:
             values = ",".join(f'"{_escaped(choice)}"' for choice in definition.choices)
         else:
             ends = (definition.minimum, definition.maximum)
-            values = "" if definition.type_name == "STRING" or None in ends else " ".join(map(_number, ends))
+            values = (
+                ""
+                if definition.type_name == "STRING" or None in ends
+                else " ".join(map(_number, ends))
+            )
         yield f'BA_DEF_{rel} {kind}"{definition.name}" {definition.type_name} {values};'
 
 
@@ -168,7 +186,9 @@ def _attributes(database: "Database") -> Iterator[str]:
     owners = sorted([("", database), *_owners(database)], key=lambda pair: order[pair[0][:3]])
     for owner, thing in owners:
         attributes: Iterable[Any] = thing.dbc.attributes.values() if thing.dbc else ()
-        yield from (f'BA_ "{a.name}" {owner}{_value(a)};' for a in attributes if a.name not in _LONG_NAMES)
+        yield from (
+            f'BA_ "{a.name}" {owner}{_value(a)};' for a in attributes if a.name not in _LONG_NAMES
+        )
     relations = database.dbc.relation_attributes
     if relations is None:
         return
@@ -176,11 +196,15 @@ def _attributes(database: "Database") -> Iterator[str]:
         for signal, by_node in by_signal.items():
             for node, found in by_node.items():
                 yield from (
-                    f'BA_REL_ "{a.name}" BU_SG_REL_ {node} SG_ {number} {signal} {_value(a)};' for a in found.values()
+                    f'BA_REL_ "{a.name}" BU_SG_REL_ {node} SG_ {number} {signal} {_value(a)};'
+                    for a in found.values()
                 )
     for number, by_node in relations.node_message_relations.items():
         for node, found in by_node.items():
-            yield from (f'BA_REL_ "{a.name}" BU_BO_REL_ {node} {number} {_value(a)};' for a in found.values())
+            yield from (
+                f'BA_REL_ "{a.name}" BU_BO_REL_ {node} {number} {_value(a)};'
+                for a in found.values()
+            )
 
 
 def _multiplexing(database: "Database") -> Iterator[str]:

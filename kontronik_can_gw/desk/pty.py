@@ -24,7 +24,15 @@ class PtyEsc:
     An existing symbolic link at ``link`` is replaced, anything else there is left alone (RunError). The link goes at close.
     """
 
-    __slots__ = ("_link", "_master", "_slave", "dropped_bytes", "first_received", "path", "received")
+    __slots__ = (
+        "_link",
+        "_master",
+        "_slave",
+        "dropped_bytes",
+        "first_received",
+        "path",
+        "received",
+    )
 
     def __init__(self, link: str | Path | None = None) -> None:
         self.dropped_bytes = 0
@@ -37,7 +45,9 @@ class PtyEsc:
         try:
             self._master, self._slave = os.openpty()
         except OSError as error:
-            raise RunError(f"no pseudo terminal to be had: {error.strerror}. Use fewer ESCs.") from None
+            raise RunError(
+                f"no pseudo terminal to be had: {error.strerror}. Use fewer ESCs."
+            ) from None
         try:
             _set_raw(self._slave)
             os.set_blocking(self._master, False)
@@ -90,7 +100,10 @@ class PtyEsc:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -157,8 +170,11 @@ def _make_link(link: Path, target: str) -> Path:
     link = link.absolute()
     try:
         if not link.is_symlink() and link.exists():
-            raise RunError(f"{link}: exists and is not a symbolic link. Remove it or give another --link.")
-        beside = link.with_name(f".{link.name}.{os.getpid()}")  # made there and moved: never a moment without a link
+            raise RunError(
+                f"{link}: exists and is not a symbolic link. Remove it or give another --link."
+            )
+        # made there and moved: never a moment without a link
+        beside = link.with_name(f".{link.name}.{os.getpid()}")
         beside.unlink(missing_ok=True)
         beside.symlink_to(target)
         try:
@@ -167,5 +183,7 @@ def _make_link(link: Path, target: str) -> Path:
             beside.unlink()
             raise
     except OSError as error:
-        raise RunError(f"{link}: no link can be made: {error.strerror}. Give another --link.") from None
+        raise RunError(
+            f"{link}: no link can be made: {error.strerror}. Give another --link."
+        ) from None
     return link

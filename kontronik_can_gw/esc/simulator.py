@@ -16,7 +16,13 @@ from typing import NamedTuple
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, device_and_variant, rows
-from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, OperatingState, SelfTestError, peak_current_of
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+    peak_current_of,
+)
 
 BYTE_NS = 11 * 1_000_000_000 // 115_200
 """Wire time of a byte: start, 8 data, parity, stop."""
@@ -117,7 +123,10 @@ class Faults:
         _check("noise", self.noise, 0, 1000)
         _check("lost bytes", self.lost_bytes, 0, 1)
         _check("flipped bits", self.flipped_bits, 0, 1)
-        if self.dropout is not None and not 0 <= self.dropout.duration_ns < self.dropout.interval_ns:
+        if (
+            self.dropout is not None
+            and not 0 <= self.dropout.duration_ns < self.dropout.interval_ns
+        ):
             raise ValueError("dropout: the duration must be shorter than the interval")
         if list(self.swaps) != sorted(self.swaps, key=lambda swap: swap.time_ns):
             raise ValueError("swaps: must be in order of time")
@@ -199,7 +208,9 @@ class SimulatedEsc:
         "next_ns",
     )
 
-    def __init__(self, options: EscOptions | None = None, *, seed: int = 0, start_ns: int = 0) -> None:
+    def __init__(
+        self, options: EscOptions | None = None, *, seed: int = 0, start_ns: int = 0
+    ) -> None:
         options = options or EscOptions()
         faults = options.faults
         self.next_ns = start_ns
@@ -272,13 +283,19 @@ class SimulatedEsc:
     def _plug_in(self, swap: Swap) -> None:
         self.device = swap.device
         self.layout = swap.layout or usual_layout(swap.device)
-        self._model = _Model(self._options, swap.device, self._seed + 1_000_003 * (1 + len(self._swaps)))
+        self._model = _Model(
+            self._options, swap.device, self._seed + 1_000_003 * (1 + len(self._swaps))
+        )
         self._frame_number = 0
 
     def _word(self, kind: type[OperatingError] | type[SelfTestError], since_start: int) -> int:
         word = 0
         for bit, start, duration in self._errors:
-            if isinstance(bit, kind) and since_start >= start and (duration is None or since_start < start + duration):
+            if (
+                isinstance(bit, kind)
+                and since_start >= start
+                and (duration is None or since_start < start + duration)
+            ):
                 word |= 1 << bit
         return word
 
@@ -436,7 +453,9 @@ class _Model:
             lag = open_voltage * drive * _SPEED_PER_VOLT - speed
             if lag > -0.03 * full_speed:
                 part = speed / full_speed
-                motor_current = self._strength * (0.75 * part * part + min(max(lag, 0) / full_speed, 0.4) + 0.01)
+                motor_current = self._strength * (
+                    0.75 * part * part + min(max(lag, 0) / full_speed, 0.4) + 0.01
+                )
                 motor_current *= 0.98 + 0.04 * random()
             else:  # slower than it turns: nothing is driven until the speed is down
                 motor_current = 0.0
@@ -462,10 +481,14 @@ class _Model:
 
         # Heat: a first-order lag each. At full load the power stage settles about 60 K above ambient.
         stage = self._stage_temperature
-        stage += (4 + 60 * abs(motor_current) / options.max_current + options.ambient - stage) * min(dt / 25, 1.0)
+        stage += (
+            4 + 60 * abs(motor_current) / options.max_current + options.ambient - stage
+        ) * min(dt / 25, 1.0)
         self._stage_temperature = stage
         bec = self._bec_temperature
-        bec += (5 + 4 * bec_current + 0.2 * (stage - options.ambient) + options.ambient - bec) * min(dt / 40, 1.0)
+        bec += (
+            5 + 4 * bec_current + 0.2 * (stage - options.ambient) + options.ambient - bec
+        ) * min(dt / 40, 1.0)
         self._bec_temperature = bec
 
         # Raw steps. What could leave its wire type is kept inside.
@@ -501,7 +524,22 @@ class _Model:
 
     def _remember(self, live: LiveData) -> None:
         """The ESC's own log: the fields of InfoData from max_electrical_speed on."""
-        (speed, voltage, battery, motor, peak, _, bec_current, bec_voltage, _, throttle, opening, stage, bec, *_) = live
+        (
+            speed,
+            voltage,
+            battery,
+            motor,
+            peak,
+            _,
+            bec_current,
+            bec_voltage,
+            _,
+            throttle,
+            opening,
+            stage,
+            bec,
+            *_,
+        ) = live
         if speed > 0:
             self._has_run = True
         log = self._log or [0, voltage, 0, 0, 0, 0, 0, bec_voltage, 0, 0, stage, stage, bec, bec]

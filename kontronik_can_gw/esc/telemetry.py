@@ -175,8 +175,11 @@ class EscTelemetry:
         shown = now if now - bound <= self._interval_ns else bound
         for frame in frames:
             after = (end - frame.offset - frame.form.length) * NS_PER_BYTE
-            limit = INFO_TIMEOUT_NS if isinstance(frame.data, InfoData) else self.settings.timeout_ns
-            if now - bound + after > limit:  # with so many bytes behind it in one read it is old already
+            limit = (
+                INFO_TIMEOUT_NS if isinstance(frame.data, InfoData) else self.settings.timeout_ns
+            )
+            if now - bound + after > limit:
+                # with so many bytes behind it in one read it is old already
                 self.late_frames += 1
             else:
                 yield self._accept(frame, shown - after, bound - after)

@@ -10,7 +10,13 @@ from enum import Enum, IntEnum
 from fractions import Fraction
 
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, rows
-from kontronik_can_gw.esc.kontronik.states import Device, ErrorBit, OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    ErrorBit,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+)
 from kontronik_can_gw.esc.telemetry import MS, MW_NS_PER_WH, SECOND, EscSettings, LinkState
 
 
@@ -88,7 +94,18 @@ def _wire_sources(data: DataType, group: Group) -> list[Source]:
         low, high = row.type_range
         expression = f"{group.value}[{index}]"
         supplied = f"esc.bec_current_supplied({expression})" if row.not_on else None
-        found.append(Source(name, row.unit, group, expression, Fraction(row.per_unit), low, high, supplied=supplied))
+        found.append(
+            Source(
+                name,
+                row.unit,
+                group,
+                expression,
+                Fraction(row.per_unit),
+                low,
+                high,
+                supplied=supplied,
+            )
+        )
     return found
 
 
@@ -110,11 +127,25 @@ def sources(settings: EscSettings) -> dict[str, Source]:
     u32 = (1 << 32) - 1
     listed = [
         *(s for s in _wire_sources(LiveData, live) if s.name != "operating_state"),
-        Source("operating_state", "", live, state, low=0, high=255, names={s: s.text for s in OperatingState}),
+        Source(
+            "operating_state",
+            "",
+            live,
+            state,
+            low=0,
+            high=255,
+            names={s: s.text for s in OperatingState},
+        ),
         Source("operating_state_raw", "", live, state, low=0, high=255),
         *_flags(OperatingError, live, errors),
-        *(s for s in _wire_sources(InfoData, info) if s.name not in ("device_and_variant", "firmware_word")),
-        Source("device", "", info, "info.device", low=0, high=63, names={d: d.text for d in Device}),
+        *(
+            s
+            for s in _wire_sources(InfoData, info)
+            if s.name not in ("device_and_variant", "firmware_word")
+        ),
+        Source(
+            "device", "", info, "info.device", low=0, high=63, names={d: d.text for d in Device}
+        ),
         Source("device_raw", "", info, "info.device", low=0, high=63),
         Source("variant", "", info, "info.variant", low=0, high=1023),
         Source("firmware_main", "", info, "info[1] >> 8", low=0, high=255),
@@ -122,14 +153,56 @@ def sources(settings: EscSettings) -> dict[str, Source]:
         *_flags(SelfTestError, info, selftest),
         Source("motor_speed", "1/min", live, speed, Fraction(settings.pole_pairs), 0, u32),
         Source("output_speed", "1/min", live, speed, settings.pole_pairs * settings.gear, 0, u32),
-        Source("battery_power", "W", live, "live[1] * live[2]", Fraction(1000), -0xFFFF * 0x8000, 0xFFFF * 0x7FFF),
-        Source("mean_cell_voltage", "V", live, "live[1] / esc.cells", Fraction(100), supplied="esc.cells", whole=False),
+        Source(
+            "battery_power",
+            "W",
+            live,
+            "live[1] * live[2]",
+            Fraction(1000),
+            -0xFFFF * 0x8000,
+            0xFFFF * 0x7FFF,
+        ),
+        Source(
+            "mean_cell_voltage",
+            "V",
+            live,
+            "live[1] / esc.cells",
+            Fraction(100),
+            supplied="esc.cells",
+            whole=False,
+        ),
         Source("energy_used", "Wh", link, "esc.energy", Fraction(MW_NS_PER_WH), 0, pace=live),
         Source("motor_run_time", "s", link, "esc.run_time", Fraction(SECOND), 0, pace=live),
-        Source("link_state", "", link, "esc.link", low=0, high=5, names={s: _pascal(s.name) for s in LinkState}),
-        Source("layout", "", link, "esc.layout", low=0, high=2, names={0: "Unknown", 1: "V4", 2: "Legacy"}),
-        Source("data_age", "ms", link, "esc.age_ms(now)", low=0, supplied="esc.live_ns is not None"),
-        Source("frame_rate", "Hz", link, "esc.frame_rate", Fraction(10), 0, supplied="esc.frame_rate is not None"),
+        Source(
+            "link_state",
+            "",
+            link,
+            "esc.link",
+            low=0,
+            high=5,
+            names={s: _pascal(s.name) for s in LinkState},
+        ),
+        Source(
+            "layout",
+            "",
+            link,
+            "esc.layout",
+            low=0,
+            high=2,
+            names={0: "Unknown", 1: "V4", 2: "Legacy"},
+        ),
+        Source(
+            "data_age", "ms", link, "esc.age_ms(now)", low=0, supplied="esc.live_ns is not None"
+        ),
+        Source(
+            "frame_rate",
+            "Hz",
+            link,
+            "esc.frame_rate",
+            Fraction(10),
+            0,
+            supplied="esc.frame_rate is not None",
+        ),
         *(
             Source(name, "", link, f"esc.{path}", low=0, rolls=True)
             for name, path in (
@@ -142,8 +215,22 @@ def sources(settings: EscSettings) -> dict[str, Source]:
                 ("suspect_frames", "suspect_frames"),
             )
         ),
-        Source("gateway_state", "", gateway, "gateway.state", low=0, names={s: _pascal(s.name) for s in GatewayState}),
-        Source("can_state", "", gateway, "gateway.can_state", low=0, names={s: _pascal(s.name) for s in CanState}),
+        Source(
+            "gateway_state",
+            "",
+            gateway,
+            "gateway.state",
+            low=0,
+            names={s: _pascal(s.name) for s in GatewayState},
+        ),
+        Source(
+            "can_state",
+            "",
+            gateway,
+            "gateway.can_state",
+            low=0,
+            names={s: _pascal(s.name) for s in CanState},
+        ),
         Source("esc_count", "", gateway, "gateway.esc_count", low=0),
         Source("escs_ok", "", gateway, "gateway.escs_ok", low=0),
         Source("uptime", "s", gateway, f"(now - gateway.started_ns) // {MS}", Fraction(1000), 0),

@@ -79,7 +79,10 @@ class CanLink:
         self._seen_waiting = False
         self._monitor: LinkMonitor | None = None
         self._ask_due: int | None = None
-        if config.interface == "socketcan" and (monitor := link_monitor(config.channel)) is not None:
+        if (
+            config.interface == "socketcan"
+            and (monitor := link_monitor(config.channel)) is not None
+        ):
             self._monitor = monitor
             self._ask_due = 0
             selector.register(monitor.fileno(), selectors.EVENT_READ, self.hear)
@@ -93,7 +96,11 @@ class CanLink:
 
     def rests(self, now: int) -> bool:
         """True where ``reopen`` and ``ask_if_due`` have nothing to do, and the port was not opened just now."""
-        return self.port is not None and not self.just_opened and (self._ask_due is None or now < self._ask_due)
+        return (
+            self.port is not None
+            and not self.just_opened
+            and (self._ask_due is None or now < self._ask_due)
+        )
 
     @property
     def longest_turn_ns(self) -> int:
@@ -107,7 +114,11 @@ class CanLink:
     @property
     def complaint(self) -> str:
         """What is wrong with the bus; empty while frames are sent."""
-        for name in (self._interface_condition, self._sending_condition, self._controller_condition):
+        for name in (
+            self._interface_condition,
+            self._sending_condition,
+            self._controller_condition,
+        ):
             if reason := self._conditions.reason(name):
                 return reason
         return ""
@@ -115,7 +126,9 @@ class CanLink:
     def facts_for_statistics(self) -> CanFacts:
         """What the statistics show of the interface."""
         told = self.facts or LinkFacts(exists=False)
-        bitrate = told.bitrate or (self.config.bitrate if self.config.interface != "socketcan" else None)
+        bitrate = told.bitrate or (
+            self.config.bitrate if self.config.interface != "socketcan" else None
+        )
         config = self.config
         return CanFacts(
             config.interface,
@@ -168,7 +181,9 @@ class CanLink:
         try:
             port = CanPort(self.config)
         except OSError as error:  # it went away a moment ago
-            raise RunError(f"CAN interface {self.config.channel}: {error.strerror or error}.") from None
+            raise RunError(
+                f"CAN interface {self.config.channel}: {error.strerror or error}."
+            ) from None
         self.port = port
         self._retry.due = None
         self._busy_until = self._busy_since = None
@@ -181,15 +196,22 @@ class CanLink:
         self.follow_ids()
         self._gateway.can_opened(now)
         self._refresh_facts(now)  # what was told before, as that it was down, is past
-        if not self._conditions.is_on(self._interface_condition):  # otherwise it is said when a frame is sent
-            self._conditions.say(logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open")
+        if not self._conditions.is_on(self._interface_condition):
+            # otherwise it is said when a frame is sent
+            self._conditions.say(
+                logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open"
+            )
 
     def _lock(self, at_start: bool = False) -> None:
         """Have what only one gateway may have on this interface."""
         if self.config.interface == "virtual":  # is in this process only
             return
         channel = self.config.channel
-        names = [node_lock(channel, node_id) for node_id in self._gateway.node_ids if node_id != UNCONFIGURED]
+        names = [
+            node_lock(channel, node_id)
+            for node_id in self._gateway.node_ids
+            if node_id != UNCONFIGURED
+        ]
         if (first := self._gateway.first_message_id) is not None:
             names.append(messages_lock(channel, first))
         if names == self._locked:
@@ -206,7 +228,9 @@ class CanLink:
     def _refuse_escs_as_channel(self) -> None:
         """Whatever its name is now: what leads to an ESC must not be opened as a CAN interface, which would send to it."""
         if (esc := self._esc_at(self.config.channel)) is not None:
-            raise RunError(f"can.channel {self.config.channel} is the port of {esc}: nothing may be sent to an ESC.")
+            raise RunError(
+                f"can.channel {self.config.channel} is the port of {esc}: nothing may be sent to an ESC."
+            )
 
     def _close_port(self) -> None:
         self._busy_until = self._busy_since = None
@@ -231,7 +255,9 @@ class CanLink:
         if self.config.interface == "socketcan":
             self._failed(str(socketcan_error(self.config, number)), now)
         else:
-            self._failed(f"CAN {self.config.interface} {self.config.channel}: the adapter has failed.", now)
+            self._failed(
+                f"CAN {self.config.interface} {self.config.channel}: the adapter has failed.", now
+            )
         self.ask(now)  # it may be there again already
 
     # --- what the kernel tells
@@ -262,7 +288,9 @@ class CanLink:
             self._lost(Sent.DOWN if facts.exists else Sent.GONE, now)
             return
         # a driver may learn of a restart later than who hears its error frames
-        behind = facts.state is CanState.BUS_OFF and (self._off or now - self._restarted_ns < RESTARTED_NS)
+        behind = facts.state is CanState.BUS_OFF and (
+            self._off or now - self._restarted_ns < RESTARTED_NS
+        )
         if facts.state is not None and facts.state is not self.port.state and not behind:
             self.port.note_state(facts.state)
         self._follow_state(now)
@@ -327,7 +355,9 @@ class CanLink:
             self._gateway.status.received_frames += len(frames)
             for frame, at in frames:
                 # a wall clock that was set moves no frame out of the time in which it must have come
-                self._gateway.receive_frame(frame, now, now if at is None else min(max(at, since), now))
+                self._gateway.receive_frame(
+                    frame, now, now if at is None else min(max(at, since), now)
+                )
             self._follow_reception(now)
 
     def is_stuck(self) -> bool:
@@ -387,7 +417,9 @@ class CanLink:
                 return
         if count and self._stalled:
             self._stalled = False
-            self._conditions.end(self._sending_condition, f"CAN {self.config.channel}: frames are sent again", now)
+            self._conditions.end(
+                self._sending_condition, f"CAN {self.config.channel}: frames are sent again", now
+            )
             self._gateway.can_returned(now)
         self._follow_state(now)
 
@@ -417,15 +449,15 @@ class CanLink:
         """The bus has not taken a frame for long: what waits is too old to be of use."""
         self.clear()
         self._stalled = True
-        text = (
-            f"CAN {self.config.channel}: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."
-        )
+        text = f"CAN {self.config.channel}: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."
         self._conditions.begin(self._sending_condition, text, now)
 
     def _works(self, now: int) -> None:
         self._is_proven = True
         self._retry.succeeded()
-        self._conditions.end(self._interface_condition, f"CAN {self.config.channel}: frames are sent again", now)
+        self._conditions.end(
+            self._interface_condition, f"CAN {self.config.channel}: frames are sent again", now
+        )
 
     def _count_losses(self) -> None:
         status, waiting = self._gateway.status, self.mailboxes
@@ -459,7 +491,9 @@ class CanLink:
         self._gateway.set_can_state(port.state, now)
         name = f"CAN {self.config.channel}"
         if port.state is CanState.BUS_OFF:
-            self._conditions.begin(self._controller_condition, f"{name}: bus-off.{self._restart_hint()}", now)
+            self._conditions.begin(
+                self._controller_condition, f"{name}: bus-off.{self._restart_hint()}", now
+            )
             self.ask(now)
         elif port.state is CanState.ERROR_PASSIVE:
             text = f"{name}: error-passive: wrong bit rate, a cable or termination fault, or nobody acknowledges."
@@ -474,7 +508,9 @@ class CanLink:
             text = f"CAN {name} runs at {bitrate} bit/s, can.bitrate says {wanted}: make them the same."
             self._conditions.begin(f"CAN {name}: bit rate", text, now)
         elif bitrate:
-            self._conditions.end(f"CAN {name}: bit rate", f"CAN {name} runs at {bitrate} bit/s", now)
+            self._conditions.end(
+                f"CAN {name}: bit rate", f"CAN {name} runs at {bitrate} bit/s", now
+            )
 
     def _restart_hint(self) -> str:
         if self.facts is None or self.facts.restart_ms != 0:
@@ -496,11 +532,19 @@ class CanLink:
         bits = "29-bit id" if conflict.is_extended else "id"
         which = f"CAN {self.config.channel}: {bits} {conflict.can_id:X}h"
         if conflict.over:
-            self._conditions.end(which, f"{which}: nobody else sends with it", now, f"; {conflict.count} frames")
+            self._conditions.end(
+                which, f"{which}: nobody else sends with it", now, f"; {conflict.count} frames"
+            )
             return
-        remedy = "Two nodes with one node-ID?" if conflict.node is not None else "Change one, as by dbc.base_id."
+        remedy = (
+            "Two nodes with one node-ID?"
+            if conflict.node is not None
+            else "Change one, as by dbc.base_id."
+        )
         self._conditions.begin(
-            which, f"{which}: somebody else sends with it too; here it is {conflict.whose}. {remedy}", now
+            which,
+            f"{which}: somebody else sends with it too; here it is {conflict.whose}. {remedy}",
+            now,
         )
 
     @property

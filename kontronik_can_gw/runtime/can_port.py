@@ -123,7 +123,10 @@ class CanPort:
 
         On SocketCAN by the kernel's filters; elsewhere by python-can's, with a thread that reads as soon as there is an id.
         """
-        if any(not 0 <= can_id <= _STANDARD_ID and not EXTENDED <= can_id <= EXTENDED | _EXTENDED_ID for can_id in ids):
+        if any(
+            not 0 <= can_id <= _STANDARD_ID and not EXTENDED <= can_id <= EXTENDED | _EXTENDED_ID
+            for can_id in ids
+        ):
             raise ValueError(f"no identifiers: {sorted(ids)}")
         self._ids = frozenset(ids)
         if self._socket is not None:
@@ -155,7 +158,10 @@ class CanPort:
         return self.send_all((frame,))[1]
 
     def send_all(
-        self, frames: Sequence[CanFrame], clock: Callable[[], int] = time.monotonic_ns, latest: int = sys.maxsize
+        self,
+        frames: Sequence[CanFrame],
+        clock: Callable[[], int] = time.monotonic_ns,
+        latest: int = sys.maxsize,
     ) -> tuple[int, Sent]:
         """Hand frames to the interface until it does not take one, or ``clock`` is beyond ``latest``.
 
@@ -208,7 +214,8 @@ class CanPort:
                 can_id, size, content = _CLASSIC.unpack(data)
             if can_id & _ERROR_FLAG:
                 self._follow(can_id, content[1])
-            elif can_id in self._ids:  # with another flag set, of a remote frame, it is none of ours
+            elif can_id in self._ids:
+                # with another flag set, of a remote frame, it is none of ours
                 frame = CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd)
                 frames.append((frame, _monotonic(ancillary)))
         else:
@@ -228,7 +235,11 @@ class CanPort:
         if self._socket is None:
             return 0
         try:
-            return int(_MEMINFO.unpack(self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))[-1])
+            return int(
+                _MEMINFO.unpack(
+                    self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+                )[-1]
+            )
         except (OSError, struct.error):  # an old kernel, which has fewer figures
             return 0
 
@@ -267,7 +278,11 @@ class CanPort:
             can_id |= EXTENDED
         if remote:
             can_id |= _REMOTE
-        packed = _FD.pack(can_id, len(data), _FD_BRS, data) if fd else _CLASSIC.pack(can_id, len(data), data)
+        packed = (
+            _FD.pack(can_id, len(data), _FD_BRS, data)
+            if fd
+            else _CLASSIC.pack(can_id, len(data), data)
+        )
         try:
             self._socket.send(packed)  # type: ignore[union-attr]  # there is one where this is called
         except OSError as error:
@@ -297,7 +312,8 @@ class CanPort:
             self._bus.send(message, timeout=0)
         except can.CanError:
             return Sent.BUSY
-        except Exception:  # what a driver lets out when its adapter has gone: OSError, termios.error ...
+        except Exception:
+            # what a driver lets out when its adapter has gone: OSError, termios.error ...
             return Sent.GONE
         return Sent.OK
 
@@ -305,14 +321,21 @@ class CanPort:
 def _monotonic(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
     """The time of reception that came with a frame, on the monotonic clock."""
     for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind in (_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD) and len(data) in _TIMES:
+        if (
+            level == socket.SOL_SOCKET
+            and kind in (_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD)
+            and len(data) in _TIMES
+        ):
             seconds, ns = _TIMES[len(data)].unpack(data)
             return int(seconds * SECOND + ns - time.time_ns() + time.monotonic_ns())
     return None
 
 
 def one_by_one(
-    send: Callable[[CanFrame], Sent], frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+    send: Callable[[CanFrame], Sent],
+    frames: Sequence[CanFrame],
+    clock: Callable[[], int],
+    latest: int,
 ) -> tuple[int, Sent]:
     """Send frames until one is not taken, or ``clock`` is beyond ``latest``: how many went, and the last answer."""
     for count, frame in enumerate(frames):
@@ -343,7 +366,10 @@ def _kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:
         step *= 2
     blocks = sorted({can_id // step * step for can_id in ids})
     flags, low = EXTENDED | _REMOTE, step - 1
-    return [(first, flags | (_EXTENDED_ID if first & EXTENDED else _STANDARD_ID) & ~low) for first in blocks]
+    return [
+        (first, flags | (_EXTENDED_ID if first & EXTENDED else _STANDARD_ID) & ~low)
+        for first in blocks
+    ]
 
 
 def check_interface(config: CanConfig) -> None:
@@ -354,7 +380,11 @@ def check_interface(config: CanConfig) -> None:
         import can
     if config.interface not in can.VALID_INTERFACES:
         near = difflib.get_close_matches(config.interface, can.VALID_INTERFACES, n=1)
-        hint = f" Did you mean {near[0]}?" if near else f" Known: {', '.join(sorted(can.VALID_INTERFACES))}."
+        hint = (
+            f" Did you mean {near[0]}?"
+            if near
+            else f" Known: {', '.join(sorted(can.VALID_INTERFACES))}."
+        )
         raise UserError(f"can.interface: {config.interface!r} is no interface of python-can.{hint}")
 
 
@@ -364,7 +394,9 @@ def fault_of(name: str) -> int:
     try:
         return 0 if int((interfaces / name / "flags").read_text(), 16) & 1 else errno.ENETDOWN
     except OSError:
-        return errno.ENODEV if (interfaces / "lo").exists() and not (interfaces / name).exists() else 0
+        return (
+            errno.ENODEV if (interfaces / "lo").exists() and not (interfaces / name).exists() else 0
+        )
     except ValueError:
         return 0
 
@@ -403,7 +435,12 @@ class _SocketCan:
 
 def _open(config: CanConfig) -> "can.BusABC | _SocketCan":
     mtu = Path("/sys/class/net", config.channel, "mtu")
-    if config.interface == "socketcan" and config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
+    if (
+        config.interface == "socketcan"
+        and config.fd
+        and mtu.exists()
+        and int(mtu.read_text()) < _FD.size
+    ):
         name = config.channel
         raise RunError(
             f"CAN interface {name}: does not do CAN FD. Adapter: sudo ip link set {name} up type can bitrate {config.bitrate} "
@@ -437,11 +474,13 @@ def _open(config: CanConfig) -> "can.BusABC | _SocketCan":
     except OSError as error:
         if config.interface == "socketcan":
             raise socketcan_error(config, error.errno or 0, error.strerror or str(error)) from None
-        raise RunError(f"CAN {config.interface} {config.channel}: cannot be opened: {error}") from None
-    except (
-        Exception
-    ) as error:  # each of python-can's drivers fails in its own ways, a missing vendor library as NameError
-        raise RunError(f"CAN {config.interface} {config.channel}: cannot be opened: {error}") from None
+        raise RunError(
+            f"CAN {config.interface} {config.channel}: cannot be opened: {error}"
+        ) from None
+    except Exception as error:  # each of python-can's drivers fails in its own ways, a missing vendor library as NameError
+        raise RunError(
+            f"CAN {config.interface} {config.channel}: cannot be opened: {error}"
+        ) from None
 
 
 def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
@@ -454,7 +493,9 @@ def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
             f"CAN interface {name}: there is none. With an adapter plugged in: {make}. For a virtual one: {virtual}."
         )
     if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
-        return RunError(f"CAN interface {name}: this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan.")
+        return RunError(
+            f"CAN interface {name}: this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan."
+        )
     if number == errno.ENETDOWN:
         return RunError(f"CAN interface {name}: is down. Start it: {make}.")
     return RunError(f"CAN interface {name}: cannot be opened: {text}")

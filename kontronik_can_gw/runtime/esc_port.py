@@ -93,7 +93,15 @@ class EscPort:
         is_open = self.port is not None
         path = self.path if self.port is None else self.port.path
         again = max(0, self.reopened)
-        return PortFacts(self.name, path, is_open, self.complaint, again, dict(self.line_errors), self._lost_since)
+        return PortFacts(
+            self.name,
+            path,
+            is_open,
+            self.complaint,
+            again,
+            dict(self.line_errors),
+            self._lost_since,
+        )
 
     def open(self, now: int, wait: bool, others: tuple[Identity | None, ...] = ()) -> None:
         """Open the port. RunError where that fails, unless ``wait``: then it is tried again.
@@ -105,7 +113,8 @@ class EscPort:
         except RunError as error:
             if not wait:
                 raise RunError(f"{self.name}: {error}") from None
-            unplugged = isinstance(error, NoPort) and self.reopened >= 0  # which was said when it was lost
+            # which was said when it was lost
+            unplugged = isinstance(error, NoPort) and self.reopened >= 0
             self._failed(str(error), now, quiet=unplugged)
             return
         self._empty_ns, self._undrained_ns = self._clock(), None
@@ -155,14 +164,17 @@ class EscPort:
             self._failed(f"{path}: lost ({error}).", now)
             return
         if data:
-            if not self._proven:  # a port that goes as soon as it has come is tried more and more seldom
+            if not self._proven:
+                # a port that goes as soon as it has come is tried more and more seldom
                 self._proven = True
                 self._retry.succeeded()
             since = self._undrained_ns
             if since is None:
                 since = max(self._empty_ns, self._selector.before)
             # nothing came faster than the wire allows
-            self._undrained_ns = None if self.port.drained else min(now, since + len(data) * NS_PER_BYTE)
+            self._undrained_ns = (
+                None if self.port.drained else min(now, since + len(data) * NS_PER_BYTE)
+            )
             self._gateway.receive_bytes(self._index, data, now, since)
 
     def reopen(self, now: int, others: tuple[Identity | None, ...] = ()) -> None:
@@ -200,11 +212,18 @@ class EscPort:
         told.forget(self._diagnosis_condition)
         layout = ("unknown layout", "V4", "legacy")[esc.layout]
         device = device_text(esc.info.device) if esc.info else None
-        said = f"{name}: telemetry {esc.link.name.lower()} ({layout}{f', {device}' if device else ''})"
+        said = (
+            f"{name}: telemetry {esc.link.name.lower()} ({layout}{f', {device}' if device else ''})"
+        )
         if told.is_on(self._link_condition):
             crc_errors = esc.counters.crc_errors - self._lost_counters[0]
             dropped = esc.counters.dropped_bytes - self._lost_counters[1]
-            told.end(self._link_condition, said, now, f"; {crc_errors} CRC errors, {dropped} bytes dropped meanwhile")
+            told.end(
+                self._link_condition,
+                said,
+                now,
+                f"; {crc_errors} CRC errors, {dropped} bytes dropped meanwhile",
+            )
         elif esc.link is LinkState.DEGRADED:
             told.begin(self._quality_condition, f"{said}: many CRC errors or dropped bytes", now)
         elif told.is_on(self._quality_condition):
@@ -230,19 +249,26 @@ class EscPort:
             if diagnosis and diagnosis not in self._diagnosed:
                 self._diagnosed.add(diagnosis)
                 self._conditions.begin(
-                    self._diagnosis_condition, f"{self.name}: no telemetry: {diagnosis}{self._line_error_words()}", now
+                    self._diagnosis_condition,
+                    f"{self.name}: no telemetry: {diagnosis}{self._line_error_words()}",
+                    now,
                 )
 
     def _count(self, counts: dict[str, int]) -> None:
         for kind, count in counts.items():
-            new = max(0, count - self._counted.get(kind, 0))  # the driver's own begin anew with each plugging in
+            # the driver's own begin anew with each plugging in
+            new = max(0, count - self._counted.get(kind, 0))
             self.line_errors[kind] = self.line_errors.get(kind, 0) + new
             if kind != "break":  # a break is a framing error too
                 self._gateway.escs[self._index].line_errors += new
         self._counted = counts
 
     def _line_error_words(self) -> str:
-        counts = [f"{count} {kind} errors" for kind, count in self.line_errors.items() if count and kind != "break"]
+        counts = [
+            f"{count} {kind} errors"
+            for kind, count in self.line_errors.items()
+            if count and kind != "break"
+        ]
         return f" (the driver counts {', '.join(counts)})" if counts else ""
 
     def _failed(self, reason: str, now: int, quiet: bool = False) -> None:
@@ -250,7 +276,9 @@ class EscPort:
         self._lost.add(self)
         self._lost_since = self._lost_since or now
         self._gateway.port_lost(self._index, now)
-        self._conditions.begin(self._port_condition, f"{self.name}: {reason} Trying again.", now, quiet=quiet)
+        self._conditions.begin(
+            self._port_condition, f"{self.name}: {reason} Trying again.", now, quiet=quiet
+        )
 
     def _path_now(self, others: tuple[Identity | None, ...]) -> str:
         """Where the port is: an adapter that was unplugged may come back under another number.
@@ -262,8 +290,13 @@ class EscPort:
         found = find_adapter(self.identity)
         if found is not None:
             return self.path if Path(self.path).resolve() == Path(found) else found
-        if any(other is not None and find_adapter(other) == str(Path(self.path).resolve()) for other in others):
-            raise RunError(f"{self.path}: is another ESC's adapter now. Name ports by /dev/serial/by-id or by-path.")
+        if any(
+            other is not None and find_adapter(other) == str(Path(self.path).resolve())
+            for other in others
+        ):
+            raise RunError(
+                f"{self.path}: is another ESC's adapter now. Name ports by /dev/serial/by-id or by-path."
+            )
         return self.path
 
     @property

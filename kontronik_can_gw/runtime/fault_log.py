@@ -106,7 +106,9 @@ class FaultLog:
         """Say the sums that are due."""
         for name in [name for name in self._summing if now >= self._known[name].due]:
             condition = self._known[name]
-            total = condition.total + (0 if condition.begun is None else now - max(condition.begun, now - MINUTE))
+            total = condition.total + (
+                0 if condition.begun is None else now - max(condition.begun, now - MINUTE)
+            )
             if condition.count:
                 in_all = f", {duration(total)} in all" if total else ""
                 self.say(

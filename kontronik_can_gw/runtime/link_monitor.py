@@ -69,7 +69,9 @@ class LinkMonitor:
         name = _attribute(_NAME, self._name + b"\0")
         body = _INTERFACE.pack(0, 0, 0, 0, 0) + name
         with contextlib.suppress(OSError):
-            self._socket.send(_HEADER.pack(_HEADER.size + len(body), _GET_LINK, _REQUEST, 0, 0) + body)
+            self._socket.send(
+                _HEADER.pack(_HEADER.size + len(body), _GET_LINK, _REQUEST, 0, 0) + body
+            )
 
     def take(self) -> list[LinkFacts]:
         """What was told of the interface since the last call, oldest first."""
@@ -115,7 +117,9 @@ class LinkMonitor:
             _STATES[state] if state is not None and state < len(_STATES) else None,
             _number(can.get(_BIT_TIMING)),
             _number(can.get(_RESTART_MS)),
-            struct.unpack_from("=HH", counters) if counters is not None and len(counters) >= 4 else None,
+            struct.unpack_from("=HH", counters)
+            if counters is not None and len(counters) >= 4
+            else None,
             flags & _RUNS == _RUNS,
         )
 
@@ -129,7 +133,9 @@ def link_monitor(name: str) -> LinkMonitor | None:
 
 
 def _number(value: bytes | None) -> int | None:
-    return int.from_bytes(value[:4], sys.byteorder) if value is not None and len(value) >= 4 else None
+    return (
+        int.from_bytes(value[:4], sys.byteorder) if value is not None and len(value) >= 4 else None
+    )
 
 
 def _attribute(kind: int, value: bytes) -> bytes:

@@ -45,7 +45,9 @@ def messages_lock(channel: str, first_id: int) -> str:
 
 def lock_folder() -> Path:
     """Where this user's gateways lock: together with the service where they may, else in a folder of the user's own."""
-    if os.geteuid() == 0 or os.access(SYSTEM_FOLDER if SYSTEM_FOLDER.exists() else SYSTEM_FOLDER.parent, os.W_OK):
+    if os.geteuid() == 0 or os.access(
+        SYSTEM_FOLDER if SYSTEM_FOLDER.exists() else SYSTEM_FOLDER.parent, os.W_OK
+    ):
         return SYSTEM_FOLDER
     given = os.environ.get("XDG_RUNTIME_DIR", "")
     if given.startswith("/") and os.access(given, os.W_OK):
@@ -74,7 +76,11 @@ def file_name(name: str, namespace: int) -> str:
 def lock_name(file: str, namespace: int) -> str | None:
     """The lock that a file stands for; None for one of another network namespace."""
     found, _, text = file.partition(".")
-    return text.replace("%2F", "/").replace("%25", "%").removeprefix(PREFIX) if found == str(namespace) else None
+    return (
+        text.replace("%2F", "/").replace("%25", "%").removeprefix(PREFIX)
+        if found == str(namespace)
+        else None
+    )
 
 
 def is_held(status: os.stat_result, lines: str) -> bool:
@@ -94,7 +100,8 @@ def lock_file(name: str | Path, folder: int | None = None) -> int:
         try:
             fd = os.open(name, _OPEN | os.O_CREAT | os.O_EXCL, 0o600, dir_fd=folder)
             if os.geteuid() == 0:
-                with contextlib.suppress(OSError):  # root's stays root's; the folder's group may open it
+                with contextlib.suppress(OSError):
+                    # root's stays root's; the folder's group may open it
                     os.fchown(fd, -1, around.st_gid)
                     os.fchmod(fd, 0o660)
         except FileExistsError:
@@ -109,7 +116,9 @@ def lock_file(name: str | Path, folder: int | None = None) -> int:
                 continue
             ours = found.st_uid in (0, os.geteuid(), around.st_uid)
             if not (ours and stat.S_ISREG(found.st_mode) and found.st_nlink == 1):
-                raise PermissionError(errno.EPERM, f"belongs to user {found.st_uid}, or is no plain file")
+                raise PermissionError(
+                    errno.EPERM, f"belongs to user {found.st_uid}, or is no plain file"
+                )
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # who had it removes it while it is locked: the name may stand for another file by now
             with contextlib.suppress(FileNotFoundError):
@@ -128,7 +137,9 @@ def lock_file(name: str | Path, folder: int | None = None) -> int:
 class Locks:
     """The locks of one process; they end by ``close`` and with the process. ``report`` is given what a person should know."""
 
-    def __init__(self, folder: Path | None = None, report: Callable[[str], None] = log.warning) -> None:
+    def __init__(
+        self, folder: Path | None = None, report: Callable[[str], None] = log.warning
+    ) -> None:
         self._path = folder
         self._report = report
         self._folder: int | None = None
@@ -167,11 +178,16 @@ class Locks:
             # the system's is made by root, and who owns it is a gateway
             if not is_system and (found.st_uid not in (0, os.geteuid()) or others_may_remove):
                 os.close(folder)
-                raise PermissionError(errno.EPERM, f"belongs to user {found.st_uid}, or others may write to it")
+                raise PermissionError(
+                    errno.EPERM, f"belongs to user {found.st_uid}, or others may write to it"
+                )
         except OSError as error:
-            self._say(f"{path}: {error.strerror}. Nothing keeps a second gateway from the same node-IDs and messages.")
+            self._say(
+                f"{path}: {error.strerror}. Nothing keeps a second gateway from the same node-IDs and messages."
+            )
             return False
-        with contextlib.suppress(OSError):  # systemd-tmpfiles leaves a folder in /tmp alone that somebody has locked
+        with contextlib.suppress(OSError):
+            # systemd-tmpfiles leaves a folder in /tmp alone that somebody has locked
             fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
         self._folder = folder
         return True
@@ -187,13 +203,17 @@ class Locks:
         except OSError as error:
             if _holder(path) == 0:  # root's, which only root may open
                 return False
-            self._say(f"{path}: cannot be locked: {error.strerror}. This lock is not obeyed; remove the file.")
+            self._say(
+                f"{path}: cannot be locked: {error.strerror}. This lock is not obeyed; remove the file."
+            )
         owner = None if path.parent == SYSTEM_FOLDER else _holder(SYSTEM_FOLDER / file)
         if owner == 0:
             self._give_back(name)
             return False
         if owner is not None:
-            self._say(f"{name}: a gateway of user {owner} has this too; this one goes on. End one of them.")
+            self._say(
+                f"{name}: a gateway of user {owner} has this too; this one goes on. End one of them."
+            )
         return True
 
     def _give_back(self, name: str) -> None:

@@ -33,7 +33,11 @@ class BackgroundHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Let the line be written; never waits for the stream."""
         try:
-            record.msg, record.args = printable(record.getMessage()), ()  # what it quotes makes no line of its own
+            # what it quotes makes no line of its own
+            record.msg, record.args = (
+                printable(record.getMessage()),
+                (),
+            )
             line = printable(self.format(record), keep="\n\t") + "\n"
         except Exception:  # a faulty message is no reason to end
             line = f"{record.msg!r} cannot be formatted\n"
@@ -68,6 +72,7 @@ class BackgroundHandler(logging.Handler):
                 lost, self._lost = self._lost, 0
             if lost:
                 text += f"{lost} log lines were lost: they could not be written in time\n"
-            with contextlib.suppress(OSError, ValueError):  # nobody reads any more: there is no one to tell
+            with contextlib.suppress(OSError, ValueError):
+                # nobody reads any more: there is no one to tell
                 self._stream.write(text)
                 self._stream.flush()

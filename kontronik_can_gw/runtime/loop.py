@@ -26,7 +26,13 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.serial_port import Identity
-from kontronik_can_gw.runtime.snapshot import ProgramFacts, StoreFacts, name_in_words, process_facts, snapshot
+from kontronik_can_gw.runtime.snapshot import (
+    ProgramFacts,
+    StoreFacts,
+    name_in_words,
+    process_facts,
+    snapshot,
+)
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.runtime.systemd import Notifier
@@ -87,7 +93,8 @@ class Loop:
         self._poller = poller or Poller(clock)
         self._lost: set[EscPort] = set()
         self.escs = [
-            EscPort(i, path, gateway, self._poller, self.conditions, self._lost, clock) for i, path in enumerate(ports)
+            EscPort(i, path, gateway, self._poller, self.conditions, self._lost, clock)
+            for i, path in enumerate(ports)
         ]
         self.can = CanLink(can_config, gateway, self._poller, self.conditions, self._esc_at, clock)
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -253,7 +260,10 @@ class Loop:
             elif self._keeping:
                 return
             else:
-                log.error("%s: parameters cannot be stored: there is no store for them", self.escs[index].name)
+                log.error(
+                    "%s: parameters cannot be stored: there is no store for them",
+                    self.escs[index].name,
+                )
                 self.gateway.saved(index, "no store", now)
             self._to_keep.popleft()
 
@@ -273,7 +283,11 @@ class Loop:
     def _publish(self, now: int) -> None:
         """Let the statistics' thread tell how things are, if it is time."""
         if self._statistics.wanted(now):
-            store = None if self._store is None else StoreFacts(len(self._to_keep) + self._keeping, self._store_error)
+            store = (
+                None
+                if self._store is None
+                else StoreFacts(len(self._to_keep) + self._keeping, self._store_error)
+            )
             document = snapshot(
                 self.gateway,
                 now=now,
@@ -322,8 +336,13 @@ class Loop:
 
     def _status_words(self) -> str:
         """How things are, in one line."""
-        words = [f"CAN {self.can.config.channel} {name_in_words(self.gateway.status.can_state.name)}"]
-        words += [f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}" for esc in self.gateway.escs]
+        words = [
+            f"CAN {self.can.config.channel} {name_in_words(self.gateway.status.can_state.name)}"
+        ]
+        words += [
+            f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}"
+            for esc in self.gateway.escs
+        ]
         return "; ".join(words)
 
     # --- words
@@ -333,14 +352,20 @@ class Loop:
         for index, key in self.gateway.take_misfits():
             where = f"{key >> 8:04X}h:{key & 0xFF:02X}"
             log.warning(
-                "%s: the stored %s is passed over: it does not fit this EDS, or clashes", self.escs[index].name, where
+                "%s: the stored %s is passed over: it does not fit this EDS, or clashes",
+                self.escs[index].name,
+                where,
             )
         states = [(node_id, state) for node_id, state, _ in self.gateway.node_states()]
         before, self._node_states = self._node_states, states
         for index, (node_id, state) in enumerate(states):
             if before and before[index] == (node_id, state):
                 continue
-            words = "waits for LSS" if node_id == UNCONFIGURED else f"{node_id} {name_in_words(state.name)}"
+            words = (
+                "waits for LSS"
+                if node_id == UNCONFIGURED
+                else f"{node_id} {name_in_words(state.name)}"
+            )
             name = f"{self.escs[index].name}: CANopen node"
             self.conditions.event(name, f"{name} {words}", now, logging.INFO)
 
@@ -361,7 +386,9 @@ class Loop:
             words.append(f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}{rate}")
             if states and states[number][0] != UNCONFIGURED:
                 node_id, state, _ = states[number]
-                words.append(f"node {node_id} {name_in_words(state.name)} {rates[1 + number]:.0f} PDOs/s")
+                words.append(
+                    f"node {node_id} {name_in_words(state.name)} {rates[1 + number]:.0f} PDOs/s"
+                )
         log.info("%s", "; ".join(words))
 
     def _look_round(self, now: int) -> None:

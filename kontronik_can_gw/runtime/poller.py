@@ -71,7 +71,10 @@ class Poller:
         self.before, self.now = self.now, self._clock()
         happened = self._poll.poll(0)
         watched = self._watched
-        return [(watched[fd][0], _READ if bits == _IN else self._events(fd, bits)) for fd, bits in happened]
+        return [
+            (watched[fd][0], _READ if bits == _IN else self._events(fd, bits))
+            for fd, bits in happened
+        ]
 
     def _events(self, fd: int, bits: int) -> int:
         if bits & select.POLLNVAL:  # a driver has closed it: it would stay readable

@@ -30,7 +30,9 @@ def begin(priority: int) -> None:
             f"run.realtime_priority = {priority}: not permitted. {_how(priority)}, then start again."
         ) from None
     except OSError as error:
-        raise RunError(f"run.realtime_priority = {priority}: {error.strerror or error}. Leave it out.") from None
+        raise RunError(
+            f"run.realtime_priority = {priority}: {error.strerror or error}. Leave it out."
+        ) from None
     _begun.append(priority)
     for thread in threading.enumerate():
         if thread is not threading.current_thread():

@@ -105,7 +105,13 @@ class RecordedGateway(Gateway):
                 self._put(now, Kind.LINE_ERRORS, esc, number_data(state.line_errors), 0, None)
 
     def _note(
-        self, now: int, kind: Kind, esc: int = 0, data: bytes = b"", flags: int = 0, came: int | None = None
+        self,
+        now: int,
+        kind: Kind,
+        esc: int = 0,
+        data: bytes = b"",
+        flags: int = 0,
+        came: int | None = None,
     ) -> None:
         counters = self._counters_now()
         if counters != self._counters:

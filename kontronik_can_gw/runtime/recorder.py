@@ -18,7 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.capture.format import SUFFIX, Kind, block, data_payload, json_payload, number_data
+from kontronik_can_gw.capture.format import (
+    SUFFIX,
+    Kind,
+    block,
+    data_payload,
+    json_payload,
+    number_data,
+)
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.states import device_text
 from kontronik_can_gw.esc.telemetry import MS, SECOND
@@ -83,7 +90,9 @@ class RecorderFacts:
 class Recorder:
     """Writes what it is given from ``start`` until ``close``."""
 
-    def __init__(self, settings: RecordSettings, clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self, settings: RecordSettings, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
         self.settings = settings
         self.facts = RecorderFacts()
         self.header: Mapping[str, Any] = {}
@@ -134,7 +143,9 @@ class Recorder:
             raise RunError("captures: the system gives no thread to write them")
         self._thread = thread
 
-    def put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None) -> None:
+    def put(
+        self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None
+    ) -> None:
         """Record an entry, as of ``capture.Entry``. Never waits."""
         if len(self._entries) >= CAPACITY:
             self._overflowed += 1
@@ -253,7 +264,9 @@ class Recorder:
             if self._full:
                 self._end_part()
                 least = self.settings.least_free_bytes // _MB
-                self._say_failed(f"{self.settings.folder}: less than {least} MB are free: nothing is recorded")
+                self._say_failed(
+                    f"{self.settings.folder}: less than {least} MB are free: nothing is recorded"
+                )
         return not self._full
 
     def _lose(self, items: list[Item]) -> None:
@@ -337,7 +350,10 @@ def is_ours(name: str) -> bool:
 def state_of(gateway: Gateway) -> dict[str, Any]:
     """What a replay that begins now cannot know."""
     return {
-        "escs": [{"energy": esc.energy, "run_time": esc.run_time, "losses": esc.losses} for esc in gateway.escs],
+        "escs": [
+            {"energy": esc.energy, "run_time": esc.run_time, "losses": esc.losses}
+            for esc in gateway.escs
+        ],
         "can_state": int(gateway.status.can_state),
         "started_ns": gateway.status.started_ns,
     }
@@ -369,7 +385,9 @@ class _Part:
         self._number = 0
         self._new = 0
         self._header: bytes | None = header
-        self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
+        self._fd = os.open(
+            self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640
+        )
         try:
             with contextlib.suppress(OSError):  # a file system without locks
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -393,7 +411,8 @@ class _Part:
     def take(self, items: list[Item]) -> None:
         """Append what came."""
         self.write(b"D", data_payload(items))
-        if self._header is not None:  # once more, elsewhere: without it nothing can be made of the rest
+        if self._header is not None:
+            # once more, elsewhere: without it nothing can be made of the rest
             self.write(b"H", self._header)
             self._header = None
 

@@ -61,7 +61,9 @@ class SerialPort:
         self.path = path
         is_pty = os.path.realpath(path).startswith("/dev/pts/")
         # one that does not lock it, as a getty, could write to it; its terminal is not touched
-        if Path("/sys/class/tty", Path(os.path.realpath(path)).name).exists() and (users := _users_now_and_then(path)):
+        if Path("/sys/class/tty", Path(os.path.realpath(path)).name).exists() and (
+            users := _users_now_and_then(path)
+        ):
             raise _in_use(path, users)
         quiet = _open_quietly(path)
         try:
@@ -137,7 +139,9 @@ class SerialPort:
     def waits_to_be_read(self) -> bool:
         """True while ``read`` would find bytes."""
         try:
-            return bool(_WAITING.unpack(fcntl.ioctl(self._fd, termios.FIONREAD, bytes(_WAITING.size)))[0])
+            return bool(
+                _WAITING.unpack(fcntl.ioctl(self._fd, termios.FIONREAD, bytes(_WAITING.size)))[0]
+            )
         except OSError:
             return False
 
@@ -182,7 +186,8 @@ def _adapters(root: Path = Path("/")) -> Iterator[tuple[str, Identity]]:
     """USB adapters that are plugged in: path and identity. The loop waits for this, so it reads no more than is needed."""
     names = []
     with contextlib.suppress(OSError):
-        names = [name for name in os.listdir(root / "sys/class/tty") if name.startswith(("ttyUSB", "ttyACM"))]  # noqa: PTH208
+        listed = os.listdir(root / "sys/class/tty")  # noqa: PTH208
+        names = [name for name in listed if name.startswith(("ttyUSB", "ttyACM"))]
     for name in names:
         with contextlib.suppress(OSError, ValueError):  # one is being unplugged
             folder = Path(os.path.realpath(root / "sys/class/tty" / name / "device"))
@@ -192,7 +197,9 @@ def _adapters(root: Path = Path("/")) -> Iterator[tuple[str, Identity]]:
                 folder = folder.parent
             if not folder.name:
                 continue
-            vendor, product = (int((folder / file).read_text(), 16) for file in ("idVendor", "idProduct"))
+            vendor, product = (
+                int((folder / file).read_text(), 16) for file in ("idVendor", "idProduct")
+            )
             file = folder / "serial"
             serial_number = file.read_text().strip() if file.exists() else ""
             # an adapter with several ports has one serial number for all
@@ -203,7 +210,11 @@ def _adapters(root: Path = Path("/")) -> Iterator[tuple[str, Identity]]:
 def _in_use(path: str, users: str) -> RunError:
     who = f": {users}" if users else " (another gateway? a getty?)"
     name = Path(os.path.realpath(path)).name
-    getty = f"; if it is a getty: sudo systemctl disable --now serial-getty@{name}" if name.startswith("tty") else ""
+    getty = (
+        f"; if it is a getty: sudo systemctl disable --now serial-getty@{name}"
+        if name.startswith("tty")
+        else ""
+    )
     return RunError(f"{path}: is in use by another program{who}. End it{getty}.")
 
 
@@ -232,19 +243,32 @@ def _open_quietly(path: str) -> int:
         termios.tcflush(fd, termios.TCOFLUSH)
     except termios.error:
         os.close(fd)
-        raise RunError(f"{path}: is not a serial port. Name the adapter's: see `ls /dev/serial/by-id`.") from None
+        raise RunError(
+            f"{path}: is not a serial port. Name the adapter's: see `ls /dev/serial/by-id`."
+        ) from None
     return fd
 
 
 def _open(path: str, parity: str, is_pty: bool) -> serial.Serial:
     try:
         return serial.Serial(path, BAUD_RATE, parity=parity, timeout=0, exclusive=True)
-    except (OSError, termios.error, ValueError) as error:  # SerialException is an OSError; termios.error is not
-        number = error.args[0] if error.args and isinstance(error.args[0], int) else getattr(error, "errno", None)
+    except (
+        OSError,
+        termios.error,
+        ValueError,
+    ) as error:
+        # SerialException is an OSError; termios.error is not
+        number = (
+            error.args[0]
+            if error.args and isinstance(error.args[0], int)
+            else getattr(error, "errno", None)
+        )
         if number == errno.EINVAL and parity == serial.PARITY_EVEN:
             if is_pty:  # a pseudo terminal has no parity and may say so
                 return _open(path, serial.PARITY_NONE, is_pty)
-            raise RunError(f"{path}: cannot do 115200 baud with even parity. {_NO_PARITY}") from None
+            raise RunError(
+                f"{path}: cannot do 115200 baud with even parity. {_NO_PARITY}"
+            ) from None
         raise _explained(path, number, str(error)) from None
 
 
@@ -264,7 +288,9 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
             shared = status.st_mode & 0o060 == 0o060
             group = grp.getgrgid(status.st_gid).gr_name
         if not shared:  # to join the group would not help
-            return RunError(f"{path}: permission denied, to its group {group} too: sudo chmod g+rw {path}.")
+            return RunError(
+                f"{path}: permission denied, to its group {group} too: sudo chmod g+rw {path}."
+            )
         return RunError(
             f"{path}: permission denied. Join its group: sudo usermod -aG {group} $USER, then log in again."
         )
@@ -299,7 +325,9 @@ def _users(path: str) -> str:
     with contextlib.suppress(OSError):
         lines = Path("/proc/consoles").read_text().splitlines()
         if any(line.split()[:1] == [name] for line in lines):
-            found.add(f"the kernel's console (take console={name} out of the kernel's command line)")
+            found.add(
+                f"the kernel's console (take console={name} out of the kernel's command line)"
+            )
     seen = [process for process in _seen_users if _has_open(process, device)]
     # who had it open when we last looked mostly has it still: all programs are not looked through each time
     for process in seen or Path("/proc").glob("[0-9]*"):

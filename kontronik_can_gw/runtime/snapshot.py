@@ -210,7 +210,9 @@ def snapshot(
             }
             for name, (node_id, state, sent) in zip(names, nodes, strict=False)
         ],
-        "store": None if store is None else {"waiting": store.waiting, "last_error": store.last_error or None},
+        "store": None
+        if store is None
+        else {"waiting": store.waiting, "last_error": store.last_error or None},
         "recording": None if recorder is None else asdict(recorder),
         "log": list(log_lines)[-LOG_LINES:],
     }
@@ -218,15 +220,20 @@ def snapshot(
 
 def with_rates(document: Document, before: Document | None) -> Document:
     """The document with what happens in a second since ``before``: frames on the bus, PDOs of each node. None without a ``before``."""
-    seconds = 0.0 if before is None else (document["monotonic_ns"] - before["monotonic_ns"]) / SECOND
+    seconds = (
+        0.0 if before is None else (document["monotonic_ns"] - before["monotonic_ns"]) / SECOND
+    )
     if before is None or seconds <= 0:
         return document | {"rates": None}
     new, old = document["can"]["counters"], before["can"]["counters"]
     pdos = zip(document["nodes"], before["nodes"], strict=False)
     rates: Document = {
-        f"{name}_per_s": round((new[name] - old[name]) / seconds, 1) for name in ("sent_frames", "received_frames")
+        f"{name}_per_s": round((new[name] - old[name]) / seconds, 1)
+        for name in ("sent_frames", "received_frames")
     }
-    rates["pdos_per_s"] = [round((now["pdos_sent"] - then["pdos_sent"]) / seconds, 1) for now, then in pdos]
+    rates["pdos_per_s"] = [
+        round((now["pdos_sent"] - then["pdos_sent"]) / seconds, 1) for now, then in pdos
+    ]
     return document | {"rates": {"seconds": round(seconds, 3)} | rates}
 
 
@@ -249,7 +256,9 @@ def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
     live, info = esc.live, esc.info
     if live is not None and now - esc.live_bound_ns > esc.settings.timeout_ns:
         live = None
-    if info is not None and (esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS):
+    if info is not None and (
+        esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS
+    ):
         info = None
     readers = _readers(esc.settings.pole_pairs, esc.settings.gear)
     alarms = None if live is None else _alarms(live.operating_errors)
@@ -260,7 +269,9 @@ def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
             "open": port.open,
             "complaint": port.complaint or None,
             "reopened": max(0, port.reopened),
-            "lost_for_s": None if port.lost_since_ns is None else _seconds(now - port.lost_since_ns),
+            "lost_for_s": None
+            if port.lost_since_ns is None
+            else _seconds(now - port.lost_since_ns),
             "line_errors": dict(port.line_errors),
         },
         "link": name_in_words(esc.link.name),
@@ -275,8 +286,14 @@ def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
         "data_age_ms": esc.age_ms(now),
         "losses": esc.losses,
         "counters": esc.counters.as_dict()
-        | {"suspect_frames": esc.suspect_frames, "late_frames": esc.late_frames, "line_errors": esc.line_errors},
-        "operating_state": None if live is None else state_text(live.operating_state) or str(live.operating_state),
+        | {
+            "suspect_frames": esc.suspect_frames,
+            "late_frames": esc.late_frames,
+            "line_errors": esc.line_errors,
+        },
+        "operating_state": None
+        if live is None
+        else state_text(live.operating_state) or str(live.operating_state),
         "errors": None if alarms is None else alarms[Severity.ERROR],
         "warnings": None if alarms is None else alarms[Severity.WARNING],
         "statuses": None if alarms is None else alarms[Severity.STATUS],
@@ -320,7 +337,9 @@ def _readers(pole_pairs: int, gear: Fraction) -> _Readers:
     settings = EscSettings(pole_pairs=pole_pairs, gear=gear)
     groups = {group: [s for s in _values(settings) if s.group is group] for group in Group}
     live, info, link = (_compiled(groups[group]) for group in (Group.LIVE, Group.INFO, Group.LINK))
-    nothing_live, nothing_known = (dict.fromkeys(s.name for s in groups[group]) for group in (Group.LIVE, Group.INFO))
+    nothing_live, nothing_known = (
+        dict.fromkeys(s.name for s in groups[group]) for group in (Group.LIVE, Group.INFO)
+    )
     return _Readers(live, info, link, nothing_live, nothing_known)
 
 

@@ -58,7 +58,9 @@ class Statistics:
         if file is not None and self._locks.hold([f"{os.path.realpath(file)}/statistics/0"]):
             if self._server is not None:
                 self._server.stop_listening()
-            raise RunError(f"statistics.file {file}: another gateway writes it. Give this one its own.")
+            raise RunError(
+                f"statistics.file {file}: another gateway writes it. Give this one its own."
+            )
         self._newest: Document | None = None
         self._reports: deque[Report] = deque()
         self._writing_since: int | None = None
@@ -106,7 +108,9 @@ class Statistics:
         since = self._writing_since
         if since is not None and now - since > STALE_NS and not self._told_slow:
             self._told_slow = True
-            taken.append(Report(True, f"{self._file}: the disk does not answer; the gateway is not held up."))
+            taken.append(
+                Report(True, f"{self._file}: the disk does not answer; the gateway is not held up.")
+            )
         elif since is None and self._told_slow:
             self._told_slow = False
             taken.append(Report(False, f"{self._file}: the disk answers again"))
@@ -130,7 +134,9 @@ class Statistics:
         selector = selectors.DefaultSelector()
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         selector.register(self._wake, selectors.EVENT_READ)
-        thread = threading.Thread(target=self._run, args=(selector,), name="statistics", daemon=True)
+        thread = threading.Thread(
+            target=self._run, args=(selector,), name="statistics", daemon=True
+        )
         if not start_beside_the_loop(thread):
             raise RuntimeError("no thread can be started")
         self._thread = thread
@@ -174,7 +180,12 @@ class Statistics:
             file.remove()
 
     def _write(self, file: "_StatusFile", document: Document) -> None:
-        data = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode("utf-8", "replace") + b"\n"
+        data = (
+            json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode(
+                "utf-8", "replace"
+            )
+            + b"\n"
+        )
         self._writing_since = time.monotonic_ns()
         if (report := file.write(data)) is not None:
             self._reports.append(report)
@@ -211,9 +222,17 @@ class _StatusFile:
                 self._temporary.unlink()
             self._failures += 1
             reason = error.strerror or str(error)
-            return None if self._failures > 1 else Report(True, f"{self}: cannot be written: {reason}. Trying again.")
+            return (
+                None
+                if self._failures > 1
+                else Report(True, f"{self}: cannot be written: {reason}. Trying again.")
+            )
         failures, self._failures = self._failures, 0
-        return Report(False, f"{self}: is written again ({failures} times it could not be)") if failures else None
+        return (
+            Report(False, f"{self}: is written again ({failures} times it could not be)")
+            if failures
+            else None
+        )
 
     def tidy(self) -> None:
         """Remove what killed writers left half."""
@@ -231,7 +250,8 @@ class _StatusFile:
 
     def _replace(self, data: bytes) -> None:
         with contextlib.suppress(FileNotFoundError):
-            if not stat.S_ISREG(self._path.lstat().st_mode):  # /dev/null would be gone, for everybody
+            if not stat.S_ISREG(self._path.lstat().st_mode):
+                # /dev/null would be gone, for everybody
                 raise OSError(errno.EINVAL, "what is there is no plain file")
         self._temporary.unlink(missing_ok=True)
         fd = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)

@@ -74,7 +74,8 @@ class ParameterStore:
         except FileNotFoundError:
             return Stored(), None
         except OSError as error:
-            self._unusable.add(name)  # perhaps only for now: it is not touched before something is to be saved
+            # perhaps only for now: it is not touched before something is to be saved
+            self._unusable.add(name)
             return Stored(), f"{path}: {_reason(error)}"
         except ValueError as error:
             try:
@@ -132,7 +133,9 @@ class ParameterStore:
 
     def _path(self, name: str) -> Path:
         if _NAME.fullmatch(name) is None:
-            raise ValueError(f"{name!r} is not a node's name: a letter, then up to 11 letters, digits or underscores")
+            raise ValueError(
+                f"{name!r} is not a node's name: a letter, then up to 11 letters, digits or underscores"
+            )
         return parameter_file(self._folder, name)
 
     def _started(self) -> bool:

@@ -22,7 +22,13 @@ class Notifier:
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         environment = os.environ if environment is None else environment
         address = environment.get("NOTIFY_SOCKET", "")
-        self._address = "\0" + address[1:] if address.startswith("@") else address if address.startswith("/") else ""
+        self._address = (
+            "\0" + address[1:]
+            if address.startswith("@")
+            else address
+            if address.startswith("/")
+            else ""
+        )
         self._watchdog_ns = _watchdog_ns(environment)
         self._socket: socket.socket | None = None
         self._owed: dict[str, str] = {}
@@ -66,7 +72,9 @@ class Notifier:
 
     def _news(self, text: str) -> dict[str, str]:
         """The line, if it is new. It can hold nothing that would be read as a message of its own."""
-        line = " ".join("".join(c if c.isprintable() else " " for c in text).split())[:_MAX_CHARACTERS]
+        line = " ".join("".join(c if c.isprintable() else " " for c in text).split())[
+            :_MAX_CHARACTERS
+        ]
         if not line or line == self._status:
             return {}
         self._status = line
@@ -127,7 +135,12 @@ class JournalFormatter(logging.Formatter):
 
 def priority(level: int) -> int:
     """Syslog's priority for a level of ``logging``: 2 critical, 3 error, 4 warning, 5 notice, 6 information, 7 debug."""
-    for least, number in ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO + 1, 5)):
+    for least, number in (
+        (logging.CRITICAL, 2),
+        (logging.ERROR, 3),
+        (logging.WARNING, 4),
+        (logging.INFO + 1, 5),
+    ):
         if level >= least:
             return number
     return 6 if level >= logging.INFO else 7

@@ -28,7 +28,9 @@ def take(pieces: Sequence[Piece], bits: int) -> int:
     return sum((bits >> piece.at & (1 << piece.width) - 1) << piece.shift for piece in pieces)
 
 
-def float_bits(value: float | None, length: int, low: float, high: float, error: int, not_available: int = -1) -> int:
+def float_bits(
+    value: float | None, length: int, low: float, high: float, error: int, not_available: int = -1
+) -> int:
     """The IEEE 754 bits of a 32- or 64-bit float.
 
     ``error`` for what is outside low..high, has no float of this length, or would look like ``not_available``.
@@ -79,13 +81,20 @@ def source_text(plan: MessagePlan) -> str:
 
 def compile_pack(plan: MessagePlan, further: Mapping[str, object] | None = None) -> Pack:
     """The function of ``source_text``, compiled. ``further``: what expressions of the plan's sources may name besides."""
-    names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf, **_tables(plan), **(further or {})}
+    names: dict[str, object] = {
+        "float_bits": float_bits,
+        "inf": math.inf,
+        **_tables(plan),
+        **(further or {}),
+    }
     exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
     return names.pop("pack")  # type: ignore[return-value]  # what its own globals hold would be a circle
 
 
 def _tables(plan: MessagePlan) -> dict[str, dict[int, int]]:
-    return {_table_name(s): {int(k): v for k, v in s.numbers.items()} for s in plan.signals if s.numbers}
+    return {
+        _table_name(s): {int(k): v for k, v in s.numbers.items()} for s in plan.signals if s.numbers
+    }
 
 
 def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
@@ -120,7 +129,8 @@ def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
 def _terms(signals: Sequence[SignalPlan]) -> list[str]:
     """Python text of each signal's bits; flags of one word that move together are one."""
     terms: list[str] = []
-    flags: dict[tuple[str, int], int] = {}  # (word, distance moved up) -> bits of the word that move together
+    # (word, distance moved up) -> bits of the word that move together
+    flags: dict[tuple[str, int], int] = {}
     for signal in signals:
         source = signal.source
         assert source is not None
@@ -140,7 +150,11 @@ def _terms(signals: Sequence[SignalPlan]) -> list[str]:
 
 def _is_plain_flag(signal: SignalPlan) -> bool:
     return (
-        signal.length == 1 and not signal.is_float and signal.slope == 1 and signal.intercept == 0 and not signal.signed
+        signal.length == 1
+        and not signal.is_float
+        and signal.slope == 1
+        and signal.intercept == 0
+        and not signal.signed
     )
 
 
@@ -148,7 +162,9 @@ def _value(signal: SignalPlan) -> str:
     """Python text of a signal's raw value, or of its Error code where it has none."""
     source = signal.source
     assert source is not None
-    expression = source.expression if source.bit is None else f"{source.expression} >> {source.bit} & 1"
+    expression = (
+        source.expression if source.bit is None else f"{source.expression} >> {source.bit} & 1"
+    )
     if signal.is_float:
         scaled = f"({expression}) * {float(signal.slope)!r} + {float(signal.intercept)!r}"
         if signal.numbers is not None:
@@ -164,7 +180,8 @@ def _value(signal: SignalPlan) -> str:
     unfit = [f"> {signal.high}"] if high is None or high > signal.high else []
     unfit += [f"< {signal.low}"] if low is None or low < signal.low else []
     if signal.low <= signal.not_available <= signal.high and signal.error != signal.not_available:
-        unfit.append(f"== {signal.not_available}")  # a code amid the values: a true value must not look like it
+        # a code amid the values: a true value must not look like it
+        unfit.append(f"== {signal.not_available}")
     if not unfit:
         return value
     name = "v"
@@ -199,7 +216,10 @@ def _ends(signal: SignalPlan) -> tuple[Fraction | None, Fraction | None]:
     assert source is not None
     if source.low is None or source.high is None or not source.whole:
         return None, None
-    ends = [source.low * signal.slope + signal.intercept, source.high * signal.slope + signal.intercept]
+    ends = [
+        source.low * signal.slope + signal.intercept,
+        source.high * signal.slope + signal.intercept,
+    ]
     return min(ends), max(ends)
 
 

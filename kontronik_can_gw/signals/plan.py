@@ -144,5 +144,6 @@ class Layout:
     def bus_load(self, bitrate: int, data_bitrate: int = 2_000_000) -> float:
         """Share of the bus, 0 to 1 and above, that the messages need at these rates in bit/s."""
         return sum(
-            message.rate_hz * (message.bits[0] / bitrate + message.bits[1] / data_bitrate) for message in self.messages
+            message.rate_hz * (message.bits[0] / bitrate + message.bits[1] / data_bitrate)
+            for message in self.messages
         )

@@ -21,7 +21,8 @@ _NONE = "none"
 _MOJIBAKE = (("Â", ""), ("Î¼", "µ"))
 """UTF-8 read as Windows-1252, as it stands in files that went through both."""
 _LETTERS = str.maketrans(
-    {"µ": "u", "μ": "u", "°": "deg", "º": "deg", "˚": "deg", "⁻": "-", "¹": "1", "·": "*"} | dict.fromkeys("()[]_. ")
+    {"µ": "u", "μ": "u", "°": "deg", "º": "deg", "˚": "deg", "⁻": "-", "¹": "1", "·": "*"}
+    | dict.fromkeys("()[]_. ")
 )
 
 

@@ -70,7 +70,9 @@ class SignalReader:
         self.layout = layout
         columns: list[Column] = []
         self.parts: list[Part] = []
-        self._messages: dict[int, tuple[int, Callable[[int], int] | None, dict[int | None, _Unpack]]] = {}
+        self._messages: dict[
+            int, tuple[int, Callable[[int], int] | None, dict[int | None, _Unpack]]
+        ] = {}
         for plan in layout.messages:
             key = plan.can_id | (EXTENDED if plan.extended else 0)
             multiplexer = next((s for s in plan.signals if s.role is Role.MULTIPLEXER), None)
@@ -82,9 +84,15 @@ class SignalReader:
                 self.parts.append(Part(len(columns), len(signals), plan, page))
                 unpacks[page] = (len(columns), compile_unpack(signals, f"{plan.name}{page or ''}"))
                 columns += [_column(s, plan, key) for s in signals]
-            self._messages[key] = (plan.length, None if multiplexer is None else _number(multiplexer), unpacks)
+            self._messages[key] = (
+                plan.length,
+                None if multiplexer is None else _number(multiplexer),
+                unpacks,
+            )
         self.columns = tuple(columns)
-        self._by_source = {(c.source, c.esc): index for index, c in reversed(list(enumerate(columns)))}
+        self._by_source = {
+            (c.source, c.esc): index for index, c in reversed(list(enumerate(columns)))
+        }
 
     def unpack_of(self, part: Part) -> Callable[[int], list[Value]]:
         """What gives the values of a part from the bits of its message."""
@@ -137,7 +145,11 @@ def _lost_flags(signals: Sequence[SignalPlan]) -> list[str]:
     groups: dict[tuple[int | None, Group], tuple[list[str], list[str]]] = {}
     for index, signal in enumerate(signals):
         source = signal.source
-        if source is None or source.group not in (Group.LIVE, Group.INFO) or source.supplied is not None:
+        if (
+            source is None
+            or source.group not in (Group.LIVE, Group.INFO)
+            or source.supplied is not None
+        ):
             continue
         flags, others = groups.setdefault((signal.esc, source.group), ([], []))
         if _is_flag(signal):
@@ -159,11 +171,15 @@ def _is_flag(signal: SignalPlan) -> bool:
     return signal.length == 1 and not signal.signed and not signal.is_float and as_it_stands
 
 
-def float_value(bits: int, length: int, codes: tuple[int, ...], factor: float, offset: float) -> float | None:
+def float_value(
+    bits: int, length: int, codes: tuple[int, ...], factor: float, offset: float
+) -> float | None:
     """The physical value of a float signal's bits; None for its codes and for NaN."""
     if bits in codes:
         return None
-    raw: float = struct.unpack("<f" if length == 32 else "<d", bits.to_bytes(length // 8, "little"))[0]
+    raw: float = struct.unpack(
+        "<f" if length == 32 else "<d", bits.to_bytes(length // 8, "little")
+    )[0]
     return None if raw != raw else raw * factor + offset
 
 
@@ -213,13 +229,31 @@ def _column(signal: SignalPlan, plan: MessagePlan, key: int) -> Column:
     if signal.is_float:
         ends = sorted(raw * float(signal.factor) + float(signal.offset) for raw in signal.limits)
         return Column(
-            signal.name, signal.unit, plan.name, key, signal.source.name, signal.esc, (), None, ends[0], ends[1]
+            signal.name,
+            signal.unit,
+            plan.name,
+            key,
+            signal.source.name,
+            signal.esc,
+            (),
+            None,
+            ends[0],
+            ends[1],
         )
     texts = tuple(sorted(signal.texts.items())) if signal.numbers is not None else ()
     ends = sorted(float(raw * signal.factor + signal.offset) for raw in (signal.low, signal.high))
     digits = max(_digits(signal.factor), _digits(signal.offset))
     return Column(
-        signal.name, signal.unit, plan.name, key, signal.source.name, signal.esc, texts, digits, ends[0], ends[1]
+        signal.name,
+        signal.unit,
+        plan.name,
+        key,
+        signal.source.name,
+        signal.esc,
+        texts,
+        digits,
+        ends[0],
+        ends[1],
     )
 
 

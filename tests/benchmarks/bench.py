@@ -36,14 +36,28 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="bench", description="Measure the gateway beside C and beside the obvious program."
     )
-    made.add_argument("--only", nargs="+", default=["*"], metavar="NAME", help="these alone; as 'cpu*' too")
+    made.add_argument(
+        "--only", nargs="+", default=["*"], metavar="NAME", help="these alone; as 'cpu*' too"
+    )
     made.add_argument("--list", action="store_true", help="list the benchmarks and end")
     made.add_argument(
-        "--seconds", type=seconds, default=5.0, metavar="N", help="length of one measurement (default: 5)"
+        "--seconds",
+        type=seconds,
+        default=5.0,
+        metavar="N",
+        help="length of one measurement (default: 5)",
     )
-    made.add_argument("--long", action="store_true", help="files of up to 100 MB too, which takes minutes")
-    made.add_argument("--quick", action="store_true", help="as short as it can be: tries the benchmarks themselves")
-    made.add_argument("--vcan", default="", metavar="NAME", help="a vcan interface in place of the local socket")
+    made.add_argument(
+        "--long", action="store_true", help="files of up to 100 MB too, which takes minutes"
+    )
+    made.add_argument(
+        "--quick",
+        action="store_true",
+        help="as short as it can be: tries the benchmarks themselves",
+    )
+    made.add_argument(
+        "--vcan", default="", metavar="NAME", help="a vcan interface in place of the local socket"
+    )
     return made
 
 
@@ -137,17 +151,22 @@ def table(results: list[dict[str, Any]]) -> str:
     for result in results:
         lines.append(result["name"])
         for figure in result["figures"]:
-            words = (
-                f"{figure['name']:{width}}  {number(figure['value']):>12}  {figure['unit']:18}  {figure['target']:9}"
-            )
+            words = f"{figure['name']:{width}}  {number(figure['value']):>12}  {figure['unit']:18}  {figure['target']:9}"
             lines.append(f"  {words}  {verdict(figure):14}  {figure['note']}".rstrip())
         for word in ("left_out", "error"):
             if result[word]:
                 lines.append(f"  {word.replace('_', ' ')}: {result[word]}")
-    counts = {reached: sum(figure["reached"] is reached for figure in figures) for reached in (True, False)}
-    left_out, failed = (sum(bool(result[word]) for result in results) for word in ("left_out", "error"))
+    counts = {
+        reached: sum(figure["reached"] is reached for figure in figures)
+        for reached in (True, False)
+    }
+    left_out, failed = (
+        sum(bool(result[word]) for result in results) for word in ("left_out", "error")
+    )
     lines.append("")
-    lines.append(f"targets: {counts[True]} reached, {counts[False]} missed; {left_out} left out, {failed} failed")
+    lines.append(
+        f"targets: {counts[True]} reached, {counts[False]} missed; {left_out} left out, {failed} failed"
+    )
     return "\n".join(lines)
 
 

@@ -90,13 +90,30 @@ def end(process: "subprocess.Popen[str]", patience_s: float = 3.0) -> None:
 class Feeder:
     """The ESCs, and the other end of the bus."""
 
-    def __init__(self, context: Context, escs: int, *options: str, seconds: float | None = None) -> None:
-        self.bus = f"can:{context.vcan}" if context.vcan else f"unix:kontronik-bench-{uuid.uuid4().hex[:12]}"
+    def __init__(
+        self, context: Context, escs: int, *options: str, seconds: float | None = None
+    ) -> None:
+        self.bus = (
+            f"can:{context.vcan}"
+            if context.vcan
+            else f"unix:kontronik-bench-{uuid.uuid4().hex[:12]}"
+        )
         program = context.compiled("feeder.c", "-pthread")
         length = context.seconds if seconds is None else seconds
         warmup = 0.5 if context.quick else 2.0
         self._limit_s = length + warmup + 30
-        words = ["--bus", self.bus, "--escs", escs, "--seconds", length, "--warmup", warmup, "--priority", _PRIORITY]
+        words = [
+            "--bus",
+            self.bus,
+            "--escs",
+            escs,
+            "--seconds",
+            length,
+            "--warmup",
+            warmup,
+            "--priority",
+            _PRIORITY,
+        ]
         command = [str(program), *map(str, words), *options]
         self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._heard = ""
@@ -163,14 +180,34 @@ class Gateway:
         if program == "c":
             command = [str(context.compiled("gateway.c")), feeder.bus, *feeder.ports]
         elif program == "obvious":
-            command = [sys.executable, str(STANDIN), feeder.bus, "obvious", str(FIVE), channel, *feeder.ports]
+            command = [
+                sys.executable,
+                str(STANDIN),
+                feeder.bus,
+                "obvious",
+                str(FIVE),
+                channel,
+                *feeder.ports,
+            ]
         else:
-            (folder / "gateway.toml").write_text(config_text(feeder.ports, channel, dbc, folder, config))
-            command = [sys.executable, str(STANDIN), feeder.bus, "ours", "run", "-c", str(folder / "gateway.toml")]
+            (folder / "gateway.toml").write_text(
+                config_text(feeder.ports, channel, dbc, folder, config)
+            )
+            command = [
+                sys.executable,
+                str(STANDIN),
+                feeder.bus,
+                "ours",
+                "run",
+                "-c",
+                str(folder / "gateway.toml"),
+            ]
         self._errors = (folder / "errors").open("w+")
         same = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""}
         nothing = subprocess.DEVNULL
-        self.process = start(wrap(command), stdin=nothing, stdout=nothing, stderr=self._errors, env=same)
+        self.process = start(
+            wrap(command), stdin=nothing, stdout=nothing, stderr=self._errors, env=same
+        )
         self.program = program
         self.pid = self.process.pid
 
@@ -190,7 +227,9 @@ class Gateway:
         self._folder.cleanup()
 
 
-def config_text(ports: Sequence[str], channel: str, dbc: Path | None, folder: Path, further: str = "") -> str:
+def config_text(
+    ports: Sequence[str], channel: str, dbc: Path | None, folder: Path, further: str = ""
+) -> str:
     """Our configuration. ``dbc`` None: the shipped one. ``further`` may begin with lines of [dbc]."""
     lines = ["[can]", 'interface = "socketcan"', f'channel = "{channel}"', "[dbc]"]
     if dbc is not None:
@@ -205,7 +244,12 @@ def config_text(ports: Sequence[str], channel: str, dbc: Path | None, folder: Pa
 
 @contextlib.contextmanager
 def running(
-    context: Context, program: str, escs: int, *options: str, seconds: float | None = None, **further: Any
+    context: Context,
+    program: str,
+    escs: int,
+    *options: str,
+    seconds: float | None = None,
+    **further: Any,
 ) -> Iterator[tuple[Feeder, Gateway]]:
     """A feeder and a gateway, both ended at the end."""
     feeder = Feeder(context, escs, *options, seconds=seconds)

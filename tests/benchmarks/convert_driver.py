@@ -11,7 +11,13 @@ import re
 import time
 from pathlib import Path
 
-from kontronik_can_gw.desk.recordings.convert import TABLES, Conversion, LogConversion, Output, TableConversion
+from kontronik_can_gw.desk.recordings.convert import (
+    TABLES,
+    Conversion,
+    LogConversion,
+    Output,
+    TableConversion,
+)
 from kontronik_can_gw.desk.recordings.inputs import DumpInput
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.desk.recordings.tables import Choice

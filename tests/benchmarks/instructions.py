@@ -122,7 +122,13 @@ def of_python(program: str, count: int) -> int:
         command = [*counted_by(out), sys.executable, __file__, program, str(count)]
         same = os.environ | {"PYTHONHASHSEED": "0"}
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=600, env=same, preexec_fn=die_with_us, check=False
+            command,
+            capture_output=True,
+            text=True,
+            timeout=600,
+            env=same,
+            preexec_fn=die_with_us,
+            check=False,
         )
         if done.returncode:
             raise RuntimeError(f"{program}: {done.stderr.strip()[-1500:]}")
@@ -135,7 +141,10 @@ def of_c(context: Context, count: int) -> int:
         out = Path(folder) / "callgrind"
         words = ("--warmup", "0", "--period", "5000")
         counted = lambda command: [*counted_by(out), *command]  # noqa: E731
-        with running(context, "c", 1, *words, seconds=count * 0.005, wrap=counted) as (feeder, gateway):
+        with running(context, "c", 1, *words, seconds=count * 0.005, wrap=counted) as (
+            feeder,
+            gateway,
+        ):
             sent = feeder.measure(gateway).sent
         return round(total(out) * count / sent)
 
@@ -150,7 +159,10 @@ def for_each(count: Callable[[int], int], number: int) -> float:
 def instructions(context: Context) -> list[Figure]:
     """The three programs."""
     number = 20 if context.quick else 200
-    found = {program: for_each(lambda n, p=program: of_python(p, n), number) for program in ("ours", "obvious")}  # type: ignore[misc]
+    found = {
+        program: for_each(lambda n, p=program: of_python(p, n), number)
+        for program in ("ours", "obvious")
+    }  # type: ignore[misc]
     found["c"] = for_each(lambda n: of_c(context, n), number)
     return [
         judged("ours: decode, pack, schedule", found["ours"], "instructions/frame", "<= 40000"),
@@ -160,7 +172,11 @@ def instructions(context: Context) -> list[Figure]:
     ]
 
 
-BENCHMARKS = [Benchmark("instructions", "instructions for each live frame, by valgrind (a minute)", instructions)]
+BENCHMARKS = [
+    Benchmark(
+        "instructions", "instructions for each live frame, by valgrind (a minute)", instructions
+    )
+]
 
 if __name__ == "__main__":
     sys.path[:0] = [str(ROOT), str(HERE / "peers")]

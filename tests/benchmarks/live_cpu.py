@@ -24,7 +24,9 @@ def compare(context: Context, escs: int, *options: str) -> dict[str, list[Measur
 def cpu_of(runs: list[Measured]) -> float:
     """Median of the rounds."""
     if not all(run.cpu_us for run in runs):
-        raise LeftOut("this kernel counts CPU time by ticks (User Mode Linux): too coarse to compare. Use a real one")
+        raise LeftOut(
+            "this kernel counts CPU time by ticks (User Mode Linux): too coarse to compare. Use a real one"
+        )
     return median([run.cpu_us for run in runs])
 
 
@@ -47,7 +49,8 @@ def beside(context: Context, escs: int, most: str, least: str, *options: str) ->
     found = compare(context, escs, *options)
     what = ", ".join([f"{escs} ESC", *options])
     figures = [
-        Figure(f"{program}, {what}", cpu_of(runs), "us/frame", note=losses(runs)) for program, runs in found.items()
+        Figure(f"{program}, {what}", cpu_of(runs), "us/frame", note=losses(runs))
+        for program, runs in found.items()
     ]
     ours, fair = found["ours"], lost_share(found["ours"]) < 0.01
     for name, value, target in (
@@ -55,7 +58,9 @@ def beside(context: Context, escs: int, most: str, least: str, *options: str) ->
         ("obvious / ours", ratio(found["obvious"], ours), least),
     ):
         title = f"{name}, {what}"
-        figures.append(judged(title, value, "x", target, fair=fair) if target else Figure(title, value, "x"))
+        figures.append(
+            judged(title, value, "x", target, fair=fair) if target else Figure(title, value, "x")
+        )
     return figures
 
 
@@ -82,7 +87,12 @@ def canopen(context: Context) -> list[Figure]:
     if not frames:
         raise RuntimeError("the CANopen nodes sent nothing")
     return [
-        Figure("ours, 8 ESC, CANopen too", cpu_of(both), "us/frame", note=f"{frames:.1f} CANopen frames a live frame"),
+        Figure(
+            "ours, 8 ESC, CANopen too",
+            cpu_of(both),
+            "us/frame",
+            note=f"{frames:.1f} CANopen frames a live frame",
+        ),
         judged("with / without CANopen", ratio(both, plain), "x", "<= 1.6"),
     ]
 
@@ -105,15 +115,23 @@ def many(context: Context) -> list[Figure]:
         what = f"{escs} ESCs" + (" on one core" if where is pinned else "")
         note = f"delay, 99 %: {run.delay['p99']} us, longest {run.delay['max']:.0f}"
         figures += [
-            Figure(f"{what}: CAN frames lost", run.lost, f"of {5 * run.sent}", "0", run.lost == 0, note),
+            Figure(
+                f"{what}: CAN frames lost", run.lost, f"of {5 * run.sent}", "0", run.lost == 0, note
+            ),
             Figure(f"{what}: share of a core", run.cpu_share * 100, "%"),
         ]
     return figures
 
 
 BENCHMARKS = [
-    Benchmark("cpu", "CPU time a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program", cpu),
+    Benchmark(
+        "cpu", "CPU time a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program", cpu
+    ),
     Benchmark("cpu-bytewise", "the same where the bytes come one by one", bytewise),
-    Benchmark("cpu-canopen", "CPU time with CANopen nodes and default PDOs, beside that without", canopen),
-    Benchmark("many", "128 ESCs in one process; 15 000 CAN frames a second on one core: none lost", many),
+    Benchmark(
+        "cpu-canopen", "CPU time with CANopen nodes and default PDOs, beside that without", canopen
+    ),
+    Benchmark(
+        "many", "128 ESCs in one process; 15 000 CAN frames a second on one core: none lost", many
+    ),
 ]

@@ -28,7 +28,9 @@ def delay(context: Context) -> list[Figure]:
     for program, runs in found.items():
         note = f"99 %: {of_runs(runs, 'p99'):.0f}, longest {of_runs(runs, 'max'):.0f}"
         figures.append(Figure(f"{program}, median", of_runs(runs, "p50"), "us", note=note))
-    value = median([a.delay["p50"] / b.delay["p50"] for a, b in zip(found["ours"], found["c"], strict=True)])
+    value = median(
+        [a.delay["p50"] / b.delay["p50"] for a, b in zip(found["ours"], found["c"], strict=True)]
+    )
     figures.append(judged("ours / c, median", value, "x", "<= 2"))
     figures.append(judged("ours, 99 %", of_runs(found["ours"], "p99"), "us", "<= 2000"))
     return figures
@@ -86,8 +88,15 @@ def full(context: Context) -> list[Figure]:
     return [
         Figure("8 ESCs and all, median", of_runs(runs, "p50"), "us"),
         judged("8 ESCs and all, 99 %", of_runs(runs, "p99"), "us", "<= 2000", longest),
-        Figure("SDO answers, 99 %", answer, "us", note=f"{asked} requests, {asked - answered} without one in 50 ms"),
-        Figure("CPU, all of it", median([run.cpu_us for run in runs]), "us/frame", note=losses(runs)),
+        Figure(
+            "SDO answers, 99 %",
+            answer,
+            "us",
+            note=f"{asked} requests, {asked - answered} without one in 50 ms",
+        ),
+        Figure(
+            "CPU, all of it", median([run.cpu_us for run in runs]), "us/frame", note=losses(runs)
+        ),
     ]
 
 
@@ -108,7 +117,9 @@ def burners() -> Iterator[None]:
 def may_have_priority(priority: int) -> bool:
     """Whether a child of ours may have it."""
     attempt = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({priority}))"
-    return subprocess.run([sys.executable, "-c", attempt], stderr=subprocess.DEVNULL).returncode == 0
+    return (
+        subprocess.run([sys.executable, "-c", attempt], stderr=subprocess.DEVNULL).returncode == 0
+    )
 
 
 def realtime(context: Context) -> list[Figure]:
@@ -119,17 +130,34 @@ def realtime(context: Context) -> list[Figure]:
     with burners():
         for _ in range(context.rounds):
             normal.append(once(context, "ours", 8))
-            preferred.append(once(context, "ours", 8, config=f"[run]\nrealtime_priority = {_PRIORITY}\n"))
-    context.data["runs"] = {"normal": [run.result for run in normal], "real-time": [run.result for run in preferred]}
+            preferred.append(
+                once(context, "ours", 8, config=f"[run]\nrealtime_priority = {_PRIORITY}\n")
+            )
+    context.data["runs"] = {
+        "normal": [run.result for run in normal],
+        "real-time": [run.result for run in preferred],
+    }
     longest = f"longest {of_runs(preferred, 'max'):.0f}"
     return [
         Figure("loaded, normal priority, 99 %", of_runs(normal, "p99"), "us"),
-        judged("loaded, real-time priority, 99 %", of_runs(preferred, "p99"), "us", "<= 500", longest),
+        judged(
+            "loaded, real-time priority, 99 %", of_runs(preferred, "p99"), "us", "<= 500", longest
+        ),
     ]
 
 
 BENCHMARKS = [
-    Benchmark("delay", "from the last byte to the fifth CAN frame: C, ours, the obvious program", delay),
-    Benchmark("delay-full", "the same with 8 ESCs, recorder, statistics, CANopen and a polling master", full),
-    Benchmark("delay-realtime", "the same with real-time priority while other programs load all cores", realtime),
+    Benchmark(
+        "delay", "from the last byte to the fifth CAN frame: C, ours, the obvious program", delay
+    ),
+    Benchmark(
+        "delay-full",
+        "the same with 8 ESCs, recorder, statistics, CANopen and a polling master",
+        full,
+    ),
+    Benchmark(
+        "delay-realtime",
+        "the same with real-time priority while other programs load all cores",
+        realtime,
+    ),
 ]

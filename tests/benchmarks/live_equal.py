@@ -21,7 +21,11 @@ def random_live(chance: random.Random) -> LiveData:
         if kind < 0.08:
             values.append(chance.choice([low, low + 1, low + 2, high, high - 1, high - 2]))
         else:
-            values.append(chance.randint(low, high) if kind < 0.4 else chance.randint(max(low, -100), min(high, 120)))
+            values.append(
+                chance.randint(low, high)
+                if kind < 0.4
+                else chance.randint(max(low, -100), min(high, 120))
+            )
     return LiveData(*values)
 
 
@@ -54,7 +58,11 @@ def pieces(data: bytes) -> tuple[bytes, list[LiveData]]:
     found, lives = bytearray(), []
     begin = 0
     for at in range(len(data)):
-        new = [frame.data for frame in deframer.feed(data[at : at + 1]) if isinstance(frame.data, LiveData)]
+        new = [
+            frame.data
+            for frame in deframer.feed(data[at : at + 1])
+            if isinstance(frame.data, LiveData)
+        ]
         if len(new) > 1:
             raise ValueError("two live frames at once: newest values would win")
         if new or at + 1 - begin == 100 or at + 1 == len(data):
@@ -96,7 +104,9 @@ def equal(context: Context) -> list[Figure]:
     ours = sent_by(context, "ours", cut)
     sent, meant = sum(map(len, ours.values())), 5 * (len(lives) + 2)
     if sent != meant:
-        raise NotEqual(f"ours sent {sent} frames, not {meant}: for {len(lives)} live frames, the start and the loss")
+        raise NotEqual(
+            f"ours sent {sent} frames, not {meant}: for {len(lives)} live frames, the start and the loss"
+        )
     figures = []
     for program in ("c", "obvious"):
         theirs = sent_by(context, program, cut)
@@ -106,4 +116,8 @@ def equal(context: Context) -> list[Figure]:
     return figures
 
 
-BENCHMARKS = [Benchmark("equal", "C, ours and the obvious program send the same frames for the same bytes", equal)]
+BENCHMARKS = [
+    Benchmark(
+        "equal", "C, ours and the obvious program send the same frames for the same bytes", equal
+    )
+]

@@ -52,7 +52,11 @@ def recording(context: Context, megabytes: float, damaged: bool = False) -> Path
         while written < size:
             data = once
             if size - written < len(data):
-                data = data[: data.rindex(b"KOD", 0, size - written)] if size - written > 100 else data[:40]
+                data = (
+                    data[: data.rindex(b"KOD", 0, size - written)]
+                    if size - written > 100
+                    else data[:40]
+                )
             out.write(spoilt(data, written) if damaged else data)
             written += len(data)
             if len(data) < len(once):
@@ -101,7 +105,9 @@ def convert(context: Context, form: str, source: Path, *options: object) -> Run:
     suffix = {"candump": ".log"}.get(form, f".{form}")
     target = context.folder / f"converted{suffix}"
     command = [sys.executable, str(HERE / "convert_driver.py"), form, source, target, *options]
-    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, timeout=3600)
+    done = subprocess.run(
+        [str(word) for word in command], capture_output=True, text=True, timeout=3600
+    )
     if done.returncode:
         raise RuntimeError(f"{form}: {(done.stderr.strip().splitlines() or ['no word'])[-1]}")
     found: dict[str, Any] = json.loads(done.stdout)
@@ -110,7 +116,10 @@ def convert(context: Context, form: str, source: Path, *options: object) -> Run:
 
 def best(context: Context, form: str, source: Path, *options: object) -> Run:
     """The quickest of the rounds."""
-    return min((convert(context, form, source, *options) for _ in range(context.rounds)), key=lambda run: run.cpu_s)
+    return min(
+        (convert(context, form, source, *options) for _ in range(context.rounds)),
+        key=lambda run: run.cpu_s,
+    )
 
 
 # --- candump ------------------------------------------------------------------------------------------------------------
@@ -120,7 +129,9 @@ def of_obvious(context: Context, source: Path) -> tuple[float, int, Path]:
     """CPU seconds and live frames of the obvious program, and its log."""
     target = context.folder / "obvious.log"
     program = HERE / "peers" / "obvious_offline.py"
-    done = subprocess.run([sys.executable, program, FIVE, source, target], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, program, FIVE, source, target], capture_output=True, text=True, check=True
+    )
     found = json.loads(done.stdout)
     return found["cpu_s"], found["live"], target
 
@@ -142,9 +153,16 @@ def candump(context: Context) -> list[Figure]:
     shipped.target.unlink()
     ratio = sorted(ratios)[len(ratios) // 2]
     return [
-        Figure("candump, the obvious program / ours", ratio, "x", note="five CAN frames a live frame"),
+        Figure(
+            "candump, the obvious program / ours", ratio, "x", note="five CAN frames a live frame"
+        ),
         Figure("candump, CPU a live frame", min(micros), "us", note="five CAN frames"),
-        Figure("candump, CPU a live frame, shipped DBC", shipped.cpu_s / lives * 1e6, "us", note=shipped.told),
+        Figure(
+            "candump, CPU a live frame, shipped DBC",
+            shipped.cpu_s / lives * 1e6,
+            "us",
+            note=shipped.told,
+        ),
         Figure("candump, peak memory", shipped.peak_mb, "MB", "<= 100", shipped.peak_mb <= 100),
     ]
 
@@ -185,18 +203,34 @@ def growth(context: Context) -> list[Figure]:
             if form != "candump" and run.count != lives:
                 raise NotEqual(f"{form}: {run.count} rows of {lives} live frames")
             run.target.unlink()
-            told = {"mb": source.stat().st_size / _MB, "cpu_s": run.cpu_s, "wall_s": run.wall_s, "peak_mb": run.peak_mb}
+            told = {
+                "mb": source.stat().st_size / _MB,
+                "cpu_s": run.cpu_s,
+                "wall_s": run.wall_s,
+                "peak_mb": run.peak_mb,
+            }
             series.setdefault(form, []).append(told)
-            context.say(f"{form}, {megabytes:g} MB: {run.cpu_s:.2f} s of CPU, {run.peak_mb:.0f} MB of memory")
+            context.say(
+                f"{form}, {megabytes:g} MB: {run.cpu_s:.2f} s of CPU, {run.peak_mb:.0f} MB of memory"
+            )
         rows = series[form]
         peak = max(row["peak_mb"] for row in rows)
         largest = rows[-1]["mb"]
-        figures.append(Figure(f"{form}, peak memory up to {largest:.0f} MB", peak, "MB", "<= 250", peak <= 250))
+        figures.append(
+            Figure(f"{form}, peak memory up to {largest:.0f} MB", peak, "MB", "<= 250", peak <= 250)
+        )
         paces = [row["cpu_s"] / row["mb"] for row in rows]
         worst = max(after / before for before, after in pairwise(paces))
         pace = ", ".join(f"{1000 * one:.0f}" for one in paces)
         figures.append(
-            Figure(f"{form}, ms a MB: next size / size", worst, "x", "<= 1.3", worst <= 1.3, f"{pace} ms of CPU a MB")
+            Figure(
+                f"{form}, ms a MB: next size / size",
+                worst,
+                "x",
+                "<= 1.3",
+                worst <= 1.3,
+                f"{pace} ms of CPU a MB",
+            )
         )
     context.data["growth"] = series
     return figures
@@ -217,13 +251,17 @@ def damage(context: Context) -> list[Figure]:
             ratios.append(runs[1].cpu_s / runs[0].cpu_s)
         pace = damaged.stat().st_size / _MB / runs[1].cpu_s
         ratio = sorted(ratios)[len(ratios) // 2]
-        figures.append(Figure(f"{form}, 1 % damaged / clean", ratio, "x", note=f"{pace:.1f} MB a CPU second"))
+        figures.append(
+            Figure(f"{form}, 1 % damaged / clean", ratio, "x", note=f"{pace:.1f} MB a CPU second")
+        )
         runs[0].target.unlink()
     return figures
 
 
 BENCHMARKS = [
-    Benchmark("offline-candump", "UART bytes to a candump log, beside the obvious program", candump),
+    Benchmark(
+        "offline-candump", "UART bytes to a candump log, beside the obvious program", candump
+    ),
     Benchmark("offline-tables", "UART bytes to CSV, JSON lines and Parquet", tables),
     Benchmark("offline-growth", "time and memory over the size of the file", growth),
     Benchmark("offline-damage", "a damaged file beside a clean one", damage),

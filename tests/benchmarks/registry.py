@@ -23,7 +23,14 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-MODULES = ("live_equal", "live_cpu", "live_delay", "instructions", "start_and_memory", "offline_speed")
+MODULES = (
+    "live_equal",
+    "live_cpu",
+    "live_delay",
+    "instructions",
+    "start_and_memory",
+    "offline_speed",
+)
 """What must be equal comes first."""
 GCC_LINE = "sudo apt-get install gcc libc6-dev"
 VALGRIND_LINE = "sudo apt-get install valgrind libc6-dbg"
@@ -49,7 +56,9 @@ class Figure:
     note: str = ""
 
 
-def judged(name: str, value: float, unit: str, target: str, note: str = "", fair: bool = True) -> Figure:
+def judged(
+    name: str, value: float, unit: str, target: str, note: str = "", fair: bool = True
+) -> Figure:
     """A figure with a target such as "<= 2.2" or ">= 4"; what is not ``fair`` has not reached it."""
     sign, limit = target.split()
     reached = value <= float(limit) if sign == "<=" else value >= float(limit)

@@ -21,7 +21,13 @@ class BusSocket(socket.socket):
 
     name = ""
 
-    def __init__(self, family: int = -1, type: int = -1, proto: int = -1, fileno: int | None = None) -> None:  # noqa: A002
+    def __init__(
+        self,
+        family: int = -1,
+        type: int = -1,  # noqa: A002
+        proto: int = -1,
+        fileno: int | None = None,
+    ) -> None:
         self.is_bus = family == socket.AF_CAN
         if self.is_bus:
             family, type, proto = socket.AF_UNIX, socket.SOCK_SEQPACKET, 0  # noqa: A001
@@ -34,7 +40,8 @@ class BusSocket(socket.socket):
             super().bind(address)
 
     def setsockopt(self, *args: Any) -> None:
-        if not self.is_bus:  # the options are of CAN; the queue's length is the same for all programs
+        if not self.is_bus:
+            # the options are of CAN; the queue's length is the same for all programs
             super().setsockopt(*args)
 
 
@@ -49,7 +56,10 @@ def use(bus: str) -> None:
 def main(arguments: list[str]) -> int:
     bus, program, *rest = arguments
     use(bus)
-    sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parent / "peers")]
+    sys.path[:0] = [
+        str(Path(__file__).resolve().parents[2]),
+        str(Path(__file__).resolve().parent / "peers"),
+    ]
     if program == "obvious":
         sys.modules["asammdf"] = None  # type: ignore[assignment]  # where it is installed python-can takes seconds to start
         import obvious

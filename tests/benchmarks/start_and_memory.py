@@ -40,10 +40,14 @@ def first_frame_ms(escs: int, config: str) -> float:
         listener.listen(1)
         listener.settimeout(_PATIENCE_S)
         file, errors = folder / "gateway.toml", folder / "errors"
-        text = config_text([port.path for port in ports], "lo", SHIPPED, folder, config.format(folder=folder))
+        text = config_text(
+            [port.path for port in ports], "lo", SHIPPED, folder, config.format(folder=folder)
+        )
         file.write_text(text.replace("[dbc]", "bitrate = 1000000\n[dbc]", 1))
         command = [sys.executable, str(STANDIN), f"unix:{name}", "ours", "run", "-c", str(file)]
-        environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+        environment = {
+            key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"
+        }
         with errors.open("w") as log:
             begun = time.perf_counter()
             process = start(command, stdin=subprocess.DEVNULL, stderr=log, env=environment)
@@ -63,7 +67,12 @@ def first_frame_ms(escs: int, config: str) -> float:
 
 def start_up(context: Context) -> list[Figure]:
     """From exec to the first CAN frame, by turns."""
-    cases = {"1 ESC": (1, ""), "8 ESCs": (8, ""), "1 ESC, CANopen": (1, CANOPEN), "8 ESCs, CANopen": (8, CANOPEN)}
+    cases = {
+        "1 ESC": (1, ""),
+        "8 ESCs": (8, ""),
+        "1 ESC, CANopen": (1, CANOPEN),
+        "8 ESCs, CANopen": (8, CANOPEN),
+    }
     first_frame_ms(1, CANOPEN)  # what is compiled at the first run is there from now on
     found: dict[str, list[float]] = {name: [] for name in cases}
     for _ in range(2 * context.rounds - 1):
@@ -82,7 +91,11 @@ def memory_of(pid: int) -> dict[str, float]:
     """Of a process now, in MB: resident, its fair share of what is shared, and what is its own."""
     text = Path(f"/proc/{pid}/smaps_rollup").read_text()
     kb = {key: int(value) for key, value in re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE)}
-    return {"RSS": kb["Rss"] / 1024, "PSS": kb["Pss"] / 1024, "USS": (kb["Private_Clean"] + kb["Private_Dirty"]) / 1024}
+    return {
+        "RSS": kb["Rss"] / 1024,
+        "PSS": kb["Pss"] / 1024,
+        "USS": (kb["Private_Clean"] + kb["Private_Dirty"]) / 1024,
+    }
 
 
 def many_escs_dbc(folder: Path) -> Path:
@@ -113,22 +126,37 @@ def memory(context: Context) -> list[Figure]:
         dbc = many_escs_dbc(Path(made))
         for case, (escs, config) in cases.items():
             text = config.format(folder=made, port=free_port())
-            with running(context, "ours", escs, seconds=seconds, dbc=dbc, config=text) as (feeder, gateway):
+            with running(context, "ours", escs, seconds=seconds, dbc=dbc, config=text) as (
+                feeder,
+                gateway,
+            ):
                 feeder.measure(gateway)
                 found[case] = memory_of(gateway.pid)
             context.say(f"{case}: RSS {found[case]['RSS']:.1f} MB")
     context.data["memory_mb"] = found
     rss = {case: memory["RSS"] for case, memory in found.items()}
-    notes = {case: f"PSS {memory['PSS']:.1f}, USS {memory['USS']:.1f}" for case, memory in found.items()}
+    notes = {
+        case: f"PSS {memory['PSS']:.1f}, USS {memory['USS']:.1f}" for case, memory in found.items()
+    }
     figures = [judged("RSS, 1 ESC", rss.pop("1 ESC"), "MB", "<= 40", notes["1 ESC"])]
-    figures += [Figure(f"RSS, {case}", value, "MB", note=notes[case]) for case, value in rss.items()]
+    figures += [
+        Figure(f"RSS, {case}", value, "MB", note=notes[case]) for case, value in rss.items()
+    ]
     one, nodes = found["1 ESC"]["RSS"], found["1 ESC, CANopen"]["RSS"]
     figures.append(judged("RSS, each further ESC", (rss["64 ESCs"] - one) / 63, "MB", "<= 0.3"))
-    figures.append(Figure("RSS, each further ESC, CANopen", (rss["8 ESCs, CANopen"] - nodes) / 7, "MB"))
+    figures.append(
+        Figure("RSS, each further ESC, CANopen", (rss["8 ESCs, CANopen"] - nodes) / 7, "MB")
+    )
     return figures
 
 
 BENCHMARKS = [
-    Benchmark("start", "from the start of the command to its first CAN frame: 1 and 8 ESCs, CANopen", start_up),
-    Benchmark("memory", "RSS, PSS and USS with 1 to 64 ESCs, CANopen, recorder, Prometheus", memory),
+    Benchmark(
+        "start",
+        "from the start of the command to its first CAN frame: 1 and 8 ESCs, CANopen",
+        start_up,
+    ),
+    Benchmark(
+        "memory", "RSS, PSS and USS with 1 to 64 ESCs, CANopen, recorder, Prometheus", memory
+    ),
 ]

@@ -16,15 +16,24 @@ def build(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "build"
 
 
-def test_every_benchmark_is_listed_and_has_a_name_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_benchmark_is_listed_and_has_a_name_of_its_own(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert bench.main(["--list"]) == 0
     listed = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
     names = [name for name, _ in listed]
     assert len(set(names)) == len(names)
     assert names[0] == "equal", "figures of programs that do not agree say nothing"
-    assert {"cpu", "cpu-canopen", "many", "delay", "delay-full", "delay-realtime", "instructions", "start"} <= set(
-        names
-    )
+    assert {
+        "cpu",
+        "cpu-canopen",
+        "many",
+        "delay",
+        "delay-full",
+        "delay-realtime",
+        "instructions",
+        "start",
+    } <= set(names)
 
 
 def test_an_unknown_name_is_told(capsys: pytest.CaptureFixture[str]) -> None:
@@ -33,7 +42,9 @@ def test_an_unknown_name_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.extended
-def test_a_short_run_gives_a_table_and_json(build: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_short_run_gives_a_table_and_json(
+    build: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert bench.main(["--quick", "--only", "many"]) == 0
     document = json.loads((build / "bench.json").read_text())
     (result,) = document["benchmarks"]
@@ -54,7 +65,11 @@ def test_a_short_run_gives_a_table_and_json(build: Path, capsys: pytest.CaptureF
         ([registry.judged("a", 5, "x", ">= 4")], 0, "reached"),
         ([registry.judged("a", 5, "x", ">= 4", fair=False)], 0, "MISSED\n"),
         ([Figure("a", 2, "of 10", "0", False)], 0, "MISSED\n"),
-        (LeftOut("no gcc: sudo apt-get install gcc"), 0, "left out: no gcc: sudo apt-get install gcc"),
+        (
+            LeftOut("no gcc: sudo apt-get install gcc"),
+            0,
+            "left out: no gcc: sudo apt-get install gcc",
+        ),
         (NotEqual("row 3"), 1, "error: not equal: row 3"),
         (RuntimeError("c ended"), 1, "error: failed: RuntimeError: c ended"),
     ],

@@ -28,7 +28,9 @@ def made(escs: int = 1, canopen: bool = False, **dbc: object) -> tuple[CaptureSe
         "can": {"interface": "virtual"},
         "dbc": dbc,
         "canopen": {"enabled": canopen, "self_start": True, "store": "/nonexistent/store"},
-        "esc": [{"port": f"/dev/ttyUSB{n}", "name": f"e{n}", "pole_pairs": n + 1} for n in range(escs)],
+        "esc": [
+            {"port": f"/dev/ttyUSB{n}", "name": f"e{n}", "pole_pairs": n + 1} for n in range(escs)
+        ],
     }
     loaded = assemble(parse(tables, "bench.toml"))
     return setup_of(loaded), loaded.layout
@@ -52,7 +54,9 @@ class Bench:
         self._saves: list[int] = []
         self._is_open = True
 
-    def _put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None) -> None:
+    def _put(
+        self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None
+    ) -> None:
         self.entries.append(Entry(time_ns, kind, esc, data, flags, came_ns))
 
     def take(self, now: int) -> None:
@@ -97,7 +101,9 @@ class Bench:
                     cut = rng.randrange(len(data) + 1)
                     for part in (data[:cut], data[cut:]):
                         if part:
-                            gateway.receive_bytes(index, part, now, now - rng.choice([0, rng.randrange(20 * MS)]))
+                            gateway.receive_bytes(
+                                index, part, now, now - rng.choice([0, rng.randrange(20 * MS)])
+                            )
             if wild:
                 self._happens(rng, now, open_ports)
             gateway.advance(now)

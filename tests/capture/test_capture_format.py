@@ -51,7 +51,10 @@ def scanned(data: bytes, size: int | None = None) -> list[Block | Damage]:
 
 @given(st.lists(entries, max_size=20))
 def test_entries_come_back(listed: list[Entry]) -> None:
-    expected = [entry if entry.kind in (Kind.BYTES, Kind.FRAME) else entry._replace(came_ns=None) for entry in listed]
+    expected = [
+        entry if entry.kind in (Kind.BYTES, Kind.FRAME) else entry._replace(came_ns=None)
+        for entry in listed
+    ]
     assert list(read_entries(data_payload(listed))) == expected
 
 
@@ -66,17 +69,29 @@ def test_rubbish_as_a_table_is_refused_or_read_but_never_more(data: bytes) -> No
 
 def test_version_1_has_no_times_of_arrival_and_version_2_is_refused_without_them() -> None:
     """As 0.5.0 wrote it: bytes of an ESC, a CAN frame, time that passes."""
-    table = b"".join(struct.pack("<QBBHI", *head) for head in ((7, 1, 0, 0, 3), (8, 2, 0, 0, 6), (9, 3, 0, 0, 0)))
+    table = b"".join(
+        struct.pack("<QBBHI", *head) for head in ((7, 1, 0, 0, 3), (8, 2, 0, 0, 6), (9, 3, 0, 0, 0))
+    )
     payload = struct.pack("<I", 3) + table + b"abc" + bytes.fromhex("0106000000 40")
     first, second, third = read_entries(payload, 1)
-    assert (first.data, first.came_ns, second.came_ns, third.kind) == (b"abc", None, None, Kind.ADVANCE)
+    assert (first.data, first.came_ns, second.came_ns, third.kind) == (
+        b"abc",
+        None,
+        None,
+        Kind.ADVANCE,
+    )
     assert read_frame(second.data) == CanFrame(0x601, b"\x40")
     with pytest.raises(ValueError, match="time of arrival"):
         list(read_entries(payload))
 
 
-@given(st.lists(st.tuples(st.sampled_from([b"H", b"D", b"I", b"E"]), payloads), max_size=6), st.integers(1, 300))
-def test_blocks_come_back_however_they_are_cut(listed: list[tuple[bytes, bytes]], size: int) -> None:
+@given(
+    st.lists(st.tuples(st.sampled_from([b"H", b"D", b"I", b"E"]), payloads), max_size=6),
+    st.integers(1, 300),
+)
+def test_blocks_come_back_however_they_are_cut(
+    listed: list[tuple[bytes, bytes]], size: int
+) -> None:
     data = b"".join(block(kind, number, payload) for number, (kind, payload) in enumerate(listed))
     found = scanned(data, size)
     assert [(b.kind, b.payload) for b in found if isinstance(b, Block)] == listed
@@ -84,7 +99,11 @@ def test_blocks_come_back_however_they_are_cut(listed: list[tuple[bytes, bytes]]
     assert [b.number for b in found if isinstance(b, Block)] == list(range(len(listed)))
 
 
-@given(st.lists(payloads, min_size=1, max_size=5), st.lists(st.binary(max_size=60), min_size=6, max_size=6), st.data())
+@given(
+    st.lists(payloads, min_size=1, max_size=5),
+    st.lists(st.binary(max_size=60), min_size=6, max_size=6),
+    st.data(),
+)
 def test_blocks_are_found_amid_rubbish_and_every_byte_is_accounted_for(
     listed: list[bytes], rubbish: list[bytes], data: st.DataObject
 ) -> None:
@@ -121,7 +140,9 @@ def test_a_file_cut_anywhere_gives_what_was_whole() -> None:
         found = scanned(stream[:cut], 7)
         whole = sum(sum(map(len, parts[: n + 1])) <= cut for n in range(3))
         assert [b.number for b in found if isinstance(b, Block)] == list(range(whole))
-        assert sum(d.length for d in found if isinstance(d, Damage)) == cut - sum(map(len, parts[:whole]))
+        assert sum(d.length for d in found if isinstance(d, Damage)) == cut - sum(
+            map(len, parts[:whole])
+        )
 
 
 def test_a_block_that_claims_to_be_huge_is_none() -> None:

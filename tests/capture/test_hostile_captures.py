@@ -13,12 +13,35 @@ import pytest
 from capture_bench import START, Bench, made
 
 from kontronik_can_gw.capture import format as capture
-from kontronik_can_gw.capture.format import MAGIC, Block, Entry, Kind, Scanner, block, data_payload, json_payload
+from kontronik_can_gw.capture.format import (
+    MAGIC,
+    Block,
+    Entry,
+    Kind,
+    Scanner,
+    block,
+    data_payload,
+    json_payload,
+)
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError, UserError
 
 VALUES: tuple[Any, ...] = (
-    *(None, 0, -1, 10**30, 1.5, 1e308, float("inf"), float("nan"), "", "x", "1/0", "1e9999", "9" * 5000),
+    *(
+        None,
+        0,
+        -1,
+        10**30,
+        1.5,
+        1e308,
+        float("inf"),
+        float("nan"),
+        "",
+        "x",
+        "1/0",
+        "1e9999",
+        "9" * 5000,
+    ),
     *([], [1], {}, {"a": 1}, True),
 )
 GONE = object()
@@ -31,7 +54,11 @@ def bench() -> Bench:
 
 @pytest.fixture(scope="module")
 def header(bench: Bench) -> dict[str, Any]:
-    state = {"escs": [{"energy": 1, "run_time": 2, "losses": 3}] * 2, "can_state": 1, "started_ns": START}
+    state = {
+        "escs": [{"energy": 1, "run_time": 2, "losses": 3}] * 2,
+        "can_state": 1,
+        "started_ns": START,
+    }
     times = {"monotonic_ns": START, "wall_ns": START, "created_ns": START}
     more = times | {"run": "r", "part": 0, "devices": [None, None], "state": state}
     found: dict[str, Any] = json.loads(json_payload(bench.setup.header() | more))
@@ -41,7 +68,9 @@ def header(bench: Bench) -> dict[str, Any]:
 def places(found: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Every place in a JSON document."""
     yield path
-    for key in found if isinstance(found, dict) else range(len(found)) if isinstance(found, list) else ():
+    for key in (
+        found if isinstance(found, dict) else range(len(found)) if isinstance(found, list) else ()
+    ):
         yield from places(found[key], (*path, key))
 
 
@@ -81,7 +110,9 @@ def read_all(path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_wrong_values_in_the_header(seed: int, header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
+def test_wrong_values_in_the_header(
+    seed: int, header: dict[str, Any], bench: Bench, tmp_path: Path
+) -> None:
     path = tmp_path / "a.kcap"
     data = block(b"D", 1, data_payload(bench.entries[:40])) + block(b"E", 2, b"")
     combinations = list(itertools.product(places(header), (*VALUES, GONE)))
@@ -90,7 +121,9 @@ def test_wrong_values_in_the_header(seed: int, header: dict[str, Any], bench: Be
         if not place and value is GONE:
             continue
         document = changed(header, place, value)
-        payload = json_payload(document) if isinstance(document, dict) else json.dumps(document).encode()
+        payload = (
+            json_payload(document) if isinstance(document, dict) else json.dumps(document).encode()
+        )
         path.write_bytes(block(b"H", 0, payload) + data)
         read_all(path)
 
@@ -105,7 +138,9 @@ def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> 
             entry = entries[at]
             entries[at] = rng.choice(
                 [
-                    entry._replace(time_ns=rng.choice([0, 2**64 - 1, 2**62 + 1, rng.randrange(2**64)])),
+                    entry._replace(
+                        time_ns=rng.choice([0, 2**64 - 1, 2**62 + 1, rng.randrange(2**64)])
+                    ),
                     entry._replace(kind=rng.randrange(256)),
                     entry._replace(esc=rng.randrange(65536)),
                     entry._replace(data=rng.randbytes(rng.randrange(40))),
@@ -115,11 +150,15 @@ def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> 
                     Entry(entry.time_ns, Kind.SAVED),
                 ]
             )
-        path.write_bytes(block(b"H", 0, json_payload(header)) + block(b"D", 1, data_payload(entries)))
+        path.write_bytes(
+            block(b"H", 0, json_payload(header)) + block(b"D", 1, data_payload(entries))
+        )
         read_all(path)
 
 
-def test_what_only_looks_like_blocks_costs_no_more_than_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_only_looks_like_blocks_costs_no_more_than_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Heads that promise megabytes, one behind the other: each would have to be read to its end."""
     head = struct.pack("<4scBHIII", MAGIC, b"D", 0, 0, 8_000_000, 8_000_000, 0) + b"\0\0\0\0"
     good = block(b"D", 7, b"good")
@@ -151,7 +190,9 @@ def test_a_file_of_nothing_but_damage_is_summed_up(header: dict[str, Any], tmp_p
         assert "and more of that kind" in found.damage
 
 
-def test_a_name_from_the_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
+def test_a_name_from_the_header_cannot_forge_lines(
+    header: dict[str, Any], bench: Bench, tmp_path: Path
+) -> None:
     path = tmp_path / "a.kcap"
     entries = block(b"D", 1, data_payload(bench.entries))
     for given, shown in (("t1", "t1"), ("can0 123#11\\n(1.0) can0", "can0")):
@@ -160,6 +201,8 @@ def test_a_name_from_the_header_cannot_forge_lines(header: dict[str, Any], bench
         with open_input(path) as found:
             assert isinstance(found, CaptureInput)
             assert found.channel == shown
-    path.write_bytes(block(b"H", 0, json_payload(changed(header, ("escs", 0, "name"), "a\nb"))) + entries)
+    path.write_bytes(
+        block(b"H", 0, json_payload(changed(header, ("escs", 0, "name"), "a\nb"))) + entries
+    )
     with pytest.raises(UserError, match="header cannot be used"):
         open_input(path)

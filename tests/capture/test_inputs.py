@@ -15,7 +15,13 @@ from kontronik_can_gw.capture.format import Entry, block, data_payload, json_pay
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.decode import Decoder
-from kontronik_can_gw.desk.recordings.inputs import CanLogInput, CaptureInput, DumpInput, Input, open_input
+from kontronik_can_gw.desk.recordings.inputs import (
+    CanLogInput,
+    CaptureInput,
+    DumpInput,
+    Input,
+    open_input,
+)
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.kontronik import Device
@@ -46,12 +52,18 @@ def capture(path: Path, setup: CaptureSetup, entries: Sequence[Entry], **more: o
     return path
 
 
-def plain_run(seconds: float, escs: int = 1, faults: Faults | None = None) -> tuple[Bench, list[list[Any]]]:
+def plain_run(
+    seconds: float, escs: int = 1, faults: Faults | None = None
+) -> tuple[Bench, list[list[Any]]]:
     """A gateway that reads each frame when its last byte has come; what the ESCs meant, by ESC, (time of the last byte, data)."""
     bench = Bench(*made(escs))
     gateway = bench.gateway
     simulated = [
-        SimulatedEsc(EscOptions(device=Device.KOSMIK, faults=faults or Faults()), seed=n, start_ns=START + n * 3 * MS)
+        SimulatedEsc(
+            EscOptions(device=Device.KOSMIK, faults=faults or Faults()),
+            seed=n,
+            start_ns=START + n * 3 * MS,
+        )
         for n in range(escs)
     ]
     due: list[tuple[int, int, Any]] = []
@@ -100,7 +112,9 @@ def test_rows_of_a_capture_are_the_esc_s_frames_at_their_times(tmp_path: Path) -
         assert found.damage == []
 
 
-def test_a_loss_is_a_row_without_values_and_so_is_everything_until_the_next_frame(tmp_path: Path) -> None:
+def test_a_loss_is_a_row_without_values_and_so_is_everything_until_the_next_frame(
+    tmp_path: Path,
+) -> None:
     bench, _ = plain_run(12, faults=Faults(dropout=Dropout(2 * SECOND, 6 * SECOND)))
     with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
         at = columns(found)
@@ -131,11 +145,15 @@ def test_the_bytes_of_an_esc_come_out_as_they_went_in(tmp_path: Path) -> None:
             assert plain.times_assumed
             at = columns(plain)
             rows = [row for row in plain.samples() if row.values[at["BatteryVoltage"]] is not None]
-            assert [r.values[at["ElectricalSpeed"]] for r in rows] == [r["electrical_speed"] for r in lives]
+            assert [r.values[at["ElectricalSpeed"]] for r in rows] == [
+                r["electrical_speed"] for r in lives
+            ]
             assert [r.time_ns for r in rows] == [n * 10 * MS for n in range(len(lives))]
             assert b"".join(plain.esc_bytes(0)) == data
             if decoder.counters.dropped_bytes:
-                assert f"{decoder.counters.dropped_bytes} bytes belong to no frame" in plain.damage[0]
+                assert (
+                    f"{decoder.counters.dropped_bytes} bytes belong to no frame" in plain.damage[0]
+                )
             assert len(list(plain.frames())) > len(lives)
 
 
@@ -161,7 +179,9 @@ def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> N
                 assert row.values[at["BatteryVoltage"]] is None
         voltages = [row.values[at["BatteryVoltage"]] for row in rows]
         assert sum(v is not None for v in voltages) > 250
-        assert any(2.0 < (row.time_ns - start) / SECOND < 4.9 for row in rows), "the loss has a row of its own"
+        assert any(2.0 < (row.time_ns - start) / SECOND < 4.9 for row in rows), (
+            "the loss has a row of its own"
+        )
         assert found.wall_ns(rows[0].time_ns) == pytest.approx(1_700_000_000 * SECOND, abs=2 * MS)
 
 
@@ -175,7 +195,9 @@ def test_every_value_of_the_shipped_dbc_reads_as_cantools_reads_it() -> None:
         message = SHIPPED.get_message_by_name(plan.name)
         for _ in range(300):
             data = (
-                rng.randbytes(8) if rng.random() < 0.7 else bytes(rng.choice([0, 255, 254, 128, 129]) for _ in range(8))
+                rng.randbytes(8)
+                if rng.random() < 0.7
+                else bytes(rng.choice([0, 255, 254, 128, 129]) for _ in range(8))
             )
             wanted = message.decode_simple(data)
             for first, values in reader.read(plan.can_id, data) or ():
@@ -188,7 +210,11 @@ def test_every_value_of_the_shipped_dbc_reads_as_cantools_reads_it() -> None:
                         assert column.digits is not None
                         assert round(value, column.digits) == value
                     elif value is None:
-                        assert str(other) in ("NotAvailable", "Error") or column.texts or column.is_flag, column.name
+                        assert (
+                            str(other) in ("NotAvailable", "Error")
+                            or column.texts
+                            or column.is_flag
+                        ), column.name
                     else:
                         assert value == str(other)
 
@@ -206,7 +232,9 @@ def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
     with open_input(tmp_path / "20260102") as found:
         assert isinstance(found, CaptureInput)
         assert found.header["run"] == "b"
-    capture(tmp_path / "20260102T000000Z-bbbbbb-0001.kcap", bench.setup, bench.entries, run="c", part=1)
+    capture(
+        tmp_path / "20260102T000000Z-bbbbbb-0001.kcap", bench.setup, bench.entries, run="c", part=1
+    )
     with open_input(tmp_path / "20260102") as found, pytest.raises(UserError, match="another run"):
         list(found.samples())
 
@@ -224,7 +252,10 @@ def test_pole_pairs_and_gear_are_those_of_the_capture_whatever_dbc_shows_it(tmp_
             at = columns(found)
             row = list(found.samples())[-1].values
             for index, poles in enumerate((7, 5)):
-                electrical, motor = row[at[f"E{index}ElectricalSpeed"]], row[at[f"E{index}MotorSpeed"]]
+                electrical, motor = (
+                    row[at[f"E{index}ElectricalSpeed"]],
+                    row[at[f"E{index}MotorSpeed"]],
+                )
                 assert isinstance(electrical, int)
                 assert motor == (2 * electrical + poles) // (2 * poles)
 
@@ -235,4 +266,6 @@ def test_a_part_without_a_header_is_told_and_the_others_are_read(tmp_path: Path)
     capture(tmp_path / "20260101T000000Z-aaaaaa-00001.kcap", bench.setup, bench.entries, part=1)
     with open_input(tmp_path) as found:
         assert len(list(found.samples())) > 50
-        assert "20260101T000000Z-aaaaaa-00000.kcap: has no header that could be read" in found.damage
+        assert (
+            "20260101T000000Z-aaaaaa-00000.kcap: has no header that could be read" in found.damage
+        )

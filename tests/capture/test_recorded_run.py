@@ -40,7 +40,10 @@ def telemetry(*options: EscOptions) -> Iterator[list[str]]:
     """ESCs on pseudo terminals; their paths."""
     terminals = [pty.PtyEsc() for _ in options]
     stopped = threading.Event()
-    escs = [(SimulatedEsc(o, seed=n), t) for n, (o, t) in enumerate(zip(options, terminals, strict=True))]
+    escs = [
+        (SimulatedEsc(o, seed=n), t)
+        for n, (o, t) in enumerate(zip(options, terminals, strict=True))
+    ]
     thread = threading.Thread(target=lambda: pty.run(escs, stop=stopped.is_set), daemon=True)
     thread.start()
     try:
@@ -60,14 +63,18 @@ class Run:
     def __init__(self, config: Path, *words: object) -> None:
         self._log = config.with_suffix(".err")
         with self._log.open("w") as file:
-            self.process = subprocess.Popen([*PROGRAM, "run", "-c", str(config), *map(str, words)], stderr=file)
+            self.process = subprocess.Popen(
+                [*PROGRAM, "run", "-c", str(config), *map(str, words)], stderr=file
+            )
 
     @property
     def log(self) -> str:
         return self._log.read_text()
 
     def wait_for(self, text: str) -> None:
-        until(lambda: text in self.log or self.process.poll() is not None, f"{text!r} in:\n{self.log}")
+        until(
+            lambda: text in self.log or self.process.poll() is not None, f"{text!r} in:\n{self.log}"
+        )
         assert text in self.log
 
     def end(self, number: int = signal.SIGTERM) -> int:
@@ -108,7 +115,10 @@ def test_a_run_is_recorded_whole_and_converts_to_the_log_that_a_replay_gives(
         until(lambda: size_of(tmp_path / "captures") > 3 * ENOUGH, "some seconds of telemetry")
         assert run.end() == 0
     again, converted = tmp_path / "again.log", tmp_path / "converted.log"
-    for words in (["replay", "captures", "--to", "log", "-o", again], ["convert", "-q", "captures", converted]):
+    for words in (
+        ["replay", "captures", "--to", "log", "-o", again],
+        ["convert", "-q", "captures", converted],
+    ):
         subprocess.run([*PROGRAM, *map(str, words)], check=True, cwd=tmp_path)
     assert again.read_bytes() == converted.read_bytes()
     assert len(again.read_text().splitlines()) > 300
@@ -118,7 +128,9 @@ def test_a_run_is_recorded_whole_and_converts_to_the_log_that_a_replay_gives(
         assert "KOSMIK 120, firmware 4.17, V4 layout" in found.provenance["esc1"]
 
 
-def test_a_can_log_is_not_written_any_more_and_the_gateway_runs(start: Callable[..., Run], tmp_path: Path) -> None:
+def test_a_can_log_is_not_written_any_more_and_the_gateway_runs(
+    start: Callable[..., Run], tmp_path: Path
+) -> None:
     """By a configuration of 0.5.0."""
     config = tmp_path / "gw.toml"
     with telemetry(EscOptions()) as ports:
@@ -126,12 +138,17 @@ def test_a_can_log_is_not_written_any_more_and_the_gateway_runs(start: Callable[
         run = start(config)
         run.wait_for("esc1: telemetry ok")
         assert run.end() == 0
-    assert f"warning: {config}: record.can_log: was removed and is ignored. `kontronik-can-gw convert" in run.log
+    assert (
+        f"warning: {config}: record.can_log: was removed and is ignored. `kontronik-can-gw convert"
+        in run.log
+    )
     assert [path.suffix for path in (tmp_path / "captures").iterdir()] == [".kcap"]
 
 
 @pytest.mark.parametrize("wait", [False, True])
-def test_a_folder_that_cannot_be_made(wait: bool, start: Callable[..., Run], tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made(
+    wait: bool, start: Callable[..., Run], tmp_path: Path
+) -> None:
     """An error at once for a person, no obstacle for a service."""
     config = tmp_path / "gw.toml"
     (tmp_path / "file").write_text("")

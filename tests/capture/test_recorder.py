@@ -101,7 +101,9 @@ def test_parts_by_size_go_on_from_each_other(tmp_path: Path) -> None:
     with open_input(tmp_path) as found:
         assert isinstance(found, CaptureInput)
         assert len(list(found.entries())) < 2000
-        assert any("1 parts of the run in front of it are not given" in line for line in found.damage)
+        assert any(
+            "1 parts of the run in front of it are not given" in line for line in found.damage
+        )
 
 
 def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
@@ -123,7 +125,9 @@ def test_the_header_tells_where_it_comes_from(tmp_path: Path) -> None:
     it.note(bench.gateway, 0)
     put(it, entries(1))
     until(lambda: it.facts.bytes > 0)
-    bench.gateway.escs[0].last_info = InfoData(device_and_variant=1 << 10 | 160, firmware_word=4 << 8 | 17)
+    bench.gateway.escs[0].last_info = InfoData(
+        device_and_variant=1 << 10 | 160, firmware_word=4 << 8 | 17
+    )
     bench.gateway.escs[0].layout = 1
     it.note(bench.gateway, 1)
     until(lambda: it._told_devices == it._devices)
@@ -138,7 +142,9 @@ def test_the_header_tells_where_it_comes_from(tmp_path: Path) -> None:
         assert abs((found.wall_ns(time.monotonic_ns()) or 0) - now) < SECOND
 
 
-def test_room_again_and_it_goes_on_and_the_loss_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_room_again_and_it_goes_on_and_the_loss_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = 10 * SECOND
     free = 0
     real = os.statvfs(tmp_path)
@@ -190,7 +196,8 @@ def test_what_somebody_else_is_writing_stays(tmp_path: Path) -> None:
     put(first, entries(5))
     until(lambda: first.facts.bytes > 0 and not first._entries)
     [in_use] = tmp_path.iterdir()
-    closed = tmp_path / "20990101T000000Z-abcdef-00000.kcap"  # a clock that was wrong: newest by name, oldest by age
+    # a clock that was wrong: newest by name, oldest by age
+    closed = tmp_path / "20990101T000000Z-abcdef-00000.kcap"
     closed.write_bytes(bytes(30_000))
     os.utime(closed, (1, 1))
     second = begun(tmp_path, keep_bytes=1)
@@ -201,7 +208,9 @@ def test_what_somebody_else_is_writing_stays(tmp_path: Path) -> None:
     first.close()
 
 
-def test_a_disk_that_fails_costs_what_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fails_costs_what_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = 10 * SECOND
     broken = threading.Event()
     real = os.write
@@ -237,7 +246,9 @@ def test_a_disk_that_fails_costs_what_is_counted(tmp_path: Path, monkeypatch: py
         assert any("was not closed" in line for line in capture.damage)
 
 
-def test_a_disk_that_stands_still_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_stands_still_holds_nobody_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stuck, go_on = threading.Event(), threading.Event()
     real = os.fdatasync
 
@@ -270,7 +281,9 @@ def test_a_disk_that_stands_still_holds_nobody_up(tmp_path: Path, monkeypatch: p
     assert sum(read_number(e.data) for e in found if e.kind == Kind.LOST) == 500
 
 
-def test_the_end_waits_for_a_stuck_disk_but_not_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_waits_for_a_stuck_disk_but_not_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(recorder, "_CLOSE_S", 0.1)
     go_on = threading.Event()
     monkeypatch.setattr(os, "fdatasync", lambda _fd: go_on.wait(600))
@@ -313,7 +326,9 @@ def test_a_folder_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
         begun(tmp_path / "file" / "captures")
 
 
-def test_another_file_is_never_overwritten_nor_a_link_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_file_is_never_overwritten_nor_a_link_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(os, "urandom", lambda n: bytes(n))
     monkeypatch.setattr(time, "strftime", lambda *_: "20260101T000000Z")
     target = tmp_path / "precious"
@@ -329,7 +344,9 @@ def test_another_file_is_never_overwritten_nor_a_link_followed(tmp_path: Path, m
     assert "cannot be written" in it.reports(0)[0].text
 
 
-def test_the_wall_clock_that_is_set_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_wall_clock_that_is_set_is_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now, shift = 10 * SECOND, 0
     it = begun(tmp_path, clock=lambda: now)
     monkeypatch.setattr(time, "time_ns", lambda: now + 1_700_000_000 * SECOND + shift)
@@ -369,7 +386,9 @@ def test_a_folder_that_is_not_there_yet_is_waited_for_where_devices_are(tmp_path
     assert [e for e in recorded(place / "captures") if e.kind == Kind.BYTES] == entries(3, 3)
 
 
-def test_a_mistake_in_what_writes_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mistake_in_what_writes_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = 10 * SECOND
 
     def fail(*_: object) -> None:

@@ -39,7 +39,9 @@ def read(log: Path) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".trc", ".mf4"])
-def test_a_log_of_each_kind_holds_what_was_sent(suffix: str, bench: Bench, recording: Path, tmp_path: Path) -> None:
+def test_a_log_of_each_kind_holds_what_was_sent(
+    suffix: str, bench: Bench, recording: Path, tmp_path: Path
+) -> None:
     target = tmp_path / f"out{suffix}"
     code, out, talk = replay(recording, "--to", "log", "-o", target)
     assert (code, out) == (0, "")
@@ -57,8 +59,12 @@ def test_a_log_of_a_log_is_the_same_log(recording: Path, tmp_path: Path) -> None
 
 def test_a_log_is_not_written_over_itself_and_has_no_bytes_of_escs(tmp_path: Path) -> None:
     log = written(tmp_path / "a.log", "(1.000000) can0 688#0000000000000000\n")
-    assert "is the recording itself" in refused(2, "replay", log, "--to", "log", "-o", log, "--force")
-    assert "log of CAN frames, which has no bytes of ESCs" in refused(2, "replay", log, "--to", "pty")
+    assert "is the recording itself" in refused(
+        2, "replay", log, "--to", "log", "-o", log, "--force"
+    )
+    assert "log of CAN frames, which has no bytes of ESCs" in refused(
+        2, "replay", log, "--to", "pty"
+    )
 
 
 def test_it_stops_at_once_when_it_is_told_to(tmp_path: Path) -> None:
@@ -69,7 +75,9 @@ def test_it_stops_at_once_when_it_is_told_to(tmp_path: Path) -> None:
     bench.take(START + 3600 * SECOND)
     path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
     words = ["replay", str(path), "--to", "pty"]
-    with subprocess.Popen([*PROGRAM, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as player:
+    with subprocess.Popen(
+        [*PROGRAM, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as player:
         assert player.stdout
         assert player.stderr
         assert player.stdout.readline().startswith("e0 "), "it runs"

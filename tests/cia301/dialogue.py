@@ -65,7 +65,12 @@ def changed(eds: Eds, changes: Changes) -> Eds:
 def default(index: int, sub: int, value: float | bytes, relative: bool | None = None) -> Changes:
     """One changed default."""
     entry = next(e for e in shipped_eds().entries if (e.index, e.sub) == (index, sub))
-    return {(index, sub): {"default": value, "relative": entry.relative if relative is None else relative}}
+    return {
+        (index, sub): {
+            "default": value,
+            "relative": entry.relative if relative is None else relative,
+        }
+    }
 
 
 NO_HEARTBEAT = default(0x1017, 0, 0)
@@ -216,7 +221,9 @@ class Bench:
         except Refused as refused:
             return refused.code
 
-    def write(self, index: int, sub: int, data: bytes | int, node: int = 1, size: int = 4) -> int | None:
+    def write(
+        self, index: int, sub: int, data: bytes | int, node: int = 1, size: int = 4
+    ) -> int | None:
         """The abort code of a download, None where it is confirmed. What is to be stored is stored at once."""
         if isinstance(data, int):
             data = data.to_bytes(size, "little", signed=data < 0)
@@ -265,7 +272,9 @@ class Bench:
             case "uart", [esc, "wrong", "CRC"]:
                 self.uart(live()[:-1] + b"\xff", int(esc))
             case "uart", [esc, kind, *fields]:
-                values = {name: int(value, 0) for name, value in (field.split("=") for field in fields)}
+                values = {
+                    name: int(value, 0) for name, value in (field.split("=") for field in fields)
+                }
                 self.uart((live if kind == "live" else info)(**values), int(esc))
             case (("read" | "write"), _):
                 return self._say_sdo(verb, rest)
@@ -299,20 +308,32 @@ class Bench:
                 return f"listens {' '.join(f'{cob_id:03X}' for cob_id in sorted(self.listened_to))}"
             case "rejected", [node, *_]:
                 keys = sorted(self.nodes[int(node) - 1].misfits)
-                return " ".join(["rejected", node, *(f"{number >> 8:04X}:{number & 0xFF:02X}" for number in keys)])
+                return " ".join(
+                    [
+                        "rejected",
+                        node,
+                        *(f"{number >> 8:04X}:{number & 0xFF:02X}" for number in keys),
+                    ]
+                )
             case _:
                 raise AssertionError(f"what is {what!r}?")
         return what
 
     def _say_sdo(self, verb: str, rest: str) -> str:
-        match = re.fullmatch(r"(\d+) ([0-9A-F]{4}):([0-9A-F]{2})((?: [0-9A-F]{2})*)(?: [=!].*)?", rest)
+        match = re.fullmatch(
+            r"(\d+) ([0-9A-F]{4}):([0-9A-F]{2})((?: [0-9A-F]{2})*)(?: [=!].*)?", rest
+        )
         assert match is not None, f"what is {rest!r}?"
         node, index, sub = int(match[1]), int(match[2], 16), int(match[3], 16)
         data = bytes.fromhex(match[4])
         said = f"{verb} {node} {match[2]}:{match[3]}"
         if verb == "read":
             found = self.read(index, sub, node)
-            return f"{said} ! {found:08X}" if isinstance(found, int) else f"{said} = {hexadecimal(found)}".rstrip()
+            return (
+                f"{said} ! {found:08X}"
+                if isinstance(found, int)
+                else f"{said} = {hexadecimal(found)}".rstrip()
+            )
         refused = self.write(index, sub, data, node)
         return f"{said} {hexadecimal(data)}" + ("" if refused is None else f" ! {refused:08X}")
 
@@ -325,7 +346,9 @@ class Bench:
         lines = []
         for time, frame in self.heard:
             flags = "".join(f" {name}" for name in FLAGS if getattr(frame, name))
-            lines.append(f"{ms(time)} -> {frame.can_id:03X} {hexadecimal(frame.data)}{flags}".rstrip())
+            lines.append(
+                f"{ms(time)} -> {frame.can_id:03X} {hexadecimal(frame.data)}{flags}".rstrip()
+            )
         self.heard = []
         return lines
 
@@ -333,8 +356,12 @@ class Bench:
 def _stored_text(stored: Stored) -> str:
     """``node-id 7 1017:00=F401 2100:01=05``."""
     values = sorted({**stored.communication, **stored.application}.items())
-    texts = [f"{number >> 8:04X}:{number & 0xFF:02X}={data.hex().upper()}" for number, data in values]
-    return " ".join(["node-id", str(stored.node_id), *texts] if stored.node_id is not None else texts)
+    texts = [
+        f"{number >> 8:04X}:{number & 0xFF:02X}={data.hex().upper()}" for number, data in values
+    ]
+    return " ".join(
+        ["node-id", str(stored.node_id), *texts] if stored.node_id is not None else texts
+    )
 
 
 def _stored(words: Sequence[str]) -> Stored:
@@ -367,8 +394,27 @@ def bench_of(options: Sequence[str]) -> Bench:
                 kept = {key: change for key, change in kept.items() if key[0] < 0x1800}
             case ["spare"]:
                 changes.update(SPARE)
-            case ["tpdo", number, "type", kind, "inhibit", inhibit, "timer", timer, "maps", *mapped]:
-                changes.update(tpdo(int(number), int(kind), int(inhibit), int(timer), *(int(m, 16) for m in mapped)))
+            case [
+                "tpdo",
+                number,
+                "type",
+                kind,
+                "inhibit",
+                inhibit,
+                "timer",
+                timer,
+                "maps",
+                *mapped,
+            ]:
+                changes.update(
+                    tpdo(
+                        int(number),
+                        int(kind),
+                        int(inhibit),
+                        int(timer),
+                        *(int(m, 16) for m in mapped),
+                    )
+                )
             case ["boot"]:
                 arguments["boot"] = False
             case ["started"]:
@@ -380,17 +426,24 @@ def bench_of(options: Sequence[str]) -> Bench:
             case ["bitrate", value]:
                 arguments["bitrate"] = int(value)
             case ["esc", *settings]:
-                arguments["escs"] = {key: _setting(value) for key, value in (each.split("=") for each in settings)}
+                arguments["escs"] = {
+                    key: _setting(value) for key, value in (each.split("=") for each in settings)
+                }
             case ["stored", *words]:
                 arguments.setdefault("stored", []).append(_stored(words))
             case ["drop", *indices]:
-                arguments["eds"] = load(without(shipped_eds().data, {int(index, 16) for index in indices}), "my.eds")
+                arguments["eds"] = load(
+                    without(shipped_eds().data, {int(index, 16) for index in indices}), "my.eds"
+                )
             case [place, "=", value] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
                 relative = value.startswith("$NODEID+")
                 change = {"default": int(value.removeprefix("$NODEID+"), 16), "relative": relative}
                 changes.setdefault((int(place[:4], 16), int(place[5:], 16)), {}).update(change)
             case [place, *attributes] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
-                change = {key: _attribute(value) for key, value in (each.split("=") for each in attributes)}
+                change = {
+                    key: _attribute(value)
+                    for key, value in (each.split("=") for each in attributes)
+                }
                 changes.setdefault((int(place[:4], 16), int(place[5:], 16)), {}).update(change)
             case _:
                 raise AssertionError(f"what is 'with {option}'?")
@@ -416,8 +469,15 @@ def tpdo(number: int, kind: int = 254, inhibit: int = 0, timer: int = 0, *mapped
     """A TPDO with its shipped COB-ID, mapped to battery voltage where nothing is named."""
     mapped = mapped or (0x20000210,)
     index = 0x1800 + number - 1
-    values = {(index, 2): kind, (index, 3): inhibit, (index, 5): timer, (index + 0x200, 0): len(mapped)}
+    values = {
+        (index, 2): kind,
+        (index, 3): inhibit,
+        (index, 5): timer,
+        (index + 0x200, 0): len(mapped),
+    }
     values |= {(index + 0x200, n): entry for n, entry in enumerate(mapped, 1)}
-    changes: dict[tuple[int, int], Any] = {place: {"default": value} for place, value in values.items()}
+    changes: dict[tuple[int, int], Any] = {
+        place: {"default": value} for place, value in values.items()
+    }
     changes[index, 1] = {"default": 0x40000080 + 0x100 * number, "relative": True}
     return changes

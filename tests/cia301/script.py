@@ -79,7 +79,9 @@ def read_dialogues(path: Path) -> list[Dialogue]:
     found = []
     for title, block in blocks:
         rows = [
-            tuple(cell.strip() for cell in line.split("|")[1:]) for _, line in block if line.startswith(("each", "|"))
+            tuple(cell.strip() for cell in line.split("|")[1:])
+            for _, line in block
+            if line.startswith(("each", "|"))
         ]
         names, values = (rows[0], rows[1:]) if rows else ((), [()])
         lines = []
@@ -95,7 +97,8 @@ def read_dialogues(path: Path) -> list[Dialogue]:
             found.append(
                 Dialogue(
                     f"{path.stem}: {title}" + (f" [{', '.join(row)}]" if row else ""),
-                    head + [line.partition(" ")[2] for _, line in filled if line.startswith("with ")],
+                    head
+                    + [line.partition(" ")[2] for _, line in filled if line.startswith("with ")],
                     [(place, line) for place, line in filled if not line.startswith("with ")],
                 )
             )
@@ -133,13 +136,22 @@ def play_lines(talker: Talker, lines: Sequence[Line]) -> None:
         time = ms(talker.now)  # a restart begins with 0
         actual += talker.heard_lines()
     wanted = [_padded(line) for _, line in expected]
-    got = [_with_wildcards(*pair) for pair in zip(actual, wanted, strict=False)] + actual[len(wanted) :]
+    got = [_with_wildcards(*pair) for pair in zip(actual, wanted, strict=False)] + actual[
+        len(wanted) :
+    ]
     if got == wanted:
         return
     at = next(
-        (n for n, pair in enumerate(zip(got, wanted, strict=False)) if pair[0] != pair[1]), min(len(got), len(wanted))
+        (n for n, pair in enumerate(zip(got, wanted, strict=False)) if pair[0] != pair[1]),
+        min(len(got), len(wanted)),
     )
-    place = expected[at][0] if at < len(expected) else f"after {expected[-1][0]}" if expected else "at the begin"
+    place = (
+        expected[at][0]
+        if at < len(expected)
+        else f"after {expected[-1][0]}"
+        if expected
+        else "at the begin"
+    )
     diff = "\n".join(ndiff(wanted, got))
     raise AssertionError(
         f"{place}: expected {wanted[at] if at < len(wanted) else 'nothing'!r}, "

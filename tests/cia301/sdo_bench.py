@@ -107,7 +107,9 @@ class Bench(Heard):
             self.now = max(self.now, deadline)
             self.server.advance(self.now)
             following = self.server.next_deadline()
-            assert following is None or following > self.now, "a deadline that advance does not settle"
+            assert following is None or following > self.now, (
+                "a deadline that advance does not settle"
+            )
         self.now = until
 
     def jump(self, now: int) -> None:
@@ -128,11 +130,20 @@ class Bench(Heard):
             case "<-", _:
                 self.request(bytes_of(rest))
             case "written", _:
-                texts = [f"{index:04X}:{sub:02X}={data.hex().upper()}" for index, sub, data in self.objects.written]
+                texts = [
+                    f"{index:04X}:{sub:02X}={data.hex().upper()}"
+                    for index, sub, data in self.objects.written
+                ]
                 return " ".join(["written", *texts])
             case "checks", _:
                 return " ".join(
-                    ["checks", *(f"{index:04X}:{sub:02X}={size}" for index, sub, size in self.objects.checks)]
+                    [
+                        "checks",
+                        *(
+                            f"{index:04X}:{sub:02X}={size}"
+                            for index, sub, size in self.objects.checks
+                        ),
+                    ]
                 )
             case "uploads", _:
                 return f"uploads {self.objects.uploads}"
@@ -142,7 +153,9 @@ class Bench(Heard):
                 deadline = self.server.next_deadline()
                 return f"deadline {'none' if deadline is None else ms(deadline)}"
             case "value", [place, "=", *data]:
-                self.objects.entries[int(place[:4], 16), int(place[5:], 16)].value = bytes_of(" ".join(data))
+                self.objects.entries[int(place[:4], 16), int(place[5:], 16)].value = bytes_of(
+                    " ".join(data)
+                )
             case "reset", []:
                 self.server.reset()
             case "confirm", []:

@@ -21,7 +21,24 @@ TEXTS = (0x09, 0x0F)
 
 LIVE = LiveData(70_000, 2442, -12, 34, 56, 789, 1234, 5678, 1500, -50, 60, -7, 8, 1 << 17, 26, 9)
 INFO = InfoData(
-    1 << 10 | 120, 4 << 8 | 17, 3, 6, 100_000, 2000, 2520, 100, 200, 300, 4, 5000, 99, 100, -10, 90, -11, 50
+    1 << 10 | 120,
+    4 << 8 | 17,
+    3,
+    6,
+    100_000,
+    2000,
+    2520,
+    100,
+    200,
+    300,
+    4,
+    5000,
+    99,
+    100,
+    -10,
+    90,
+    -11,
+    50,
 )
 
 
@@ -42,7 +59,11 @@ def of(entry: Entry) -> str:
 def ends(entry: Entry) -> tuple[int, int]:
     """Smallest and greatest value of the type."""
     bits = 8 * struct.calcsize(FORMATS[entry.data_type])
-    return (-(1 << bits - 1), (1 << bits - 1) - 1) if FORMATS[entry.data_type].islower() else (0, (1 << bits) - 1)
+    return (
+        (-(1 << bits - 1), (1 << bits - 1) - 1)
+        if FORMATS[entry.data_type].islower()
+        else (0, (1 << bits) - 1)
+    )
 
 
 def test_every_other_index_is_06020000h(bench: Bench) -> None:
@@ -53,7 +74,20 @@ def test_every_other_index_is_06020000h(bench: Bench) -> None:
         assert answer[1:3] == index.to_bytes(2, "little")
         codes.add(answer[:1] + answer[3:])
     assert codes == {b"\x80\0" + NO_OBJECT.to_bytes(4, "little")}
-    for index in (0x0000, 0x0001, 0x1006, 0x1200 + 1, 0x1400, 0x1600, 0x1806, 0x2003, 0x5FFF, 0x6000, 0xA000, 0xFFFF):
+    for index in (
+        0x0000,
+        0x0001,
+        0x1006,
+        0x1200 + 1,
+        0x1400,
+        0x1600,
+        0x1806,
+        0x2003,
+        0x5FFF,
+        0x6000,
+        0xA000,
+        0xFFFF,
+    ):
         assert bench.write(index, 0, 0) == NO_OBJECT
     assert gateway.take_frames() == []
 
@@ -99,7 +133,10 @@ RULED = {0x1003, 0x1005, 0x1010, 0x1011, 0x1014, 0x1F80, 0x2102}
 def test_limits(entry: Entry, bench: Bench) -> None:
     at = entry.index, entry.sub
     least, most = ends(entry)
-    low, high = least if entry.low is None else entry.low, most if entry.high is None else entry.high
+    low, high = (
+        least if entry.low is None else entry.low,
+        most if entry.high is None else entry.high,
+    )
     size = struct.calcsize(FORMATS[entry.data_type])
     before = bench.read(*at)
     if low > least:
@@ -122,7 +159,11 @@ def test_the_defaults_are_those_of_the_eds() -> None:
     for (index, sub), entry in entries().items():
         if entry.access == "wo" or (index >= 0x2000 and entry.access == "ro"):
             continue
-        if entry.default is None or (index, bool(sub)) == (0x1003, True) or (index, sub) in ((0x1018, 4), (0x100A, 0)):
+        if (
+            entry.default is None
+            or (index, bool(sub)) == (0x1003, True)
+            or (index, sub) in ((0x1018, 4), (0x100A, 0))
+        ):
             continue
         data = bench.read(index, sub)
         assert isinstance(data, bytes)
@@ -143,7 +184,9 @@ def test_the_serial_number_and_the_vendor_are_the_configurations() -> None:
 # --- values of the ESC
 
 
-def values(record: type[LiveData] | type[InfoData], data: LiveData | InfoData) -> Iterator[tuple[str, bytes]]:
+def values(
+    record: type[LiveData] | type[InfoData], data: LiveData | InfoData
+) -> Iterator[tuple[str, bytes]]:
     """Name and wire bytes of each field."""
     for name, row in rows(record).items():
         yield name, struct.pack("<" + row.wire, getattr(data, name))
@@ -171,7 +214,11 @@ def fed(behaviour: int = 0) -> Bench:
 
 def test_before_the_first_frame_there_is_no_data() -> None:
     bench = Bench(changes=QUIET)
-    for at in [*all_live(), *((0x2010, sub) for sub in range(1, 8)), *((0x2011, sub) for sub in range(1, 15))]:
+    for at in [
+        *all_live(),
+        *((0x2010, sub) for sub in range(1, 8)),
+        *((0x2011, sub) for sub in range(1, 15)),
+    ]:
         assert bench.read(*at) == NO_DATA
     assert bench.number(0x2020, 1) == 0
     assert bench.number(0x2020, 3) == bench.number(0x2020, 4) == 0xFFFF
@@ -187,7 +234,8 @@ def test_fresh_values_are_those_of_the_uart_frame() -> None:
     for sub, (name, data) in enumerate(wanted[4:], 1):
         assert bench.read(0x2011, sub) == data, name
     assert bench.number(0x2001, 1) == bench.number(0x606C) == 70_000
-    assert bench.read(0x2001, 3) == (-293).to_bytes(4, "little", signed=True)  # 24.42 V, -1.2 A: -29.304 W
+    # 24.42 V, -1.2 A: -29.304 W
+    assert bench.read(0x2001, 3) == (-293).to_bytes(4, "little", signed=True)
     assert bench.number(0x2001, 5) == 4070
     assert bench.number(0x6079) == 24420
     assert bench.number(0x2020, 1) == 0x82
@@ -214,7 +262,12 @@ def test_lost_values_abort_or_stay_or_are_codes_by_setting(behaviour: int) -> No
 @pytest.mark.parametrize("behaviour", [0, 1, 2])
 def test_information_counters_and_energy_keep_their_values(behaviour: int) -> None:
     bench = fed(behaviour=behaviour)
-    kept = [*((0x2010, sub) for sub in range(1, 8)), *((0x2011, sub) for sub in range(1, 15)), (0x2001, 4), (0x2001, 6)]
+    kept = [
+        *((0x2010, sub) for sub in range(1, 8)),
+        *((0x2011, sub) for sub in range(1, 15)),
+        (0x2001, 4),
+        (0x2001, 6),
+    ]
     before = {at: bench.read(*at) for at in kept}
     assert not any(isinstance(data, int) for data in before.values())
     lose(bench)

@@ -18,7 +18,9 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 
 DATA = shipped("eds/kontronik_esc.eds").read_bytes()
 PDOS = frozenset(range(0x1800, 0x1C00))
-OPTIONAL = sorted({entry.index for entry in shipped_eds().entries} - PDOS - {0x1000, 0x1001, 0x1018})
+OPTIONAL = sorted(
+    {entry.index for entry in shipped_eds().entries} - PDOS - {0x1000, 0x1001, 0x1018}
+)
 EVERY_SYNC = {(0x1800, 2): {"default": 1}}
 LSS_INQUIRY = ("5A", "5B", "5C", "5D", "5E")
 
@@ -45,7 +47,12 @@ def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
     bench.put(0, "01 00")
     for number in range(60):
         bench.wait(10)
-        bench.uart(live(battery_voltage=2000 + number, operating_errors=(0, 1 << 17, 1 | 1 << 17, 0)[number // 15]))
+        bench.uart(
+            live(
+                battery_voltage=2000 + number,
+                operating_errors=(0, 1 << 17, 1 | 1 << 17, 0)[number // 15],
+            )
+        )
         if number == 5:
             bench.uart(info(cell_count=6))
         if number % 7 == 0:
@@ -91,15 +98,27 @@ def test_a_dropped_object_leaves_the_behaviour_of_the_shipped_default(index: int
 def test_all_dropped_at_once_leave_it_too() -> None:
     pdos = frozenset(index for index in shipped_eds().object_names if index in PDOS)
     assert behaviour(frozenset(OPTIONAL) | pdos) == whole(pdos)
-    assert behaviour(frozenset(OPTIONAL) | pdos, self_start=True) == behaviour(pdos, self_start=True)
+    assert behaviour(frozenset(OPTIONAL) | pdos, self_start=True) == behaviour(
+        pdos, self_start=True
+    )
 
 
 def test_the_behaviour_without_an_object_is_that_of_the_shipped_file() -> None:
-    shipped_numbers = {key(entry.index, entry.sub): entry.default for entry in shipped_eds().entries}
+    shipped_numbers = {
+        key(entry.index, entry.sub): entry.default for entry in shipped_eds().entries
+    }
     assert {number: shipped_numbers[number] for number in _IF_ABSENT} == _IF_ABSENT
-    services = {entry.index for entry in shipped_eds().entries if entry.index < 0x2000 and entry.index not in PDOS}
+    services = {
+        entry.index
+        for entry in shipped_eds().entries
+        if entry.index < 0x2000 and entry.index not in PDOS
+    }
     for number, default in shipped_numbers.items():
-        if number & 0xFF and number >> 8 in services - {0x1010, 0x1011, 0x1200} and isinstance(default, int):
+        if (
+            number & 0xFF
+            and number >> 8 in services - {0x1010, 0x1011, 0x1200}
+            and isinstance(default, int)
+        ):
             assert _IF_ABSENT.get(number, 0) == default, f"{number:06X}"
 
 
@@ -119,8 +138,12 @@ def problems(data: bytes, node_ids: tuple[int, ...] = (1,)) -> list[str]:
 
 
 def test_a_cob_id_of_emergencies_that_are_not_in_the_eds_is_taken() -> None:
-    data = without(with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080").encode(), {0x1014})
-    assert "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in problems(data)[0]
+    data = without(
+        with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080").encode(), {0x1014}
+    )
+    assert (
+        "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in problems(data)[0]
+    )
 
 
 def test_a_default_pdo_that_maps_nothing_is_named() -> None:
@@ -128,7 +151,9 @@ def test_a_default_pdo_that_maps_nothing_is_named() -> None:
     check_eds(data, EscSettings())  # a board that ran so with 0.5.0 goes on
     setup = CanopenSetup(data, (NodeSettings(5),), (Stored(),), (EscSettings(),))
     (said,) = without_objects(setup.nodes(setup.esc_settings((EscSettings(),))))
-    assert said.startswith("TPDO 2 is never sent: 1A01h maps nothing, so 1801h:01 cannot be valid. ")
+    assert said.startswith(
+        "TPDO 2 is never sent: 1A01h maps nothing, so 1801h:01 cannot be valid. "
+    )
 
 
 def test_the_shipped_eds_is_right_for_all_node_ids_at_once() -> None:
@@ -143,13 +168,21 @@ def test_a_default_cob_id_without_bit_30_is_that_of_a_pdo() -> None:
 def test_a_cob_id_that_is_restricted_for_one_node_only_is_refused_for_that() -> None:
     changed = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
     check_eds(load(changed.encode(), "my.eds"), EscSettings(), [1])
-    assert "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3" in problems(changed.encode(), (3,))[0]
+    assert (
+        "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3"
+        in problems(changed.encode(), (3,))[0]
+    )
 
 
 def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:
-    changed = with_key(with_key(SHIPPED, "2100sub4", "DataType", "0x0005"), "2100sub4", "HighLimit", "0xFF")
+    changed = with_key(
+        with_key(SHIPPED, "2100sub4", "DataType", "0x0005"), "2100sub4", "HighLimit", "0xFF"
+    )
     changed = with_key(changed, "2100sub4", "DefaultValue", "0xFA")
     eds = load(changed.encode(), "my.eds")
     check_eds(eds, EscSettings())
-    with pytest.raises(UserError, match="2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says"):
+    with pytest.raises(
+        UserError,
+        match="2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says",
+    ):
         check_eds(eds, [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])

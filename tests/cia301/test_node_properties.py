@@ -18,10 +18,25 @@ FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthChec
 NODES = 2
 
 data8 = st.binary(min_size=8, max_size=8)
-known_ids = st.sampled_from([0, 0x80, 0x81, 0x181, 0x581, 0x601, 0x602, 0x67F, 0x701, 0x705, 0x7E4, 0x7E5])
+known_ids = st.sampled_from(
+    [0, 0x80, 0x81, 0x181, 0x581, 0x601, 0x602, 0x67F, 0x701, 0x705, 0x7E4, 0x7E5]
+)
 objects = st.sampled_from(
     [
-        *(0x1000, 0x1003, 0x1005, 0x1008, 0x1010, 0x1011, 0x1014, 0x1016, 0x1017, 0x1019, 0x1021, 0x1029),
+        *(
+            0x1000,
+            0x1003,
+            0x1005,
+            0x1008,
+            0x1010,
+            0x1011,
+            0x1014,
+            0x1016,
+            0x1017,
+            0x1019,
+            0x1021,
+            0x1029,
+        ),
         *(0x1800, 0x1801, 0x1A00, 0x1F80, 0x2000, 0x2020, 0x2100, 0x2101, 0x2102, 0x603F, 0x3000),
     ]
 )
@@ -32,13 +47,40 @@ def sdo_requests(draw: st.DrawFn) -> CanFrame:
     """Requests that are more than noise: known objects, useful values."""
     command = draw(
         st.sampled_from(
-            [0x2F, 0x2B, 0x23, 0x21, 0x22, 0x40, 0x60, 0x70, 0x00, 0x10, 0x01, 0x80, 0xA0, 0xA4, 0xC2, 0xC6]
+            [
+                0x2F,
+                0x2B,
+                0x23,
+                0x21,
+                0x22,
+                0x40,
+                0x60,
+                0x70,
+                0x00,
+                0x10,
+                0x01,
+                0x80,
+                0xA0,
+                0xA4,
+                0xC2,
+                0xC6,
+            ]
         )
     )
     value = draw(
         st.one_of(
             st.binary(min_size=4, max_size=4),
-            st.sampled_from([b"save", b"load", b"rset", bytes(4), b"\x81\x01\0\x40", b"\x81\x01\0\xc0", b"\xc8\0\5\0"]),
+            st.sampled_from(
+                [
+                    b"save",
+                    b"load",
+                    b"rset",
+                    bytes(4),
+                    b"\x81\x01\0\x40",
+                    b"\x81\x01\0\xc0",
+                    b"\xc8\0\5\0",
+                ]
+            ),
         )
     )
     multiplexer = draw(objects).to_bytes(2, "little") + bytes((draw(st.integers(0, 9)),))
@@ -47,8 +89,12 @@ def sdo_requests(draw: st.DrawFn) -> CanFrame:
 
 @st.composite
 def lss_requests(draw: st.DrawFn) -> CanFrame:
-    service = draw(st.sampled_from([0x04, 0x11, 0x13, 0x15, 0x17, 0x40, 0x43, 0x46, 0x4C, 0x51, 0x5A, 0x5E]))
-    return CanFrame(0x7E5, bytes((service, draw(st.sampled_from([0, 1, 2, 9, 128, 255])))) + bytes(6))
+    service = draw(
+        st.sampled_from([0x04, 0x11, 0x13, 0x15, 0x17, 0x40, 0x43, 0x46, 0x4C, 0x51, 0x5A, 0x5E])
+    )
+    return CanFrame(
+        0x7E5, bytes((service, draw(st.sampled_from([0, 1, 2, 9, 128, 255])))) + bytes(6)
+    )
 
 
 any_frames = st.builds(
@@ -132,7 +178,11 @@ MAPPABLE = [
     if e.mappable and (size := Variable(e).size) is not None
 ]
 pdo_writes = st.one_of(
-    st.tuples(st.just(1), st.sampled_from([0x40000181, 0x181, 0xC0000181, 0x40000333, 0x40000281]), st.just(4)),
+    st.tuples(
+        st.just(1),
+        st.sampled_from([0x40000181, 0x181, 0xC0000181, 0x40000333, 0x40000281]),
+        st.just(4),
+    ),
     st.tuples(st.just(2), st.sampled_from([0, 1, 2, 240, 254, 255]), st.just(1)),
     st.tuples(st.just(3), st.sampled_from([0, 100, 5000]), st.just(2)),
     st.tuples(st.just(5), st.sampled_from([0, 7, 100]), st.just(2)),
@@ -182,7 +232,11 @@ def is_answer_to(request: bytes, answer: bytes) -> bool:
     client, server = request[0] >> 5, answer[0] >> 5
     if len(answer) != 8:
         return False
-    initiate = client in (1, 2) or (client == 5 and request[0] & 3 == 0) or (client == 6 and not request[0] & 1)
+    initiate = (
+        client in (1, 2)
+        or (client == 5 and request[0] & 3 == 0)
+        or (client == 6 and not request[0] & 1)
+    )
     if answer[0] == 0x80:
         return not initiate or answer[1:4] == request[1:4]
     if initiate and answer[1:4] != request[1:4]:
@@ -193,7 +247,9 @@ def is_answer_to(request: bytes, answer: bytes) -> bool:
 
 @given(st.lists(st.one_of(sdo_requests(), sdo_noise), max_size=50))
 @FEW
-def test_each_sdo_request_gets_exactly_one_right_answer_from_its_node(requests: list[CanFrame]) -> None:
+def test_each_sdo_request_gets_exactly_one_right_answer_from_its_node(
+    requests: list[CanFrame],
+) -> None:
     bench = Bench(NODES, changes=NO_HEARTBEAT)
     in_block = dict.fromkeys(range(1, NODES + 1), False)
     for request in requests:
@@ -281,7 +337,11 @@ def test_heartbeats_tell_the_state_at_their_times(story: list[CanFrame | int]) -
         assert told == [(time, model.state) for time in range(first, bench.now + 1, period)]
 
 
-@given(st.lists(st.one_of(any_frames, plain_frames, nmt_frames, sdo_requests(), lss_requests()), max_size=50))
+@given(
+    st.lists(
+        st.one_of(any_frames, plain_frames, nmt_frames, sdo_requests(), lss_requests()), max_size=50
+    )
+)
 @FEW
 def test_a_node_says_nothing_unless_asked_but_by_its_timers(story: list[CanFrame]) -> None:
     """Foreign ids and other nodes' ids cause no frame at all; its own ids from others one EMCY 8150h; only who was asked answers."""
@@ -318,7 +378,9 @@ def test_no_pdo_outside_operational_no_emergency_while_stopped_nothing_without_a
             if frame.can_id == 0x7E4:
                 continue
             assert node_id in states, frame
-            changed_state = states[node_id] != next((n.state for n in bench.nodes if n.node_id == node_id), None)
+            changed_state = states[node_id] != next(
+                (n.state for n in bench.nodes if n.node_id == node_id), None
+            )
             if changed_state:
                 continue
             if service in (0x180, 0x280, 0x380, 0x480):

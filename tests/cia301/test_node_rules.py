@@ -18,7 +18,9 @@ from kontronik_can_gw.signals.plan import Layout
 VALUE, TAKEN = 0x06090030, 0x06040043
 
 
-def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_it_has_ceased() -> None:
+def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_it_has_ceased() -> (
+    None
+):
     bench = Bench(changes=QUIET)
     bench.take()
     for n in range(300):
@@ -89,7 +91,15 @@ def test_a_node_id_whose_cob_ids_the_dbc_has_is_refused() -> None:
 
 def test_each_mappable_object_can_be_sent_and_carries_what_sdo_reads() -> None:
     bench = Bench(changes={**QUIET, **default(0x2100, 5, 2)})
-    bench.uart(live(electrical_speed=66051, battery_voltage=2442, bec_current=5, operating_state=26, throttle=-5))
+    bench.uart(
+        live(
+            electrical_speed=66051,
+            battery_voltage=2442,
+            bec_current=5,
+            operating_state=26,
+            throttle=-5,
+        )
+    )
     bench.start()
     tried = 0
     for entry in shipped_eds().entries:
@@ -109,9 +119,13 @@ def test_each_mappable_object_can_be_sent_and_carries_what_sdo_reads() -> None:
 
 
 def test_objects_from_a000h_on_are_stored_too() -> None:
-    swapped = SHIPPED.replace("[ManufacturerObjects]", "[Kept]").replace("[OptionalObjects]", "[ManufacturerObjects]")
+    swapped = SHIPPED.replace("[ManufacturerObjects]", "[Kept]").replace(
+        "[OptionalObjects]", "[ManufacturerObjects]"
+    )
     changed = with_object(swapped, 0xA000, variable(0x05, DefaultValue="1"))
-    changed = changed.replace("[ManufacturerObjects]", "[OptionalObjects]").replace("[Kept]", "[ManufacturerObjects]")
+    changed = changed.replace("[ManufacturerObjects]", "[OptionalObjects]").replace(
+        "[Kept]", "[ManufacturerObjects]"
+    )
     bench = Bench(eds=load(changed.encode("ascii"), "my.eds"), changes=QUIET)
     assert bench.write(0xA000, 0, b"\x05") is None
     assert bench.write(0x1010, 1, b"save") is None
@@ -119,7 +133,12 @@ def test_objects_from_a000h_on_are_stored_too() -> None:
 
 
 def test_serial_numbers_differ_by_number_name_and_machine(tmp_path: Path) -> None:
-    made = {serial_number(n, name, identity) for n in (1, 2) for name in ("left", "right") for identity in (b"a", b"b")}
+    made = {
+        serial_number(n, name, identity)
+        for n in (1, 2)
+        for name in ("left", "right")
+        for identity in (b"a", b"b")
+    }
     assert len(made) == 8
     assert serial_number(1, "left", b"a") == serial_number(1, "left", b"a")
     assert serial_number(1, "left", b"") == 0
@@ -130,7 +149,10 @@ def test_serial_numbers_differ_by_number_name_and_machine(tmp_path: Path) -> Non
 
 
 def setup_of(tmp_path: Path) -> Loaded:
-    tables = {"canopen": {"enabled": True, "store": str(tmp_path)}, "esc": [{"port": "p1"}, {"port": "p2"}]}
+    tables = {
+        "canopen": {"enabled": True, "store": str(tmp_path)},
+        "esc": [{"port": "p1"}, {"port": "p2"}],
+    }
     return assemble(parse(tables, "test"))
 
 
@@ -152,11 +174,26 @@ def u32(value: int) -> bytes:
         {"esc1": Stored(communication={0x100500: u32(0x90), 0x180501: u32(0x40000080)})},
         {"esc1": Stored(communication={0x100500: u32(0x87)}), "esc2": Stored(7)},
         {"esc1": Stored(communication={0x101400: u32(0x82)})},
-        {"esc1": Stored(communication={0x180501: u32(0x40000680), 0x1A0500: b"\1", 0x1A0501: u32(0x20000220)})},
-        {"esc1": Stored(communication={(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)} | {0x101700: b"\1\0"})},
+        {
+            "esc1": Stored(
+                communication={
+                    0x180501: u32(0x40000680),
+                    0x1A0500: b"\1",
+                    0x1A0501: u32(0x20000220),
+                }
+            )
+        },
+        {
+            "esc1": Stored(
+                communication={(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)}
+                | {0x101700: b"\1\0"}
+            )
+        },
     ],
 )
-def test_nothing_a_master_stored_keeps_the_gateway_from_starting(tmp_path: Path, stored: dict[str, Stored]) -> None:
+def test_nothing_a_master_stored_keeps_the_gateway_from_starting(
+    tmp_path: Path, stored: dict[str, Stored]
+) -> None:
     keep(tmp_path, **stored)
     loaded = setup_of(tmp_path)
     assert loaded.canopen is not None
@@ -165,11 +202,14 @@ def test_nothing_a_master_stored_keeps_the_gateway_from_starting(tmp_path: Path,
     for node in nodes:
         for cob_id, what in node.cob_ids():
             assert ids.setdefault(cob_id, what) == what
-    assert loaded.warnings or any(node.misfits for node in nodes)  # said at start, or by the node when it boots
+    # said at start, or by the node when it boots
+    assert loaded.warnings or any(node.misfits for node in nodes)
 
 
 @pytest.mark.parametrize("clashing", [Stored(2), Stored(communication={0x101400: u32(0x82)})])
-def test_1020h_does_not_stay_where_something_stored_with_it_gave_way(tmp_path: Path, clashing: Stored) -> None:
+def test_1020h_does_not_stay_where_something_stored_with_it_gave_way(
+    tmp_path: Path, clashing: Stored
+) -> None:
     verify = {0x102001: u32(15685), 0x102002: u32(43_200_000), 0x101700: b"\xf4\x01"}
     for stored, expected in ((Stored(7), 15685), (clashing, 0)):
         keep(tmp_path, esc1=Stored(stored.node_id, {**stored.communication, **verify}))

@@ -34,7 +34,11 @@ def put_out(frames: list[CanFrame]) -> list[CanFrame]:
 def test_of_what_a_node_answers_nothing_is_overtaken() -> None:
     """Only measurements are; SDO answers, emergencies and heartbeats of one id all go, in their order."""
     bench = Bench(changes=QUIET)
-    for request in ("40 00 10 00 00 00 00 00", "40 18 10 01 00 00 00 00", "40 18 10 04 00 00 00 00"):
+    for request in (
+        "40 00 10 00 00 00 00 00",
+        "40 18 10 01 00 00 00 00",
+        "40 18 10 04 00 00 00 00",
+    ):
         bench.put(0x601, request)
     bench.uart(live(operating_errors=1))
     bench.uart(live())
@@ -47,7 +51,10 @@ def test_of_what_a_node_answers_nothing_is_overtaken() -> None:
 
 
 def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> None:
-    bench = Bench(changes=QUIET, stored=[Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})])
+    bench = Bench(
+        changes=QUIET,
+        stored=[Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})],
+    )
     assert sorted(bench.gateway.take_misfits()) == [(0, 0x101700), (0, 0x210001)]
     for _ in range(3):
         bench.put(0, "82 01")

@@ -16,17 +16,30 @@ RIGHT = """
 
 def play(text: str, *options: str) -> None:
     play_lines(
-        bench_of(options or ["heartbeat"]), [(f"a.txt:{n}", line) for n, line in enumerate(text.splitlines(), 1)]
+        bench_of(options or ["heartbeat"]),
+        [(f"a.txt:{n}", line) for n, line in enumerate(text.splitlines(), 1)],
     )
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("1000 -> 701 7F", "1000 -> 701 05", "a.txt:4: expected '1000 -> 701 05', got '1000 -> 701 7F'"),
+        (
+            "1000 -> 701 7F",
+            "1000 -> 701 05",
+            "a.txt:4: expected '1000 -> 701 05', got '1000 -> 701 7F'",
+        ),
         (" 1000 -> 701 7F\n", "", "after a.txt:3: expected 'nothing', got '1000 -> 701 7F'"),
-        ("0 -> 581 43 .. 10 00 00*", "0 -> 581 43 .. 10 00", "a.txt:3: expected '0 -> 581 43 .. 10 00', got"),
-        ("1500 -", "2000 -> 701 7F\n 2001 -> 701 7F", "a.txt:6: expected '2001 -> 701 7F', got 'nothing'"),
+        (
+            "0 -> 581 43 .. 10 00 00*",
+            "0 -> 581 43 .. 10 00",
+            "a.txt:3: expected '0 -> 581 43 .. 10 00', got",
+        ),
+        (
+            "1500 -",
+            "2000 -> 701 7F\n 2001 -> 701 7F",
+            "a.txt:6: expected '2001 -> 701 7F', got 'nothing'",
+        ),
         (
             "1500 -",
             "1500 read 1 1017:00 = E8 04",

@@ -54,7 +54,11 @@ class Model:
         if len(data) != 8:
             return []
         try:
-            answers = self.block_segment(data, now) if self.phase == "block down" else self.other(data, now)
+            answers = (
+                self.block_segment(data, now)
+                if self.phase == "block down"
+                else self.other(data, now)
+            )
         except SdoAbort as abort:
             self.phase = "idle"
             answers = [abort.code]
@@ -254,7 +258,9 @@ class Model:
         if self.phase == "block up start":
             return b"\xa3" + bytes(7)
         if self.phase == "block up ack":
-            return bytes((0xA2, max(0, self.counted + (1, 0, 0, 0, 0, -1, -1, -2)[pick % 8]), 1 + low % 5)) + bytes(5)
+            return bytes(
+                (0xA2, max(0, self.counted + (1, 0, 0, 0, 0, -1, -1, -2)[pick % 8]), 1 + low % 5)
+            ) + bytes(5)
         if self.phase == "block up end":
             return b"\xa1" + bytes(7)
         (index, sub), command = PLACES[pick % len(PLACES)], INITIATES[low % len(INITIATES)]
@@ -280,8 +286,33 @@ def test_the_crc_of_the_model_and_of_the_server_agree(data: bytes) -> None:
     assert slow_crc(b"123456789") == 0x31C3  # as the standard says
 
 
-PLACES = [*usual_entries(), (0x1000, 7), (0x3000, 0), (0x2003, 0), (0x2003, 0), (0x2004, 0), (0x2005, 0)]
-INITIATES = (0x40, 0x21, 0x20, 0x23, 0x27, 0x2B, 0x2F, 0x22, 0xA0, 0xA4, 0xA4, 0xC0, 0xC2, 0xC4, 0xC6, 0xC6)
+PLACES = [
+    *usual_entries(),
+    (0x1000, 7),
+    (0x3000, 0),
+    (0x2003, 0),
+    (0x2003, 0),
+    (0x2004, 0),
+    (0x2005, 0),
+]
+INITIATES = (
+    0x40,
+    0x21,
+    0x20,
+    0x23,
+    0x27,
+    0x2B,
+    0x2F,
+    0x22,
+    0xA0,
+    0xA4,
+    0xA4,
+    0xC0,
+    0xC2,
+    0xC4,
+    0xC6,
+    0xC6,
+)
 GAPS = (0, 0, 0, 1 * MS, 30 * MS, 60 * MS, 1990 * MS, 2000 * MS, 5000 * MS)
 
 
@@ -294,7 +325,8 @@ class Step(NamedTuple):
 
 
 STEPS = st.lists(
-    st.builds(Step, st.integers(0, 15), st.binary(min_size=8, max_size=8), st.sampled_from(GAPS)), max_size=40
+    st.builds(Step, st.integers(0, 15), st.binary(min_size=8, max_size=8), st.sampled_from(GAPS)),
+    max_size=40,
 )
 
 
@@ -304,7 +336,9 @@ def code_of(answer: bytes) -> int | None:
 
 @settings(max_examples=600, deadline=None)
 @given(STEPS)
-def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(steps: list[Step]) -> None:
+def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(
+    steps: list[Step],
+) -> None:
     bench, model = Bench(), Model()
     for how, raw, gap in steps:
         bench.answers = []
@@ -332,7 +366,9 @@ def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(ste
             index, sub = PLACES[raw[1] % len(PLACES)]
             data = bytes((raw[0],)) + index.to_bytes(2, "little") + bytes((sub,)) + raw[4:]
         answers = bench.request(data)
-        assert [code_of(answer) for answer in answers] == (expected if len(data) == 8 else []) + model.hear(data, now)
+        assert [code_of(answer) for answer in answers] == (
+            expected if len(data) == 8 else []
+        ) + model.hear(data, now)
         bench.server.advance(now)  # after a frame that was none the time-out may still be due
         assert bench.server.busy == (model.phase != "idle")
         assert (bench.server.next_deadline() is None) == (model.phase in ("idle", "late"))
@@ -350,7 +386,9 @@ class Client:
 
     multiplexer = b"\x03\x20\0"
 
-    def __init__(self, bench: Bench, lose: Callable[[], bool] = lambda: False, pauses: Sequence[int] = (MS,)) -> None:
+    def __init__(
+        self, bench: Bench, lose: Callable[[], bool] = lambda: False, pauses: Sequence[int] = (MS,)
+    ) -> None:
         self.bench = bench
         self.lose = lose
         self._pauses = cycle(pauses)
@@ -449,7 +487,9 @@ SIZES = st.one_of(
     st.sampled_from([126, 127, 7 * 126, 7 * 127 - 1, 7 * 127, 7 * 127 + 1, 7 * 128, 7 * 254]),
     st.integers(0, 2000),
 )
-DATA = st.builds(lambda size, seed: random.Random(seed).randbytes(size), SIZES, st.integers(0, 2**32))
+DATA = st.builds(
+    lambda size, seed: random.Random(seed).randbytes(size), SIZES, st.integers(0, 2**32)
+)
 
 
 def losing(seed: int, percent: int) -> Callable[[], bool]:
@@ -469,7 +509,13 @@ def losing(seed: int, percent: int) -> Callable[[], bool]:
 )
 @example(b"", [1], True, True, 0, 0, 255)
 def test_blocks_carry_any_data_both_ways_though_segments_get_lost(
-    data: bytes, block_sizes: list[int], tell_size: bool, with_crc: bool, seed: int, percent: int, threshold: int
+    data: bytes,
+    block_sizes: list[int],
+    tell_size: bool,
+    with_crc: bool,
+    seed: int,
+    percent: int,
+    threshold: int,
 ) -> None:
     bench = Bench()
     client = Client(bench, losing(seed, percent))
@@ -537,7 +583,9 @@ def master(bench: Bench, lose: Callable[[bytes], bool] = lambda data: False) -> 
             return []
         bench.now += MS
         answers = list(bench.request(data))
-        while (deadline := bench.server.next_deadline()) is not None and deadline < bench.now + 1000 * MS:
+        while (
+            deadline := bench.server.next_deadline()
+        ) is not None and deadline < bench.now + 1000 * MS:
             bench.answers = []
             bench.pass_time(deadline)
             answers += bench.answers
@@ -576,7 +624,13 @@ def test_canopen_transfers_blocks(size: int, with_crc: bool, segment_ns: int) ->
     bench = Bench(segment_ns)
     sdo = master(bench)
     with sdo.open(
-        0x2003, 0, "wb", size=size, block_transfer=True, request_crc_support=with_crc, buffering=1024
+        0x2003,
+        0,
+        "wb",
+        size=size,
+        block_transfer=True,
+        request_crc_support=with_crc,
+        buffering=1024,
     ) as stream:
         stream.write(data)
     assert bench.objects.written == [(0x2003, 0, data)]
@@ -597,7 +651,9 @@ def test_canopen_repeats_block_segments_that_got_lost() -> None:
         return False
 
     bench = Bench()
-    with master(bench, lose).open(0x2003, 0, "wb", size=3000, block_transfer=True, buffering=1024) as stream:
+    with master(bench, lose).open(
+        0x2003, 0, "wb", size=3000, block_transfer=True, buffering=1024
+    ) as stream:
         stream.write(data)
     assert lost == []
     assert bench.objects.written == [(0x2003, 0, data)]

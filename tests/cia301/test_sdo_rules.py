@@ -28,7 +28,9 @@ def test_a_dictionary_may_confirm_from_within_the_download() -> None:
             return sub == 0
 
     answers: list[bytes] = []
-    server = SdoServer(Eager({(0x2005, 0): Entry(size=4), (0x2005, 1): Entry(size=4)}), answers.append)
+    server = SdoServer(
+        Eager({(0x2005, 0): Entry(size=4), (0x2005, 1): Entry(size=4)}), answers.append
+    )
     server.receive(WRITE_LATE, 0)
     assert answers == [LATE_OK]
     server.receive(bytes.fromhex("2305200173617665"), 0)

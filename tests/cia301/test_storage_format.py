@@ -64,7 +64,8 @@ def test_there_and_back(stored: Stored) -> None:
 def refused(data: bytes) -> str:
     with pytest.raises(ValueError) as caught:
         decode(data)
-    assert type(caught.value) is ValueError  # a reason of ours, not what a library happened to raise
+    # a reason of ours, not what a library happened to raise
+    assert type(caught.value) is ValueError
     return str(caught.value)
 
 
@@ -101,7 +102,9 @@ def test_rubbish_alone_and_anything_appended_are_refused(stored: Stored, more: b
 
 json_values = st.recursive(
     st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=6)),
-    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=6), inner, max_size=3)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=6), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 
@@ -125,7 +128,10 @@ def test_other_json_with_a_right_crc_is_refused(value: Any) -> None:
         (encode(SAMPLE).split(b"\n")[1] + b"\n", "first line"),
         (encode(SAMPLE).split(b"\n")[0] + b"\n", "CRC-32"),
         (with_crc(content(), version=2), "version 2 is unknown"),
-        (b'{"format":"kontronik-can-gw parameters","version":12}\nsomething of the future', "version 12 is unknown"),
+        (
+            b'{"format":"kontronik-can-gw parameters","version":12}\nsomething of the future',
+            "version 12 is unknown",
+        ),
         (with_crc(content(), version='"1"'), "first line"),
         (with_crc(content(), version="01"), "form"),
         (with_crc(b"\xff\xfe\n"), "not JSON"),

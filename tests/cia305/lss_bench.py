@@ -59,7 +59,12 @@ class Talk(Heard):
                 case ["node-id", active, pending]:
                     self.node.active_node_id, self.node.pending_node_id = int(active), int(pending)
                 case ["identity", vendor, product, revision, serial]:
-                    self.node.identity = int(vendor, 16), int(product, 16), int(revision, 16), int(serial, 16)
+                    self.node.identity = (
+                        int(vendor, 16),
+                        int(product, 16),
+                        int(revision, 16),
+                        int(serial, 16),
+                    )
                 case ["read-only"]:
                     self.node.writable = False
                 case ["refuses", "to", "store"]:
@@ -91,9 +96,16 @@ class Talk(Heard):
             case "node-id", _:
                 return f"node-id {self.node.active_node_id} {self.node.pending_node_id}"
             case "stores", _:
-                return " ".join(["stores", *(str(node_id) for asked, node_id in self.node.asked if asked == "store")])
+                return " ".join(
+                    [
+                        "stores",
+                        *(str(node_id) for asked, node_id in self.node.asked if asked == "store"),
+                    ]
+                )
             case "left", _:
-                return " ".join(["left", *(ms(time) for asked, time in self.node.asked if asked == "left")])
+                return " ".join(
+                    ["left", *(ms(time) for asked, time in self.node.asked if asked == "left")]
+                )
             case _:
                 raise AssertionError(f"what is {what!r}?")
         return what

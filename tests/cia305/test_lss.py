@@ -18,7 +18,9 @@ FILES = Path(__file__).parent.glob("dialogues/*.txt")
 
 
 @pytest.mark.parametrize(
-    "dialogue", [each for path in sorted(FILES) for each in read_dialogues(path)], ids=lambda dialogue: dialogue.name
+    "dialogue",
+    [each for path in sorted(FILES) for each in read_dialogues(path)],
+    ids=lambda dialogue: dialogue.name,
 )
 def test_dialogue(dialogue: Dialogue) -> None:
     play_lines(Talk(dialogue.options), dialogue.lines)
@@ -74,7 +76,9 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("no_pauses")
 @pytest.mark.parametrize("seed", range(5))
-def test_a_foreign_master_finds_each_of_several_slaves_by_fastscan_and_gives_it_a_node_id(seed: int) -> None:
+def test_a_foreign_master_finds_each_of_several_slaves_by_fastscan_and_gives_it_a_node_id(
+    seed: int,
+) -> None:
     nodes = [Node(identity=identity) for identity in identities(seed, 6)]
     bus = Bus(*nodes, Node(identity=(0, 0, 0, 0), active_node_id=100, pending_node_id=100))
     master = master_of(bus)

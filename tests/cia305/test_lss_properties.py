@@ -6,7 +6,16 @@ from lss_bench import Identity, Node
 
 from kontronik_can_gw.canopen.lss import LssSlave
 
-SERVICES = (0x04, 0x11, 0x13, 0x15, 0x17, *range(0x40, 0x45), *range(0x46, 0x52), *range(0x5A, 0x5F))
+SERVICES = (
+    0x04,
+    0x11,
+    0x13,
+    0x15,
+    0x17,
+    *range(0x40, 0x45),
+    *range(0x46, 0x52),
+    *range(0x5A, 0x5F),
+)
 
 
 class Oracle:
@@ -32,10 +41,12 @@ class Oracle:
         numbers = self._ended(0x46, 0x4B)
         if numbers is None or numbers[:2] != self.parts[:2]:
             return False
-        low_revision, high_revision, low_serial, high_serial = (int.from_bytes(n, "little") for n in numbers[2:])
-        return self.identity[2] in range(low_revision, high_revision + 1) and self.identity[3] in range(
-            low_serial, high_serial + 1
+        low_revision, high_revision, low_serial, high_serial = (
+            int.from_bytes(n, "little") for n in numbers[2:]
         )
+        return self.identity[2] in range(low_revision, high_revision + 1) and self.identity[
+            3
+        ] in range(low_serial, high_serial + 1)
 
     def _scanned(self, frame: bytes) -> bool:
         bit, part, following = frame[5:]
@@ -85,7 +96,9 @@ class Oracle:
 
 
 ME: Identity = (5, 0x80000000, 0, 0xFFFFFFFF)
-numbers = st.one_of(st.sampled_from(ME), st.sampled_from((0, 0xFFFFFFFF)), st.integers(0, 0xFFFFFFFF))
+numbers = st.one_of(
+    st.sampled_from(ME), st.sampled_from((0, 0xFFFFFFFF)), st.integers(0, 0xFFFFFFFF)
+)
 small = st.one_of(st.integers(0, 4), st.integers(0, 255))
 
 
@@ -129,7 +142,11 @@ single = st.one_of(
         numbers,
         st.tuples(st.one_of(st.just(0x80), st.integers(0, 33), st.integers(0, 255)), small, small),
     ),
-    st.builds(lambda service, first: bytes((service, first, 0, 0, 0, 0, 0, 0)), st.sampled_from(SERVICES), small),
+    st.builds(
+        lambda service, first: bytes((service, first, 0, 0, 0, 0, 0, 0)),
+        st.sampled_from(SERVICES),
+        small,
+    ),
     st.binary(min_size=8, max_size=8),
     st.binary(max_size=12),
 )

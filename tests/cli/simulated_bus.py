@@ -10,27 +10,43 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
-from kontronik_can_gw.esc.simulator import FLIGHT, SECOND_NS, ErrorWindow, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.simulator import (
+    FLIGHT,
+    SECOND_NS,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    SimulatedEsc,
+)
 from kontronik_can_gw.esc.values import GatewayState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 
 STEP_NS = 10_000_000
 START_S = 1_790_000_000
-FLYING = tuple(phase._replace(duration_s=phase.duration_s * 0.4, ramp_s=phase.ramp_s * 0.4) for phase in FLIGHT)
+FLYING = tuple(
+    phase._replace(duration_s=phase.duration_s * 0.4, ramp_s=phase.ramp_s * 0.4) for phase in FLIGHT
+)
 Timed = list[tuple[int, CanFrame]]
 
 
 def layout_of(names: Sequence[str]) -> BusLayout:
     """The shipped DBC for these ESCs."""
-    escs = [{"port": f"/dev/tty{name}", "name": name, "pole_pairs": 7, "gear": 9.8} for name in names]
+    escs = [
+        {"port": f"/dev/tty{name}", "name": name, "pole_pairs": 7, "gear": 9.8} for name in names
+    ]
     loaded = assemble(parse({"can": {"bitrate": 1_000_000}, "esc": escs}, "test.toml"))
     assert loaded.database is not None
     return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
 
 
 def flight(
-    bus: BusLayout, seconds: float, options: Sequence[EscOptions] = (), *, replay: bool = False, until: float = 1e9
+    bus: BusLayout,
+    seconds: float,
+    options: Sequence[EscOptions] = (),
+    *,
+    replay: bool = False,
+    until: float = 1e9,
 ) -> Timed:
     """What the gateway sends while ESCs fly. ``until``: from then on (s) all lines are silent."""
     given = [*options, *[EscOptions(profile=FLYING)] * (len(bus.escs) - len(options))]
@@ -54,7 +70,9 @@ def flight(
 
 def with_errors(*bits: OperatingError | SelfTestError) -> EscOptions:
     """An ESC that has these bits set all the time."""
-    return EscOptions(profile=FLYING, faults=Faults(errors=tuple(ErrorWindow(bit, 0) for bit in bits)))
+    return EscOptions(
+        profile=FLYING, faults=Faults(errors=tuple(ErrorWindow(bit, 0) for bit in bits))
+    )
 
 
 def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float = START_S) -> Path:
@@ -84,13 +102,17 @@ class Clock:
         self.now += seconds
 
 
-def capture_file(bench: Bench, wall_ns: int = 1_700_000_000 * SECOND_NS, devices: Sequence[str] = ()) -> bytes:
+def capture_file(
+    bench: Bench, wall_ns: int = 1_700_000_000 * SECOND_NS, devices: Sequence[str] = ()
+) -> bytes:
     """What was recorded, as the file of a capture. ``devices``: what is learnt of the ESCs at its end."""
     times = {"created_ns": START, "monotonic_ns": START, "wall_ns": wall_ns}
     parts = [block(b"H", 0, json_payload(bench.setup.header() | {"run": "r", "part": 0} | times))]
     for number, at in enumerate(range(0, len(bench.entries), 300)):
         parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
     if devices:
-        learnt = [{"device": name, "variant": 200, "firmware": "1.2", "layout": "V4"} for name in devices]
+        learnt = [
+            {"device": name, "variant": 200, "firmware": "1.2", "layout": "V4"} for name in devices
+        ]
         parts.append(block(b"I", len(parts), json_payload({"devices": learnt})))
     return b"".join([*parts, block(b"E", len(parts), b"")])

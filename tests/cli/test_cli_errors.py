@@ -24,8 +24,13 @@ Done = subprocess.CompletedProcess[str]
 
 def program(*words: object, before: Sequence[str] = ()) -> Done:
     command = [*before, *PROGRAM, *map(str, words)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "COLUMNS": "200"}
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment)
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        "COLUMNS": "200",
+    }
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, env=environment
+    )
 
 
 def configuration(tmp_path: Path, port: object = "/dev/ttyUSB0", **more: str) -> Path:
@@ -46,8 +51,12 @@ def terminal() -> Iterator[PtyEsc]:
 # --- usage
 
 
-@pytest.mark.parametrize("given", ["--tape x", "--tape=x", "--format=wax", "--format wax", "-h --tape"])
-def test_a_removed_option_is_one_line_with_what_to_type_instead(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "given", ["--tape x", "--tape=x", "--format=wax", "--format wax", "-h --tape"]
+)
+def test_a_removed_option_is_one_line_with_what_to_type_instead(
+    given: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--tape"), "Type -o x.")
     monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--format wax"), "Type -o x.")
     option = "--tape" if "--tape" in given else "--format wax"
@@ -64,7 +73,9 @@ def test_no_removed_option_is_in_use() -> None:
     for (command, option), advice in REMOVED_OPTIONS.items():
         name, _, choice = option.partition(" ")
         usage = run(command, "--help").out
-        assert not re.search(rf"{name}\b" if not choice else rf"{name} {{[^}}]*\b{choice}\b", usage), option
+        assert not re.search(
+            rf"{name}\b" if not choice else rf"{name} {{[^}}]*\b{choice}\b", usage
+        ), option
         assert advice.endswith("."), option
 
 
@@ -92,7 +103,10 @@ def test_what_is_no_serial_port_is_told_so_with_where_to_look(tmp_path: Path, ki
     elif kind == "pipe":
         os.mkfifo(port)
     said = refused(1, "run", "-c", configuration(tmp_path, port))
-    assert f"esc1: {port}: {'no such serial port' if kind == 'none' else 'is not a serial port'}" in said
+    assert (
+        f"esc1: {port}: {'no such serial port' if kind == 'none' else 'is not a serial port'}"
+        in said
+    )
     assert "/dev/serial/by-id" in said
 
 
@@ -107,11 +121,17 @@ def forbidden(path: str, mode: int) -> list[str]:
     os.chown(path, 65534, os.stat(path).st_gid)
     os.chmod(path, mode)
     assert shutil.which("setpriv"), "util-linux is needed"
-    return ["setpriv", "--clear-groups", "--regid=65533", "--bounding-set=-dac_override,-dac_read_search"]
+    return [
+        "setpriv",
+        "--clear-groups",
+        "--regid=65533",
+        "--bounding-set=-dac_override,-dac_read_search",
+    ]
 
 
 @pytest.mark.parametrize(
-    ("mode", "remedy"), [(0o660, "Join its group: sudo usermod -aG {} $USER"), (0o600, "chmod g+rw")]
+    ("mode", "remedy"),
+    [(0o660, "Join its group: sudo usermod -aG {} $USER"), (0o600, "chmod g+rw")],
 )
 def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
     tmp_path: Path, terminal: PtyEsc, mode: int, remedy: str
@@ -121,7 +141,12 @@ def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
     group = Path(terminal.path).group()
     before = forbidden(terminal.path, mode)
     done = program("run", "-c", configuration(tmp_path, terminal.path), before=before)
-    assert (done.returncode, done.stdout, done.stderr.count("\n"), "Traceback" in done.stderr) == (1, "", 1, False)
+    assert (done.returncode, done.stdout, done.stderr.count("\n"), "Traceback" in done.stderr) == (
+        1,
+        "",
+        1,
+        False,
+    )
     assert f"esc1: {terminal.path}: permission denied" in done.stderr
     assert remedy.format(group) in done.stderr
     assert ("usermod" in done.stderr) == (mode == 0o660)
@@ -154,7 +179,10 @@ def test_one_device_by_two_names_is_refused(tmp_path: Path, terminal: PtyEsc) ->
     file.write_text(file.read_text() + f'[[esc]]\nport = "{link}"\n')
     device = os.path.realpath(terminal.path)
     for command in ("check", "run"):
-        assert refused(2, command, "-c", file) == f"{file}: the ports of esc1 and esc2 are one device, {device}"
+        assert (
+            refused(2, command, "-c", file)
+            == f"{file}: the ports of esc1 and esc2 are one device, {device}"
+        )
 
 
 def test_only_a_configuration_that_is_not_there_is_answered_with_init(tmp_path: Path) -> None:
@@ -165,12 +193,16 @@ def test_only_a_configuration_that_is_not_there_is_answered_with_init(tmp_path: 
 # --- CAN interface
 
 
-def test_socketcan_that_is_not_there_is_told_with_the_command_that_makes_it(tmp_path: Path, terminal: PtyEsc) -> None:
+def test_socketcan_that_is_not_there_is_told_with_the_command_that_makes_it(
+    tmp_path: Path, terminal: PtyEsc
+) -> None:
     file = configuration(tmp_path, terminal.path, can='channel = "nocan7"')
     said = refused(1, "run", "-c", file)
     assert "CAN interface nocan7: " in said
     no_socketcan = "this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan" in said
-    assert no_socketcan or ("there is none" in said and "ip link set nocan7 up type can bitrate 500000" in said)
+    assert no_socketcan or (
+        "there is none" in said and "ip link set nocan7 up type can bitrate 500000" in said
+    )
 
 
 # --- init, check, schema
@@ -228,7 +260,9 @@ def test_a_dbc_goes_into_a_pipe_and_through_a_link_without_replacing_them(tmp_pa
 @pytest.mark.parametrize("words", [["schema"], ["init", "-"], ["dbc"]])
 def test_a_full_disk_behind_standard_output_is_one_line(words: list[str]) -> None:
     with open("/dev/full", "w") as full:
-        done = subprocess.run([*PROGRAM, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run(
+            [*PROGRAM, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1, done.stderr
     assert "standard output: cannot be written: No space left on device" in done.stderr

@@ -28,7 +28,9 @@ def command(*words: object) -> tuple[object, str, str]:
     return done.code, done.data.decode("ascii"), done.err
 
 
-def configuration(folder: Path, canopen_lines: str = "enabled = true", left: str = "", right: str = "") -> Path:
+def configuration(
+    folder: Path, canopen_lines: str = "enabled = true", left: str = "", right: str = ""
+) -> Path:
     file = folder / "gateway.toml"
     file.write_text(
         '[can]\ninterface = "virtual"\nbitrate = 250000\n[dbc]\nenabled = false\n'
@@ -49,10 +51,14 @@ def values(dictionary: Any) -> dict[Key, int | bytes]:
     """Every ParameterValue, as the canopen library reads it."""
     found: dict[Key, int | bytes] = {}
     for item in dictionary.values():
-        members = [item] if isinstance(item, canopen.objectdictionary.ODVariable) else list(item.values())
+        members = (
+            [item] if isinstance(item, canopen.objectdictionary.ODVariable) else list(item.values())
+        )
         for each in members:
             if each.value is not None:
-                found[each.index, each.subindex] = each.value.encode() if isinstance(each.value, str) else each.value
+                found[each.index, each.subindex] = (
+                    each.value.encode() if isinstance(each.value, str) else each.value
+                )
     return found
 
 
@@ -66,7 +72,11 @@ def dcf_values(*words: object) -> dict[Key, int | bytes]:
 
 
 def test_without_a_node_id_the_shipped_eds_is_written_byte_for_byte(tmp_path: Path) -> None:
-    assert command("-o", tmp_path / "out.eds") == (0, "", f"kontronik-can-gw: {tmp_path}/out.eds written\n")
+    assert command("-o", tmp_path / "out.eds") == (
+        0,
+        "",
+        f"kontronik-can-gw: {tmp_path}/out.eds written\n",
+    )
     assert (tmp_path / "out.eds").read_bytes() == EDS.read_bytes()
     assert os.listdir(tmp_path) == ["out.eds"]
     code, text, said = command()
@@ -102,21 +112,31 @@ def test_telemetry_states_and_commands_are_not_in_a_dcf() -> None:
 
 
 @pytest.mark.parametrize(
-    ("output", "named"), [("left.dcf", "left.dcf"), ("mötor.dcf", "mine_1.dcf"), ("a;b.dcf", "mine_1.dcf")]
+    ("output", "named"),
+    [("left.dcf", "left.dcf"), ("mötor.dcf", "mine_1.dcf"), ("a;b.dcf", "mine_1.dcf")],
 )
-def test_a_dcf_names_itself_and_the_eds_it_was_made_from(tmp_path: Path, output: str, named: str) -> None:
-    lines = EDS.read_bytes().replace(b"FileName=kontronik_esc.eds\r\n", b"filename = old.eds\r\nLastEDS=older.eds\r\n")
+def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
+    tmp_path: Path, output: str, named: str
+) -> None:
+    lines = EDS.read_bytes().replace(
+        b"FileName=kontronik_esc.eds\r\n", b"filename = old.eds\r\nLastEDS=older.eds\r\n"
+    )
     (tmp_path / "mine.eds").write_bytes(lines)
     file = configuration(tmp_path, 'enabled = true\neds = "mine.eds"')
     assert command("-c", file, "--node-id", 1, "-o", tmp_path / output)[0] == 0
     head = (tmp_path / output).read_text("ascii").partition("[DeviceInfo]")[0]
-    assert re.findall("(?im)^(filename|lasteds) ?= ?(.*)", head) == [("FileName", named), ("LastEDS", "mine.eds")]
+    assert re.findall("(?im)^(filename|lasteds) ?= ?(.*)", head) == [
+        ("FileName", named),
+        ("LastEDS", "mine.eds"),
+    ]
 
 
 # --- the DCF of a configured node -----------------------------------------------------------------------------------------
 
 
-def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_master_stored(tmp_path: Path) -> None:
+def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_master_stored(
+    tmp_path: Path,
+) -> None:
     file = configuration(
         tmp_path,
         "enabled = true\nnode_id = 20\nvendor_id = 0x123\nserial = 1000\nself_start = true",
@@ -139,7 +159,12 @@ def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_maste
     assert [found[0x1018, sub] for sub in (1, 4)] == [0x123, 1001]
     assert [found[0x2100, sub] for sub in range(1, 9)] == [7, 5, 2, 400, 0, 0xFF, 12, 5]
     assert [found[0x2101, sub] for sub in (1, 2, 3, 4)] == [33, 33, 250_000, 250_000]
-    assert (found[0x1017, 0], found[0x1800, 3], found[0x1A00, 0], found[0x1F80, 0]) == (500, 1000, 1, 0)
+    assert (found[0x1017, 0], found[0x1800, 3], found[0x1A00, 0], found[0x1F80, 0]) == (
+        500,
+        1000,
+        1,
+        0,
+    )
     assert (found[0x1014, 0], found[0x1200, 1], found[0x1803, 1]) == (0xA1, 0x621, 0x400004A1)
 
     of_left = dcf_values("-c", file, "--node-id", "0x14")
@@ -156,7 +181,9 @@ def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
     for (index, sub), value in found.items():
         variable = dictionary.get_variable(index, sub)
         text = value.decode() if isinstance(value, bytes) else value
-        assert variable.encode_raw(text) == node.dictionary.upload(index, sub, 0), f"{index:04X}h:{sub:02X}"
+        assert variable.encode_raw(text) == node.dictionary.upload(index, sub, 0), (
+            f"{index:04X}h:{sub:02X}"
+        )
 
 
 @pytest.mark.parametrize(

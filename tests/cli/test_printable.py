@@ -70,7 +70,9 @@ def test_talk_lines_and_errors(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("style", ["", "bold"])
 def test_screens(style: str) -> None:
     terminal = Terminal()
-    Console(file=terminal, force_terminal=True, color_system=None, width=99).print(_rich([Piece(EVIL, style)]))
+    Console(file=terminal, force_terminal=True, color_system=None, width=99).print(
+        _rich([Piece(EVIL, style)])
+    )
     assert re.sub(r"\x1b\[\d*m", "", terminal.text()).rstrip("\n") == SHOWN
 
 
@@ -94,7 +96,11 @@ def test_a_log_line_is_one_line() -> None:
     try:
         raise ValueError(EVIL)
     except ValueError as error:
-        handler.emit(logging.LogRecord("x", logging.ERROR, "", 0, "b", (), (ValueError, error, error.__traceback__)))
+        handler.emit(
+            logging.LogRecord(
+                "x", logging.ERROR, "", 0, "b", (), (ValueError, error, error.__traceback__)
+            )
+        )
     handler.close()
     assert stream.getvalue().startswith(f"WARNING said {SHOWN}\nERROR b\nTraceback")
     assert is_clean(stream.getvalue())
@@ -112,7 +118,9 @@ def test_a_file_that_is_written_to_a_terminal() -> None:
     assert pipe.buffer.getvalue().decode() == text
 
 
-def test_what_a_library_logs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_library_logs(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     main(["schema"])
     capsys.readouterr()
     record = logging.LogRecord("cantools", logging.WARNING, "", 0, "overwriting %s", (EVIL,), None)
@@ -128,7 +136,9 @@ def test_what_a_library_logs(capsys: pytest.CaptureFixture[str], monkeypatch: py
 def folder(tmp_path: Path) -> Path:
     """A configuration whose DBC and EDS are full of it."""
     evil = "a\x1bEVIL\x07\x9b\u202eb"
-    dbc = re.sub(r'(CM_ (?:SG_|BO_)?[^"]*"|NotAvailable" 0x|VAL_ 1664 OperatingState 1 ")', rf"\1{evil}", DBC)
+    dbc = re.sub(
+        r'(CM_ (?:SG_|BO_)?[^"]*"|NotAvailable" 0x|VAL_ 1664 OperatingState 1 ")', rf"\1{evil}", DBC
+    )
     (tmp_path / "my.dbc").write_text(dbc)
     eds = re.sub(r"ParameterName=([^\n]*)", "ParameterName=\\1 a\x1bEVIL\x07\x7fb", EDS)
     (tmp_path / "my.eds").write_text(eds, "ascii")
@@ -159,7 +169,9 @@ def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> N
         ("\x1b]0;x\x07.bin", "", ["decode"]),
     ],
 )
-def test_what_is_wrong_with_hostile_files(name: str, content: str, words: list[str], tmp_path: Path) -> None:
+def test_what_is_wrong_with_hostile_files(
+    name: str, content: str, words: list[str], tmp_path: Path
+) -> None:
     path = tmp_path / name
     path.write_text(content)
     done = run(*words, path, *(["-"] if words[0] == "convert" else []))

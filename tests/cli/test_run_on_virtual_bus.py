@@ -33,7 +33,9 @@ from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.transmit_queue import Sent
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
-LIVE = LiveData(electrical_speed=12_345, battery_voltage=2442, battery_current=-17, operating_state=21)
+LIVE = LiveData(
+    electrical_speed=12_345, battery_voltage=2442, battery_current=-17, operating_state=21
+)
 
 
 class Bench:
@@ -61,7 +63,9 @@ class Bench:
             self.bus.shutdown()
             raise
 
-    def until(self, wanted: Callable[[str, dict[str, Any]], bool], what: str, seconds: float = 60) -> dict[str, Any]:
+    def until(
+        self, wanted: Callable[[str, dict[str, Any]], bool], what: str, seconds: float = 60
+    ) -> dict[str, Any]:
         """Read the bus until a message is as wanted; its signals, enumerations as numbers."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -75,7 +79,11 @@ class Bench:
 
     def speed(self, wanted: int, seconds: float = 60) -> None:
         """Wait for a speed on the bus."""
-        self.until(lambda name, signals: signals.get("ElectricalSpeed") == wanted, f"speed {wanted}", seconds)
+        self.until(
+            lambda name, signals: signals.get("ElectricalSpeed") == wanted,
+            f"speed {wanted}",
+            seconds,
+        )
 
     def stop(self) -> None:
         self.loop.stop()
@@ -113,10 +121,16 @@ def test_a_terminal_that_echoes_gets_no_echo_from_the_gateway() -> None:
             modes = termios.tcgetattr(slave)
             assert not modes[3] & (termios.ECHO | termios.ECHONL | termios.ICANON | termios.ISIG)
             assert not modes[1] & termios.OPOST
-            for speed in (1, 0x0A0D03, 0x1A1104):  # carriage return, line feed, ^C, ^Z, ^Q, ^D among the bytes
+            for speed in (
+                1,
+                0x0A0D03,
+                0x1A1104,
+            ):
+                # carriage return, line feed, ^C, ^Z, ^Q, ^D among the bytes
                 os.write(master, encode(LIVE._replace(electrical_speed=speed), Layout.V4))
                 running.speed(speed)
-            os.write(master, b"+++AT\rATSN?\r\n")  # what an ESC sends at power-up, to see whether someone answers
+            # what an ESC sends at power-up, to see whether someone answers
+            os.write(master, b"+++AT\rATSN?\r\n")
             os.write(master, encode(LIVE, Layout.V4))
             running.speed(12_345)
             with pytest.raises(BlockingIOError):
@@ -219,7 +233,9 @@ def socket_port(monkeypatch: pytest.MonkeyPatch) -> tuple[CanPort, FakeSocket]:
     return CanPort(CanConfig()), fake
 
 
-def test_frames_go_out_as_the_kernel_wants_them_and_nothing_waits(socket_port: tuple[CanPort, FakeSocket]) -> None:
+def test_frames_go_out_as_the_kernel_wants_them_and_nothing_waits(
+    socket_port: tuple[CanPort, FakeSocket],
+) -> None:
     port, fake = socket_port
     assert not fake.blocking
     assert fake.options[0][-1] == b"", "no data frames are received"  # type: ignore[index]
@@ -238,7 +254,12 @@ def test_frames_go_out_as_the_kernel_wants_them_and_nothing_waits(socket_port: t
         ([errno.ENOBUFS], Sent.BUSY, CanState.UNKNOWN),
         ([errno.ENOMEM], Sent.BUSY, CanState.UNKNOWN),
         ([errno.EAGAIN], Sent.FULL, CanState.UNKNOWN),
-        ([errno.ENETDOWN], Sent.OK, CanState.ERROR_ACTIVE),  # an old report of an interface that is up again
+        # an old report of an interface that is up again
+        (
+            [errno.ENETDOWN],
+            Sent.OK,
+            CanState.ERROR_ACTIVE,
+        ),
         ([errno.ENETDOWN] * 2, Sent.DOWN, CanState.DOWN),
         ([errno.ENXIO], Sent.GONE, CanState.DOWN),
         ([errno.ENODEV], Sent.GONE, CanState.DOWN),
@@ -283,14 +304,18 @@ def test_error_frames_tell_the_controllers_state(
     assert port.state is state
 
 
-def test_fragments_and_data_frames_say_nothing_of_the_state(socket_port: tuple[CanPort, FakeSocket]) -> None:
+def test_fragments_and_data_frames_say_nothing_of_the_state(
+    socket_port: tuple[CanPort, FakeSocket],
+) -> None:
     port, fake = socket_port
     fake.inbox = [struct.pack("=IB3x8s", 0x40, 8, b"\x40" * 8), b"short"]
     assert port.receive() == []
     assert port.state is CanState.UNKNOWN
 
 
-def test_a_flood_of_error_frames_does_not_hold_the_loop(socket_port: tuple[CanPort, FakeSocket]) -> None:
+def test_a_flood_of_error_frames_does_not_hold_the_loop(
+    socket_port: tuple[CanPort, FakeSocket],
+) -> None:
     port, fake = socket_port
     fake.inbox = [error_frame(0x40)] * 1000
     port.receive()

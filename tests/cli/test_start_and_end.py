@@ -47,7 +47,9 @@ def run(*command: str, folder: Path) -> "subprocess.CompletedProcess[str]":
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "gateway.toml").write_text('[can]\ninterface = "virtual"\n[[esc]]\nport = "nowhere"\n')
+    (tmp_path / "gateway.toml").write_text(
+        '[can]\ninterface = "virtual"\n[[esc]]\nport = "nowhere"\n'
+    )
     return tmp_path
 
 
@@ -74,8 +76,15 @@ def test_ctrl_c_while_modules_are_loaded_ends_it_without_a_word(
 
 def test_who_has_ctrl_c_ignored_is_not_ended_by_it(folder: Path) -> None:
     """As of a shell script's background jobs."""
-    code = INTERRUPTED.format(module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[])
-    done = run(sys.executable, "-c", "import signal; signal.signal(2, signal.SIG_IGN)\n" + code, folder=folder)
+    code = INTERRUPTED.format(
+        module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[]
+    )
+    done = run(
+        sys.executable,
+        "-c",
+        "import signal; signal.signal(2, signal.SIG_IGN)\n" + code,
+        folder=folder,
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -87,7 +96,8 @@ def test_the_installed_program_begins_where_this_is_seen_to() -> None:
 
 
 @pytest.mark.parametrize(
-    "words", ["run --wait -c gateway.toml", "check -c gateway.toml", "status --once", "doctor", "eds"]
+    "words",
+    ["run --wait -c gateway.toml", "check -c gateway.toml", "status --once", "doctor", "eds"],
 )
 @pytest.mark.parametrize("limit", [5, 20, 63])
 def test_too_few_open_files_are_one_line(limit: int, words: str, folder: Path) -> None:
@@ -100,7 +110,9 @@ def test_too_few_open_files_are_one_line(limit: int, words: str, folder: Path) -
 
 def test_each_esc_needs_files_too_and_a_soft_limit_is_raised(folder: Path) -> None:
     command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", "gateway.toml"]
-    assert "`ulimit -n 66` or more" in run("sh", "-c", LIMITED, "65", *command, folder=folder).stderr
+    assert (
+        "`ulimit -n 66` or more" in run("sh", "-c", LIMITED, "65", *command, folder=folder).stderr
+    )
     for limit in ("66", "-S 20"):
         done = run("sh", "-c", LIMITED.replace('"$0"', "$0"), limit, *command, folder=folder)
         assert "nowhere: no such serial port" in done.stderr

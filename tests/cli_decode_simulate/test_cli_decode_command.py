@@ -49,13 +49,16 @@ def test_csv_has_one_header_and_a_row_per_frame(flight: bytes) -> None:
 
 
 def test_a_stream_is_decoded_as_it_comes() -> None:
-    with subprocess.Popen([*COMMAND, "-"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        [*COMMAND, "-"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
         assert process.stdin
         assert process.stdout
         for number in range(3):
             process.stdin.write(LIVE)
             process.stdin.flush()
-            assert json.loads(process.stdout.readline())["offset"] == number * 38  # while the input is still open
+            # while the input is still open
+            assert json.loads(process.stdout.readline())["offset"] == number * 38
         process.stdin.close()
         assert process.stdout.read() == b""
     assert process.returncode == 0

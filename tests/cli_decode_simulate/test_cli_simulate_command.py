@@ -9,7 +9,15 @@ from pathlib import Path
 from command_line import refused
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.esc.kontronik import Deframer, Device, Frame, InfoData, Layout, LiveData, OperatingError
+from kontronik_can_gw.esc.kontronik import (
+    Deframer,
+    Device,
+    Frame,
+    InfoData,
+    Layout,
+    LiveData,
+    OperatingError,
+)
 from kontronik_can_gw.esc.simulator import SimulatedEsc
 
 COMMAND = [sys.executable, "-m", "kontronik_can_gw", "simulate"]
@@ -34,7 +42,16 @@ def test_the_bytes_of_a_file_are_those_of_the_simulator(tmp_path: Path) -> None:
 
 
 def test_several_escs_of_mixed_layouts_write_a_file_each(tmp_path: Path) -> None:
-    words = ["--esc", "3", "--layout", "mixed", "--seconds", "2s", "--out", str(tmp_path / "esc{n}.bin")]
+    words = [
+        "--esc",
+        "3",
+        "--layout",
+        "mixed",
+        "--seconds",
+        "2s",
+        "--out",
+        str(tmp_path / "esc{n}.bin"),
+    ]
     assert main(["simulate", *words]) == 0
     layouts = [{frame.layout for frame in frames_of(tmp_path / f"esc{n}.bin")} for n in (1, 2, 3)]
     assert layouts == [{Layout.V4}, {Layout.LEGACY}, {Layout.V4}]
@@ -52,10 +69,19 @@ def test_device_variant_firmware_and_cells_are_as_told(tmp_path: Path) -> None:
 
 
 def test_error_bits_and_device_swaps_come_when_told(tmp_path: Path) -> None:
-    words = ["--error", "undervoltage@1s+500ms", "--error", "BEC-overcurrent@2", "--swap-device", "jivepro@3s"]
+    words = [
+        "--error",
+        "undervoltage@1s+500ms",
+        "--error",
+        "BEC-overcurrent@2",
+        "--swap-device",
+        "jivepro@3s",
+    ]
     frames = written(tmp_path, *words, "--swap-device", "uhv:legacy@4.5s", "--seconds", "6")
     lives = [frame for frame in frames if isinstance(frame.data, LiveData)]
-    words_of_errors = [frame.data.operating_errors for frame in lives if isinstance(frame.data, LiveData)]
+    words_of_errors = [
+        frame.data.operating_errors for frame in lives if isinstance(frame.data, LiveData)
+    ]
     assert [word & 1 for word in words_of_errors] == [int(100 <= n < 150) for n in range(600)]
     bec = 1 << OperatingError.BEC_OVERCURRENT
     assert [word & bec for word in words_of_errors] == [bec if n >= 200 else 0 for n in range(600)]
@@ -88,7 +114,9 @@ def test_escs_on_terminals_are_listed_and_send_until_the_signal(tmp_path: Path) 
     for number in (signal.SIGINT, signal.SIGTERM):
         link = tmp_path / "esc{n}"
         words = [*COMMAND, "--esc", "2", "--link", str(link), "--layout", "legacy"]
-        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        with subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
             assert process.stdout
             assert process.stderr
             lines = [process.stdout.readline().split() for _ in range(2)]
@@ -110,13 +138,18 @@ def test_escs_on_terminals_are_listed_and_send_until_the_signal(tmp_path: Path) 
 
 
 def test_a_gateway_that_transmits_is_reported_loudly() -> None:
-    with subprocess.Popen(COMMAND, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        COMMAND, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout
         assert process.stderr
         path = process.stdout.readline().split()[1]
         fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
         os.write(fd, b"AT")
-        assert process.stderr.readline() == f"ERROR: esc1 {path}: the gateway transmits to the ESC: 41 54\n"
+        assert (
+            process.stderr.readline()
+            == f"ERROR: esc1 {path}: the gateway transmits to the ESC: 41 54\n"
+        )
         process.send_signal(signal.SIGTERM)
         assert "2 bytes came from the gateway, beginning with 41 54" in process.stderr.read()
         os.close(fd)

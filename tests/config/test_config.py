@@ -15,7 +15,16 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import kontronik_can_gw
-from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, as_toml, load, mqtt_with, parse, schema, shipped
+from kontronik_can_gw.config.keys import (
+    REMOVED_KEYS,
+    Config,
+    as_toml,
+    load,
+    mqtt_with,
+    parse,
+    schema,
+    shipped,
+)
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS
@@ -41,10 +50,26 @@ can bitrate 10000 1000000, can data_bitrate 10000 8000000, dbc base_id 0 5368709
 run realtime_priority 1 99, canopen vendor_id 0 4294967295, canopen serial 0 4294967295, canopen node_id 1 127, record part_mb 1 4000,
 record part_minutes 1 10000, record keep_mb 0 10000000, record min_free_mb 0 10000000, esc node_id 1 127, esc pole_pairs 1 100,
 esc cell_count 0 255, esc telemetry_timeout_ms 20 60000"""
-RANGES = {(table, key): (int(low), int(high)) for table, key, low, high in map(str.split, _WHOLE.split(","))}
-STRINGS = [("can", "interface"), ("can", "channel"), ("dbc", "file"), ("dbc", "node"), ("esc", "port")]
-STRINGS += [("canopen", "eds"), ("canopen", "store"), ("statistics", "file"), ("record", "directory")]
-STRINGS += [("mqtt", key) for key in ("ca_file", "cert_file", "key_file", "username", "password_file")]
+RANGES = {
+    (table, key): (int(low), int(high))
+    for table, key, low, high in map(str.split, _WHOLE.split(","))
+}
+STRINGS = [
+    ("can", "interface"),
+    ("can", "channel"),
+    ("dbc", "file"),
+    ("dbc", "node"),
+    ("esc", "port"),
+]
+STRINGS += [
+    ("canopen", "eds"),
+    ("canopen", "store"),
+    ("statistics", "file"),
+    ("record", "directory"),
+]
+STRINGS += [
+    ("mqtt", key) for key in ("ca_file", "cert_file", "key_file", "username", "password_file")
+]
 BOOLEANS = [("can", "fd"), ("run", "wait_for_devices"), ("dbc", "enabled")]
 BOOLEANS += [("mqtt", "tls"), ("mqtt", "retain")]
 BOOLEANS += [("canopen", key) for key in ("enabled", "self_start", "read_only", "cia402_mirrors")]
@@ -165,11 +190,16 @@ REFUSED: list[tuple[str, str, str, list[Any]]] = [
 @pytest.mark.parametrize(("table", "key"), list(TAKEN))
 def test_a_value_of_a_key_is_taken_as_it_is(table: str, key: str) -> None:
     for value in TAKEN[table, key]:
-        assert taken(table, key, value) == value and type(taken(table, key, value)) in (type(value), float)
+        assert taken(table, key, value) == value and type(taken(table, key, value)) in (
+            type(value),
+            float,
+        )
 
 
 @pytest.mark.parametrize(
-    ("table", "key", "reason", "values"), REFUSED, ids=lambda value: value if isinstance(value, str) else ""
+    ("table", "key", "reason", "values"),
+    REFUSED,
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_a_value_that_a_key_cannot_have_is_refused_with_the_reason(
     table: str, key: str, reason: str, values: list[Any]
@@ -180,7 +210,9 @@ def test_a_value_that_a_key_cannot_have_is_refused_with_the_reason(
 
 def test_some_values_mean_others() -> None:
     for text in ("9.8", "98/10", "9.8/10", "1/3", "007", "1/1000"):
-        assert taken("esc", "gear", text) == Fraction(text.partition("/")[0]) / Fraction(text.partition("/")[2] or 1)
+        assert taken("esc", "gear", text) == Fraction(text.partition("/")[0]) / Fraction(
+            text.partition("/")[2] or 1
+        )
     for number in (1, 9.8, 0.001, 1000, 1e3):
         assert taken("esc", "gear", number) == Fraction(str(number))
     assert taken("dbc", "messages", ["Motor_*", "X"]) == ("Motor_*", "X")
@@ -188,7 +220,9 @@ def test_some_values_mean_others() -> None:
     addresses = {"127.0.0.1:9123": ("127.0.0.1", 9123), "127.255.0.9:1": ("127.255.0.9", 1)}
     addresses |= {"localhost:65535": ("127.0.0.1", 65_535), "[::1]:9123": ("::1", 9123)}
     for place, address in addresses.items():
-        assert parse(tables("statistics", "prometheus", place), "a.toml").statistics.address == address
+        assert (
+            parse(tables("statistics", "prometheus", place), "a.toml").statistics.address == address
+        )
 
 
 @pytest.mark.parametrize(
@@ -225,8 +259,16 @@ def test_options_are_checked_as_keys_of_the_file_are() -> None:
     assert (made.broker, made.topic, made.rate) == ("a", "t", 5)
     with pytest.raises(UserError) as caught:
         mqtt_with(made, {"rate": 99.0, "ca_file": "", "broker": "a b"})
-    assert [line.partition(": ")[0] for line in caught.value.problems] == ["--rate", "--ca-file", "--broker"]
-    for key, missing in (("ca_file", "--tls"), ("key_file", "--tls"), ("password_file", "--username")):
+    assert [line.partition(": ")[0] for line in caught.value.problems] == [
+        "--rate",
+        "--ca-file",
+        "--broker",
+    ]
+    for key, missing in (
+        ("ca_file", "--tls"),
+        ("key_file", "--tls"),
+        ("password_file", "--username"),
+    ):
         with pytest.raises(UserError, match=missing):
             mqtt_with(made, {key: "x"})
 
@@ -243,7 +285,11 @@ def test_options_are_checked_as_keys_of_the_file_are() -> None:
 )
 def test_bindings_may_be_quoted_dotted_or_nested(text: str) -> None:
     config = parse(tomllib.loads(text + '\n[[esc]]\nport = "x"'), "a.toml")
-    assert dict(config.dbc.bind) == {"EscPower.BattVolt": "battery_voltage", "Spare": 0, "Half": 0.5}
+    assert dict(config.dbc.bind) == {
+        "EscPower.BattVolt": "battery_voltage",
+        "Spare": 0,
+        "Half": 0.5,
+    }
 
 
 # --- mistakes
@@ -286,7 +332,9 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("made", "said"), MISTAKES)
-def test_a_mistake_is_one_line_with_its_place_and_what_was_meant(made: dict[str, Any], said: str) -> None:
+def test_a_mistake_is_one_line_with_its_place_and_what_was_meant(
+    made: dict[str, Any], said: str
+) -> None:
     (line,) = problems(made)
     assert line.startswith("a.toml: ") and said in line
     assert ": unknown" not in line or line == f"a.toml: {said}"
@@ -302,11 +350,22 @@ def test_all_mistakes_are_told_at_once() -> None:
     }
     said = problems(wrong)
     starts = [line.split(": ")[1] for line in said]
-    expected = ["canbus", "can.bitrate", "can.chanel", "dbc.on_loss", "dbc.bind", "run", "esc[1].prot", "esc[1].port"]
+    expected = [
+        "canbus",
+        "can.bitrate",
+        "can.chanel",
+        "dbc.on_loss",
+        "dbc.bind",
+        "run",
+        "esc[1].prot",
+        "esc[1].port",
+    ]
     assert starts == [*expected, "esc[2].gear", "esc[4].port"]
 
 
-@pytest.mark.parametrize("names", [("a", "ab"), ("left", "left2"), ("esc1", "esc10", "esc11"), ("nose", "rear")])
+@pytest.mark.parametrize(
+    "names", [("a", "ab"), ("left", "left2"), ("esc1", "esc10", "esc11"), ("nose", "rear")]
+)
 def test_names_that_begin_alike_but_can_be_told_apart_are_taken(names: tuple[str, ...]) -> None:
     config = parse(named(*names), "a.toml")
     assert [esc.name for esc in config.escs] == list(names)
@@ -315,10 +374,15 @@ def test_names_that_begin_alike_but_can_be_told_apart_are_taken(names: tuple[str
 # --- keys of earlier versions
 
 
-def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(REMOVED_KEYS, "can.queue", "Leave it out.")
     monkeypatch.setitem(REMOVED_KEYS, "esc.motor", "Give pole_pairs.")
-    old = {"can": {"queue": 3, "channel": "can1"}, "esc": [{"port": "a"}, {"port": "b", "motor": [], "gear": 2}]}
+    old = {
+        "can": {"queue": 3, "channel": "can1"},
+        "esc": [{"port": "a"}, {"port": "b", "motor": [], "gear": 2}],
+    }
     config = parse(old, "a.toml")
     assert config.warnings == (
         "a.toml: can.queue: was removed and is ignored. Leave it out.",
@@ -333,9 +397,13 @@ def test_a_removed_key_is_a_warning_with_its_place_and_what_to_do_instead(monkey
 
 def test_a_removed_key_hides_no_mistake(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(REMOVED_KEYS, "can.queue", "Leave it out.")
-    assert problems(tables("can", "queues", 1)) == [f"a.toml: can.queues: unknown key. {KNOWN_IN_CAN}"]
+    assert problems(tables("can", "queues", 1)) == [
+        f"a.toml: can.queues: unknown key. {KNOWN_IN_CAN}"
+    ]
     assert problems(tables("dbc", "queue", 1))[0].startswith("a.toml: dbc.queue: unknown key.")
-    assert problems(tables("can", "queue", 1) | {"run": 1}) == ["a.toml: run: is a table, written [run]"]
+    assert problems(tables("can", "queue", 1) | {"run": 1}) == [
+        "a.toml: run: is a table, written [run]"
+    ]
 
 
 def test_no_removed_key_is_in_use_and_each_says_what_to_do_instead() -> None:
@@ -361,7 +429,9 @@ def test_no_removed_key_is_in_use_and_each_says_what_to_do_instead() -> None:
     ],
     ids=range(15),
 )  # fmt: skip
-def test_a_file_that_is_no_configuration_is_one_line(tmp_path: Path, content: bytes, said: str) -> None:
+def test_a_file_that_is_no_configuration_is_one_line(
+    tmp_path: Path, content: bytes, said: str
+) -> None:
     (line,) = at_load(tmp_path / "a.toml", content)
     assert said in line and ("(at line" not in said or "is not valid TOML: " in line)
 
@@ -372,8 +442,13 @@ def test_a_byte_order_mark_and_windows_line_ends_do_not_matter(tmp_path: Path) -
     assert load(file).esc[0].port == "COM3"
 
 
-def test_a_missing_file_and_a_directory_are_told_with_the_command_that_writes_an_example(tmp_path: Path) -> None:
-    for path, reason in ((tmp_path / "none.toml", "No such file or directory"), (tmp_path, "Is a directory")):
+def test_a_missing_file_and_a_directory_are_told_with_the_command_that_writes_an_example(
+    tmp_path: Path,
+) -> None:
+    for path, reason in (
+        (tmp_path / "none.toml", "No such file or directory"),
+        (tmp_path, "Is a directory"),
+    ):
         with pytest.raises(UserError) as caught:
             load(path)
         assert caught.value.exit_code == 2
@@ -383,8 +458,13 @@ def test_a_missing_file_and_a_directory_are_told_with_the_command_that_writes_an
 
 def test_the_dbc_file_is_relative_to_the_configuration(tmp_path: Path) -> None:
     file = tmp_path / "deep" / "a.toml"
-    assert parse(tables("dbc", "file", "my.dbc"), str(file)).dbc_path == tmp_path / "deep" / "my.dbc"
-    assert parse(tables("dbc", "file", "../my.dbc"), str(file)).dbc_path == tmp_path / "deep" / ".." / "my.dbc"
+    assert (
+        parse(tables("dbc", "file", "my.dbc"), str(file)).dbc_path == tmp_path / "deep" / "my.dbc"
+    )
+    assert (
+        parse(tables("dbc", "file", "../my.dbc"), str(file)).dbc_path
+        == tmp_path / "deep" / ".." / "my.dbc"
+    )
     assert parse(tables("dbc", "file", "/etc/my.dbc"), str(file)).dbc_path == Path("/etc/my.dbc")
     assert parse(tables(), str(file)).dbc_path == shipped("dbc/kontronik_esc.dbc")
     assert shipped("dbc/kontronik_esc.dbc").is_file()
@@ -395,7 +475,12 @@ def test_the_dbc_file_is_relative_to_the_configuration(tmp_path: Path) -> None:
 
 def uncommented() -> str:
     """The example with each line uncommented that is a key or the head of a table."""
-    return re.sub(r'^#(?=\[|"?[A-Za-z_.0-9]+"? = )', "", EXAMPLE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return re.sub(
+        r'^#(?=\[|"?[A-Za-z_.0-9]+"? = )',
+        "",
+        EXAMPLE.read_text(encoding="utf-8"),
+        flags=re.MULTILINE,
+    )
 
 
 def test_the_shipped_example_with_every_line_uncommented_is_valid() -> None:
@@ -416,17 +501,29 @@ def test_the_shipped_example_has_every_key_of_every_table() -> None:
     for table, keys in TABLES.items():
         entries = properties[table].get("items", properties[table])["properties"]
         assert {key for key, entry in entries.items() if "deprecated" not in entry} == set(keys)
-        found = {key for entry in made["esc"] for key in entry} if table == "esc" else set(made[table])
+        found = (
+            {key for entry in made["esc"] for key in entry} if table == "esc" else set(made[table])
+        )
         assert found == set(keys)
     assert set(properties) == set(TABLES) == set(made)
 
 
 def test_what_the_example_shows_as_default_is_the_default() -> None:
     made = tomllib.loads(uncommented())
-    shown = {(table, key): value for table in TABLES if table != "esc" for key, value in made[table].items()}
+    shown = {
+        (table, key): value
+        for table in TABLES
+        if table != "esc"
+        for key, value in made[table].items()
+    }
     shown |= {("esc", key): value for key, value in made["esc"][0].items()}
     examples = {("can", "options"), ("esc", "port"), ("esc", "pole_pairs")}
-    examples |= {(table, key) for table, keys in DEFAULTS.items() for key in keys if keys[key] in (None, {}, ())}
+    examples |= {
+        (table, key)
+        for table, keys in DEFAULTS.items()
+        for key in keys
+        if keys[key] in (None, {}, ())
+    }
     for (table, key), value in shown.items():
         if (table, key) not in examples:
             assert value == DEFAULTS[table][key], f"{table}.{key}"
@@ -465,14 +562,82 @@ def test_every_key_of_the_schema_is_described_and_its_default_is_the_parsers() -
 
 def samples() -> list[tuple[str, dict[str, Any]]]:
     """Configurations in which one key has one value: of each kind, each end, each wrong type."""
-    values: list[Any] = [0, 1, -1, 7, 19, 20, 100, 101, 255, 256, 9999, 10_000, 60_000, 60_001, 10**6, 10**6 + 1]
-    values += [8 * 10**6, 8 * 10**6 + 1, 0x1FFFFFFF, 0x20000000, 10**30, 0.0005, 0.001, 0.5, 9.8, 1000.5, -0.5]
-    values += ["", " ", "x", "silent", "not_available", "1/3", "98/10", "9.8/2", " 1/3", "1 / 3", "1e1", ".5", "+1"]
-    values += ["-1", "٣", "a b", "1a", "A234567890123", "max", True, False, [], [1], {}, {"a": 1}, {"a": "x"}]
-    values += [{"a": ""}, {"a": True}, {"a": 1.5}, {"a": -1}, {"a": 65_535}, {"a": 65_536}, {"a": {"b": 1}}]
+    values: list[Any] = [
+        0,
+        1,
+        -1,
+        7,
+        19,
+        20,
+        100,
+        101,
+        255,
+        256,
+        9999,
+        10_000,
+        60_000,
+        60_001,
+        10**6,
+        10**6 + 1,
+    ]
+    values += [
+        8 * 10**6,
+        8 * 10**6 + 1,
+        0x1FFFFFFF,
+        0x20000000,
+        10**30,
+        0.0005,
+        0.001,
+        0.5,
+        9.8,
+        1000.5,
+        -0.5,
+    ]
+    values += [
+        "",
+        " ",
+        "x",
+        "silent",
+        "not_available",
+        "1/3",
+        "98/10",
+        "9.8/2",
+        " 1/3",
+        "1 / 3",
+        "1e1",
+        ".5",
+        "+1",
+    ]
+    values += [
+        "-1",
+        "٣",
+        "a b",
+        "1a",
+        "A234567890123",
+        "max",
+        True,
+        False,
+        [],
+        [1],
+        {},
+        {"a": 1},
+        {"a": "x"},
+    ]
+    values += [
+        {"a": ""},
+        {"a": True},
+        {"a": 1.5},
+        {"a": -1},
+        {"a": 65_535},
+        {"a": 65_536},
+        {"a": {"b": 1}},
+    ]
     values += [{"a": {"b": "x"}}, {"a": {"b": {"c": 1}}}, {"a": {"b": []}}, {"a": {}}, {"a": []}]
     made = [
-        (f"{t}.{k}={v!r}"[:60], tables(t, k, v)) for t, keys in TABLES.items() for k in (*keys, "x") for v in values
+        (f"{t}.{k}={v!r}"[:60], tables(t, k, v))
+        for t, keys in TABLES.items()
+        for k in (*keys, "x")
+        for v in values
     ]
     kinds: list[Any] = [{}, [], 1, "x", [{}], [1], [{"port": "a"}, {"port": "b"}], [{}, {}]]
     made += [(f"{t}={v!r}", tables() | {t: v}) for t in (*TABLES, "x") for v in kinds]
@@ -515,7 +680,12 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     ("esc", "device"): st.sampled_from([device.text for device in Device]),
     ("can", "options"): st.dictionaries(
         _TEXT,
-        st.one_of(st.text(), st.integers(), st.booleans(), st.floats(allow_nan=False, allow_infinity=False)),
+        st.one_of(
+            st.text(),
+            st.integers(),
+            st.booleans(),
+            st.floats(allow_nan=False, allow_infinity=False),
+        ),
         max_size=3,
     ),
     ("dbc", "bind"): st.dictionaries(
@@ -531,8 +701,12 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     ("dbc", "e2e_data_ids"): st.dictionaries(_TEXT, st.integers(0, 0xFFFF), max_size=3),
     ("dbc", "unbound"): st.sampled_from(["error", "start_value"]),
     ("dbc", "messages"): st.lists(st.from_regex(r"\A[A-Za-z_*?]{1,8}\Z"), max_size=3),
-    ("dbc", "send_type"): st.dictionaries(_TEXT, st.sampled_from(["Cyclic", "OnChange"]), max_size=3),
-    ("dbc", "units"): st.dictionaries(_TEXT, st.sampled_from(["V", "degC", "1/min", "-"]), max_size=3),
+    ("dbc", "send_type"): st.dictionaries(
+        _TEXT, st.sampled_from(["Cyclic", "OnChange"]), max_size=3
+    ),
+    ("dbc", "units"): st.dictionaries(
+        _TEXT, st.sampled_from(["V", "degC", "1/min", "-"]), max_size=3
+    ),
     ("statistics", "prometheus"): st.builds(
         lambda host, port: f"{host}:{port}",
         st.sampled_from(["127.0.0.1", "localhost", "[::1]", "127.255.3.200"]),
@@ -559,11 +733,19 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
     """TOML tables in which each key has one of its values or is left out; the ESCs differ in name and port."""
 
     def table(name: str) -> dict[str, Any]:
-        return {key: draw(_RIGHT[name, key]) for key in TABLES[name] if key == "port" or draw(st.booleans())}
+        return {
+            key: draw(_RIGHT[name, key])
+            for key in TABLES[name]
+            if key == "port" or draw(st.booleans())
+        }
 
-    made: dict[str, Any] = {name: table(name) for name in TABLES if name != "esc" and draw(st.booleans())}
+    made: dict[str, Any] = {
+        name: table(name) for name in TABLES if name != "esc" and draw(st.booleans())
+    }
     escs = [table("esc") for _ in range(draw(st.integers(1, 3)))]
-    return made | {"esc": [e | {"name": f"e{n}", "port": f"{n}{e['port']}"} for n, e in enumerate(escs)]}
+    return made | {
+        "esc": [e | {"name": f"e{n}", "port": f"{n}{e['port']}"} for n, e in enumerate(escs)]
+    }
 
 
 def equal(config: Config) -> None:
@@ -580,8 +762,20 @@ def test_the_effective_configuration_as_toml_is_read_back_equal(made: dict[str, 
 
 
 def test_texts_with_quotes_backslashes_and_control_characters_are_read_back_equal() -> None:
-    for port in ('a"b', "C:\\x", "a\nb", "\t\x01\x1f\x7f\x85", "ü€😀", "'''", '"""', "#", "a = [b]"):
-        equal(parse({"esc": [{"port": port}], "dbc": {"bind": {port: port}, "file": port}}, "a.toml"))
+    for port in (
+        'a"b',
+        "C:\\x",
+        "a\nb",
+        "\t\x01\x1f\x7f\x85",
+        "ü€😀",
+        "'''",
+        '"""',
+        "#",
+        "a = [b]",
+    ):
+        equal(
+            parse({"esc": [{"port": port}], "dbc": {"bind": {port: port}, "file": port}}, "a.toml")
+        )
 
 
 def test_the_example_is_read_back_equal() -> None:
@@ -591,7 +785,9 @@ def test_the_example_is_read_back_equal() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.binary(max_size=200))
-def test_no_content_of_a_file_makes_anything_but_a_user_error(tmp_path_factory: Any, content: bytes) -> None:
+def test_no_content_of_a_file_makes_anything_but_a_user_error(
+    tmp_path_factory: Any, content: bytes
+) -> None:
     file = tmp_path_factory.getbasetemp() / "any.toml"
     file.write_bytes(content)
     with pytest.raises(UserError):

@@ -32,11 +32,15 @@ def some_frames(count: int, seed: int = 1, fd: bool = False) -> list[Item]:
         is_fd = fd and chance.random() < 0.3
         size = chance.choice((0, 1, 8, 12, 20, 64)) if is_fd else chance.randrange(9)
         can_id = chance.randrange(1 << 29) if extended else chance.randrange(1 << 11)
-        items.append((now, CanFrame(can_id, chance.randbytes(size), extended, is_fd), chance.random() < 0.5))
+        items.append(
+            (now, CanFrame(can_id, chance.randbytes(size), extended, is_fd), chance.random() < 0.5)
+        )
     return items
 
 
-def write_log(path: Path, format_: str, items: list[Item], wall_start_ns: int | None = WALL_NS) -> None:
+def write_log(
+    path: Path, format_: str, items: list[Item], wall_start_ns: int | None = WALL_NS
+) -> None:
     """By our writer."""
     first = items[0][0] if items else 0
     if format_ == "mf4":
@@ -55,7 +59,10 @@ def write_log(path: Path, format_: str, items: list[Item], wall_start_ns: int | 
 def read_log(path: Path, channel: str | None = None) -> tuple[list[Item], list[str]]:
     """By our reader: frames with Unix times (if the log has them), and the damage."""
     with CanLog(path, channel) as log:
-        items = [((log.wall_start_ns or 0) + time_ns, frame, received) for time_ns, frame, received in log.frames()]
+        items = [
+            ((log.wall_start_ns or 0) + time_ns, frame, received)
+            for time_ns, frame, received in log.frames()
+        ]
         return items, log.damage
 
 

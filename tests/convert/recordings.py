@@ -24,7 +24,9 @@ def convert(*words: object) -> int:
 
 
 @cache
-def capture_bytes(escs: int = 2, seed: int = 3, seconds: float = 6, devices: Sequence[str] = ()) -> bytes:
+def capture_bytes(
+    escs: int = 2, seed: int = 3, seconds: float = 6, devices: Sequence[str] = ()
+) -> bytes:
     """A capture file in which everything happens. ``devices``: what is learnt of the ESCs at its end."""
     return capture_file(Bench(*made(escs)).live(seed, seconds), WALL_NS, devices)
 
@@ -62,12 +64,19 @@ def candump_lines(count: int, seed: int = 1) -> list[tuple[int, int, bytes]]:
             if names and len(names) > 2 and chance.random() < 0.9:
                 values[signal.name] = chance.choice(names)
             else:
-                values[signal.name] = chance.choice((low, low + bits - 1, chance.randrange(low, low + bits)))
+                values[signal.name] = chance.choice(
+                    (low, low + bits - 1, chance.randrange(low, low + bits))
+                )
         lines.append((now, message.frame_id, message.encode(values, scaling=False, strict=False)))
     return lines
 
 
 def write_candump(path: Path, lines: list[tuple[int, int, bytes]]) -> Path:
     """As ``candump -L`` has it."""
-    path.write_text("".join(f"({us // 10**6}.{us % 10**6:06d}) can0 {i:03X}#{d.hex().upper()}\n" for us, i, d in lines))
+    path.write_text(
+        "".join(
+            f"({us // 10**6}.{us % 10**6:06d}) can0 {i:03X}#{d.hex().upper()}\n"
+            for us, i, d in lines
+        )
+    )
     return path

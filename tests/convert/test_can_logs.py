@@ -6,7 +6,16 @@ import can
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from log_files import READERS, SUFFIX, Item, at_wall, read_by_library, read_log, some_frames, write_log
+from log_files import (
+    READERS,
+    SUFFIX,
+    Item,
+    at_wall,
+    read_by_library,
+    read_log,
+    some_frames,
+    write_log,
+)
 
 from kontronik_can_gw.desk.recordings.can_logs import CanLog, CanLogWriter, log_format
 from kontronik_can_gw.errors import RunError, UserError
@@ -44,7 +53,8 @@ def test_what_python_can_writes_is_read(tmp_path: Path, format_: str) -> None:
     found, damage = read_log(path)
     assert damage == []
     assert [item[1:] for item in found] == [item[1:] for item in items]
-    if format_ == "asc":  # python-can's header of 5 ms says 500: the start may be wrong, the distances are not
+    if format_ == "asc":
+        # python-can's header of 5 ms says 500: the start may be wrong, the distances are not
         shift = found[0][0] - items[0][0]
         found = [(time_ns - shift, *rest) for time_ns, *rest in found]  # type: ignore[misc]
     assert max(abs(a[0] - b[0]) for a, b in zip(found, items, strict=True)) <= 1000
@@ -60,13 +70,17 @@ ITEM = st.builds(
     st.booleans(),
     st.integers(0, (1 << 29) - 1),
     st.booleans(),
-    st.sampled_from((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64)).flatmap(lambda n: st.binary(min_size=n, max_size=n)),
+    st.sampled_from((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64)).flatmap(
+        lambda n: st.binary(min_size=n, max_size=n)
+    ),
     st.booleans(),
 )
 
 
 @pytest.mark.parametrize("format_", ["candump", "asc", "blf", "trc"])
-@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(items=st.lists(ITEM, min_size=1, max_size=20))
 def test_any_frames_come_back(tmp_path: Path, format_: str, items: list[Item]) -> None:
     items.sort(key=lambda item: item[0])
@@ -177,13 +191,21 @@ def test_older_trc_files_are_read_as_python_can_reads_them(tmp_path: Path, versi
     path = tmp_path / "old.trc"
     path.write_text(head + columns + ";########\n" + TRC[version])
     expected = [
-        (round(m.timestamp * 1e6) * 1000, m.arbitration_id, m.is_extended_id, bytes(m.data), m.is_rx)
+        (
+            round(m.timestamp * 1e6) * 1000,
+            m.arbitration_id,
+            m.is_extended_id,
+            bytes(m.data),
+            m.is_rx,
+        )
         for m in can.TRCReader(path)
         if not m.is_remote_frame
     ]
     found, damage = read_log(path)
     assert damage == []
-    assert [(t, f.can_id, f.extended, f.data) for t, f, _ in found] == [item[:4] for item in expected]
+    assert [(t, f.can_id, f.extended, f.data) for t, f, _ in found] == [
+        item[:4] for item in expected
+    ]
     if version != "1.0":  # which does not say the direction
         assert [received for _, _, received in found] == [item[4] for item in expected]
 

@@ -18,7 +18,9 @@ PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 def program(*words: object, **options: object) -> "subprocess.CompletedProcess[str]":
     """Run it as a process of its own."""
     command = [*PROGRAM, *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)  # type: ignore[call-overload, no-any-return]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, **options
+    )  # type: ignore[call-overload, no-any-return]
 
 
 @pytest.fixture
@@ -49,18 +51,28 @@ def test_a_log_goes_through_every_format_and_comes_back_the_same(tmp_path: Path,
 # --- standard output and talk
 
 
-def test_text_on_standard_output_is_that_of_a_file_and_talk_goes_to_standard_error(dump: Path, tmp_path: Path) -> None:
+def test_text_on_standard_output_is_that_of_a_file_and_talk_goes_to_standard_error(
+    dump: Path, tmp_path: Path
+) -> None:
     done = run("convert", dump, "-", "--to", "csv", "--live-rate", "50")
     assert convert(dump, tmp_path / "out.csv", "--live-rate", "50") == 0
     assert (done.code, done.data) == (0, (tmp_path / "out.csv").read_bytes())
-    assert [line.partition(",")[0] for line in done.out.splitlines()[1:4]] == ["0.000000", "0.020000", "0.040000"]
+    assert [line.partition(",")[0] for line in done.out.splitlines()[1:4]] == [
+        "0.000000",
+        "0.020000",
+        "0.040000",
+    ]
     assert "times are assumed: 50 live frames a second" in done.err
 
 
 @pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "mf4", "candump", "blf", "mf4-log"])
-def test_nothing_to_convert_leaves_nothing(tmp_path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_to_convert_leaves_nothing(
+    tmp_path: Path, form: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = tmp_path / "other.log"
-    source.write_text("(1700000000.000000) can0 123#00\n" if form in ("csv", "jsonl", "parquet", "mf4") else "\n")
+    source.write_text(
+        "(1700000000.000000) can0 123#00\n" if form in ("csv", "jsonl", "parquet", "mf4") else "\n"
+    )
     said = refused(1, "convert", source, tmp_path / "out", "--to", form)
     assert f"{source}: nothing in it can be converted" in said
     assert "--dbc" in said or form not in ("csv", "jsonl", "parquet", "mf4")
@@ -99,18 +111,28 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(dump: Path, tmp_path: Path, 
 
     done = program(dump, tmp_path / "out", "--to", form, preexec_fn=small)
     assert done.returncode == 1, done.stderr
-    assert done.stderr == f"kontronik-can-gw convert: {tmp_path / 'out'}: cannot be written: File too large.\n"
+    assert (
+        done.stderr
+        == f"kontronik-can-gw convert: {tmp_path / 'out'}: cannot be written: File too large.\n"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
 
 
 @pytest.mark.parametrize(
     ("form", "number"),
-    [("csv", signal.SIGINT), ("csv", signal.SIGHUP), ("parquet", signal.SIGTERM), ("blf", signal.SIGINT)],
+    [
+        ("csv", signal.SIGINT),
+        ("csv", signal.SIGHUP),
+        ("parquet", signal.SIGTERM),
+        ("blf", signal.SIGINT),
+    ],
 )
 def test_a_signal_leaves_no_half_file(tmp_path: Path, form: str, number: signal.Signals) -> None:
     source = write_candump(tmp_path / "long.log", candump_lines(10_000))
     source.write_text(source.read_text() * 15)  # far more than is done before the signal comes
-    process = subprocess.Popen([*PROGRAM, source, tmp_path / "out", "--to", form], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*PROGRAM, source, tmp_path / "out", "--to", form], stderr=subprocess.PIPE, text=True
+    )
     while process.poll() is None and not (tmp_path / "out.part").exists():
         time.sleep(0.001)
     process.send_signal(number)
@@ -130,7 +152,9 @@ def _peak(source: Path, out: Path, *options: object) -> int:
         "print(next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM'))); sys.exit(code)"
     )
     words = [sys.executable, "-c", code, str(source), str(out), "-q", *map(str, options)]
-    return int(subprocess.run(words, capture_output=True, text=True, timeout=120, check=True).stdout)
+    return int(
+        subprocess.run(words, capture_output=True, text=True, timeout=120, check=True).stdout
+    )
 
 
 @pytest.mark.extended

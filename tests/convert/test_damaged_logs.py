@@ -29,7 +29,9 @@ def _is_part(found: list[Item], items: list[Item]) -> bool:
 
 
 @pytest.mark.parametrize("format_", OWN)
-def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(tmp_path: Path, format_: str) -> None:
+def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(
+    tmp_path: Path, format_: str
+) -> None:
     path, items, content = _log(tmp_path, format_, 8)
     most = 0
     for cut in range(len(content) - 1, 0, -1):
@@ -41,7 +43,9 @@ def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(tmp_path: Path
         if format_ in TEXT:
             # of a line that is cut a shorter number may be left, which nobody can tell
             whole = found[:-1] if found and not content[:cut].endswith(b"\n") else found
-            lines = content[:cut].count(b"\n") - content.count(b"\n") + len(items) + (format_ == "asc")
+            lines = (
+                content[:cut].count(b"\n") - content.count(b"\n") + len(items) + (format_ == "asc")
+            )
             assert len(whole) >= min(lines, len(items)) - 1
         else:
             whole = found
@@ -53,7 +57,9 @@ def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(tmp_path: Path
 
 
 @pytest.mark.parametrize("format_", TEXT)
-@pytest.mark.parametrize("rubbish", [b"\0" * 10_000, b"hello\n", bytes(range(256)) * 3 + b"\n", b"\n\n", b"(1.5) \n"])
+@pytest.mark.parametrize(
+    "rubbish", [b"\0" * 10_000, b"hello\n", bytes(range(256)) * 3 + b"\n", b"\n\n", b"(1.5) \n"]
+)
 def test_rubbish_between_lines_costs_no_frame(tmp_path: Path, format_: str, rubbish: bytes) -> None:
     path, items, content = _log(tmp_path, format_, 40)
     at = content.index(b"\n", len(content) // 2) + 1

@@ -27,8 +27,12 @@ BO_ 256 Live: 8 Gateway
 PERIOD_NS = 20_000_000
 STREAMS: dict[str, Callable[[random.Random], bytes]] = {
     "frames and pieces of frames": lambda source: random_stream(source, 60),
-    "long rubbish": lambda source: b"".join(random_stream(source, 8) + source.randbytes(3000) for _ in range(4)),
-    "headers without end": lambda source: random_stream(source, 20) + b"KODL" * 900 + random_stream(source, 20),
+    "long rubbish": lambda source: b"".join(
+        random_stream(source, 8) + source.randbytes(3000) for _ in range(4)
+    ),
+    "headers without end": lambda source: (
+        random_stream(source, 20) + b"KODL" * 900 + random_stream(source, 20)
+    ),
     "nothing": lambda _: b"",
 }
 
@@ -81,7 +85,9 @@ def test_rows_are_the_frames_that_brute_force_finds(
         if frame.kind == "live"
     ]
     rows = list(dump.samples())
-    assert [row.values for row in rows] == [[data[0], data[1] / 100, data[2] / 10] for _, _, data in lives]
+    assert [row.values for row in rows] == [
+        [data[0], data[1] / 100, data[2] / 10] for _, _, data in lives
+    ]
     for row, (time_ns, at_once, _) in zip(rows, lives, strict=True):
         # a frame behind a header that may still become one comes with the bytes after it
         assert row.time_ns == time_ns if at_once else time_ns <= row.time_ns <= time_ns + PERIOD_NS
@@ -91,7 +97,9 @@ def test_rows_are_the_frames_that_brute_force_finds(
     assert dump.position == len(stream)
 
 
-@pytest.mark.parametrize(("start", "end"), [("3.3", "9"), ("0", "0"), (None, "7.7"), ("12", None), ("8", "8.001")])
+@pytest.mark.parametrize(
+    ("start", "end"), [("3.3", "9"), ("0", "0"), (None, "7.7"), ("12", None), ("8", "8.001")]
+)
 def test_a_part_of_the_frames_of_plain_bytes_is_cut_out_of_all(
     tmp_path: Path, start: str | None, end: str | None
 ) -> None:

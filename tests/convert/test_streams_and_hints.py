@@ -16,12 +16,20 @@ from simulated_bus import write_log as write_bus_log
 from kontronik_can_gw.desk.recordings.can_logs import NAMES, CanLog
 
 
-def program(command: str, data: bytes | None = None, cwd: Path | None = None) -> "subprocess.CompletedProcess[bytes]":
+def program(
+    command: str, data: bytes | None = None, cwd: Path | None = None
+) -> "subprocess.CompletedProcess[bytes]":
     """A line of bash; ``gw`` is the program."""
     line = f'gw() {{ "{sys.executable}" -m kontronik_can_gw "$@"; }}; {command}'
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     return subprocess.run(
-        ["bash", "-c", line], input=data, capture_output=True, timeout=60, check=False, cwd=cwd, env=environment
+        ["bash", "-c", line],
+        input=data,
+        capture_output=True,
+        timeout=60,
+        check=False,
+        cwd=cwd,
+        env=environment,
     )
 
 
@@ -63,7 +71,10 @@ def test_a_pipe_gives_what_the_file_gives(tmp_path: Path, kind: str, way: str) -
     ("command", "said"),
     [
         ("gw convert - o.csv < /dev/null", "standard input: is empty"),
-        ("gw convert /dev/zero o.csv", "/dev/zero: is a terminal or another device. Give a file, or a pipe"),
+        (
+            "gw convert /dev/zero o.csv",
+            "/dev/zero: is a terminal or another device. Give a file, or a pipe",
+        ),
         ("gw convert - o.csv < /dev/zero", "standard input: is a terminal or another device."),
         ("echo rubbish | gw convert - o.csv", "standard input: is no capture, no CAN log"),
     ],
@@ -87,7 +98,9 @@ def test_a_log_of_several_escs_by_the_dbc_of_one_is_told(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("format_", sorted(SUFFIX))
 @pytest.mark.parametrize("rubbish", ["random", "text", "zeros"])
-def test_rubbish_with_the_name_of_a_log_is_one_line(tmp_path: Path, format_: str, rubbish: str) -> None:
+def test_rubbish_with_the_name_of_a_log_is_one_line(
+    tmp_path: Path, format_: str, rubbish: str
+) -> None:
     content = {
         "random": random.Random(1).randbytes(50_000),
         "text": b"hello, this is no log\n" * 3000,
@@ -100,7 +113,9 @@ def test_rubbish_with_the_name_of_a_log_is_one_line(tmp_path: Path, format_: str
 
 
 @pytest.mark.parametrize("format_", ["candump", "asc", "blf"])
-def test_a_log_whose_beginning_is_damaged_is_read_from_where_it_is_whole(tmp_path: Path, format_: str) -> None:
+def test_a_log_whose_beginning_is_damaged_is_read_from_where_it_is_whole(
+    tmp_path: Path, format_: str
+) -> None:
     items = some_frames(20_000)
     path = tmp_path / f"x{SUFFIX[format_]}"
     write_log(path, format_, items)

@@ -140,7 +140,11 @@ def test_every_format_reads_back_equal(tmp_path: Path, recording: Path, form: st
     assert len(found) == len(expected) > 100
     for one, other in zip(found, expected, strict=True):
         if form == "mf4" and "Utc" in one:  # a float of seconds behind the start
-            one["Utc"] = other["Utc"] if abs(pd.Timestamp(one["Utc"]) - pd.Timestamp(other["Utc"])) < _US else "?"
+            one["Utc"] = (
+                other["Utc"]
+                if abs(pd.Timestamp(one["Utc"]) - pd.Timestamp(other["Utc"])) < _US
+                else "?"
+            )
         assert one == other
 
 
@@ -163,7 +167,11 @@ def decoded(lines: list[tuple[int, int, bytes]]) -> Cells:
         values = message.decode(data, decode_choices=True)
         assert isinstance(values, dict)
         gone: set[str] = set()
-        cells: dict[str, Any] = {"Time": (us - lines[0][0]) / 1e6, "Id": f"{can_id:03X}", "Message": message.name}
+        cells: dict[str, Any] = {
+            "Time": (us - lines[0][0]) / 1e6,
+            "Id": f"{can_id:03X}",
+            "Message": message.name,
+        }
         for signal in message.signals:
             value: Any = values[signal.name]
             if str(value) == "NotAvailable":
@@ -196,9 +204,13 @@ def test_rows_of_frames_are_what_cantools_reads(tmp_path: Path, form: str) -> No
         of_message = {name for name in other if name in fields}
         for name in ("Time", "Id", "Message", *of_message):
             assert one[name] == (
-                pytest.approx(other[name], abs=1e-9) if isinstance(other[name], float) else other[name]
+                pytest.approx(other[name], abs=1e-9)
+                if isinstance(other[name], float)
+                else other[name]
             )
-        others = {name: value for name, value in one.items() if name in fields and name not in of_message}
+        others = {
+            name: value for name, value in one.items() if name in fields and name not in of_message
+        }
         assert not others if form == "jsonl" else set(others.values()) <= {None}
 
 
@@ -209,25 +221,36 @@ def test_mf4_of_frames_has_a_group_for_each_message(tmp_path: Path) -> None:
     assert convert(source, out, "--frames") == 0
     mdf = asammdf.MDF(out)
     groups: list[Any] = list(mdf.groups)
-    assert [group.channel_group.acq_name for group in groups] == [m.name for m in _messages_with_signals(mdf)]
+    assert [group.channel_group.acq_name for group in groups] == [
+        m.name for m in _messages_with_signals(mdf)
+    ]
     for message in _messages_with_signals(mdf):
         rows = [row for row in decoded(lines) if row["Message"] == message.name]
         for signal in message.signals:
             if signal.name not in mdf:
                 continue
             found = mdf.get(signal.name)
-            assert found.timestamps.tolist() == pytest.approx([row["Time"] for row in rows], abs=1e-9)
+            assert found.timestamps.tolist() == pytest.approx(
+                [row["Time"] for row in rows], abs=1e-9
+            )
             assert found.unit == (signal.unit or "")
-            texts = [v.decode() if isinstance(v, bytes) else None if math.isnan(v) else v for v in found.samples]
+            texts = [
+                v.decode() if isinstance(v, bytes) else None if math.isnan(v) else v
+                for v in found.samples
+            ]
             assert [None if text == "NotAvailable" else text for text in texts] == [
-                pytest.approx(row[signal.name]) if isinstance(row[signal.name], float) else row[signal.name]
+                pytest.approx(row[signal.name])
+                if isinstance(row[signal.name], float)
+                else row[signal.name]
                 for row in rows
             ]
     mdf.close()
 
 
 def _messages_with_signals(mdf: Any) -> list[Any]:
-    return [m for m in shipped_database().messages if any(signal.name in mdf for signal in m.signals)]
+    return [
+        m for m in shipped_database().messages if any(signal.name in mdf for signal in m.signals)
+    ]
 
 
 def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
@@ -248,8 +271,12 @@ def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
     for column in columns:
         field = schema.field(f"{column.name} [{column.unit}]" if column.unit else column.name)
         assert field.metadata[b"unit"].decode() == mdf.get(column.name).unit == column.unit
-        kinds = [pa.int8()] if column.is_flag else [pa.int64()] if column.is_whole else [pa.float64()]
-        assert field.type in (kinds if not column.texts else [pa.dictionary(pa.int32(), pa.string())])
+        kinds = (
+            [pa.int8()] if column.is_flag else [pa.int64()] if column.is_whole else [pa.float64()]
+        )
+        assert field.type in (
+            kinds if not column.texts else [pa.dictionary(pa.int32(), pa.string())]
+        )
     assert json.loads(schema.metadata[b"kontronik_can_gw"]) == provenance
     assert all(f"{key}: {value}" in mdf.header.comment for key, value in provenance.items())
     assert 0 <= mdf.header.start_time.timestamp() - WALL_NS / 1e9 < 0.1
@@ -278,17 +305,27 @@ def _rows(tmp_path: Path, *options: object) -> Cells:
 
 def test_signals_are_chosen_by_name_in_the_given_order(tmp_path: Path) -> None:
     rows = _rows(tmp_path, "--signals", "operatingstate, Battery*,BatteryVoltage")
-    assert list(rows[0]) == ["Time", "OperatingState", "BatteryVoltage", "BatteryCurrent", "BatteryPower"]
+    assert list(rows[0]) == [
+        "Time",
+        "OperatingState",
+        "BatteryVoltage",
+        "BatteryCurrent",
+        "BatteryPower",
+    ]
 
 
 def test_a_cut_has_all_rows_between_the_times_and_keeps_their_times(tmp_path: Path) -> None:
     every = _rows(tmp_path)
-    assert _rows(tmp_path, "--from", "1", "--until", "2.5") == [row for row in every if 1 <= row["Time"] <= 2.5]
+    assert _rows(tmp_path, "--from", "1", "--until", "2.5") == [
+        row for row in every if 1 <= row["Time"] <= 2.5
+    ]
     assert _rows(tmp_path, "--from", "0", "--until", "0") == every[:1]
 
 
 @given(st.lists(st.integers(0, 10**10), max_size=200), st.floats(0.1, 1000))
-def test_thinning_gives_at_most_the_rate_and_ends_with_the_newest(times: list[int], rate: float) -> None:
+def test_thinning_gives_at_most_the_rate_and_ends_with_the_newest(
+    times: list[int], rate: float
+) -> None:
     rows = [Row(time_ns, None, (index,)) for index, time_ns in enumerate(sorted(times))]
     thin = list(thinned(iter(rows), rate))
     assert thin[-1:] == rows[-1:]
@@ -299,7 +336,8 @@ def test_thinning_gives_at_most_the_rate_and_ends_with_the_newest(times: list[in
 
 def test_names_that_are_there_twice_get_their_message_in_front() -> None:
     columns = [
-        Column(name, "V", message, 1, "battery_voltage", 0) for message, name in (("A", "X"), ("B", "X"), ("B", "Y"))
+        Column(name, "V", message, 1, "battery_voltage", 0)
+        for message, name in (("A", "X"), ("B", "X"), ("B", "Y"))
     ]
     columns.append(Column("Time", "", "B", 1, "firmware", 0))
     assert [field.name for field in fields_of(columns)] == ["A.X", "B.X", "Y", "B.Time"]
@@ -311,7 +349,13 @@ FIELDS = (
     Field("Flag", "", Kind.FLAG, "M"),
     Field("Whole", "us", Kind.WHOLE, "M"),
     Field("Float", "deg C", Kind.FLOAT, "M"),
-    Field("Text", "", Kind.TEXT, "M", ((0, "Plain"), (1, 'odd, "quoted"'), (7, "{braces}"), (300, "µ"))),
+    Field(
+        "Text",
+        "",
+        Kind.TEXT,
+        "M",
+        ((0, "Plain"), (1, 'odd, "quoted"'), (7, "{braces}"), (300, "µ")),
+    ),
 )
 ROW = st.tuples(
     st.integers(0, 10**13),
@@ -326,13 +370,19 @@ ROW = st.tuples(
 
 
 @pytest.mark.parametrize("form", sorted(READ))
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(rows=st.lists(ROW, min_size=1, max_size=20), has_utc=st.booleans())
-def test_any_values_read_back_equal(tmp_path: Path, form: str, rows: list[Any], has_utc: bool) -> None:
+def test_any_values_read_back_equal(
+    tmp_path: Path, form: str, rows: list[Any], has_utc: bool
+) -> None:
     rows.sort(key=lambda row: row[0])
     path = tmp_path / f"any.{form}"
     table = Table(FIELDS, has_utc)
-    with open_table(path if form in ("parquet", "mf4") else (file := path.open("wb")), form, table) as writer:
+    with open_table(
+        path if form in ("parquet", "mf4") else (file := path.open("wb")), form, table
+    ) as writer:
         for row in rows:
             writer.write(Row(*row))
     if form not in ("parquet", "mf4"):
@@ -342,6 +392,10 @@ def test_any_values_read_back_equal(tmp_path: Path, form: str, rows: list[Any], 
     for cells, (time_ns, wall_ns, values) in zip(found, rows, strict=True):
         assert round(cells["Time"] * 1e9) == time_ns
         if has_utc and form != "mf4":
-            text = "" if wall_ns is None else f"{datetime.fromtimestamp(wall_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%S}"
+            text = (
+                ""
+                if wall_ns is None
+                else f"{datetime.fromtimestamp(wall_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%S}"
+            )
             assert cells["Utc"] == (f"{text}.{wall_ns % 10**9 // 1000:06d}Z" if text else None)
         assert tuple(cells[field.name] for field in FIELDS) == values

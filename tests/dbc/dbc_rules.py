@@ -119,7 +119,10 @@ class Database:
 
     def attribute(self, name: str, *key: str | int) -> str | None:
         """The one value that a BA_ line gives, without quotes; None if there is none, never a default."""
-        return next((value.strip('"') for n, k, value in self.attributes if (n, k) == (name, key or ("",))), None)
+        return next(
+            (value.strip('"') for n, k, value in self.attributes if (n, k) == (name, key or ("",))),
+            None,
+        )
 
     def number(self, name: str, message: Message) -> int:
         """A whole-number attribute of a message; -1 if it is missing or no number."""
@@ -128,7 +131,10 @@ class Database:
 
     def send_type(self, message: Message) -> str:
         """The send type of a message by its index; empty if there is none."""
-        choices, index = self.definitions.get("GenMsgSendType", []), self.number("GenMsgSendType", message)
+        choices, index = (
+            self.definitions.get("GenMsgSendType", []),
+            self.number("GenMsgSendType", message),
+        )
         return choices[index] if 0 <= index < len(choices) else ""
 
 
@@ -145,14 +151,18 @@ LINES: dict[str, re.Pattern[str]] = {
     "NS_": re.compile(r"^NS_ :$"),
     "BS_": re.compile(r"^BS_:$"),
     "BU_": re.compile(rf"^BU_:(?P<nodes>(?: {NAME})*)$"),
-    "BO_": re.compile(rf"^BO_ (?P<id>[0-9]+) (?P<name>{NAME}): (?P<dlc>[0-9]+) (?P<sender>{NAME})$"),
+    "BO_": re.compile(
+        rf"^BO_ (?P<id>[0-9]+) (?P<name>{NAME}): (?P<dlc>[0-9]+) (?P<sender>{NAME})$"
+    ),
     "CM_": re.compile(rf'^CM_ {OBJECT}"(?P<text>[^"]*)";$'),
     "BA_DEF_": re.compile(
         r'^BA_DEF_ (?:(?:BU_|BO_|SG_) )?"(?P<name>[^"]+)" (?:INT|FLOAT|STRING|ENUM|HEX) ?(?P<rest>.*);$'
     ),
     "BA_DEF_DEF_": re.compile(r'^BA_DEF_DEF_ "[^"]+" .+;$'),
     "BA_": re.compile(rf'^BA_ "(?P<name>[^"]+)" {OBJECT}(?P<value>"[^"]*"|{NUMBER});$'),
-    "VAL_": re.compile(rf'^VAL_ (?P<id>[0-9]+) (?P<name>{NAME})(?P<pairs>(?: -?[0-9]+ "[^"]*")+) ;$'),
+    "VAL_": re.compile(
+        rf'^VAL_ (?P<id>[0-9]+) (?P<name>{NAME})(?P<pairs>(?: -?[0-9]+ "[^"]*")+) ;$'
+    ),
 }
 
 
@@ -181,7 +191,9 @@ def parse(data: bytes) -> Database:
             case "BU_":
                 db.nodes += match["nodes"].split()
             case "BO_":
-                db.messages.append(Message(int(match["id"]), match["name"], int(match["dlc"]), match["sender"], ()))
+                db.messages.append(
+                    Message(int(match["id"]), match["name"], int(match["dlc"]), match["sender"], ())
+                )
             case "SG_" if db.messages:
                 message = db.messages.pop()
                 signal = Signal(
@@ -199,7 +211,9 @@ def parse(data: bytes) -> Database:
                     receivers=tuple(match["receivers"].split(",")),
                 )
                 signals = (*message.signals, signal)
-                db.messages.append(Message(message.id, message.name, message.dlc, message.sender, signals))
+                db.messages.append(
+                    Message(message.id, message.name, message.dlc, message.sender, signals)
+                )
             case "CM_":
                 db.comments.append((_key(match), match["text"]))
             case "BA_DEF_":
@@ -207,7 +221,10 @@ def parse(data: bytes) -> Database:
             case "BA_":
                 db.attributes.append((match["name"], _key(match), match["value"]))
             case "VAL_":
-                pairs = [(int(n), text) for n, text in re.findall(r'(-?[0-9]+) "([^"]*)"', match["pairs"])]
+                pairs = [
+                    (int(n), text)
+                    for n, text in re.findall(r'(-?[0-9]+) "([^"]*)"', match["pairs"])
+                ]
                 db.value_tables.append(((int(match["id"]), match["name"]), pairs))
             case _:
                 pass
@@ -279,7 +296,9 @@ def limits_leave_out_the_codes(db: Database) -> Iterator[str]:
     for signal in db.signals:
         if signal.is_flag or signal.is_alive_counter:
             continue
-        named = [number for number, text in db.tables.get(signal.key, {}).items() if text not in CODES]
+        named = [
+            number for number, text in db.tables.get(signal.key, {}).items() if text not in CODES
+        ]
         if signal.signed:
             raw = (signal.error + 1, (1 << (signal.length - 1)) - 1)
         else:
@@ -295,12 +314,21 @@ def enums_are_closed(db: Database) -> Iterator[str]:
     """Every value that the gateway can send has a name, and nothing else has: one unknown sample costs all names."""
     found = set()
     for signal in db.signals:
-        named = {number: text for number, text in db.tables.get(signal.key, {}).items() if text not in CODES}
+        named = {
+            number: text
+            for number, text in db.tables.get(signal.key, {}).items()
+            if text not in CODES
+        }
         if named or signal.name in ENUMS:
             found.add(signal.name)
             if named != ENUMS.get(signal.name):
                 yield f"{signal.name} has {named}"
-            if (signal.factor, signal.offset, signal.signed, signal.unit) != (Decimal(1), Decimal(0), False, ""):
+            if (signal.factor, signal.offset, signal.signed, signal.unit) != (
+                Decimal(1),
+                Decimal(0),
+                False,
+                "",
+            ):
                 yield f"{signal.name} is an enum with scale, sign or unit"
     for missing in set(ENUMS) - found:
         yield f"{missing} is missing"

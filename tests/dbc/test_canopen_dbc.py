@@ -27,7 +27,14 @@ from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
-from kontronik_can_gw.esc.simulator import BYTE_NS, Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.simulator import (
+    BYTE_NS,
+    Dropout,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    SimulatedEsc,
+)
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
@@ -41,10 +48,15 @@ NA = "NotAvailable"
 
 
 def setup(
-    escs: Sequence[EscSettings], node_ids: Sequence[int] = (), stored: Sequence[Stored] = (), eds: Eds = EDS
+    escs: Sequence[EscSettings],
+    node_ids: Sequence[int] = (),
+    stored: Sequence[Stored] = (),
+    eds: Eds = EDS,
 ) -> CanopenSetup:
     ids = node_ids or range(1, len(escs) + 1)
-    return CanopenSetup(eds, tuple(NodeSettings(i, serial=i) for i in ids), tuple(stored) or (Stored(),) * len(escs))
+    return CanopenSetup(
+        eds, tuple(NodeSettings(i, serial=i) for i in ids), tuple(stored) or (Stored(),) * len(escs)
+    )
 
 
 def written(of: CanopenSetup, escs: Sequence[EscSettings]) -> str:
@@ -57,14 +69,18 @@ def written(of: CanopenSetup, escs: Sequence[EscSettings]) -> str:
 class Bench:
     """A gateway with simulated ESCs on its lines; each frame is decoded at once and held against the telemetry of that moment."""
 
-    def __init__(self, of: CanopenSetup, escs: Sequence[EscSettings], simulated: Sequence[EscOptions] = ()) -> None:
+    def __init__(
+        self, of: CanopenSetup, escs: Sequence[EscSettings], simulated: Sequence[EscOptions] = ()
+    ) -> None:
         self.setup = of
         self.escs = of.esc_settings(escs)
         self.gateway = Gateway(self.escs, Layout("", "", ()), 0, canopen=of)
         assert self.gateway.nodes is not None
         self.nodes = self.gateway.nodes
         options = simulated or (EscOptions(),) * len(escs)
-        self.simulators = [SimulatedEsc(option, seed=n, start_ns=MS) for n, option in enumerate(options)]
+        self.simulators = [
+            SimulatedEsc(option, seed=n, start_ns=MS) for n, option in enumerate(options)
+        ]
         self.prefixes = [esc_prefix(esc.name) if len(escs) > 1 else "" for esc in escs]
         self.database = read(written(of, escs))
         self.seen: dict[str, list[dict[str, Any]]] = {}
@@ -103,7 +119,9 @@ class Bench:
             message = self.database.get_message_by_frame_id(sent.can_id)
             assert len(sent.data) == message.length, message.name
             decoded: Any = message.decode(sent.data)
-            values = {k: str(v) if isinstance(v, NamedSignalValue) else v for k, v in decoded.items()}
+            values = {
+                k: str(v) if isinstance(v, NamedSignalValue) else v for k, v in decoded.items()
+            }
             self.seen.setdefault(message.name, []).append(values)
             esc = self.of_message(sent.can_id)
             if "Tpdo" in message.name:
@@ -132,12 +150,19 @@ class Bench:
         assert len(answers) == 1
         return answers[0].data.hex()
 
-    def write(self, index: int, sub: int, value: int, size: int, now: int = 2 * MS, node_id: int = 1) -> None:
+    def write(
+        self, index: int, sub: int, value: int, size: int, now: int = 2 * MS, node_id: int = 1
+    ) -> None:
         command = {1: "2f", 2: "2b", 4: "23"}[size]
         place = f"{index.to_bytes(2, 'little').hex()}{sub:02x}"
-        assert self.sdo(f"{command}{place}{value.to_bytes(4, 'little').hex()}", now, node_id) == f"60{place}00000000"
+        assert (
+            self.sdo(f"{command}{place}{value.to_bytes(4, 'little').hex()}", now, node_id)
+            == f"60{place}00000000"
+        )
 
-    def remap(self, pdo: int, cob_id: int, objects: Sequence[int], node_id: int = 1, kind: int = 254) -> None:
+    def remap(
+        self, pdo: int, cob_id: int, objects: Sequence[int], node_id: int = 1, kind: int = 254
+    ) -> None:
         """The procedure of CiA 301 for another mapping; ``objects`` as mapping entries."""
         self.write(0x1800 + pdo, 1, 0xC0000000 | cob_id, 4, node_id=node_id)
         self.write(0x1A00 + pdo, 0, 0, 1, node_id=node_id)
@@ -158,7 +183,9 @@ def expected(esc: EscTelemetry) -> dict[str, Any]:
             found[signal] = NA if data is None else row.physical(getattr(data, name))
     found["OperatingState"] = NA
     if live is not None:
-        found["OperatingState"] = ENUMS["OperatingState"].get(live.operating_state, f"State{live.operating_state}")
+        found["OperatingState"] = ENUMS["OperatingState"].get(
+            live.operating_state, f"State{live.operating_state}"
+        )
     word = 0xFFFFFFFF if live is None else live.operating_errors
     found |= {pascal(bit.name): word >> bit & 1 for bit in OperatingError}
     if not (esc.bec_current_supplied(live.bec_current) if live else False):
@@ -197,7 +224,14 @@ def test_the_shipped_file_keeps_the_rule(rule: str) -> None:
     assert list(RULES[rule](parse(SHIPPED.read_bytes()))) == []
 
 
-NEVER_MISSING = {"LinkState", "LiveCounter", "NodeState", "EmergencyCode", "EmergencySource", "EmergencyWord"}
+NEVER_MISSING = {
+    "LinkState",
+    "LiveCounter",
+    "NodeState",
+    "EmergencyCode",
+    "EmergencySource",
+    "EmergencyWord",
+}
 
 
 def test_not_available_is_named_outside_the_limits_and_the_start_value() -> None:
@@ -211,7 +245,9 @@ def test_not_available_is_named_outside_the_limits_and_the_start_value() -> None
         assert table[signal.not_available] == NA
         assert start == signal.not_available
         raw = (signal.error, (1 << signal.length - 1) - 1) if signal.signed else (0, signal.error)
-        assert (signal.minimum, signal.maximum) == tuple(number * signal.factor for number in raw), signal.name
+        assert (signal.minimum, signal.maximum) == tuple(
+            number * signal.factor for number in raw
+        ), signal.name
 
 
 def test_enumerations_name_every_value_that_can_be_sent() -> None:
@@ -223,22 +259,47 @@ def test_enumerations_name_every_value_that_can_be_sent() -> None:
     assert {number: states[number] for number in ENUMS["OperatingState"]} == ENUMS["OperatingState"]
     assert [states[number] for number in (0, 27, 255)] == ["State0", "State27", NA]
     assert tables["LinkState"] == ENUMS["LinkState"]
-    assert tables["NodeState"] == {0: "BootUp", 4: "Stopped", 5: "Operational", 127: "PreOperational"}
+    assert tables["NodeState"] == {
+        0: "BootUp",
+        4: "Stopped",
+        5: "Operational",
+        127: "PreOperational",
+    }
     assert sorted(tables["EmergencySource"]) == [*range(32), 255]
     codes = tables["EmergencyCode"]
-    design = [0x3220, 0x3210, 0x2350, 0x2351, 0xFF04, 0x4210, 0x5114, 0x5115, 0x2220, 0x4410, 0xFF0A, 0xFF0B]
+    design = [
+        0x3220,
+        0x3210,
+        0x2350,
+        0x2351,
+        0xFF04,
+        0x4210,
+        0x5114,
+        0x5115,
+        0x2220,
+        0x4410,
+        0xFF0A,
+        0xFF0B,
+    ]
     design += [0x1000, 0xFF0D, 0x5000, 0x5530, 0x6010, *range(0xFF11, 0xFF18)]
     assert [codes[code] for code in design] == [pascal(bit.name) for bit in OperatingError]
-    assert set(codes) == {0, *design, *range(0xFF18, 0xFF20)} | {error.value[0] for error in GatewayError}
+    assert set(codes) == {0, *design, *range(0xFF18, 0xFF20)} | {
+        error.value[0] for error in GatewayError
+    }
 
 
 def test_names_are_those_of_the_shipped_dbc_where_both_show_a_value() -> None:
     """A logger that is set up for one finds the same names in the other."""
     ours = {signal.name: signal for signal in parse(SHIPPED.read_bytes()).signals}
-    others = {signal.name: signal for signal in parse(shipped("dbc/kontronik_esc.dbc").read_bytes()).signals}
+    others = {
+        signal.name: signal
+        for signal in parse(shipped("dbc/kontronik_esc.dbc").read_bytes()).signals
+    }
     common = set(ours) & set(others)
     own = {"Replay", "InfoValid", "LiveCounter", "NodeState"}
-    assert {name for name in set(ours) - common if not name.startswith(("Emergency", "ErrorRegister"))} == own
+    assert {
+        name for name in set(ours) - common if not name.startswith(("Emergency", "ErrorRegister"))
+    } == own
     assert all(ours[name].unit == others[name].unit for name in common)
 
 
@@ -258,18 +319,39 @@ def test_every_frame_of_a_running_node_decodes_to_the_telemetry() -> None:
     assert count["EscTpdo1"] > 300
     assert count["EscTpdo2"] > 100
     assert count["EscTpdo3"] > 60
-    assert [values["NodeState"] for values in bench.seen["EscHeartbeat"]] == ["BootUp", *["Operational"] * 8]
-    told = [(v["EmergencyCode"], v["EmergencySource"], v["EmergencyWord"]) for v in bench.seen["EscEmergency"]]
-    assert [code for code, _, _ in told] == ["Undervoltage", "NoError", "PowerStageOvertempWarning", "NoError"]
-    assert [source for _, source, _ in told] == ["Undervoltage", "Gateway", "PowerStageOvertempWarning", "Gateway"]
+    assert [values["NodeState"] for values in bench.seen["EscHeartbeat"]] == [
+        "BootUp",
+        *["Operational"] * 8,
+    ]
+    told = [
+        (v["EmergencyCode"], v["EmergencySource"], v["EmergencyWord"])
+        for v in bench.seen["EscEmergency"]
+    ]
+    assert [code for code, _, _ in told] == [
+        "Undervoltage",
+        "NoError",
+        "PowerStageOvertempWarning",
+        "NoError",
+    ]
+    assert [source for _, source, _ in told] == [
+        "Undervoltage",
+        "Gateway",
+        "PowerStageOvertempWarning",
+        "Gateway",
+    ]
     assert [word & 0x1F for _, _, word in told] == [1, 0, 16, 0]
     first = bench.seen["EscEmergency"][0]
     register = {
-        name.removeprefix("ErrorRegister") for name in first if name.startswith("ErrorRegister") and first[name]
+        name.removeprefix("ErrorRegister")
+        for name in first
+        if name.startswith("ErrorRegister") and first[name]
     }
     assert register == {"Generic", "Voltage"}
     assert max(values["BatteryCurrent"] for values in bench.seen["EscTpdo1"]) > 5
-    assert {values["OperatingState"] for values in bench.seen["EscTpdo4"]} >= {"MotorOff", "SpoolUpFromStill"}
+    assert {values["OperatingState"] for values in bench.seen["EscTpdo4"]} >= {
+        "MotorOff",
+        "SpoolUpFromStill",
+    }
 
 
 def test_lost_telemetry_is_not_available_and_told_as_an_emergency() -> None:
@@ -285,7 +367,10 @@ def test_lost_telemetry_is_not_available_and_told_as_an_emergency() -> None:
         assert (values["OperatingState"] == NA) == (not fresh)
         assert (values["Timing"] == NA) == (not fresh)
     assert any(values["InfoValid"] for values in states)
-    told = [(v["EmergencyCode"], v["EmergencySource"], v["EmergencyWord"]) for v in bench.seen["EscEmergency"]]
+    told = [
+        (v["EmergencyCode"], v["EmergencySource"], v["EmergencyWord"])
+        for v in bench.seen["EscEmergency"]
+    ]
     assert told == [("TelemetryFault", "Gateway", 1), ("NoError", "Gateway", 0)]
 
 
@@ -302,7 +387,9 @@ def test_several_escs_have_their_names_in_front() -> None:
     bench.operational(0)
     bench.run(3 * SECOND)
     assert set(bench.seen) == {
-        f"{prefix}{stem}" for prefix in ("Left", "RightR") for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat")
+        f"{prefix}{stem}"
+        for prefix in ("Left", "RightR")
+        for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat")
     }
     ids = {message.name: message.frame_id for message in bench.database.messages}
     assert (ids["LeftTpdo1"], ids["RightRTpdo1"], ids["RightRHeartbeat"]) == (0x185, 0x189, 0x709)
@@ -330,7 +417,11 @@ def test_what_a_master_mapped_and_stored_is_described_from_the_configuration() -
     signals = {m.name: {s.name for s in m.signals} for m in bench.database.messages}
     assert signals["RightRTpdo5"] == {"RightRMotorSpeed", "RightRBatteryPower"}
     assert signals["RightRTpdo1"] == {"RightRVelocityActualValue", "RightRDcLinkCircuitVoltage"}
-    assert signals["LeftTpdo1"] == {"LeftElectricalSpeed", "LeftBatteryVoltage", "LeftBatteryCurrent"}
+    assert signals["LeftTpdo1"] == {
+        "LeftElectricalSpeed",
+        "LeftBatteryVoltage",
+        "LeftBatteryCurrent",
+    }
     assert "LeftTpdo5" not in signals
     extremes = bench.database.get_message_by_name("RightRTpdo2")
     assert (extremes.cycle_time, extremes.send_type) == (400, "CyclicAndEvent")
@@ -352,7 +443,9 @@ def test_a_value_in_two_pdos_has_two_names() -> None:
     assert names["EscTpdo5"] == ["BatteryVoltage2", "Throttle2Percent", "BatteryVoltage3"]
     assert names["EscTpdo4"][0] == "Undervoltage"
     assert (names["EscTpdo6"][0], names["EscTpdo6"][-1]) == ("Undervoltage2", "CrcErrors")
-    comment = bench.database.get_message_by_name("EscTpdo6").get_signal_by_name("Undervoltage2").comment
+    comment = (
+        bench.database.get_message_by_name("EscTpdo6").get_signal_by_name("Undervoltage2").comment
+    )
     assert comment is not None
     assert comment.endswith("While the word is not available all its bits are set.")
 
@@ -397,7 +490,9 @@ def with_objects(*sections: tuple[int, str, int, str]) -> Eds:
     """The shipped EDS with mappable plain variables: index, name, data type, default."""
     text = EDS_TEXT
     for index, name, data_type, default in sections:
-        text = with_object(text, index, variable(data_type, name=name, DefaultValue=default, PDOMapping=1))
+        text = with_object(
+            text, index, variable(data_type, name=name, DefaultValue=default, PDOMapping=1)
+        )
     return reader.load(text.encode(), "mine.eds")
 
 
@@ -497,7 +592,10 @@ def test_a_node_that_waits_for_lss_has_no_frames_and_is_warned_of(
     )
     assert main(["dbc", "--canopen", "-c", str(file)]) == 0
     text, said = capsys.readouterr()
-    assert said == "kontronik-can-gw: warning: right_r: no node-ID yet (LSS gives one), so no frames to describe\n"
+    assert (
+        said
+        == "kontronik-can-gw: warning: right_r: no node-ID yet (LSS gives one), so no frames to describe\n"
+    )
     db = parse(text.encode())
     assert {message.name for message in db.messages} == {
         f"Left{stem}" for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat", "Emergency")

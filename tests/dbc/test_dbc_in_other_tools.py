@@ -34,7 +34,9 @@ def frame(message: Message, raw: dict[str, int]) -> bytes:
 
 
 def not_available(message: Message) -> dict[str, int]:
-    return {s.name: 0 if s.is_flag or s.is_alive_counter else s.not_available for s in message.signals}
+    return {
+        s.name: 0 if s.is_flag or s.is_alive_counter else s.not_available for s in message.signals
+    }
 
 
 def error(message: Message) -> dict[str, int]:
@@ -48,7 +50,9 @@ def valid(message: Message, choice: random.Random, file: Path = SHIPPED) -> dict
     for signal in message.signals:
         low, high = int(signal.minimum / signal.factor), int(signal.maximum / signal.factor)
         named = [number for number in tables.get(signal.key, {}) if low <= number <= high]
-        raw[signal.name] = choice.choice(named) if named else choice.choice([low, high, choice.randint(low, high)])
+        raw[signal.name] = (
+            choice.choice(named) if named else choice.choice([low, high, choice.randint(low, high)])
+        )
     return raw
 
 
@@ -56,7 +60,11 @@ def random_frames(message: Message) -> list[bytes]:
     """Any bytes whatever, and the two extremes; the same on each run."""
     choice = random.Random(message.id)
     size = message.dlc
-    return [bytes(size), b"\xff" * size, *(choice.randbytes(size) for _ in range(FRAMES_PER_MESSAGE))]
+    return [
+        bytes(size),
+        b"\xff" * size,
+        *(choice.randbytes(size) for _ in range(FRAMES_PER_MESSAGE)),
+    ]
 
 
 # --- cantools -------------------------------------------------------------------------------------------------------
@@ -71,7 +79,9 @@ def cantools_database() -> Any:
 
 @BOTH
 @pytest.mark.filterwarnings("error")
-def test_cantools_loads_the_file_strictly_and_silently(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_cantools_loads_the_file_strictly_and_silently(
+    file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     import cantools
 
     with caplog.at_level(logging.INFO):
@@ -84,22 +94,43 @@ def test_cantools_sees_what_the_lines_say(cantools_database: Any) -> None:
     comments = dict(db.comments)
     assert [node.name for node in cantools_database.nodes] == db.nodes
     assert cantools_database.dbc.attributes["LayoutVersion"].value == db.attribute("LayoutVersion")
-    assert [message.frame_id for message in cantools_database.messages] == [message.id for message in db.messages]
+    assert [message.frame_id for message in cantools_database.messages] == [
+        message.id for message in db.messages
+    ]
     for message, seen in zip(db.messages, cantools_database.messages, strict=True):
-        assert (seen.name, seen.length, seen.senders) == (message.name, message.dlc, [message.sender])
+        assert (seen.name, seen.length, seen.senders) == (
+            message.name,
+            message.dlc,
+            [message.sender],
+        )
         assert seen.comment == comments[("BO_", message.id)]
         assert seen.send_type == db.send_type(message)
         assert (seen.cycle_time or 0) == db.number("GenMsgCycleTime", message)
         assert seen.dbc.attributes["GenMsgDelayTime"].value == db.number("GenMsgDelayTime", message)
-        assert (seen.is_extended_frame, seen.is_fd, seen.is_multiplexed(), seen.protocol) == (False, False, False, None)
+        assert (seen.is_extended_frame, seen.is_fd, seen.is_multiplexed(), seen.protocol) == (
+            False,
+            False,
+            False,
+            None,
+        )
         for signal in message.signals:
             its = seen.get_signal_by_name(signal.name)
-            assert (its.start, its.length, its.byte_order) == (signal.start, signal.length, "little_endian")
-            assert (its.is_signed, its.is_float, its.receivers) == (signal.signed, False, list(signal.receivers))
+            assert (its.start, its.length, its.byte_order) == (
+                signal.start,
+                signal.length,
+                "little_endian",
+            )
+            assert (its.is_signed, its.is_float, its.receivers) == (
+                signal.signed,
+                False,
+                list(signal.receivers),
+            )
             assert its.comment == comments[("SG_", *signal.key)]
             assert (its.unit or "") == signal.unit
             assert (its.minimum, its.maximum) == (float(signal.minimum), float(signal.maximum))
-            assert {n: str(text) for n, text in (its.choices or {}).items()} == db.tables.get(signal.key, {})
+            assert {n: str(text) for n, text in (its.choices or {}).items()} == db.tables.get(
+                signal.key, {}
+            )
 
 
 @pytest.mark.parametrize(("text", "raw_of"), [("NotAvailable", not_available), ("Error", error)])
@@ -115,7 +146,9 @@ def test_cantools_starts_every_signal_not_available(cantools_database: Any) -> N
     """The start value is raw: an initial value of 655.35 V would be a number, not a missing one."""
     for message in layout().messages:
         seen = cantools_database.get_message_by_frame_id(message.id)
-        assert {signal.name: signal.raw_initial for signal in seen.signals} == not_available(message)
+        assert {signal.name: signal.raw_initial for signal in seen.signals} == not_available(
+            message
+        )
         initial = {signal.name: signal.initial for signal in seen.signals}
         assert seen.encode(initial, strict=False) == frame(message, not_available(message))
 
@@ -138,18 +171,34 @@ def test_canmatrix_sees_what_the_lines_say(file: Path, caplog: pytest.LogCapture
     canmatrix_matrix, db = matrix_of(file, caplog), layout(file)
     comments = dict(db.comments)
     assert [ecu.name for ecu in canmatrix_matrix.ecus] == db.nodes
-    assert canmatrix_matrix.attributes == {"LayoutVersion": db.attribute("LayoutVersion"), "BusType": "CAN"}
+    assert canmatrix_matrix.attributes == {
+        "LayoutVersion": db.attribute("LayoutVersion"),
+        "BusType": "CAN",
+    }
     assert len(canmatrix_matrix.frames) == len(db.messages)
     for message, seen in zip(db.messages, canmatrix_matrix.frames, strict=True):
-        assert (seen.name, seen.arbitration_id.id, seen.size) == (message.name, message.id, message.dlc)
-        assert (seen.arbitration_id.extended, seen.is_fd, seen.is_j1939, seen.is_multiplexed) == (False,) * 4
-        assert (seen.transmitters, seen.comment) == ([message.sender], comments[("BO_", message.id)])
+        assert (seen.name, seen.arbitration_id.id, seen.size) == (
+            message.name,
+            message.id,
+            message.dlc,
+        )
+        assert (seen.arbitration_id.extended, seen.is_fd, seen.is_j1939, seen.is_multiplexed) == (
+            False,
+        ) * 4
+        assert (seen.transmitters, seen.comment) == (
+            [message.sender],
+            comments[("BO_", message.id)],
+        )
         assert seen.attributes["GenMsgSendType"] == db.send_type(message)
         assert seen.cycle_time == db.number("GenMsgCycleTime", message)
         for signal in message.signals:
             its = seen.signal_by_name(signal.name)
             assert (its.get_startbit(bit_numbering=1), its.size) == (signal.start, signal.length)
-            assert (its.is_little_endian, its.is_signed, its.is_float) == (True, signal.signed, False)
+            assert (its.is_little_endian, its.is_signed, its.is_float) == (
+                True,
+                signal.signed,
+                False,
+            )
             assert (its.min, its.max) == (signal.minimum, signal.maximum)
             assert (its.unit, its.receivers) == (signal.unit, list(signal.receivers))
             assert its.comment == comments[("SG_", *signal.key)]
@@ -168,13 +217,19 @@ def test_opendbc_reads_every_signal_from_the_path_of_the_file(file: Path) -> Non
 
     db = layout(file)
     seen = DBC(str(file))
-    assert {address: message.name for address, message in seen.msgs.items()} == {m.id: m.name for m in db.messages}
+    assert {address: message.name for address, message in seen.msgs.items()} == {
+        m.id: m.name for m in db.messages
+    }
     for message in db.messages:
         signals = seen.msgs[message.id].sigs
         assert list(signals) == [signal.name for signal in message.signals]
         for signal in message.signals:
             its = signals[signal.name]
-            assert (its.lsb, its.size, its.is_signed) == (signal.start, signal.length, signal.signed)
+            assert (its.lsb, its.size, its.is_signed) == (
+                signal.start,
+                signal.length,
+                signal.signed,
+            )
             assert (its.factor, its.offset, its.type) == (float(signal.factor), 0.0, 0)
 
 
@@ -187,7 +242,9 @@ def test_opendbc_reads_every_value_text(file: Path) -> None:
     names = {message.id: message.name for message in db.messages}
     defined = CANDefine(str(file)).dv
     for (message_id, name), table in db.tables.items():
-        assert defined[names[message_id]][name] == {number: text.upper() for number, text in table.items()}
+        assert defined[names[message_id]][name] == {
+            number: text.upper() for number, text in table.items()
+        }
 
 
 def test_opendbc_packs_and_parses_valid_frames() -> None:
@@ -216,7 +273,9 @@ def test_opendbc_packs_and_parses_valid_frames() -> None:
 
 
 @BOTH
-def test_all_readers_find_the_same_raw_values_in_any_bytes(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_all_readers_find_the_same_raw_values_in_any_bytes(
+    file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     import cantools
     from opendbc.can.dbc import DBC
     from opendbc.can.parser import get_raw_value  # type: ignore[import-untyped]
@@ -227,8 +286,13 @@ def test_all_readers_find_the_same_raw_values_in_any_bytes(file: Path, caplog: p
         matrix_frame = matrix.frame_by_name(message.name)
         for data in random_frames(message):
             expected = {signal.name: raw_value(signal, data) for signal in message.signals}
-            assert database.decode_message(message.id, data, decode_choices=False, scaling=False) == expected
-            assert {name: seen.raw_value for name, seen in matrix_frame.decode(data).items()} == expected
+            assert (
+                database.decode_message(message.id, data, decode_choices=False, scaling=False)
+                == expected
+            )
+            assert {
+                name: seen.raw_value for name, seen in matrix_frame.decode(data).items()
+            } == expected
             for name, its in opendbc.msgs[message.id].sigs.items():
                 raw = get_raw_value(data, its)
                 raw -= (raw >> (its.size - 1) << its.size) if its.is_signed else 0
@@ -283,9 +347,16 @@ def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path, file: Path) -> None
             assert seen.unit == signal.unit
             table = db.tables.get(signal.key, {})
             if set(table.values()) - set(CODES):
-                assert [text.decode() for text in seen.samples] == [table[number] for number in sent]
+                assert [text.decode() for text in seen.samples] == [
+                    table[number] for number in sent
+                ]
             else:
-                expected = [float("nan") if number in table else float(number * signal.factor) for number in sent]
-                np.testing.assert_allclose(seen.samples.astype(float), expected, rtol=1e-12, err_msg=signal.name)
+                expected = [
+                    float("nan") if number in table else float(number * signal.factor)
+                    for number in sent
+                ]
+                np.testing.assert_allclose(
+                    seen.samples.astype(float), expected, rtol=1e-12, err_msg=signal.name
+                )
                 assert (seen.samples.dtype.kind == "f") == bool(table), signal.name
     decoded.close()

@@ -39,9 +39,13 @@ MUTATIONS: list[tuple[str, str, str]] = [
 
 @pytest.mark.parametrize(("rule", "pattern", "replacement"), MUTATIONS)
 def test_a_violation_is_reported_by_its_rule(rule: str, pattern: str, replacement: str) -> None:
-    mutant, changes = re.subn(pattern, replacement, DATA.decode("ascii"), count=1, flags=re.MULTILINE)
+    mutant, changes = re.subn(
+        pattern, replacement, DATA.decode("ascii"), count=1, flags=re.MULTILINE
+    )
     assert changes == 1
-    assert [finding for finding in findings(mutant.encode("latin-1")) if finding.startswith(f"{rule}: ")]
+    assert [
+        finding for finding in findings(mutant.encode("latin-1")) if finding.startswith(f"{rule}: ")
+    ]
 
 
 def test_every_rule_is_shown_able_to_fail() -> None:
@@ -98,7 +102,9 @@ def test_every_message_has_the_place_and_timing_that_its_readers_expect() -> Non
 
 
 @pytest.mark.parametrize(("escs", "least", "most"), [(1, 0.05, 0.10), (8, 0.5, 0.8)])
-def test_one_esc_loads_the_bus_below_ten_percent_and_eight_fit_on_it(escs: int, least: float, most: float) -> None:
+def test_one_esc_loads_the_bus_below_ten_percent_and_eight_fit_on_it(
+    escs: int, least: float, most: float
+) -> None:
     """500 kbit/s, the worst case: 135 bits a frame, each change as often as its delay allows, events with 100 live frames a second."""
     db = parse(DATA)
     hertz = 0.0

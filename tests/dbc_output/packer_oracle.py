@@ -68,7 +68,9 @@ STATES, DEVICES = sheet.OPERATING_STATES, sheet.DEVICES
 LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
 LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
 GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay")))
-CAN_STATES = dict(enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down")))
+CAN_STATES = dict(
+    enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down"))
+)
 
 ERROR_BITS = [
     "undervoltage", "overvoltage", "overcurrent_integral_error", "overcurrent_integral_warning",
@@ -141,7 +143,9 @@ def _bec_current(esc: EscTelemetry, live: LiveData) -> Fraction | None:
     if esc.info is None:
         was_jive = esc.last_info is not None and esc.last_info.device_and_variant >> 10 == JIVEPRO
         return Fraction(live.bec_current, 1000) if live.bec_current and not was_jive else None
-    return None if esc.info.device_and_variant >> 10 == JIVEPRO else Fraction(live.bec_current, 1000)
+    return (
+        None if esc.info.device_and_variant >> 10 == JIVEPRO else Fraction(live.bec_current, 1000)
+    )
 
 
 def _max_bec_current(esc: EscTelemetry) -> Fraction | None:
@@ -157,11 +161,16 @@ def _age(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> Fraction | Non
 def _plain(fields: Sequence[sheet.Field], reader: Callable[[str, str], Reader]) -> dict[str, Known]:
     """Fields whose number is the value."""
     spelled = str.maketrans({"µ": "u", "°": "deg"})
-    return {f.name: Known(f.unit.translate(spelled), reader(f.name, f"1/{f.steps}")) for f in fields}
+    return {
+        f.name: Known(f.unit.translate(spelled), reader(f.name, f"1/{f.steps}")) for f in fields
+    }
 
 
 def _counters(
-    names: str, read: Callable[[Any], Any], of: Callable[[Callable[..., Any]], Reader], gateway: bool = False
+    names: str,
+    read: Callable[[Any], Any],
+    of: Callable[[Callable[..., Any]], Reader],
+    gateway: bool = False,
 ) -> dict[str, Known]:
     def reader(path: str) -> Reader:
         return of(lambda owner, *_: getattr(read(owner), path))
@@ -212,15 +221,39 @@ UNITS: dict[str, list[tuple[str, str, str]]] = {
     "V": [("V", "1", "0"), ("mV", "1000", "0"), ("kV", "1/1000", "0"), ("", "1", "0")],
     "A": [("A", "1", "0"), ("mA", "1000", "0"), ("kA", "1/1000", "0")],
     "W": [("W", "1", "0"), ("kW", "1/1000", "0"), ("mW", "1000", "0")],
-    "Wh": [("Wh", "1", "0"), ("kWh", "1/1000", "0"), ("J", "3600", "0"), ("kJ", "18/5", "0"), ("mWh", "1000", "0")],
+    "Wh": [
+        ("Wh", "1", "0"),
+        ("kWh", "1/1000", "0"),
+        ("J", "3600", "0"),
+        ("kJ", "18/5", "0"),
+        ("mWh", "1000", "0"),
+    ],
     "mAh": [("mAh", "1", "0"), ("Ah", "1/1000", "0"), ("As", "18/5", "0")],
-    "s": [("s", "1", "0"), ("ms", "1000", "0"), ("min", "1/60", "0"), ("h", "1/3600", "0"), ("us", "1000000", "0")],
+    "s": [
+        ("s", "1", "0"),
+        ("ms", "1000", "0"),
+        ("min", "1/60", "0"),
+        ("h", "1/3600", "0"),
+        ("us", "1000000", "0"),
+    ],
     "us": [("us", "1", "0"), ("ms", "1/1000", "0"), ("s", "1/1000000", "0")],
     "ms": [("ms", "1", "0"), ("s", "1/1000", "0"), ("us", "1000", "0")],
     "Hz": [("Hz", "1", "0"), ("kHz", "1/1000", "0")],
-    "1/min": [("1/min", "1", "0"), ("rpm", "1", "0"), ("rps", "1/60", "0"), ("1/s", "1/60", "0"), ("U/min", "1", "0")],
+    "1/min": [
+        ("1/min", "1", "0"),
+        ("rpm", "1", "0"),
+        ("rps", "1/60", "0"),
+        ("1/s", "1/60", "0"),
+        ("U/min", "1", "0"),
+    ],
     "%": [("%", "1", "0"), ("percent", "1", "0")],
-    "degC": [("degC", "1", "0"), ("C", "1", "0"), ("K", "1", "273.15"), ("degF", "9/5", "32"), ("Celsius", "1", "0")],
+    "degC": [
+        ("degC", "1", "0"),
+        ("C", "1", "0"),
+        ("K", "1", "273.15"),
+        ("degF", "9/5", "32"),
+        ("Celsius", "1", "0"),
+    ],
     "": [("", "1", "0"), ("-", "1", "0"), ("count", "1", "0"), ("1", "1", "0")],
 }
 
@@ -263,7 +296,11 @@ class Sig:
 
     @property
     def range(self) -> tuple[int, int]:
-        return (-(1 << self.length - 1), (1 << self.length - 1) - 1) if self.signed else (0, (1 << self.length) - 1)
+        return (
+            (-(1 << self.length - 1), (1 << self.length - 1) - 1)
+            if self.signed
+            else (0, (1 << self.length) - 1)
+        )
 
     def code(self, text: str) -> int | None:
         return next((number for number, name in self.texts.items() if name == text), None)
@@ -303,7 +340,11 @@ class Sig:
     def physical(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction | None:
         """The value in the signal's unit."""
         value = KNOWN[self.source].read(esc, gateway, now)
-        return None if value is None else value * Fraction(self.conversion[0]) + Fraction(self.conversion[1])
+        return (
+            None
+            if value is None
+            else value * Fraction(self.conversion[0]) + Fraction(self.conversion[1])
+        )
 
     def allowed(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> set[int]:
         """The raw values that are right: one, or two where the value lies halfway (or within a float's rounding of it)."""
@@ -311,7 +352,12 @@ class Sig:
         value = self.physical(esc, gateway, now)
         if value is None:
             return {self.not_available}
-        by_text = {n: c for n, t in known.names.items() for c, name in self.texts.items() if plain(name) == plain(t)}
+        by_text = {
+            n: c
+            for n, t in known.names.items()
+            for c, name in self.texts.items()
+            if plain(name) == plain(t)
+        }
         if by_text:
             return {by_text.get(int(value), self.error)}
         low, high = self.limits
@@ -319,7 +365,10 @@ class Sig:
             return {int(value) % (high + 1)}
         exact = (value - Fraction(self.offset)) / Fraction(self.factor)
         slack = Fraction(0) if known.exact else abs(exact) / 10**12 + Fraction(1, 10**9)
-        nearest = {math.floor(exact + Fraction(1, 2) + slack), math.ceil(exact - Fraction(1, 2) - slack)}
+        nearest = {
+            math.floor(exact + Fraction(1, 2) + slack),
+            math.ceil(exact - Fraction(1, 2) - slack),
+        }
         return {self._sent(raw, low, high) for raw in nearest}
 
     def _sent(self, raw: int, low: int, high: int) -> int:
@@ -339,9 +388,15 @@ class Sig:
         exact = (value - Fraction(self.offset)) / Fraction(self.factor)
         if math.isnan(sent) or math.isinf(sent):
             return math.isnan(sent) and self.length == 32 and abs(exact) > Fraction(3.4028234e38)
-        size = max(abs(exact), abs(Fraction(self.offset) / Fraction(self.factor)), abs(Fraction(self.conversion[1])))
+        size = max(
+            abs(exact),
+            abs(Fraction(self.offset) / Fraction(self.factor)),
+            abs(Fraction(self.conversion[1])),
+        )
         tolerance = (
-            abs(exact) * Fraction(2) ** (-24 if self.length == 32 else -52) + size / 10**14 + Fraction(1, 10**40)
+            abs(exact) * Fraction(2) ** (-24 if self.length == 32 else -52)
+            + size / 10**14
+            + Fraction(1, 10**40)
         )
         return abs(Fraction(sent) - exact) <= tolerance
 
@@ -465,7 +520,11 @@ class LayoutMaker:
         while (can_id, extended) in self.ids:
             can_id = rng.randrange(1 << 29 if extended else 1 << 11)
         self.ids.add((can_id, extended))
-        length = rng.choice((12, 16, 20, 24, 32, 48, 64)) if self.fd and rng.random() < 0.15 else rng.randint(1, 8)
+        length = (
+            rng.choice((12, 16, 20, 24, 32, 48, 64))
+            if self.fd and rng.random() < 0.15
+            else rng.randint(1, 8)
+        )
         message = Msg(f"M{self.count}", can_id, length, [], extended)
         common: set[tuple[int, int]] = set()
         wanted = rng.randint(1, 8)
@@ -488,7 +547,9 @@ class LayoutMaker:
             return self.message()
         return message
 
-    def _position(self, taken: set[tuple[int, int]], width: int, length: int) -> tuple[int, bool] | None:
+    def _position(
+        self, taken: set[tuple[int, int]], width: int, length: int
+    ) -> tuple[int, bool] | None:
         rng = self.rng
         for _ in range(12):
             start, little = rng.randrange(length * 8), rng.random() < 0.5
@@ -513,7 +574,16 @@ class LayoutMaker:
             length = 8
         if (place := self._position(taken, length, message.length)) is None:
             return
-        signal = Sig(f"S{len(message.signals)}", place[0], length, place[1], signed, is_float, mux=mux, source=source)
+        signal = Sig(
+            f"S{len(message.signals)}",
+            place[0],
+            length,
+            place[1],
+            signed,
+            is_float,
+            mux=mux,
+            source=source,
+        )
         signal.esc = rng.randrange(len(self.escs))
         unit, scale, shift = rng.choice(UNITS[known.unit])
         signal.unit, signal.conversion = unit, (scale, shift)
@@ -525,7 +595,11 @@ class LayoutMaker:
                 self._limits(signal, known)
         prefix = "" if known.gateway else self.escs[signal.esc].name
         if rng.random() < 0.3:
-            name = pascal(f"{prefix}_{source}") if rng.random() < 0.5 else spelled(rng, f"{prefix}_{source}".strip("_"))
+            name = (
+                pascal(f"{prefix}_{source}")
+                if rng.random() < 0.5
+                else spelled(rng, f"{prefix}_{source}".strip("_"))
+            )
             if unit == "%" and rng.random() < 0.5:
                 name += "Percent"
             if all(s.name != name for s in message.signals) and name[0].isalpha():
@@ -582,7 +656,9 @@ def length_is_enough(signal: Sig) -> bool:
 def random_integer(rng: random.Random, low: int, high: int) -> int:
     """Ends and neighbours of zero often, anything else else."""
     if rng.random() < 0.3:
-        return rng.choice([v for v in (low, low + 1, -1, 0, 1, 99, 100, high - 1, high) if low <= v <= high])
+        return rng.choice(
+            [v for v in (low, low + 1, -1, 0, 1, 99, 100, high - 1, high) if low <= v <= high]
+        )
     if rng.random() < 0.5:
         return rng.randint(max(low, -200), min(high, 3000))
     return rng.randint(low, high)
@@ -610,7 +686,9 @@ def random_info(rng: random.Random) -> InfoData:
     return InfoData(*values)
 
 
-def random_escs(rng: random.Random, settings: Sequence[EscSettings], now: int) -> tuple[list[EscTelemetry], int]:
+def random_escs(
+    rng: random.Random, settings: Sequence[EscSettings], now: int
+) -> tuple[list[EscTelemetry], int]:
     """ESCs that were fed random frames: some up, some stale, some with info, some never seen. And the time after that."""
     escs = [EscTelemetry(each, now) for each in settings]
     for _ in range(rng.randint(0, 3)):
@@ -629,7 +707,11 @@ def random_escs(rng: random.Random, settings: Sequence[EscSettings], now: int) -
     for esc in escs:
         esc.advance(now)
         if rng.random() < 0.3:
-            esc.energy = rng.choice((1, -1)) * rng.randrange(10**19) if rng.random() < 0.5 else rng.randrange(10**17)
+            esc.energy = (
+                rng.choice((1, -1)) * rng.randrange(10**19)
+                if rng.random() < 0.5
+                else rng.randrange(10**17)
+            )
             esc.run_time = rng.randrange(10**14)
             esc.losses = rng.randrange(10**6)
             esc.frame_rate = rng.choice((None, 0, 5, 999, 1004))
@@ -638,13 +720,22 @@ def random_escs(rng: random.Random, settings: Sequence[EscSettings], now: int) -
 
 def random_gateway(rng: random.Random, now: int) -> GatewayStatus:
     status = GatewayStatus(
-        rng.choice(list(GatewayState)), rng.choice(list(CanState)), rng.randint(0, 9), rng.randint(0, 9)
+        rng.choice(list(GatewayState)),
+        rng.choice(list(CanState)),
+        rng.randint(0, 9),
+        rng.randint(0, 9),
     )
     status.started_ns, status.sent_frames, status.replaced_frames = (
         now - rng.randrange(10**14),
         rng.randrange(10**10),
         rng.randrange(1000),
     )
-    for name in ("send_failures", "received_frames", "bus_off_count", "dropped_frames", "id_conflicts"):
+    for name in (
+        "send_failures",
+        "received_frames",
+        "bus_off_count",
+        "dropped_frames",
+        "id_conflicts",
+    ):
         setattr(status, name, rng.randrange(100000))
     return status

@@ -45,10 +45,14 @@ def layout_of(
     **more: Any,
 ) -> Layout:
     escs = [EscSettings(name, 7) for name in names]
-    return prepare(read(dbc_text(messages)), "my.dbc", escs, DbcSettings(bind or {}, **more), fd_allowed=True)[1]
+    return prepare(
+        read(dbc_text(messages)), "my.dbc", escs, DbcSettings(bind or {}, **more), fd_allowed=True
+    )[1]
 
 
-def frames_of(layout: Layout, lives: Sequence[LiveData | None], info: InfoData | None = None) -> list[CanFrame]:
+def frames_of(
+    layout: Layout, lives: Sequence[LiveData | None], info: InfoData | None = None
+) -> list[CanFrame]:
     """What every message holds when each ESC has just sent this."""
     names = [f"esc{n + 1}" for n in range(len(lives))]
     gateway = Gateway([EscSettings(name, 7) for name in names], layout, 0)
@@ -59,13 +63,21 @@ def frames_of(layout: Layout, lives: Sequence[LiveData | None], info: InfoData |
             gateway.receive_bytes(index, encode(live, WireLayout.V4), 50 * MS, 50 * MS)
     return [
         CanFrame(
-            plan.can_id, compile_pack(plan)(gateway.escs, gateway.status, 50 * MS, 0, 0).to_bytes(plan.length, "little")
+            plan.can_id,
+            compile_pack(plan)(gateway.escs, gateway.status, 50 * MS, 0, 0).to_bytes(
+                plan.length, "little"
+            ),
         )
         for plan in layout.messages
     ]
 
 
-def raw_of(signal: Sig, bind: str | float | None = None, live: LiveData = LIVE, info: InfoData | None = None) -> int:
+def raw_of(
+    signal: Sig,
+    bind: str | float | None = None,
+    live: LiveData = LIVE,
+    info: InfoData | None = None,
+) -> int:
     """The raw value that a lone signal carries."""
     signal.start, message = 8, Msg("M", 0x100, 20, [signal])
     layout = layout_of([message], None if bind is None else {"M." + signal.name: bind})
@@ -84,7 +96,9 @@ def raw_of(signal: Sig, bind: str | float | None = None, live: LiveData = LIVE, 
         ("ThrottlePercent throttle_percent Throttle Esc1ThrottlePercent", Sig("", 0, 8, signed=True, unit="%"), -7),
     ],
 )  # fmt: skip
-def test_a_name_is_found_whatever_its_case_underscores_prefix_and_percent(names: str, signal: Sig, raw: int) -> None:
+def test_a_name_is_found_whatever_its_case_underscores_prefix_and_percent(
+    names: str, signal: Sig, raw: int
+) -> None:
     for name in names.split():
         assert raw_of(replace(signal, name=name)) == raw
 
@@ -126,7 +140,9 @@ def test_a_binding_overrides_the_name() -> None:
 
 
 def test_a_binding_of_the_message_and_signal_beats_one_of_the_signal_alone() -> None:
-    messages = [Msg(name, number, 8, [Sig("U", 0, 16)]) for number, name in enumerate(("A", "B"), 1)]
+    messages = [
+        Msg(name, number, 8, [Sig("U", 0, 16)]) for number, name in enumerate(("A", "B"), 1)
+    ]
     layout = layout_of(messages, {"U": "battery_voltage", "B.U": "operating_state_raw"})
     assert [p.signals[0].source.name for p in layout.messages if p.signals[0].source] == [
         "battery_voltage",
@@ -135,7 +151,12 @@ def test_a_binding_of_the_message_and_signal_beats_one_of_the_signal_alone() -> 
 
 
 def test_a_source_of_a_named_esc_can_be_bound() -> None:
-    message = Msg("Both", 1, 8, [Sig("A", 0, 16, unit="V"), Sig("B", 16, 16, unit="V"), Sig("C", 32, 16, unit="s")])
+    message = Msg(
+        "Both",
+        1,
+        8,
+        [Sig("A", 0, 16, unit="V"), Sig("B", 16, 16, unit="V"), Sig("C", 32, 16, unit="s")],
+    )
     bind = {"A": "esc2.battery_voltage", "B": "esc1.battery_voltage", "C": "uptime"}
     layout = layout_of([message], bind, ("esc1", "esc2"))
     assert [signal.esc for signal in layout.messages[0].signals] == [1, 0, None]
@@ -143,10 +164,15 @@ def test_a_source_of_a_named_esc_can_be_bound() -> None:
 
 def test_bindings_of_a_one_esc_layout_go_to_every_esc() -> None:
     message = Msg(
-        "Power", 0x100, 8, [Sig("U", 0, 16, unit="V", factor="0.01"), Sig("Id", 16, 8), Sig("Up", 24, 32, unit="s")]
+        "Power",
+        0x100,
+        8,
+        [Sig("U", 0, 16, unit="V", factor="0.01"), Sig("Id", 16, 8), Sig("Up", 24, 32, unit="s")],
     )
     for key in ("U", "Power.U"):
-        layout = layout_of([message], {key: "battery_voltage", "Id": 7, "Up": "uptime"}, ("esc1", "esc2"))
+        layout = layout_of(
+            [message], {key: "battery_voltage", "Id": 7, "Up": "uptime"}, ("esc1", "esc2")
+        )
         frames = frames_of(layout, [LIVE, LIVE._replace(battery_voltage=1)])
         assert [frame.can_id for frame in frames] == [0x100, 0x101]
         assert [get(frame.data, 0, 16, True) for frame in frames] == [4442, 1]
@@ -172,7 +198,8 @@ def test_a_constant_is_sent_as_its_physical_value(signal: Sig, constant: float, 
 
 @pytest.mark.parametrize(("length", "code"), [(32, "<f"), (64, "<d")])
 @pytest.mark.parametrize(
-    ("constant", "factor", "stored"), [(1, "1", 1.0), (1.5, "1", 1.5), (-3, "0.5", -6.0), (0, "1", 0.0)]
+    ("constant", "factor", "stored"),
+    [(1, "1", 1.0), (1.5, "1", 1.5), (-3, "0.5", -6.0), (0, "1", 0.0)],
 )
 def test_a_constant_in_a_float_is_sent_as_a_float(
     length: int, code: str, constant: float, factor: str, stored: float
@@ -201,10 +228,23 @@ def test_a_value_halfway_between_two_steps_goes_to_the_upper_one(signal: Sig, ra
         ("44.416", "100", 4442), ("44.421", "100", 9), ("44.43", "100", 9), ("0", "0", 4442),
     ],
 )  # fmt: skip
-def test_limits_that_lie_between_two_steps_leave_out_what_is_beyond_them(minimum: str, maximum: str, raw: int) -> None:
+def test_limits_that_lie_between_two_steps_leave_out_what_is_beyond_them(
+    minimum: str, maximum: str, raw: int
+) -> None:
     texts = {9: "Error"}
     assert (
-        raw_of(Sig("BatteryVoltage", 0, 16, unit="V", factor="0.01", minimum=minimum, maximum=maximum, texts=texts))
+        raw_of(
+            Sig(
+                "BatteryVoltage",
+                0,
+                16,
+                unit="V",
+                factor="0.01",
+                minimum=minimum,
+                maximum=maximum,
+                texts=texts,
+            )
+        )
         == raw
     )
 
@@ -217,7 +257,10 @@ def state(number: int) -> LiveData:
 
 
 def test_an_enumeration_is_mapped_by_text_to_the_numbers_of_the_dbc() -> None:
-    texts = {200 + n: text for n, text in enumerate(STATES.values())} | {254: "Error", 255: "NotAvailable"}
+    texts = {200 + n: text for n, text in enumerate(STATES.values())} | {
+        254: "Error",
+        255: "NotAvailable",
+    }
     for place, number in enumerate(STATES):
         assert raw_of(Sig("OperatingState", 0, 8, texts=texts), live=state(number)) == 200 + place
     for number in set(range(256)) - set(STATES):
@@ -232,15 +275,29 @@ def test_texts_of_an_enumeration_are_compared_without_case_and_underscores() -> 
 
 
 def test_a_state_that_is_not_listed_is_sent_as_error_else_as_not_available() -> None:
-    assert raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff", 77: "Error"}), live=state(21)) == 77
-    assert raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff", 88: "NotAvailable"}), live=state(21)) == 88
+    assert (
+        raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff", 77: "Error"}), live=state(21))
+        == 77
+    )
+    assert (
+        raw_of(
+            Sig("OperatingState", 0, 8, texts={1: "MotorOff", 88: "NotAvailable"}), live=state(21)
+        )
+        == 88
+    )
     assert raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff"}), live=state(21)) == 255
 
 
 def test_without_texts_of_ours_the_number_itself_is_sent() -> None:
     assert raw_of(Sig("OperatingState", 0, 8), live=state(21)) == 21
     assert raw_of(Sig("OperatingState", 0, 8), live=state(5)) == 5
-    assert raw_of(Sig("OperatingStateRaw", 0, 8, texts={254: "Error", 255: "NotAvailable"}), live=state(99)) == 99
+    assert (
+        raw_of(
+            Sig("OperatingStateRaw", 0, 8, texts={254: "Error", 255: "NotAvailable"}),
+            live=state(99),
+        )
+        == 99
+    )
 
 
 def test_an_enumeration_in_a_float_keeps_its_table() -> None:
@@ -252,7 +309,9 @@ def test_an_enumeration_in_a_float_keeps_its_table() -> None:
     assert number != number
 
 
-@pytest.mark.parametrize("text", ["NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"])
+@pytest.mark.parametrize(
+    "text", ["NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"]
+)
 def test_not_available_is_known_by_its_usual_names(text: str) -> None:
     signal = Sig("MaxBatteryVoltage", 0, 8, texts={9: text})
     assert raw_of(signal) == 9  # no info yet
@@ -278,7 +337,9 @@ def test_error_is_known_by_its_usual_names(text: str) -> None:
         (Sig("TestEepromSize", 0, 1, start_value=0), 0),
     ],
 )
-def test_not_available_is_the_value_table_else_the_start_value_else_the_end_of_the_type(signal: Sig, raw: int) -> None:
+def test_not_available_is_the_value_table_else_the_start_value_else_the_end_of_the_type(
+    signal: Sig, raw: int
+) -> None:
     assert raw_of(signal) == raw
 
 
@@ -286,7 +347,9 @@ def test_not_available_is_the_value_table_else_the_start_value_else_the_end_of_t
 
 
 def test_one_message_can_hold_values_of_several_escs_and_of_the_gateway() -> None:
-    signals = [Sig(f"Esc{n}BatteryVoltage", 16 * n - 16, 16, unit="mV", factor="10") for n in (1, 2, 3)]
+    signals = [
+        Sig(f"Esc{n}BatteryVoltage", 16 * n - 16, 16, unit="mV", factor="10") for n in (1, 2, 3)
+    ]
     signals += [Sig("EscsOk", 48, 8), Sig("BusAlive", 56, 8)]
     layout = layout_of([Msg("All", 0x100, 8, signals)], names=("esc1", "esc2", "esc3"))
     (plan,) = layout.messages
@@ -309,7 +372,9 @@ def test_an_alive_counter_and_a_crc_are_known_by_their_names(alive: str, crc: st
 
 
 def test_alive_counter_and_crc_can_be_bound_by_name_too() -> None:
-    layout = layout_of([Msg("M", 1, 8, [Sig("C", 0, 8), Sig("Z", 8, 4)])], {"C": "crc", "M.Z": "alive_counter"})
+    layout = layout_of(
+        [Msg("M", 1, 8, [Sig("C", 0, 8), Sig("Z", 8, 4)])], {"C": "crc", "M.Z": "alive_counter"}
+    )
     assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
 
 
@@ -326,7 +391,9 @@ def theirs(data: bytes, at: int, data_id: int) -> bytes:
 
 
 @given(st.binary(min_size=2, max_size=64), st.integers(0, 0xFFFF), st.data())
-def test_the_crc_is_that_of_the_autosar_package_at_every_place(data: bytes, data_id: int, draw: st.DataObject) -> None:
+def test_the_crc_is_that_of_the_autosar_package_at_every_place(
+    data: bytes, data_id: int, draw: st.DataObject
+) -> None:
     at = draw.draw(st.integers(0, len(data) - 2))
     assert e2e.crc(data, at, data_id) == theirs(data, at, data_id)[at]
 
@@ -339,17 +406,26 @@ def test_the_crc_has_the_check_value_of_sae_j1850_with_start_and_final_xor_0() -
 
 
 @pytest.mark.parametrize(("at", "data_ids"), [(0, {}), (3, {}), (7, {"M": 0xABCD}), (1, {"M": 0})])
-def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(at: int, data_ids: dict[str, int]) -> None:
+def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
+    at: int, data_ids: dict[str, int]
+) -> None:
     counter_at = (at + 1) % 8 * 8
     value_at = 16 * ((at // 2 + 2) % 4)
-    signals = [Sig("Crc8", at * 8, 8), Sig("Alive", counter_at, 4), Sig("BatteryVoltage", value_at, 16, unit="V")]
+    signals = [
+        Sig("Crc8", at * 8, 8),
+        Sig("Alive", counter_at, 4),
+        Sig("BatteryVoltage", value_at, 16, unit="V"),
+    ]
     layout = layout_of([Msg("M", 0x12345, 8, signals, extended=True)], data_ids=data_ids)
     data_id = data_ids.get("M", 0x2345)
     gateway = Gateway([EscSettings("esc1", 7, Fraction(1))], layout, 0)
     gateway.start(0)
     for n in range(40):
         gateway.receive_bytes(
-            0, encode(LIVE._replace(battery_voltage=n * 100), WireLayout.V4), (50 + n * 10) * MS, (50 + n * 10) * MS
+            0,
+            encode(LIVE._replace(battery_voltage=n * 100), WireLayout.V4),
+            (50 + n * 10) * MS,
+            (50 + n * 10) * MS,
         )
     frames = gateway.take_frames()
     assert [get(frame.data, counter_at, 4, True) for frame in frames] == [n % 15 for n in range(41)]

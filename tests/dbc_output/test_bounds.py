@@ -14,7 +14,9 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
 SIGNAL = 'SG_ s : 0|8@1+ (1,0) [0|0] "" A\n'
-PAGED = 'BO_ 1 Msg: 8 A\n SG_ m M : 0|32@1+ (1,0) [0|0] "" A\n SG_ s m0 : 32|8@1+ (1,0) [0|0] "" A\n'
+PAGED = (
+    'BO_ 1 Msg: 8 A\n SG_ m M : 0|32@1+ (1,0) [0|0] "" A\n SG_ s m0 : 32|8@1+ (1,0) [0|0] "" A\n'
+)
 ATTRIBUTE = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\n'
 
 
@@ -30,7 +32,10 @@ def nested(depth: int, width: int) -> str:
     [
         (f"BO_ 1 Msg: 400000000 A\n {SIGNAL}", "Msg: length in bytes is 400000000, not 0 to 4095"),
         (f"BO_ 1 Msg: // 8\n 400000000 A\n {SIGNAL}", "Msg: length in bytes is 400000000"),
-        (f"BO_ 1 Msg: 8 A\n {SIGNAL.replace('|8@', '|4294967295@')}", "Msg.s: length in bits is 4294967295"),
+        (
+            f"BO_ 1 Msg: 8 A\n {SIGNAL.replace('|8@', '|4294967295@')}",
+            "Msg.s: length in bits is 4294967295",
+        ),
         (
             f"BO_ 1 Msg: 8 A\n {SIGNAL.replace(': 0|', ': 4294967295|')}",
             "Msg.s: start bit is 4294967295, not 0 to 32759",
@@ -39,10 +44,22 @@ def nested(depth: int, width: int) -> str:
         (f"BO_ 99999999999 Msg: 8 A\n {SIGNAL}", "Msg: CAN id is 99999999999"),
         (f"BO_ -1 Msg: 8 A\n {SIGNAL}", "Msg: CAN id is -1"),
         (PAGED.replace("m0", "m99999999999"), "Msg.s: multiplexer value is 99999999999"),
-        (PAGED + "SG_MUL_VAL_ 1 s m 0-3000000;", "SG_MUL_VAL_ of s: number of multiplexer values in all is 3000001"),
-        (PAGED + "SG_MUL_VAL_ 1 s m 0 93000000;", "SG_MUL_VAL_ of s: number of multiplexer values in all is 3000001"),
-        (PAGED + "SG_MUL_VAL_ 1 s m 0-40000, 0-40000;", "number of multiplexer values in all is 80002"),
-        (PAGED + "VAL_ 1 m" + ' 1 "x"' * 70_000 + ";", "Msg: number of multiplexer values in all is 70001"),
+        (
+            PAGED + "SG_MUL_VAL_ 1 s m 0-3000000;",
+            "SG_MUL_VAL_ of s: number of multiplexer values in all is 3000001",
+        ),
+        (
+            PAGED + "SG_MUL_VAL_ 1 s m 0 93000000;",
+            "SG_MUL_VAL_ of s: number of multiplexer values in all is 3000001",
+        ),
+        (
+            PAGED + "SG_MUL_VAL_ 1 s m 0-40000, 0-40000;",
+            "number of multiplexer values in all is 80002",
+        ),
+        (
+            PAGED + "VAL_ 1 m" + ' 1 "x"' * 70_000 + ";",
+            "Msg: number of multiplexer values in all is 70001",
+        ),
         (nested(5, 16), "Msg: number of multiplexer values in all is 88740"),
         (nested(20, 2), "Msg: depth of multiplexers is 9"),
         ("".join(f"BO_ {n} M{n}: 8 A\n" for n in range(10_001)), "number of messages is 10001"),
@@ -50,16 +67,27 @@ def nested(depth: int, width: int) -> str:
         ("BU_:" + " A" * 2_001, "number of nodes is 2001"),
         ("BO_ 1 Msg: 8 A\n" + " ," * 500_000, "more than 500000 words"),
         (SIGNAL.replace("(1,", f"({'1' * 5000},"), "line 5: a number of more than 400 digits"),
-        (ATTRIBUTE + 'BA_ "GenMsgCycleTime" BO_ 1 1e999999999;', "line 6: exponent is 999999999, not 0 to 4200"),
-        (ATTRIBUTE + 'BA_DEF_DEF_ "GenMsgCycleTime" " 1e999_999_999";', "line 6: exponent is 999999999"),
-        ('VAL_TABLE_ T 0 "' + "x" * 10_000 + '";\n' + "VAL_ 1 s T;\n" * 801, "value tables that VAL_ names"),
+        (
+            ATTRIBUTE + 'BA_ "GenMsgCycleTime" BO_ 1 1e999999999;',
+            "line 6: exponent is 999999999, not 0 to 4200",
+        ),
+        (
+            ATTRIBUTE + 'BA_DEF_DEF_ "GenMsgCycleTime" " 1e999_999_999";',
+            "line 6: exponent is 999999999",
+        ),
+        (
+            'VAL_TABLE_ T 0 "' + "x" * 10_000 + '";\n' + "VAL_ 1 s T;\n" * 801,
+            "value tables that VAL_ names",
+        ),
         (" " * MAX_BYTES, "is larger than 8 MB"),
     ],
 )
 def test_what_is_out_of_bounds_is_one_line_and_cantools_is_not_called(
     text: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cantools.database, "load_string", lambda *_, **__: pytest.fail("cantools was called"))
+    monkeypatch.setattr(
+        cantools.database, "load_string", lambda *_, **__: pytest.fail("cantools was called")
+    )
     with pytest.raises(UserError) as caught:
         parse_database((HEAD + text).encode(), "my.dbc")
     (line,) = caught.value.problems
@@ -92,9 +120,18 @@ def test_what_real_files_have_is_read(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (f"BO_ 1 Msg: 8 A\n {SIGNAL.replace('|8@1+', '|14280@1-')}", "s: lies outside the message's 8 bytes"),
-        (f"BO_ 1 Msg: 1785 A\n {SIGNAL.replace('|8@1+', '|14280@1-')}", "CAN FD has no frames of 1785 bytes"),
-        (PAGED + "SG_MUL_VAL_ 1 s m 0-2000;", "Msg: has 2001 multiplexer values; 1024 are supported"),
+        (
+            f"BO_ 1 Msg: 8 A\n {SIGNAL.replace('|8@1+', '|14280@1-')}",
+            "s: lies outside the message's 8 bytes",
+        ),
+        (
+            f"BO_ 1 Msg: 1785 A\n {SIGNAL.replace('|8@1+', '|14280@1-')}",
+            "CAN FD has no frames of 1785 bytes",
+        ),
+        (
+            PAGED + "SG_MUL_VAL_ 1 s m 0-2000;",
+            "Msg: has 2001 multiplexer values; 1024 are supported",
+        ),
         (
             ATTRIBUTE + f'BO_ 1 Msg: 8 A\n {SIGNAL}BA_ "GenMsgCycleTime" BO_ 1 1e4000;',
             "GenMsgCycleTime is '1000",
@@ -107,7 +144,12 @@ def test_what_real_files_have_is_read(text: str) -> None:
 )
 def test_what_only_our_messages_must_not_ask_for_is_said_shortly(text: str, said: str) -> None:
     with pytest.raises(UserError) as caught:
-        prepare(parse_database((HEAD + text).encode(), "my.dbc"), "my.dbc", [EscSettings("esc1")], DbcSettings())
+        prepare(
+            parse_database((HEAD + text).encode(), "my.dbc"),
+            "my.dbc",
+            [EscSettings("esc1")],
+            DbcSettings(),
+        )
     assert any(said in line for line in caught.value.problems)
     assert len(caught.value.problems) < 3_000
     assert all(len(line) < 500 for line in caught.value.problems)

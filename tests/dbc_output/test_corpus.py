@@ -30,7 +30,13 @@ from kontronik_can_gw.signals.units import conversion, says_nothing
 
 FOLDER = Path(opendbc.__file__).parent / "dbc"
 FILES = sorted(FOLDER.rglob("*.dbc"))
-SAMPLE = ["tesla_can", "rivian_primary_actuator", "mazda_2017", "gm_global_a_powertrain", "luxgen_s5_2015"]
+SAMPLE = [
+    "tesla_can",
+    "rivian_primary_actuator",
+    "mazda_2017",
+    "gm_global_a_powertrain",
+    "luxgen_s5_2015",
+]
 ESC = EscSettings("esc1", 7)
 LIVE = LiveData(electrical_speed=21_000, battery_voltage=1234, battery_current=56, consumed_charge=78, pwm_input=1500, throttle=42,
                 power_stage_temperature=33)  # fmt: skip
@@ -43,7 +49,12 @@ def by_unit(messages: list[Message]) -> Iterator[tuple[str, str, Signal]]:
     """Key, source and signal of what a unit gives a meaning."""
     for message in messages:
         for signal in message.signals:
-            if signal.length < 2 or signal.is_multiplexer or signal.is_float or says_nothing(signal.unit or ""):
+            if (
+                signal.length < 2
+                or signal.is_multiplexer
+                or signal.is_float
+                or says_nothing(signal.unit or "")
+            ):
                 continue
             for name in VALUES:
                 if conversion(sources(ESC)[name].unit, signal.unit or "") is not None:
@@ -51,13 +62,19 @@ def by_unit(messages: list[Message]) -> Iterator[tuple[str, str, Signal]]:
                     break
 
 
-def as_people_do(database: Database, file: str, node: str) -> tuple[Layout | None, dict[str, str], list[str]]:
+def as_people_do(
+    database: Database, file: str, node: str
+) -> tuple[Layout | None, dict[str, str], list[str]]:
     """What can be sent, how it is bound, and the refusals on the way."""
     ours = [message for message in database.messages if node in message.senders]
     bind: dict[str, str | float] = {key: name for key, name, _ in by_unit(ours)}
     settings = DbcSettings(bind, node, unbound="start_value")
     try:
-        return prepare(database, file, [ESC], settings, True)[1], {k: str(v) for k, v in bind.items()}, []
+        return (
+            prepare(database, file, [ESC], settings, True)[1],
+            {k: str(v) for k, v in bind.items()},
+            [],
+        )
     except UserError as error:
         refused = list(error.problems)
     bad = {found[1] for line in refused if (found := re.match(rf"{re.escape(file)}: (\w+)", line))}
@@ -85,7 +102,8 @@ def check_file(file: Path) -> None:
     for node in sorted({sender for message in database.messages for sender in message.senders}):
         with_nothing_said = refusals(database, name, node)
         assert all(
-            line.startswith((name, "dbc.")) and "\n" not in line and len(line) < 600 for line in with_nothing_said
+            line.startswith((name, "dbc.")) and "\n" not in line and len(line) < 600
+            for line in with_nothing_said
         )
         layout, bound, refused = as_people_do(database, name, node)
         assert all(line.startswith(name) and "no such source" not in line for line in refused)
@@ -108,20 +126,40 @@ def check_frames(database: Database, layout: Layout, bound: dict[str, str]) -> N
     for plan in layout.messages:
         # cantools' codec wants sorted signals, which our loading does not give it
         of = database.get_message_by_name(plan.name)
-        message = Message(of.frame_id, of.name, of.length, of.signals, is_extended_frame=plan.extended, strict=False)
+        message = Message(
+            of.frame_id,
+            of.name,
+            of.length,
+            of.signals,
+            is_extended_frame=plan.extended,
+            strict=False,
+        )
         for page in plan.pages:
             bits = compile_pack(plan)(gateway.escs, gateway.status, 50 * MS, 0, page or 0)
             data = bits.to_bytes(plan.length, "little")
-            read: dict[str, Any] = dict(message.decode_simple(data, decode_choices=False, scaling=False))
+            read: dict[str, Any] = dict(
+                message.decode_simple(data, decode_choices=False, scaling=False)
+            )
             for signal in (signal for signal in message.signals if signal.name in read):
                 raw, source = read[signal.name], bound.get(f"{plan.name}.{signal.name}")
-                (planned,) = (p for p in plan.signals if p.name == signal.name and p.page in (None, page))
+                (planned,) = (
+                    p for p in plan.signals if p.name == signal.name and p.page in (None, page)
+                )
                 if source is None:
                     start = signal.raw_initial
-                    assert not planned.unbound or raw == (start or 0) or planned.not_available == planned.constant
+                    assert (
+                        not planned.unbound
+                        or raw == (start or 0)
+                        or planned.not_available == planned.constant
+                    )
                     continue
-                factor, offset = conversion(sources(ESC)[source].unit, signal.unit or "") or (Fraction(0), Fraction(0))
-                steps = (float(VALUES[source] * factor + offset) - float(signal.offset)) / float(signal.scale)
+                factor, offset = conversion(sources(ESC)[source].unit, signal.unit or "") or (
+                    Fraction(0),
+                    Fraction(0),
+                )
+                steps = (float(VALUES[source] * factor + offset) - float(signal.offset)) / float(
+                    signal.scale
+                )
                 if planned.low + 1 < steps < planned.high - 1:
                     assert abs(float(raw) - steps) <= 0.5 + 1e-6, f"{plan.name}.{signal.name}"
                 elif not planned.low - 1 <= steps <= planned.high + 1:
@@ -153,7 +191,9 @@ def test_a_diesel_of_vw_can_be_worked_with_by_the_keys_of_the_configuration() ->
     assert [plan.name for plan in layout.messages] == ["Motor_12", "Motor_14"]
     gateway = Gateway([ESC], layout, 0)
     gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), 50 * MS, 50 * MS)
-    data = compile_pack(layout.messages[0])(gateway.escs, gateway.status, 50 * MS, 9, 0).to_bytes(8, "little")
+    data = compile_pack(layout.messages[0])(gateway.escs, gateway.status, 50 * MS, 9, 0).to_bytes(
+        8, "little"
+    )
     read = database.get_message_by_name("Motor_12").decode_simple(data, decode_choices=False)
     assert (read["MO_Drehzahl_01"], read["Motor_12_BZ"], read["MO_Mom_neg_verfuegbar"], read["Motor_12_CRC"]) == (
         3000, 9, 1, 0,

@@ -27,22 +27,24 @@ from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, Role, SendType
 from kontronik_can_gw.signals.units import conversion
 
-HEAD = (
-    'VERSION ""\nNS_ :\n\tNS_DESC_\n\tVAL_\n\tVAL_TABLE_\n\tBA_DEF_\n\tSIG_VALTYPE_\n\nBS_:\n\nBU_: Gateway Other\n\n'
-)
+HEAD = 'VERSION ""\nNS_ :\n\tNS_DESC_\n\tVAL_\n\tVAL_TABLE_\n\tBA_DEF_\n\tSIG_VALTYPE_\n\nBS_:\n\nBU_: Gateway Other\n\n'
 MESSAGE = "BO_ 256 Power: 8 Gateway\n"
 STATE = f'{MESSAGE} SG_ OperatingState : 0|8@1+ (1,0) [0|0] "" Other\n'
 
 
 def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> Layout:
     database = parse_database((HEAD + text).encode(), "my.dbc")
-    return prepare(database, "my.dbc", [EscSettings(name, 7) for name in names], DbcSettings(**settings), True)[1]
+    return prepare(
+        database, "my.dbc", [EscSettings(name, 7) for name in names], DbcSettings(**settings), True
+    )[1]
 
 
 def refused(text: str, **settings: Any) -> list[str]:
     with pytest.raises(UserError) as caught:
         compiled(text, **settings)
-    assert all(line.startswith(("my.dbc: ", "dbc.")) and "\n" not in line for line in caught.value.problems)
+    assert all(
+        line.startswith(("my.dbc: ", "dbc.")) and "\n" not in line for line in caught.value.problems
+    )
     return list(caught.value.problems)
 
 
@@ -56,7 +58,10 @@ def refused(text: str, **settings: Any) -> list[str]:
             'CM_ BO_ 256 "first\nVAL_ 256 OperatingState States ;\nBA_ ";',
             "first\nVAL_ 256 OperatingState States ;\nBA_ ",
         ),
-        ('CM_ BO_ 256 "one; two\nVAL_TABLE_ States 1 fake ;";', "one; two\nVAL_TABLE_ States 1 fake ;"),
+        (
+            'CM_ BO_ 256 "one; two\nVAL_TABLE_ States 1 fake ;";',
+            "one; two\nVAL_TABLE_ States 1 fake ;",
+        ),
     ],
 )
 def test_comments_and_value_texts_are_not_touched(comment: str, read: str) -> None:
@@ -73,10 +78,16 @@ def test_an_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> Non
 
 
 @pytest.mark.parametrize(
-    "table", ['VAL_TABLE_ States 21 "Forward" 12 "MotorOff" ;', 'VAL_TABLE_ States\n21 "Forward"\n12 "MotorOff";']
+    "table",
+    [
+        'VAL_TABLE_ States 21 "Forward" 12 "MotorOff" ;',
+        'VAL_TABLE_ States\n21 "Forward"\n12 "MotorOff";',
+    ],
 )
 def test_a_value_table_may_be_named_although_ns_lists_its_keyword(table: str) -> None:
-    (plan,) = compiled(f"VAL_TABLE_ Empty ;\n{table}\n{STATE}VAL_ 256 OperatingState States ;\n").messages
+    (plan,) = compiled(
+        f"VAL_TABLE_ Empty ;\n{table}\n{STATE}VAL_ 256 OperatingState States ;\n"
+    ).messages
     assert plan.signals[0].numbers == {21: 21, 12: 12}
 
 
@@ -91,7 +102,9 @@ def test_a_value_table_may_be_named_although_ns_lists_its_keyword(table: str) ->
         ('BA_DEF_DEF_ "Colour" 1;', 'BA_DEF_DEF_ "Colour"'),
     ],
 )
-def test_an_entry_for_what_is_not_in_the_file_is_ignored_with_a_warning(entry: str, words: str) -> None:
+def test_an_entry_for_what_is_not_in_the_file_is_ignored_with_a_warning(
+    entry: str, words: str
+) -> None:
     warnings: list[str] = []
     text = f'{HEAD}{STATE}CM_ SG_ 256 OperatingState "{entry.replace(chr(34), "")}";\n{entry}\n'
     database = parse_database(text.encode(), "my.dbc", warnings)
@@ -155,8 +168,13 @@ def spelled() -> list[tuple[str, str, str, str]]:
 
 
 @pytest.mark.parametrize(("source", "value", "meant", "text"), spelled())
-def test_a_unit_is_known_however_it_is_spelled(source: str, value: str, meant: str, text: str) -> None:
-    factor, offset = conversion(sources(EscSettings())[source].unit, text) or (Fraction(0), Fraction(0))
+def test_a_unit_is_known_however_it_is_spelled(
+    source: str, value: str, meant: str, text: str
+) -> None:
+    factor, offset = conversion(sources(EscSettings())[source].unit, text) or (
+        Fraction(0),
+        Fraction(0),
+    )
     assert float(Fraction(value) * factor + offset) == pytest.approx(float(meant), rel=1e-11)
 
 
@@ -171,9 +189,13 @@ def test_a_unit_is_known_however_it_is_spelled(source: str, value: str, meant: s
         ("battery_power", "MW", "W, mW, kW, hp, PS"),
     ],
 )
-def test_a_unit_of_another_quantity_or_of_two_meanings_is_refused(source: str, texts: str, possible: str) -> None:
+def test_a_unit_of_another_quantity_or_of_two_meanings_is_refused(
+    source: str, texts: str, possible: str
+) -> None:
     for text in texts.split():
-        (line,) = refused(f'{MESSAGE} SG_ X : 0|16@1+ (1,0) [0|0] "{text}" Other\n', bind={"X": source})
+        (line,) = refused(
+            f'{MESSAGE} SG_ X : 0|16@1+ (1,0) [0|0] "{text}" Other\n', bind={"X": source}
+        )
         assert f"'{text}'" in line and f"Possible: {possible};" in line and "dbc.units" in line
 
 
@@ -182,7 +204,9 @@ def test_dbc_units_says_what_a_text_means_whatever_it_means_elsewhere() -> None:
     (plan,) = compiled(text, units={"Zaehler": "mV", "A": "mV"}).messages
     assert [(s.unit, float(s.slope)) for s in plan.signals] == [("mV", 1000), ("mV", 1)]
     lines = refused(text, units={"Zaehler": "mV", "A": "mV", "Zahler": "V"})
-    assert lines == ["dbc.units.Zahler: no signal of Gateway has this unit in my.dbc. Did you mean 'Zaehler'?"]
+    assert lines == [
+        "dbc.units.Zahler: no signal of Gateway has this unit in my.dbc. Did you mean 'Zaehler'?"
+    ]
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
@@ -217,14 +241,20 @@ ECU = (
         ([], ["Motor_11", "Motor_12", "Brake_1", "Motor_20", "Motor_21"]),
     ],
 )
-def test_messages_are_chosen_by_patterns_of_their_names(patterns: list[str], chosen: list[str]) -> None:
+def test_messages_are_chosen_by_patterns_of_their_names(
+    patterns: list[str], chosen: list[str]
+) -> None:
     layout = compiled(ECU, node="Gateway", messages=patterns, unbound="start_value")
     assert [plan.name for plan in layout.messages] == chosen
 
 
 @pytest.mark.parametrize(
     ("pattern", "words"),
-    [("Motr_11", "Did you mean Motor_11?"), ("Motor_9*", "Motor_90 is sent by Other."), ("qqq*", "in my.dbc.")],
+    [
+        ("Motr_11", "Did you mean Motor_11?"),
+        ("Motor_9*", "Motor_90 is sent by Other."),
+        ("qqq*", "in my.dbc."),
+    ],
 )
 def test_a_pattern_that_names_no_message_of_ours_is_refused(pattern: str, words: str) -> None:
     (line,) = refused(ECU, node="Gateway", messages=["Motor_11", pattern], unbound="start_value")
@@ -244,20 +274,36 @@ def test_only_what_is_chosen_has_to_be_right_and_many_unbound_signals_come_with_
 
 
 def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() -> None:
-    layout = compiled(ECU, node="Gateway", messages=["Motor_2?"], unbound="start_value", bind={"Gear": 5})
+    layout = compiled(
+        ECU, node="Gateway", messages=["Motor_2?"], unbound="start_value", bind={"Gear": 5}
+    )
     gateway = Gateway([EscSettings("esc1", 7)], layout, 0)
-    gateway.receive_bytes(0, encode(LiveData(battery_voltage=4442), WireLayout.V4), 50 * MS, 50 * MS)
+    gateway.receive_bytes(
+        0, encode(LiveData(battery_voltage=4442), WireLayout.V4), 50 * MS, 50 * MS
+    )
     database = parse_database((HEAD + ECU).encode(), "my.dbc")
     read: dict[str, Any] = {}
     for plan in layout.messages:
         bits = compile_pack(plan)(gateway.escs, gateway.status, 50 * MS, 0, 0)
         data = bits.to_bytes(8, "little")
-        read |= dict(database.get_message_by_frame_id(plan.can_id).decode_simple(data, decode_choices=False))
-    assert read == {"BatteryVoltage": 44.42, "Torque": -512.5, "Warm": 15, "Gear": 5, "Ratio": 1.5, "Cool": -2}
+        read |= dict(
+            database.get_message_by_frame_id(plan.can_id).decode_simple(data, decode_choices=False)
+        )
+    assert read == {
+        "BatteryVoltage": 44.42,
+        "Torque": -512.5,
+        "Warm": 15,
+        "Gear": 5,
+        "Ratio": 1.5,
+        "Cool": -2,
+    }
     unbound = [signal.name for plan in layout.messages for signal in plan.signals if signal.unbound]
     assert unbound == ["Torque", "Warm", "Ratio", "Cool"]
     said = "\n".join(check.unbound(layout))
-    assert "Motor_20: Torque = -512.5 Nm, Warm = 15" in said and "Motor_21: Ratio = 1.5, Cool = -2" in said
+    assert (
+        "Motor_20: Torque = -512.5 Nm, Warm = 15" in said
+        and "Motor_21: Ratio = 1.5, Cool = -2" in said
+    )
     assert [line for line in layout.warnings if "sent once" in line] == [
         "my.dbc: sent once at the start, without a cycle and a value that changes: Motor_21"
     ]
@@ -272,7 +318,11 @@ def test_a_start_value_that_the_signal_cannot_hold_is_refused(value: str) -> Non
 
 def test_a_wrong_binding_is_refused_whatever_becomes_of_signals_without_one() -> None:
     (line,) = refused(
-        ECU, node="Gateway", messages=["Motor_11"], unbound="start_value", bind={"Motor_11X": "batery_voltage"}
+        ECU,
+        node="Gateway",
+        messages=["Motor_11"],
+        unbound="start_value",
+        bind={"Motor_11X": "batery_voltage"},
     )
     assert "bound by dbc.bind to 'batery_voltage'" in line and "battery_voltage" in line
 
@@ -302,12 +352,15 @@ def sent(text: str, cycle: int = 20, **settings: Any) -> Layout:
 
 
 @pytest.mark.parametrize(
-    ("meant", "text"), [(meant, text) for meant, texts in SEND_TYPES.items() for text in texts.split()]
+    ("meant", "text"),
+    [(meant, text) for meant, texts in SEND_TYPES.items() for text in texts.split()],
 )
 def test_a_send_type_is_known_by_its_names_in_use(meant: str, text: str) -> None:
     layout = sent(text)
     assert layout.messages[0].send_type == (NAMES[meant] if meant else SendType.CYCLIC)
-    assert ("sent all the time" in "".join(layout.warnings)) == ("active" in text.lower() or text == "EnabledPeriodic")
+    assert ("sent all the time" in "".join(layout.warnings)) == (
+        "active" in text.lower() or text == "EnabledPeriodic"
+    )
     if not meant:
         assert sent(text, 0).messages[0].send_type == SendType.EVENT
 
@@ -316,10 +369,18 @@ def test_a_send_type_is_known_by_its_names_in_use(meant: str, text: str) -> None
 def test_another_send_type_is_refused_unless_dbc_send_type_says_what_it_means(text: str) -> None:
     (line,) = refused_type(text)
     assert f"GenMsgSendType {text!r} is not known" in line and f"dbc.send_type.{text!r}" in line
-    assert sent(text, send_types={text: "CyclicAndEvent"}).messages[0].send_type == SendType.CYCLIC | SendType.EVENT
-    assert sent("OnChange", send_types={"OnChange": "Event"}).messages[0].send_type == SendType.EVENT
+    assert (
+        sent(text, send_types={text: "CyclicAndEvent"}).messages[0].send_type
+        == SendType.CYCLIC | SendType.EVENT
+    )
+    assert (
+        sent("OnChange", send_types={"OnChange": "Event"}).messages[0].send_type == SendType.EVENT
+    )
     (line,) = refused_type("Event", send_types={"Evnt": "Cyclic"})
-    assert line == "dbc.send_type.Evnt: no message of Gateway has this GenMsgSendType in my.dbc. Did you mean 'Event'?"
+    assert (
+        line
+        == "dbc.send_type.Evnt: no message of Gateway has this GenMsgSendType in my.dbc. Did you mean 'Event'?"
+    )
 
 
 def refused_type(text: str, **settings: Any) -> Sequence[str]:
@@ -349,8 +410,12 @@ def test_a_counter_of_frames_is_known_by_its_name(name: str) -> None:
     assert role(name, bind={"Beside": 0, name: 1}) is Role.CONSTANT
 
 
-@pytest.mark.parametrize("name", ["ErrorCounter", "AliveCnt2", "FaultCnt", "COUNTER_PEDAL", "Counter1", "Alive_1"])
-def test_what_may_count_something_else_is_refused_with_the_way_to_say_that_it_counts_frames(name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["ErrorCounter", "AliveCnt2", "FaultCnt", "COUNTER_PEDAL", "Counter1", "Alive_1"]
+)
+def test_what_may_count_something_else_is_refused_with_the_way_to_say_that_it_counts_frames(
+    name: str,
+) -> None:
     (line,) = refused(f'{MESSAGE} SG_ {name} : 0|8@1+ (1,0) [0|0] "" Other\n')
     assert "no such source" in line and 'bind = "alive"' in line
     assert role(name, bind={"Beside": 0, name: "alive"}) is Role.ALIVE
@@ -361,13 +426,21 @@ def test_a_word_that_only_ends_alike_is_neither(name: str) -> None:
     assert counters.kind(name) is None
 
 
-@pytest.mark.parametrize("crc", ["CHKSM", "CRC8", "Checksum", "Motor_11_CRC", "Chksum", "EPS_CKS", "Mdps_CS"])
+@pytest.mark.parametrize(
+    "crc", ["CHKSM", "CRC8", "Checksum", "Motor_11_CRC", "Chksum", "EPS_CKS", "Mdps_CS"]
+)
 @pytest.mark.parametrize("counter", ["COUNTER", "Motor_11_BZ", "AliveCnt", "Nothing"])
-def test_a_checksum_of_unknown_making_is_refused_until_somebody_says_what_it_is(crc: str, counter: str) -> None:
+def test_a_checksum_of_unknown_making_is_refused_until_somebody_says_what_it_is(
+    crc: str, counter: str
+) -> None:
     text = f'{MESSAGE} SG_ {crc} : 0|8@1+ (1,0) [0|0] "" Other\n SG_ {counter} : 8|4@1+ (1,0) [0|0] "" Other\n'
     for settings in ({}, {"unbound": "start_value"}):
         (line,) = refused(text, bind={"Nothing": 0} if counter == "Nothing" else {}, **settings)
-        assert f"Power.{crc}: " in line and "dbc.e2e_data_ids.Power = 0x100" in line and "dbc.messages" in line
+        assert (
+            f"Power.{crc}: " in line
+            and "dbc.e2e_data_ids.Power = 0x100" in line
+            and "dbc.messages" in line
+        )
     bind: dict[str, str | float] = {counter: "alive"}
     for said in ({"data_ids": {"Power": 7}, "bind": bind}, {"bind": {crc: "crc"} | bind}):
         layout = compiled(text, **said)
@@ -378,7 +451,9 @@ def test_a_checksum_of_unknown_making_is_refused_until_somebody_says_what_it_is(
 
 def test_what_0_5_0_sent_as_e2e_profile_1_by_its_names_goes_on_with_a_warning() -> None:
     text = f'{MESSAGE} SG_ Crc : 0|8@1+ (1,0) [0|0] "" Other\n SG_ Alive : 8|4@1+ (1,0) [0|0] "" Other\n'
-    assert any("AUTOSAR E2E profile 1" in line and "= 0x100" in line for line in compiled(text).warnings)
+    assert any(
+        "AUTOSAR E2E profile 1" in line and "= 0x100" in line for line in compiled(text).warnings
+    )
     assert not any("E2E" in line for line in compiled(text, data_ids={"Power": 0x100}).warnings)
     other = compiled(
         text.replace("Alive", "MsgNo"), bind={"MsgNo": "alive"}
@@ -418,9 +493,13 @@ def test_a_flag_without_a_code_is_0_without_telemetry_or_what_is_asked_for(
     pack, gateway = compile_pack(plan), Gateway([EscSettings("esc1", 7)], Layout("", "", ()), 0)
     assert pack(gateway.escs, gateway.status, 0, 0, 0) == raw
     for word in (0, 1):
-        gateway.receive_bytes(0, encode(LiveData(operating_errors=word), WireLayout.V4), 50 * MS, 50 * MS)
+        gateway.receive_bytes(
+            0, encode(LiveData(operating_errors=word), WireLayout.V4), 50 * MS, 50 * MS
+        )
         value = (word - plan.signals[0].offset) / plan.signals[0].factor
-        assert pack(gateway.escs, gateway.status, 50 * MS, 0, 0) == value % (1 << plan.signals[0].length)
+        assert pack(gateway.escs, gateway.status, 50 * MS, 0, 0) == value % (
+            1 << plan.signals[0].length
+        )
 
 
 def test_a_bit_that_cannot_hold_both_values_of_a_flag_is_refused() -> None:
@@ -435,9 +514,20 @@ def test_a_bit_that_cannot_hold_both_values_of_a_flag_is_refused() -> None:
         (' SG_ BatteryVoltage : 8|16@1+ (0.01,0) [0|0] "V" Other\n', None),
         (' SG_ BatteryVoltage : 8|16@1+ (0.01,0) [0|100] "V" Other\n', "BatteryVoltage"),
         (' SG_ LinkState : 8|8@1+ (1,0) [0|0] "" Other\n', "LinkState"),
-        (' SG_ Device : 8|8@1+ (1,0) [0|5] "" Other\n', None),  # of the information, which outlives the link
-        (' SG_ BecCurrent : 8|16@1+ (0.01,0) [0|100] "A" Other\n', None),  # not available on a JIVEPro at any time
-        (' SG_ Throttle : 32|32@1- (1,0) [0|0] "%" Other\nSIG_VALTYPE_ 256 Throttle : 1;\n', "Throttle"),
+        # of the information, which outlives the link
+        (
+            ' SG_ Device : 8|8@1+ (1,0) [0|5] "" Other\n',
+            None,
+        ),
+        # not available on a JIVEPro at any time
+        (
+            ' SG_ BecCurrent : 8|16@1+ (0.01,0) [0|100] "A" Other\n',
+            None,
+        ),
+        (
+            ' SG_ Throttle : 32|32@1- (1,0) [0|0] "%" Other\nSIG_VALTYPE_ 256 Throttle : 1;\n',
+            "Throttle",
+        ),
         (' SG_ MessageAlive : 8|8@1+ (1,0) [0|0] "" Other\n', None),
     ],
 )
@@ -449,12 +539,16 @@ def test_check_names_the_signal_that_reports_the_loss_and_warns_where_there_is_n
     assert ("reports the loss" in row) == (reporter is not None)
     assert reporter is None or f"{reporter} reports the loss" in row
     warned = unreported(layout, silent=False)
-    assert [line for line in warned if 'on_loss = "silent"' in line and "Undervoltage" in line] == warned
+    assert [
+        line for line in warned if 'on_loss = "silent"' in line and "Undervoltage" in line
+    ] == warned
     assert len(warned) == (reporter is None)
     assert not unreported(layout, silent=True)
 
 
-def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_that_advice() -> None:
+def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_that_advice() -> (
+    None
+):
     layout = compiled(f'{FLAG} SG_ CrcErrors : 8|8@1+ (1,0) [0|0] "" Other\n')
     for silent in (False, True):
         (line,) = unreported(layout, silent)
@@ -463,9 +557,12 @@ def test_a_message_that_goes_on_although_on_loss_is_silent_is_warned_of_without_
 
 def test_of_two_escs_each_flag_needs_a_signal_of_its_own_esc() -> None:
     text = MESSAGE + "".join(
-        f' SG_ {n}Undervoltage : {at}|1@1+ (1,0) [0|1] "" Other\n' for at, n in enumerate(("Left", "Right"))
+        f' SG_ {n}Undervoltage : {at}|1@1+ (1,0) [0|1] "" Other\n'
+        for at, n in enumerate(("Left", "Right"))
     )
-    layout = compiled(f'{text} SG_ LeftLinkState : 8|8@1+ (1,0) [0|0] "" Other\n', names=("left", "right"))
+    layout = compiled(
+        f'{text} SG_ LeftLinkState : 8|8@1+ (1,0) [0|0] "" Other\n', names=("left", "right")
+    )
     (line,) = unreported(layout, silent=False)
     assert "RightUndervoltage" in line and "LeftUndervoltage" not in line
 
@@ -479,9 +576,15 @@ def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
         "flags_on_loss": 1,
     }
     config = parse(
-        {"dbc": {"bind": {"A.B": 1}, "e2e_data_ids": {"M": 7}, "base_id": 5} | keys, "esc": [{"port": "-"}]}, "a.toml"
+        {
+            "dbc": {"bind": {"A.B": 1}, "e2e_data_ids": {"M": 7}, "base_id": 5} | keys,
+            "esc": [{"port": "-"}],
+        },
+        "a.toml",
     )
-    setup = CaptureSetup(tuple(config.escs), ("-",), ("my.dbc", b""), config.dbc_settings, False, False, None)
+    setup = CaptureSetup(
+        tuple(config.escs), ("-",), ("my.dbc", b""), config.dbc_settings, False, False, None
+    )
     header = json.loads(json.dumps(setup.header()))
     assert CaptureSetup.of(header).dbc_settings == config.dbc_settings
     for later in ("units", "send_types", "messages", "unbound", "flags_on_loss"):

@@ -54,11 +54,17 @@ def test_the_file_for_eight_escs_keeps_the_rules() -> None:
     db = parse(text)
     for line in findings(text):
         assert line.startswith("enums_are_closed: ") or line.endswith("is longer than 28"), line
-    assert all(len(name) <= 32 for name in [m.name for m in db.messages] + [s.name for s in db.signals])
+    assert all(
+        len(name) <= 32 for name in [m.name for m in db.messages] + [s.name for s in db.signals]
+    )
     ids = [message.id for message in db.messages]
     assert len(set(ids)) == len(ids)
     for signal in db.signals:
-        named = {n: t for n, t in db.tables.get(signal.key, {}).items() if t not in ("Error", "NotAvailable")}
+        named = {
+            n: t
+            for n, t in db.tables.get(signal.key, {}).items()
+            if t not in ("Error", "NotAvailable")
+        }
         assert named == ENUMS.get(re.sub("^Esc[1-8]", "", signal.name), {}), signal.name
 
 
@@ -80,7 +86,11 @@ def test_every_property_of_each_of_eight_escs_is_that_of_the_one() -> None:
 
 def attributes(thing: Any) -> dict[str, Any]:
     dbc = getattr(thing, "dbc", None)
-    return {name: a.value for name, a in dbc.attributes.items() if "LongSymbol" not in name} if dbc else {}
+    return (
+        {name: a.value for name, a in dbc.attributes.items() if "LongSymbol" not in name}
+        if dbc
+        else {}
+    )
 
 
 def facts_of_signal(signal: Signal, prefix: str) -> dict[str, Any]:
@@ -88,25 +98,48 @@ def facts_of_signal(signal: Signal, prefix: str) -> dict[str, Any]:
     selector = signal.multiplexer_signal
     return {
         "name": signal.name.removeprefix(prefix),
-        "place": (signal.start, signal.length, signal.byte_order, signal.is_signed, signal.is_float),
+        "place": (
+            signal.start,
+            signal.length,
+            signal.byte_order,
+            signal.is_signed,
+            signal.is_float,
+        ),
         "scale": (signal.scale, signal.offset, signal.minimum, signal.maximum, signal.unit),
         "texts": {number: str(text) for number, text in (signal.choices or {}).items()},
         "comment": signal.comment,
         "receivers": signal.receivers,
-        "mux": (signal.is_multiplexer, signal.multiplexer_ids, selector and selector.removeprefix(prefix)),
+        "mux": (
+            signal.is_multiplexer,
+            signal.multiplexer_ids,
+            selector and selector.removeprefix(prefix),
+        ),
         "attributes": attributes(signal),
         "start": signal.raw_initial,
     }
 
 
 def facts_of_message(message: Message, prefix: str) -> dict[str, Any]:
-    assert all(name.startswith(prefix) for group in message.signal_groups or [] for name in group.signal_names)
+    assert all(
+        name.startswith(prefix)
+        for group in message.signal_groups or []
+        for name in group.signal_names
+    )
     return {
-        "form": (message.is_extended_frame, message.is_fd, message.length, message.cycle_time, message.send_type),
+        "form": (
+            message.is_extended_frame,
+            message.is_fd,
+            message.length,
+            message.cycle_time,
+            message.send_type,
+        ),
         "comment": message.comment,
         "senders": message.senders,
         "attributes": attributes(message),
-        "signals": [facts_of_signal(s, prefix) for s in sorted(message.signals, key=lambda s: (s.start, s.name))],
+        "signals": [
+            facts_of_signal(s, prefix)
+            for s in sorted(message.signals, key=lambda s: (s.start, s.name))
+        ],
         "groups": [
             (g.name, g.repetitions, [name.removeprefix(prefix) for name in g.signal_names])
             for g in message.signal_groups or []
@@ -117,19 +150,34 @@ def facts_of_message(message: Message, prefix: str) -> dict[str, Any]:
 def facts_of_database(database: Database) -> dict[str, Any]:
     dbc = database.dbc
     assert dbc is not None
-    definitions = [*dbc.attribute_definitions.values(), *dbc.relation_attribute_definitions.values()]
+    definitions = [
+        *dbc.attribute_definitions.values(),
+        *dbc.relation_attribute_definitions.values(),
+    ]
     return {
         "version": database.version,
         "nodes": [(node.name, node.comment, attributes(node)) for node in database.nodes],
         "comments": [bus.comment for bus in database.buses],
         "attributes": attributes(database),
         "definitions": {
-            d.name: (d.type_name, d.kind, d.default_value, d.minimum, d.maximum, d.choices) for d in definitions
+            d.name: (d.type_name, d.kind, d.default_value, d.minimum, d.maximum, d.choices)
+            for d in definitions
         },
-        "tables": {name: {n: str(t) for n, t in table.items()} for name, table in dbc.value_tables.items()},
+        "tables": {
+            name: {n: str(t) for n, t in table.items()} for name, table in dbc.value_tables.items()
+        },
         "environment": [
             (
-                (v.name, v.env_type, v.minimum, v.maximum, v.unit, v.initial_value, v.env_id, v.access_type),
+                (
+                    v.name,
+                    v.env_type,
+                    v.minimum,
+                    v.maximum,
+                    v.unit,
+                    v.initial_value,
+                    v.env_id,
+                    v.access_type,
+                ),
                 (v.access_nodes, v.data_size, v.comment, attributes(v)),
             )
             for v in dbc.environment_variables.values()
@@ -146,9 +194,15 @@ def relations(database: Database) -> set[tuple[Any, ...]]:
     found: set[tuple[Any, ...]] = set()
     for number, by_signal in dbc.relation_attributes.node_signal_relations.items():
         for signal, by_node in by_signal.items():
-            found |= {(number, signal, n, a.name, a.value) for n, each in by_node.items() for a in each.values()}
+            found |= {
+                (number, signal, n, a.name, a.value)
+                for n, each in by_node.items()
+                for a in each.values()
+            }
     for number, by_node in dbc.relation_attributes.node_message_relations.items():
-        found |= {(number, n, a.name, a.value) for n, each in by_node.items() for a in each.values()}
+        found |= {
+            (number, n, a.name, a.value) for n, each in by_node.items() for a in each.values()
+        }
     return found
 
 
@@ -170,7 +224,10 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
     assert facts_of_database(after) == facts_of_database(before)
     for prefix in ("Left", "Right"):
         for old, stem in (("EscPower", "Power"), ("Flow", "Flow")):
-            copy, original = after.get_message_by_name(prefix + stem), before.get_message_by_name(old)
+            copy, original = (
+                after.get_message_by_name(prefix + stem),
+                before.get_message_by_name(old),
+            )
             assert facts_of_message(copy, prefix) == facts_of_message(original, "")
     for name in ("GatewayHealth", "Foreign"):
         copy, original = after.get_message_by_name(name), before.get_message_by_name(name)
@@ -193,9 +250,17 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
 
 def test_the_database_that_is_multiplied_is_left_as_it_was() -> None:
     database = read(RICH)
-    before = (facts_of_database(database), [facts_of_message(m, "") for m in database.messages], relations(database))
+    before = (
+        facts_of_database(database),
+        [facts_of_message(m, "") for m in database.messages],
+        relations(database),
+    )
     expand.expand(database, "Gw", PAIR, "my.dbc", None, 0x300)
-    after = (facts_of_database(database), [facts_of_message(m, "") for m in database.messages], relations(database))
+    after = (
+        facts_of_database(database),
+        [facts_of_message(m, "") for m in database.messages],
+        relations(database),
+    )
     assert after == before
 
 
@@ -206,7 +271,11 @@ def test_extended_multiplexing_of_one_level_comes_through() -> None:
                 "EscX",
                 5,
                 8,
-                [Sig("Page", 0, 4, mux="M"), Sig("BatteryVoltage", 8, 16, mux="m0"), Sig("Timing", 32, 8, mux="m2")],
+                [
+                    Sig("Page", 0, 4, mux="M"),
+                    Sig("BatteryVoltage", 8, 16, mux="m0"),
+                    Sig("Timing", 32, 8, mux="m2"),
+                ],
             )
         ]
     )
@@ -222,13 +291,22 @@ def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_the
         'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_DEF_DEF_ "SystemSignalLongSymbol" "";\n'
         'BA_ "SystemSignalLongSymbol" SG_ 5 U "BatteryVoltage";'
     )
-    after, text = multiplied(dbc_text([Msg("EscX", 5, 8, [Sig("U", 0, 16, unit="V")])], more), PAIR, "Gateway")
-    assert [s.name for m in after.messages for s in m.signals] == ["LeftBatteryVoltage", "RightBatteryVoltage"]
+    after, text = multiplied(
+        dbc_text([Msg("EscX", 5, 8, [Sig("U", 0, 16, unit="V")])], more), PAIR, "Gateway"
+    )
+    assert [s.name for m in after.messages for s in m.signals] == [
+        "LeftBatteryVoltage",
+        "RightBatteryVoltage",
+    ]
     assert 'BA_ "SystemSignalLongSymbol"' not in text
 
 
 @settings(max_examples=80, deadline=None)
-@given(st.text(st.sampled_from('aB1 \n";:,_()[]|é.'), max_size=40).filter(lambda text: not text.endswith("\\")))
+@given(
+    st.text(st.sampled_from('aB1 \n";:,_()[]|é.'), max_size=40).filter(
+        lambda text: not text.endswith("\\")
+    )
+)
 def test_any_comment_and_any_text_come_through(words: str) -> None:
     escaped = words.replace('"', '\\"')
     text = dbc_text(
@@ -247,8 +325,14 @@ def test_any_comment_and_any_text_come_through(words: str) -> None:
 
 
 def simple(*ids: int, extended: bool = False, gateway: tuple[int, ...] = ()) -> str:
-    messages = [Msg(f"EscM{n}", i, 8, [Sig("BatteryVoltage", 0, 16, unit="V")], extended) for n, i in enumerate(ids)]
-    messages += [Msg(f"Gw{n}", i, 8, [Sig("Uptime", 0, 32, unit="s")], extended) for n, i in enumerate(gateway)]
+    messages = [
+        Msg(f"EscM{n}", i, 8, [Sig("BatteryVoltage", 0, 16, unit="V")], extended)
+        for n, i in enumerate(ids)
+    ]
+    messages += [
+        Msg(f"Gw{n}", i, 8, [Sig("Uptime", 0, 32, unit="s")], extended)
+        for n, i in enumerate(gateway)
+    ]
     return dbc_text(messages)
 
 
@@ -269,9 +353,15 @@ def ids_of(database: Database) -> list[int]:
     ],
 )
 def test_ids_are_moved_by_the_smallest_step_without_a_clash(
-    own: tuple[int, ...], gateway: tuple[int, ...], base: int | None, step: int | None, expected: list[int]
+    own: tuple[int, ...],
+    gateway: tuple[int, ...],
+    base: int | None,
+    step: int | None,
+    expected: list[int],
 ) -> None:
-    after, _ = multiplied(simple(*own, gateway=gateway), PAIR, "Gateway", base_id=base, id_step=step)
+    after, _ = multiplied(
+        simple(*own, gateway=gateway), PAIR, "Gateway", base_id=base, id_step=step
+    )
     assert ids_of(after) == expected
 
 
@@ -307,7 +397,10 @@ def test_ids_that_clash_or_leave_their_range_are_refused(
 
 
 def test_the_last_ids_are_within_their_range() -> None:
-    assert ids_of(multiplied(simple(0x1FFFFFFE, extended=True), PAIR, "Gateway")[0]) == [0x1FFFFFFE, 0x1FFFFFFF]
+    assert ids_of(multiplied(simple(0x1FFFFFFE, extended=True), PAIR, "Gateway")[0]) == [
+        0x1FFFFFFE,
+        0x1FFFFFFF,
+    ]
 
 
 def test_ids_that_move_among_those_of_canopen_are_named() -> None:
@@ -325,26 +418,49 @@ def test_ids_that_move_among_those_of_canopen_are_named() -> None:
     assert "1 of 2 ids" in left(simple(0x6DF), 2)
     assert not left(simple(0x700), 2)  # it was there before
     escs = [EscSettings(f"esc{number}") for number in range(1, 10)]
-    layout = prepare(parse_database(shipped.encode(), "test.dbc"), "test.dbc", escs, DbcSettings())[1]
-    assert [line for line in layout.warnings if "for 9 ESCs, 52 of 101 ids leave" in line and "--base-id" in line]
-    assert not prepare(parse_database(shipped.encode(), "t"), "t", escs, DbcSettings(base_id=0x680))[1].warnings
+    layout = prepare(parse_database(shipped.encode(), "test.dbc"), "test.dbc", escs, DbcSettings())[
+        1
+    ]
+    assert [
+        line
+        for line in layout.warnings
+        if "for 9 ESCs, 52 of 101 ids leave" in line and "--base-id" in line
+    ]
+    assert not prepare(
+        parse_database(shipped.encode(), "t"), "t", escs, DbcSettings(base_id=0x680)
+    )[1].warnings
 
 
 def test_names_of_more_than_32_characters_are_refused() -> None:
     text = dbc_text([Msg("EscM", 1, 8, [Sig("LimitBatteryVoltageMinimum", 0, 1)])])
     assert multiplied(text, [EscSettings("abcdef"), EscSettings("b")], "Gateway")[0]
     line = refused(text, [EscSettings("abcdefg"), EscSettings("b")])
-    assert all(words in line for words in ("abcdefg", "longer than 32", "LimitBatteryVoltageMinimum", "at most 6"))
+    assert all(
+        words in line
+        for words in ("abcdefg", "longer than 32", "LimitBatteryVoltageMinimum", "at most 6")
+    )
 
 
 def test_two_messages_that_would_get_one_name_are_refused() -> None:
-    text = dbc_text([Msg(n, i, 8, [Sig("BatteryVoltage", 0, 16)]) for i, n in enumerate(("EscPower", "Power"), 0x100)])
+    text = dbc_text(
+        [
+            Msg(n, i, 8, [Sig("BatteryVoltage", 0, 16)])
+            for i, n in enumerate(("EscPower", "Power"), 0x100)
+        ]
+    )
     assert "LeftPower" in refused(text)
 
 
 @pytest.mark.parametrize(
     ("name", "prefix"),
-    [("left", "Left"), ("left_front", "LeftFront"), ("esc1", "Esc1"), ("FR", "FR"), ("a_b_1", "AB1"), ("x__y_", "XY")],
+    [
+        ("left", "Left"),
+        ("left_front", "LeftFront"),
+        ("esc1", "Esc1"),
+        ("FR", "FR"),
+        ("a_b_1", "AB1"),
+        ("x__y_", "XY"),
+    ],
 )
 def test_the_prefix_of_an_esc_is_its_name_in_pascal_case(name: str, prefix: str) -> None:
     assert expand.esc_prefix(name) == prefix
@@ -369,9 +485,15 @@ def plain_plan(plan: MessagePlan) -> MessagePlan:
 
 def test_plans_from_a_rich_file_are_those_of_the_gateway() -> None:
     for escs in ([EscSettings("esc1")], PAIR):
-        database, layout = prepare(read(RICH), "x", escs, DbcSettings(node="Gw", base_id=0x10), fd_allowed=True)
-        _, again = prepare(read(written(database)), "x", escs, DbcSettings(node="Gw"), fd_allowed=True)
-        assert [plain_plan(plan) for plan in again.messages] == [plain_plan(plan) for plan in layout.messages]
+        database, layout = prepare(
+            read(RICH), "x", escs, DbcSettings(node="Gw", base_id=0x10), fd_allowed=True
+        )
+        _, again = prepare(
+            read(written(database)), "x", escs, DbcSettings(node="Gw"), fd_allowed=True
+        )
+        assert [plain_plan(plan) for plan in again.messages] == [
+            plain_plan(plan) for plan in layout.messages
+        ]
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -381,10 +503,16 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
     before = read(dbc_text(messages))
     after = read(written(before))
     assert facts_of_database(after) == facts_of_database(before)
-    assert [facts_of_message(m, "") for m in after.messages] == [facts_of_message(m, "") for m in before.messages]
+    assert [facts_of_message(m, "") for m in after.messages] == [
+        facts_of_message(m, "") for m in before.messages
+    ]
     bind = DbcSettings(bindings(messages))
-    old, new = (compile_layout(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after))
-    assert [plain_plan(plan) for plan in new.messages] == [plain_plan(plan) for plan in old.messages]
+    old, new = (
+        compile_layout(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after)
+    )
+    assert [plain_plan(plan) for plan in new.messages] == [
+        plain_plan(plan) for plan in old.messages
+    ]
 
 
 def test_the_command_writes_eight_escs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -111,7 +111,9 @@ REFUSED: list[tuple[list[Sig], list[str]]] = [
 
 
 @pytest.mark.parametrize(("signals", "words"), REFUSED)
-def test_a_mistake_of_a_signal_is_one_line_with_its_place(tmp_path: Path, signals: list[Sig], words: list[str]) -> None:
+def test_a_mistake_of_a_signal_is_one_line_with_its_place(
+    tmp_path: Path, signals: list[Sig], words: list[str]
+) -> None:
     only(mistakes(tmp_path, one(*signals)), "my_car.dbc: ", *words)
 
 
@@ -119,9 +121,17 @@ def test_what_lies_near_a_mistake_is_none(tmp_path: Path) -> None:
     current = Sig("BatteryCurrent", 16, 16, signed=True, mux="m1", unit="A")
     assert load(tmp_path, one(PAGE, volts(8, mux="m0"), current)).messages[0].pages == (0, 1)
     assert load(
-        tmp_path, one(PAGE, Sig("Crc8", 8, 8), Sig("AliveCounter", 16, 4), Sig("Timing", 24, 8, unit="us", mux="m1"))
+        tmp_path,
+        one(
+            PAGE,
+            Sig("Crc8", 8, 8),
+            Sig("AliveCounter", 16, 4),
+            Sig("Timing", 24, 8, unit="us", mux="m1"),
+        ),
     ).messages
-    assert load(tmp_path, one(Sig("Page", 0, 5, mux="M"), volts(16, mux="m16"))).messages[0].pages == (16,)
+    assert load(tmp_path, one(Sig("Page", 0, 5, mux="M"), volts(16, mux="m16"))).messages[
+        0
+    ].pages == (16,)
 
 
 @pytest.mark.parametrize(
@@ -132,14 +142,22 @@ def test_what_lies_near_a_mistake_is_none(tmp_path: Path) -> None:
         (version(32, signed=True, is_float=True), 1e39), (version(32, signed=True, is_float=True), float("inf")),
     ],
 )  # fmt: skip
-def test_a_constant_that_cannot_be_sent_exactly_is_refused(tmp_path: Path, signal: Sig, constant: float) -> None:
+def test_a_constant_that_cannot_be_sent_exactly_is_refused(
+    tmp_path: Path, signal: Sig, constant: float
+) -> None:
     lines = mistakes(tmp_path, one(signal), DbcSettings({"Version": constant}))
     only(lines, "my_car.dbc: Power.Version", f"constant {constant}")
 
 
 def test_suggestions_go_without_prefix_and_without_likeness_there_is_none(tmp_path: Path) -> None:
-    text = one(Sig("LeftBatteryVoltag", 0, 16, unit="V"), Sig("RightBatteryVoltage", 16, 16, unit="V"))
-    only(mistakes(tmp_path, text, names=("left", "right")), "LeftBatteryVoltag: no such source", "battery_voltage")
+    text = one(
+        Sig("LeftBatteryVoltag", 0, 16, unit="V"), Sig("RightBatteryVoltage", 16, 16, unit="V")
+    )
+    only(
+        mistakes(tmp_path, text, names=("left", "right")),
+        "LeftBatteryVoltag: no such source",
+        "battery_voltage",
+    )
     (line,) = mistakes(tmp_path, one(Sig("Qqq", 0, 16)))
     assert "Did you mean" not in line
     lines = mistakes(tmp_path, one(Sig("U", 0, 16)), DbcSettings({"U": "batery_voltage"}))
@@ -147,7 +165,9 @@ def test_suggestions_go_without_prefix_and_without_likeness_there_is_none(tmp_pa
 
 
 def test_a_16_bit_float_is_refused(tmp_path: Path) -> None:
-    text = one(volts(signed=True, is_float=True)).replace("BatteryVoltage : 2;", "BatteryVoltage : 1;")
+    text = one(volts(signed=True, is_float=True)).replace(
+        "BatteryVoltage : 2;", "BatteryVoltage : 1;"
+    )
     only(mistakes(tmp_path, text), "my_car.dbc: Power.BatteryVoltage", "16 bits", "32 and 64")
 
 
@@ -164,7 +184,11 @@ def file_of(*messages: tuple[Any, ...], **more: Any) -> str:
     """Messages of (name, id, signal, sender, 29 bits)."""
     filled = [(*m, *("Gateway", False)[len(m) - 3 :]) for m in messages]
     return dbc_text(
-        [Msg(name, can_id, 8, [signal], ext, sender) for name, can_id, signal, sender, ext in filled], **more
+        [
+            Msg(name, can_id, 8, [signal], ext, sender)
+            for name, can_id, signal, sender, ext in filled
+        ],
+        **more,
     )
 
 
@@ -179,10 +203,18 @@ def test_ids_and_names_are_each_of_one_message(tmp_path: Path) -> None:
     only(mistakes(tmp_path, file_of(THEIRS, POWER), gateway), "Power", "123h", "Brake")
     twice = mistakes(tmp_path, file_of(POWER, ("Power", 0x124, CURRENT)))
     only(twice, "my_car.dbc", "Power", "two messages have this name")
-    assert any("123h" in line for line in mistakes(tmp_path, file_of(POWER, ("Power", 0x123, CURRENT))))
+    assert any(
+        "123h" in line for line in mistakes(tmp_path, file_of(POWER, ("Power", 0x123, CURRENT)))
+    )
     # among messages of others it is none of our business, and 11 and 29 bits do not meet
-    (_,) = load(tmp_path, file_of(THEIRS, ("Wheel", 0x123, FOO, "Other"), ("Power", 0x124, VOLTAGE)), gateway).messages
-    assert [m.extended for m in load(tmp_path, file_of(POWER, (*FLOW, "Gateway", True))).messages] == [False, True]
+    (_,) = load(
+        tmp_path,
+        file_of(THEIRS, ("Wheel", 0x123, FOO, "Other"), ("Power", 0x124, VOLTAGE)),
+        gateway,
+    ).messages
+    assert [
+        m.extended for m in load(tmp_path, file_of(POWER, (*FLOW, "Gateway", True))).messages
+    ] == [False, True]
 
 
 def test_an_id_that_is_taken_by_canopen_is_named_with_its_user(tmp_path: Path) -> None:
@@ -192,16 +224,32 @@ def test_an_id_that_is_taken_by_canopen_is_named_with_its_user(tmp_path: Path) -
 
 
 def test_can_fd_is_refused_unless_allowed_and_some_lengths_are_none(tmp_path: Path) -> None:
-    only(mistakes(tmp_path, one(VOLTAGE, length=12)), "my_car.dbc: Power", "CAN FD", "12 bytes", "can.fd")
+    only(
+        mistakes(tmp_path, one(VOLTAGE, length=12)),
+        "my_car.dbc: Power",
+        "CAN FD",
+        "12 bytes",
+        "can.fd",
+    )
     assert load(tmp_path, one(VOLTAGE, length=12), fd=True).messages[0].fd
     for length in (9, 11, 13, 63, 65, 100, 1000):
-        only(mistakes(tmp_path, one(VOLTAGE, length=length), fd=True), "my_car.dbc: Power", f"{length} bytes")
+        only(
+            mistakes(tmp_path, one(VOLTAGE, length=length), fd=True),
+            "my_car.dbc: Power",
+            f"{length} bytes",
+        )
 
 
 def test_the_node_is_the_only_one_that_sends_ours_or_the_one_that_is_named(tmp_path: Path) -> None:
     text = file_of(("Power", 1, VOLTAGE), ("Brake", 2, FOO, "Other"))
     for node in ("Motor", "Logger"):
-        only(mistakes(tmp_path, text, DbcSettings(node=node)), "my_car.dbc", f"'{node}'", "Gateway, Other", "dbc.node")
+        only(
+            mistakes(tmp_path, text, DbcSettings(node=node)),
+            "my_car.dbc",
+            f"'{node}'",
+            "Gateway, Other",
+            "dbc.node",
+        )
     only(mistakes(tmp_path, text), "my_car.dbc", "several nodes", "Gateway, Other", "dbc.node")
     assert load(tmp_path, text.replace("Gateway", "KontronikGateway")).node == "KontronikGateway"
     silent = one(VOLTAGE).replace("8 Gateway", "8 Vector__XXX")
@@ -226,20 +274,28 @@ def test_send_types_are_known_and_a_cycle_has_a_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize("attribute", ["GenMsgCycleTime", "GenMsgDelayTime"])
 @pytest.mark.parametrize("value", ['"soon"', '"inf"', '"nan"', '"-1"'])
 def test_a_time_that_is_none_is_refused(tmp_path: Path, attribute: str, value: str) -> None:
-    text = timed(f'BA_ "{attribute}" BO_ 256 {value};').replace(f'"{attribute}" INT 0 65535', f'"{attribute}" STRING ')
-    (line,) = mistakes(tmp_path, text.replace(f'BA_DEF_DEF_ "{attribute}" 0', f'BA_DEF_DEF_ "{attribute}" ""'))
+    text = timed(f'BA_ "{attribute}" BO_ 256 {value};').replace(
+        f'"{attribute}" INT 0 65535', f'"{attribute}" STRING '
+    )
+    (line,) = mistakes(
+        tmp_path, text.replace(f'BA_DEF_DEF_ "{attribute}" 0', f'BA_DEF_DEF_ "{attribute}" ""')
+    )
     assert "my_car.dbc" in line
 
 
 def test_a_start_value_that_is_no_number_does_no_harm(tmp_path: Path) -> None:
     text = timed('BA_ "GenSigStartValue" SG_ 256 BatteryVoltage 1;')
-    text = re.sub(r'BA_DEF_ SG_ "GenSigStartValue".*', 'BA_DEF_ SG_ "GenSigStartValue" ENUM "a","b";', text)
+    text = re.sub(
+        r'BA_DEF_ SG_ "GenSigStartValue".*', 'BA_DEF_ SG_ "GenSigStartValue" ENUM "a","b";', text
+    )
     text = text.replace('BA_DEF_DEF_ "GenSigStartValue" 0', 'BA_DEF_DEF_ "GenSigStartValue" "a"')
     assert load(tmp_path, text).messages[0].signals[0].not_available == 65535
 
 
 def test_a_bus_that_is_too_full_is_refused(tmp_path: Path) -> None:
-    layout = load(tmp_path, timed('BA_ "GenMsgSendType" BO_ 256 0;\nBA_ "GenMsgCycleTime" BO_ 256 1;'))
+    layout = load(
+        tmp_path, timed('BA_ "GenMsgSendType" BO_ 256 0;\nBA_ "GenMsgCycleTime" BO_ 256 1;')
+    )
     assert check_load(layout, 1_000_000) is None
     warning = check_load(layout, 200_000)
     assert warning is not None and "my_car.dbc" in warning and "%" in warning
@@ -251,28 +307,50 @@ def test_a_bus_that_is_too_full_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
-def test_keys_that_bind_nothing_are_named_with_the_nearest_signal(tmp_path: Path, names: tuple[str, ...]) -> None:
+def test_keys_that_bind_nothing_are_named_with_the_nearest_signal(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
     keys = ("Power.BatteryVoltge", "Nope.Signal", "BatteryVolt")
     lines = mistakes(tmp_path, one(VOLTAGE), DbcSettings(dict.fromkeys(keys, 1)), names)
-    assert sorted(line.partition(": ")[0] for line in lines) == sorted(f"dbc.bind.{key}" for key in keys)
+    assert sorted(line.partition(": ")[0] for line in lines) == sorted(
+        f"dbc.bind.{key}" for key in keys
+    )
     assert all("my_car.dbc" in line for line in lines)
     assert any("Did you mean" in line and "BatteryVoltage" in line for line in lines)
     # a signal of another node is no signal of ours; one of ours may have the name of theirs
     text = file_of(("Power", 1, VOLTAGE), ("Brake", 9, FOO, "Other"))
-    only(mistakes(tmp_path, text, DbcSettings({"Foo": 1}, "Gateway"), names), "dbc.bind.Foo", "no such signal")
+    only(
+        mistakes(tmp_path, text, DbcSettings({"Foo": 1}, "Gateway"), names),
+        "dbc.bind.Foo",
+        "no such signal",
+    )
     text = file_of(("Power", 1, Sig("U", 0, 16, unit="V")), ("Brake", 9, Sig("U", 0, 8), "Other"))
-    assert len(load(tmp_path, text, DbcSettings({"U": "battery_voltage"}, "Gateway"), names).messages) == len(names)
+    assert len(
+        load(tmp_path, text, DbcSettings({"U": "battery_voltage"}, "Gateway"), names).messages
+    ) == len(names)
 
 
 def test_a_signal_that_does_not_say_of_which_esc_is_refused(tmp_path: Path) -> None:
-    left, right = Sig("LeftBatteryVoltage", 0, 16, unit="V"), Sig("RightBatteryVoltage", 16, 16, unit="V")
+    left, right = (
+        Sig("LeftBatteryVoltage", 0, 16, unit="V"),
+        Sig("RightBatteryVoltage", 16, 16, unit="V"),
+    )
     lines = mistakes(
-        tmp_path, one(left, Sig("U", 16, 16, unit="V")), DbcSettings({"U": "right.battery_voltag"}), ("left", "right")
+        tmp_path,
+        one(left, Sig("U", 16, 16, unit="V")),
+        DbcSettings({"U": "right.battery_voltag"}),
+        ("left", "right"),
     )
     only(lines, "Power.U", "right.battery_voltag", "battery_voltage")
     text = one(left, right, Sig("BatteryCurrent", 32, 16, signed=True, unit="A"))
     lines = mistakes(tmp_path, text, names=("left", "right"))
-    only(lines, "Power.BatteryCurrent", "of which ESC", "left.battery_current", "right.battery_current")
+    only(
+        lines,
+        "Power.BatteryCurrent",
+        "of which ESC",
+        "left.battery_current",
+        "right.battery_current",
+    )
 
 
 # --- all at once --------------------------------------------------------------------------------------------------------
@@ -280,8 +358,18 @@ def test_a_signal_that_does_not_say_of_which_esc_is_refused(tmp_path: Path) -> N
 
 def test_all_mistakes_come_at_once_each_naming_its_place(tmp_path: Path) -> None:
     messages = [
-        Msg("Power", 0x10, 8, [Sig("BattVolt", 0, 16, unit="V"), Sig("BatteryCurrent", 8, 16, unit="V")]),
-        Msg("Heat", 0x10, 8, [Sig("BecTemperature", 60, 8, unit="degC"), Sig("CrcErrors", 0, 8, factor="2")]),
+        Msg(
+            "Power",
+            0x10,
+            8,
+            [Sig("BattVolt", 0, 16, unit="V"), Sig("BatteryCurrent", 8, 16, unit="V")],
+        ),
+        Msg(
+            "Heat",
+            0x10,
+            8,
+            [Sig("BecTemperature", 60, 8, unit="degC"), Sig("CrcErrors", 0, 8, factor="2")],
+        ),
         Msg("Wide", 0x11, 16, [VOLTAGE]),
     ]
     lines = mistakes(
@@ -321,7 +409,9 @@ def test_all_mistakes_come_at_once_each_naming_its_place(tmp_path: Path) -> None
         (b'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: A\n', "no message"),
     ],
 )
-def test_a_file_that_is_no_dbc_is_said_to_be_none(tmp_path: Path, content: bytes, words: str) -> None:
+def test_a_file_that_is_no_dbc_is_said_to_be_none(
+    tmp_path: Path, content: bytes, words: str
+) -> None:
     file = tmp_path / "my_car.dbc"
     file.write_bytes(content)
     with pytest.raises(UserError) as caught:
@@ -365,7 +455,9 @@ def broken(rng: random.Random, text: str) -> str:
 
 
 @pytest.mark.parametrize("batch", range(5))
-def test_a_broken_version_of_the_shipped_file_works_or_is_refused_in_words(tmp_path: Path, batch: int) -> None:
+def test_a_broken_version_of_the_shipped_file_works_or_is_refused_in_words(
+    tmp_path: Path, batch: int
+) -> None:
     text = SHIPPED.read_text()
     refusals: list[tuple[str, ...]] = []
     for seed in range(batch * 20, batch * 20 + 20):
@@ -377,5 +469,7 @@ def test_a_broken_version_of_the_shipped_file_works_or_is_refused_in_words(tmp_p
         except UserError as error:
             refusals.append(error.problems)
     assert all(problems for problems in refusals)
-    assert all("\n" not in line and "my_car.dbc" in line for problems in refusals for line in problems), refusals
+    assert all(
+        "\n" not in line and "my_car.dbc" in line for problems in refusals for line in problems
+    ), refusals
     assert 2 < len(refusals) < 20

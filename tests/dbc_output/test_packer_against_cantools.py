@@ -42,15 +42,21 @@ MESSAGES = 30
 ROUNDS = 3
 
 
-def compiled(messages: list[Msg], database: Database, escs: tuple[EscSettings, ...] = ESCS) -> dict[str, MessagePlan]:
-    layout = compile_layout(database, "random.dbc", escs, DbcSettings(bindings(messages)), fd_allowed=True)
+def compiled(
+    messages: list[Msg], database: Database, escs: tuple[EscSettings, ...] = ESCS
+) -> dict[str, MessagePlan]:
+    layout = compile_layout(
+        database, "random.dbc", escs, DbcSettings(bindings(messages)), fd_allowed=True
+    )
     return {plan.name: plan for plan in layout.messages}
 
 
 State = tuple[list[EscTelemetry], GatewayStatus, int]
 
 
-def check_frame(message: Msg, page: int | None, data: bytes, database: Database, state: State) -> None:
+def check_frame(
+    message: Msg, page: int | None, data: bytes, database: Database, state: State
+) -> None:
     """One frame against the oracle, and against what cantools reads in it and would have sent itself."""
     escs, gateway, now = state
     expected_bytes = bytearray(message.length)
@@ -58,7 +64,9 @@ def check_frame(message: Msg, page: int | None, data: bytes, database: Database,
     physicals: dict[str, Any] = {}
     compared: list[tuple[Sig, bool]] = []
     for signal in message.page_of(page):
-        raw = get(data, signal.start, signal.length, signal.little, signal.signed and not signal.is_float)
+        raw = get(
+            data, signal.start, signal.length, signal.little, signal.signed and not signal.is_float
+        )
         about = f"{message.name} {signal.line} of {signal.source} page {page}: {raw}"
         put(expected_bytes, raw, signal.start, signal.length, signal.little)
         if signal.mux == "M":
@@ -88,7 +96,9 @@ def check_frame(message: Msg, page: int | None, data: bytes, database: Database,
         other = get(encoded, signal.start, signal.length, signal.little, signal.signed)
         if abs(raws[signal.name]) < SAFE:
             apart = abs(raws[signal.name] - other)
-            assert apart <= is_half, f"{message.name} {signal.line}: {raws[signal.name]}, cantools {other}"
+            assert apart <= is_half, (
+                f"{message.name} {signal.line}: {raws[signal.name]}, cantools {other}"
+            )
 
 
 SAFE = 1 << 45
@@ -112,7 +122,9 @@ def physical_for_cantools(signal: Sig, raw: int, state: State) -> tuple[Fraction
 
 def float_of(raw: int, length: int) -> float:
     """The IEEE 754 number of 32 or 64 bits."""
-    number: float = struct.unpack("<f" if length == 32 else "<d", raw.to_bytes(length // 8, "little"))[0]
+    number: float = struct.unpack(
+        "<f" if length == 32 else "<d", raw.to_bytes(length // 8, "little")
+    )[0]
     return number
 
 
@@ -132,7 +144,11 @@ def test_every_random_layout_is_packed_as_the_oracle_and_cantools_say(seed: int)
     packs = {name: compile_pack(plan) for name, plan in plans.items()}
     for message in messages:
         plan = plans[message.name]
-        assert (plan.can_id, plan.extended, plan.length) == (message.can_id, message.extended, message.length)
+        assert (plan.can_id, plan.extended, plan.length) == (
+            message.can_id,
+            message.extended,
+            message.length,
+        )
         assert list(plan.pages) == message.pages
     for _ in range(ROUNDS):
         escs, now = random_escs(rng, ESCS, rng.randrange(10**15))
@@ -161,10 +177,20 @@ def wide_signals() -> tuple[list[Msg], Database, dict[str, MessagePlan]]:
                 if is_float and (known.rolls or known.names):
                     continue
                 signed = not known.rolls
-                signal = Sig("Value", 0, 64, True, signed, is_float, "1" if known.rolls or known.names else "0.01")
+                signal = Sig(
+                    "Value",
+                    0,
+                    64,
+                    True,
+                    signed,
+                    is_float,
+                    "1" if known.rolls or known.names else "0.01",
+                )
                 signal.unit, signal.conversion, signal.source = unit, (scale, shift), source
                 signal.bind = source if known.gateway else f"left.{source}"
-                messages.append(Msg(f"{source}_{number}_{is_float:d}", len(messages) + 1, 8, [signal]))
+                messages.append(
+                    Msg(f"{source}_{number}_{is_float:d}", len(messages) + 1, 8, [signal])
+                )
     database = read(dbc_text(messages))
     return messages, database, compiled(messages, database)
 
@@ -184,7 +210,8 @@ def test_every_source_is_right_in_every_unit(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "right"), [(None, 7), (-1.5, 7), (100.5, 7), (math.nan, 7), (100.0, 0x42C80000), (0.0, 0)]
+    ("value", "right"),
+    [(None, 7), (-1.5, 7), (100.5, 7), (math.nan, 7), (100.0, 0x42C80000), (0.0, 0)],
 )
 def test_a_float_outside_its_limits_is_sent_as_error(value: float | None, right: int) -> None:
     assert float_bits(value, 32, 0.0, 100.0, 7) == right

@@ -95,14 +95,22 @@ class Bench:
         return [when // MS for when, frame in self.sent if frame.can_id == can_id]
 
     def raws(self, length: int = 16, start: int = 0, can_id: int = 0x100) -> list[int]:
-        return [get(frame.data, start, length, True) for _, frame in self.sent if frame.can_id == can_id]
+        return [
+            get(frame.data, start, length, True) for _, frame in self.sent if frame.can_id == can_id
+        ]
 
     def forget(self) -> None:
         self.sent.clear()
 
 
-def lone(kind: int, cycle: int = 0, delay: int = 0, *more: Sig, silent: bool = False, start: bool = False) -> Bench:
-    return Bench([(Msg("EscPower", 0x100, 8, [VOLTAGE, *more]), kind, cycle, delay)], silent=silent, start=start)
+def lone(
+    kind: int, cycle: int = 0, delay: int = 0, *more: Sig, silent: bool = False, start: bool = False
+) -> Bench:
+    return Bench(
+        [(Msg("EscPower", 0x100, 8, [VOLTAGE, *more]), kind, cycle, delay)],
+        silent=silent,
+        start=start,
+    )
 
 
 # --- scenes: what happens at which ms, and when frames go with which voltage -----------------------------------------------------
@@ -136,7 +144,9 @@ SCENES: list[tuple[str, int, int, int, str, list[tuple[int, int]]]] = [
 
 
 @pytest.mark.parametrize(
-    ("kind", "cycle", "delay", "steps", "sent"), [row[1:] for row in SCENES], ids=[row[0] for row in SCENES]
+    ("kind", "cycle", "delay", "steps", "sent"),
+    [row[1:] for row in SCENES],
+    ids=[row[0] for row in SCENES],
 )
 def test_scene(kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[int, int]]) -> None:
     """``=`` in front of a time: nobody looks at the clock until then."""
@@ -201,7 +211,13 @@ def test_the_same_message_of_several_escs_never_goes_at_one_instant(count: int) 
     assert all(len(ids) == 1 for ids in escs_of_one.values())
 
 
-@given(st.lists(st.sampled_from([0, 10 * MS, 20 * MS, 50 * MS, 100 * MS, 1000 * MS, 7 * MS]), min_size=1, max_size=100))
+@given(
+    st.lists(
+        st.sampled_from([0, 10 * MS, 20 * MS, 50 * MS, 100 * MS, 1000 * MS, 7 * MS]),
+        min_size=1,
+        max_size=100,
+    )
+)
 def test_phases_lie_within_the_cycle_and_evenly_apart(cycles: list[int]) -> None:
     found = phases(cycles)
     for cycle in set(cycles) - {0}:
@@ -243,7 +259,13 @@ def test_an_event_message_of_info_values_goes_with_info_frames_only() -> None:
 
 
 def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> None:
-    for kind, cycle in ((EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 40), (CYCLIC_AND_ON_CHANGE, 30), (CYCLIC, 50)):
+    for kind, cycle in (
+        (EVENT, 0),
+        (ON_CHANGE, 0),
+        (CYCLIC_AND_EVENT, 40),
+        (CYCLIC_AND_ON_CHANGE, 30),
+        (CYCLIC, 50),
+    ):
         bench = lone(kind, cycle, 15)
         rng = random.Random(kind)
         for n in range(300):
@@ -269,7 +291,9 @@ def test_on_change_goes_only_when_a_raw_value_changes() -> None:
 # --- loss and return ----------------------------------------------------------------------------------------------------
 
 
-def test_on_loss_a_cyclic_message_goes_on_with_not_available_from_the_first_frame_after_the_time_out() -> None:
+def test_on_loss_a_cyclic_message_goes_on_with_not_available_from_the_first_frame_after_the_time_out() -> (
+    None
+):
     bench = lone(CYCLIC, 10)
     bench.feed(500 * MS)
     bench.forget()
@@ -283,7 +307,9 @@ def test_on_loss_a_cyclic_message_goes_on_with_not_available_from_the_first_fram
 @pytest.mark.parametrize("kind", [EVENT, ON_CHANGE])
 @pytest.mark.parametrize("delay", [0, 5, 100])
 @pytest.mark.parametrize("late", [False, True])
-def test_on_loss_an_event_message_is_sent_exactly_once_with_not_available(kind: int, delay: int, late: bool) -> None:
+def test_on_loss_an_event_message_is_sent_exactly_once_with_not_available(
+    kind: int, delay: int, late: bool
+) -> None:
     bench = lone(kind, 0, delay, start=True)
     bench.feed(500 * MS, 10 * MS)
     bench.until(505 * MS)
@@ -302,13 +328,25 @@ def test_on_loss_an_event_message_is_sent_exactly_once_with_not_available(kind: 
 
 def escs_message(n: int) -> Msg:
     return Msg(
-        f"EscLink{n}", 0x200 + n, 8, [Sig("LinkState", 0, 8), Sig("Losses", 8, 8), Sig("DataAge", 16, 16, unit="ms")]
+        f"EscLink{n}",
+        0x200 + n,
+        8,
+        [Sig("LinkState", 0, 8), Sig("Losses", 8, 8), Sig("DataAge", 16, 16, unit="ms")],
     )
 
 
 def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() -> None:
-    kinds = [(CYCLIC, 20), (EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 50), (CYCLIC_AND_ON_CHANGE, 30)]
-    messages = [(Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]), kind, cycle, 0) for n, (kind, cycle) in enumerate(kinds)]
+    kinds = [
+        (CYCLIC, 20),
+        (EVENT, 0),
+        (ON_CHANGE, 0),
+        (CYCLIC_AND_EVENT, 50),
+        (CYCLIC_AND_ON_CHANGE, 30),
+    ]
+    messages = [
+        (Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]), kind, cycle, 0)
+        for n, (kind, cycle) in enumerate(kinds)
+    ]
     messages += [(escs_message(n), kind, cycle, 0) for n, (kind, cycle) in enumerate(kinds)]
     for silent in (False, True):
         bench = Bench(messages, silent=silent, start=True)
@@ -323,7 +361,11 @@ def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() ->
             assert link, (n, silent)
             assert get(link[-1][1].data, 0, 8, True) == 4  # Lost
             assert get(link[-1][1].data, 8, 8, True) == 1
-            if kind in (EVENT, ON_CHANGE):  # without a cycle: on the loss, and then each second, for age and counters
+            if kind in (
+                EVENT,
+                ON_CHANGE,
+            ):
+                # without a cycle: on the loss, and then each second, for age and counters
                 assert len(link) == 3
             else:
                 assert len(link) >= 2250 // cycle - 1
@@ -363,7 +405,10 @@ def test_values_are_back_with_the_first_frame_after_a_loss() -> None:
 
 
 def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
-    signals = [Sig("LeftBatteryVoltage", 0, 16, factor="0.01"), Sig("RightBatteryVoltage", 16, 16, factor="0.01")]
+    signals = [
+        Sig("LeftBatteryVoltage", 0, 16, factor="0.01"),
+        Sig("RightBatteryVoltage", 16, 16, factor="0.01"),
+    ]
     bench = Bench([(Msg("Both", 0x100, 8, signals), EVENT, 0, 0)], ("left", "right"))
     bench.live(volts(1), 0)
     bench.live(volts(2), 1)
@@ -400,10 +445,15 @@ def test_info_of_another_device_is_gone_with_the_telemetry() -> None:
 
 
 @pytest.mark.parametrize(
-    ("length", "maximum", "modulus"), [(4, "0", 16), (4, "14", 15), (8, "0", 256), (2, "0", 4), (3, "5", 6)]
+    ("length", "maximum", "modulus"),
+    [(4, "0", 16), (4, "14", 15), (8, "0", 256), (2, "0", 4), (3, "5", 6)],
 )
-def test_the_alive_counter_goes_up_by_one_with_each_frame_and_wraps(length: int, maximum: str, modulus: int) -> None:
-    bench = lone(CYCLIC_AND_EVENT, 33, 0, Sig("PowerAlive", 24, length, maximum=maximum), start=True)
+def test_the_alive_counter_goes_up_by_one_with_each_frame_and_wraps(
+    length: int, maximum: str, modulus: int
+) -> None:
+    bench = lone(
+        CYCLIC_AND_EVENT, 33, 0, Sig("PowerAlive", 24, length, maximum=maximum), start=True
+    )
     bench.feed(2 * SECOND)
     bench.until(4 * SECOND)
     bench.feed(7 * SECOND)
@@ -427,10 +477,13 @@ NOTHING = {1: 0xFFFF, 5: 0x80, 9: 0x80}
 
 @pytest.mark.parametrize("kind", [EVENT, ON_CHANGE])
 @pytest.mark.parametrize("delay", [0, 30])
-def test_after_a_loss_each_page_says_by_itself_that_its_value_is_gone(kind: int, delay: int) -> None:
+def test_after_a_loss_each_page_says_by_itself_that_its_value_is_gone(
+    kind: int, delay: int
+) -> None:
     bench = paged(kind, 0, delay, start=True)
     bench.until(SECOND)
-    assert [frame.data[0] for _, frame in bench.sent] == list(NOTHING)  # at the start, without an event
+    # at the start, without an event
+    assert [frame.data[0] for _, frame in bench.sent] == list(NOTHING)
     for number in range(12):
         bench.until(bench.now + 10 * MS)
         bench.live(LiveData(battery_voltage=2400 + number, throttle=number, bec_temperature=number))
@@ -474,9 +527,20 @@ def test_of_multiplexed_pages_sent_on_change_the_changed_one_goes() -> None:
 
 
 @pytest.mark.parametrize(("length", "modulus"), [(4, 15), (5, 15), (8, 15)])
-def test_frames_with_e2e_protection_pass_the_check_through_losses_and_returns(length: int, modulus: int) -> None:
+def test_frames_with_e2e_protection_pass_the_check_through_losses_and_returns(
+    length: int, modulus: int
+) -> None:
     crc, alive = Sig("Crc8", 0, 8), Sig("AliveCounter", 8, length)
-    bench = Bench([(Msg("EscPower", 0x100, 8, [crc, alive, Sig("BatteryVoltage", 16, 16)]), CYCLIC_AND_EVENT, 20, 0)])
+    bench = Bench(
+        [
+            (
+                Msg("EscPower", 0x100, 8, [crc, alive, Sig("BatteryVoltage", 16, 16)]),
+                CYCLIC_AND_EVENT,
+                20,
+                0,
+            )
+        ]
+    )
     for _ in range(3):
         bench.feed(bench.now + 200 * MS)
         bench.until(bench.now + 600 * MS)
@@ -492,13 +556,22 @@ def test_frames_with_e2e_protection_pass_the_check_through_losses_and_returns(le
 
 @pytest.mark.parametrize(
     ("extended", "size", "at", "fd_format"),
-    [(False, 8, 48, 0), (True, 8, 0, 0), (False, 3, 8, 0), (False, 64, 496, 14), (False, 8, 0, 14), (True, 12, 80, 15)],
+    [
+        (False, 8, 48, 0),
+        (True, 8, 0, 0),
+        (False, 3, 8, 0),
+        (False, 64, 496, 14),
+        (False, 8, 0, 14),
+        (True, 12, 80, 15),
+    ],
 )
 @pytest.mark.parametrize(("kind", "cycle"), [(EVENT, 0), (CYCLIC_AND_EVENT, 10_000)])
 def test_a_live_frame_is_followed_by_a_frame_of_the_right_kind(
     kind: int, cycle: int, extended: bool, size: int, at: int, fd_format: int
 ) -> None:
-    message = Msg("EscWide", 0x123, size, [Sig("BatteryVoltage", at, 16, unit="V", factor="0.01")], extended)
+    message = Msg(
+        "EscWide", 0x123, size, [Sig("BatteryVoltage", at, 16, unit="V", factor="0.01")], extended
+    )
     fd = 'BA_DEF_ BO_ "VFrameFormat" INT 0 15;\nBA_DEF_DEF_ "VFrameFormat" 0;\n'
     fd += f'BA_ "VFrameFormat" BO_ {message.dbc_id} {fd_format};\n'
     bench = Bench([(message, kind, cycle, 0)], start=True, attributes=fd)
@@ -517,7 +590,9 @@ def test_a_live_frame_is_followed_by_a_frame_of_the_right_kind(
 
 
 @pytest.mark.parametrize(("kind", "cycle"), [(EVENT, 0), (CYCLIC, 10), (CYCLIC_AND_EVENT, 10)])
-def test_pole_pairs_and_gear_from_a_master_hold_for_messages_from_the_next_frame_on(kind: int, cycle: int) -> None:
+def test_pole_pairs_and_gear_from_a_master_hold_for_messages_from_the_next_frame_on(
+    kind: int, cycle: int
+) -> None:
     motor_speed = Sig("MotorSpeed", 0, 16, unit="1/min")
     output_speed = Sig("OutputSpeed", 32, 32, unit="1/min", factor="0.5")
     message = Msg("EscSpeed", 0x100, 8, [motor_speed, replace(VOLTAGE, start=16), output_speed])
@@ -530,7 +605,9 @@ def test_pole_pairs_and_gear_from_a_master_hold_for_messages_from_the_next_frame
     ):
         for request in writes:
             bench.put(0x601, request)
-        assert [frame.data[0] for frame in bench.take() if frame.can_id == 0x581] == [0x60] * len(writes)
+        assert [frame.data[0] for frame in bench.take() if frame.can_id == 0x581] == [0x60] * len(
+            writes
+        )
         bench.uart(encode(LIVE._replace(electrical_speed=21_000), WireLayout.V4))
         bench.wait(10)
         data = [frame.data for frame in bench.take() if frame.can_id == 0x100][-1]
@@ -541,8 +618,15 @@ def test_pole_pairs_and_gear_from_a_master_hold_for_messages_from_the_next_frame
 
 
 def health(kind: int, cycle: int = 0, delay: int = 0) -> Bench:
-    signals = [Sig("GatewayState", 0, 8), Sig("CanState", 8, 8), Sig("EscsOk", 16, 8), Sig("EscCount", 24, 8)]
-    return Bench([(Msg("Health", 0x300, 8, signals), kind, cycle, delay)], ("left", "right"), start=True)
+    signals = [
+        Sig("GatewayState", 0, 8),
+        Sig("CanState", 8, 8),
+        Sig("EscsOk", 16, 8),
+        Sig("EscCount", 24, 8),
+    ]
+    return Bench(
+        [(Msg("Health", 0x300, 8, signals), kind, cycle, delay)], ("left", "right"), start=True
+    )
 
 
 @pytest.mark.parametrize("kind", [ON_CHANGE, EVENT, CYCLIC_AND_ON_CHANGE])
@@ -590,7 +674,9 @@ def test_messages_without_a_cycle_are_sent_once_at_the_start() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.tuples(st.integers(0, 400), st.sampled_from(["live", "lost", "wait"])), max_size=40),
+    st.lists(
+        st.tuples(st.integers(0, 400), st.sampled_from(["live", "lost", "wait"])), max_size=40
+    ),
     st.sampled_from([EVENT, ON_CHANGE, CYCLIC, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE]),
     st.sampled_from([0, 5, 30]),
     st.booleans(),

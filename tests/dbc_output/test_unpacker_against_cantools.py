@@ -26,7 +26,13 @@ def wanted(plan: Any, raw: Any, bits: int) -> Any:
         if bits in (plan.not_available, plan.error) or raw != raw:
             return None
         return raw * float(plan.factor) + float(plan.offset)
-    is_flag = plan.length == 1 and not plan.signed and plan.numbers is None and plan.factor == 1 and plan.offset == 0
+    is_flag = (
+        plan.length == 1
+        and not plan.signed
+        and plan.numbers is None
+        and plan.factor == 1
+        and plan.offset == 0
+    )
     if not is_flag and raw in (plan.not_available, plan.error):
         return None
     if plan.numbers is not None:
@@ -42,7 +48,9 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
     maker = LayoutMaker(rng, ESCS)
     messages = [maker.message() for _ in range(MESSAGES)]
     database = read(dbc_text(messages))
-    layout = compile_layout(database, "random.dbc", ESCS, DbcSettings(bindings(messages)), fd_allowed=True)
+    layout = compile_layout(
+        database, "random.dbc", ESCS, DbcSettings(bindings(messages)), fd_allowed=True
+    )
     reader = SignalReader(layout)
     plans = {plan.name: plan for plan in layout.messages}
     compared = 0
@@ -51,7 +59,9 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
         key = message.can_id | (EXTENDED if message.extended else 0)
         for _ in range(8):
             data = bytearray(
-                rng.choice([rng.randbytes(message.length), bytes(message.length), b"\xff" * message.length])
+                rng.choice(
+                    [rng.randbytes(message.length), bytes(message.length), b"\xff" * message.length]
+                )
             )
             page = rng.choice(message.pages)
             selector = next((s for s in message.signals if s.mux == "M"), None)
@@ -68,7 +78,11 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
             assert isinstance(raws, dict)
             lost_flags = {name for name, value in got.items() if value is None}
             for name, value in got.items():
-                plan = next(s for s in plans[message.name].signals if s.name == name and s.page in (None, page))
+                plan = next(
+                    s
+                    for s in plans[message.name].signals
+                    if s.name == name and s.page in (None, page)
+                )
                 made = next(s for s in message.signals if s.name == name)
                 bits = get(bytes(data), made.start, made.length, made.little, False)
                 expected = wanted(plan, raws[name], bits)
@@ -84,7 +98,10 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
                     ]
                     assert any(s.length > 1 and s.name in lost_flags for s in beside)
                 elif isinstance(expected, float) and isinstance(value, float):
-                    assert value == expected or math.isclose(value, expected, rel_tol=1e-12), (message.name, name)
+                    assert value == expected or math.isclose(value, expected, rel_tol=1e-12), (
+                        message.name,
+                        name,
+                    )
                 else:
                     assert value == expected, (message.name, name)
                 compared += 1

@@ -38,7 +38,9 @@ def nasty(folder: Path) -> Path:
         encoding="utf-8",
     )
     text = EDS.read_text().replace("ParameterName=Live data\n", f"ParameterName={NASTY_NAME}\n")
-    (folder / "nasty.eds").write_text(text.replace("Line8=", "Line8=</table>|<script>"), encoding="utf-8")
+    (folder / "nasty.eds").write_text(
+        text.replace("Line8=", "Line8=</table>|<script>"), encoding="utf-8"
+    )
     return configuration(
         folder,
         '[dbc]\nfile = "nasty.dbc"\nnode = "Gate"\n[dbc.bind]\nMark = 5\n'

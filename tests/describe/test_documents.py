@@ -67,7 +67,12 @@ class Page(HTMLParser):
 def read_markdown(text: str) -> Page:
     """Markdown as markdown-it makes HTML of it; nothing that is HTML in the source may come through."""
     parser = MarkdownIt("commonmark").enable("table").enable("strikethrough")
-    raw = [t.content for token in parser.parse(text) for t in (token, *(token.children or ())) if "html" in t.type]
+    raw = [
+        t.content
+        for token in parser.parse(text)
+        for t in (token, *(token.children or ()))
+        if "html" in t.type
+    ]
     assert set(raw) <= {"<!-- -->"}
     return Page(parser.render(text).replace("<!-- -->", ""))
 
@@ -108,7 +113,9 @@ def test_markup_in_a_dbc_or_eds_is_shown_as_text(tmp_path: Path) -> None:
     assert all({len(row) for row in table} == {len(table[0])} for table in found.tables)
 
 
-texts = st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Zl", "Zp"]), max_size=40)
+texts = st.text(
+    st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Zl", "Zp"]), max_size=40
+)
 markup = st.text(st.sampled_from("|`*_[]()<>&\\#-+.!~=$:/1a \n\t\"'"), max_size=24)
 words = st.one_of(texts, markup)
 
@@ -125,7 +132,9 @@ def test_any_text_comes_back_as_it_is(title: str, paragraph: str, cell: str, nam
     document = Document("All", ("lead",), (Section(f"T {title}", 2, "t", blocks),))
     found = read_markdown(markdown(document))
     assert list(map(one_line, found.titles)) == ["All", one_line(f"T {title}")]
-    assert one_line(blocks[0] if isinstance(blocks[0], str) else "") in map(one_line, found.paragraphs)
+    assert one_line(blocks[0] if isinstance(blocks[0], str) else "") in map(
+        one_line, found.paragraphs
+    )
     assert [[one_line(text) for text in row] for row in found.tables[0]] == [
         ["one", "two"],
         [one_line(cell), one_line(name)],
@@ -173,7 +182,9 @@ def test_bash_completes_commands_options_choices_and_files_of_the_right_kind(
     script: Path, typed: str, offered: set[str]
 ) -> None:
     command = ["bash", "--norc", "-c", ASKED, str(script), typed]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True, cwd=script.parent)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=True, cwd=script.parent
+    )
     assert set(done.stdout.split()) == offered
 
 

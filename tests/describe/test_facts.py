@@ -47,7 +47,8 @@ def test_each_error_and_state_has_a_meaning_of_its_own_and_a_remedy(kind: Any) -
 
 
 @pytest.mark.parametrize(
-    ("texts", "states"), [(LINK_STATES, LinkState), (CAN_STATES, CanState), (GATEWAY_STATES, GatewayState)]
+    ("texts", "states"),
+    [(LINK_STATES, LinkState), (CAN_STATES, CanState), (GATEWAY_STATES, GatewayState)],
 )
 def test_each_state_of_line_controller_and_gateway_has_a_meaning_and_a_remedy(
     texts: dict[IntEnum, tuple[str, str]], states: type[IntEnum]
@@ -66,13 +67,19 @@ def test_messages_and_signals_are_those_that_cantools_reads(facts: Facts) -> Non
     assert set(told) == {message.name for message in database.messages}
     for message in database.messages:
         found = told[message.name]
-        assert (found["id"], found["length"], found["comment"]) == (message.frame_id, message.length, message.comment)
+        assert (found["id"], found["length"], found["comment"]) == (
+            message.frame_id,
+            message.length,
+            message.comment,
+        )
         assert (found["extended"], found["fd"]) == (message.is_extended_frame, message.is_fd)
         assert found["cycle_ms"] == (message.cycle_time or 0)
         assert message.dbc is not None
         assert found["delay_ms"] == message.dbc.attributes["GenMsgDelayTime"].value
         assert ("cyclic" in found["send_type"]) == ("Cyclic" in str(message.send_type))
-        assert {signal["name"] for signal in found["signals"]} == {signal.name for signal in message.signals}
+        assert {signal["name"] for signal in found["signals"]} == {
+            signal.name for signal in message.signals
+        }
         for row in found["signals"]:
             signal = message.get_signal_by_name(row["name"])
             assert (row["start_bit"], row["length"], row["byte_order"]) == (
@@ -89,7 +96,10 @@ def test_messages_and_signals_are_those_that_cantools_reads(facts: Facts) -> Non
             choices = {int(number): str(name) for number, name in (signal.choices or {}).items()}
             assert {value["value"]: value["name"] for value in row["values"]} == choices
             texts = {name: number for number, name in choices.items()}
-            assert (row["not_available"], row["error"]) == (texts.get("NotAvailable"), texts.get("Error"))
+            assert (row["not_available"], row["error"]) == (
+                texts.get("NotAvailable"),
+                texts.get("Error"),
+            )
 
 
 def test_objects_are_those_that_canopen_reads(facts: Facts) -> None:
@@ -99,7 +109,9 @@ def test_objects_are_those_that_canopen_reads(facts: Facts) -> None:
     for index, item in dictionary.items():
         found = told[index]
         assert found["name"] == item.name
-        variables: dict[int, Any] = {0: item} if isinstance(item, ODVariable) else dict(item.subindices)
+        variables: dict[int, Any] = (
+            {0: item} if isinstance(item, ODVariable) else dict(item.subindices)
+        )
         assert [entry["sub"] for entry in found["entries"]] == sorted(variables)
         assert (found["kind"] == "VAR") == isinstance(item, ODVariable) or found["kind"] == "DOMAIN"
         for entry in found["entries"]:
@@ -118,7 +130,9 @@ def test_objects_are_those_that_canopen_reads(facts: Facts) -> None:
 def test_the_node_has_the_cob_ids_and_pdos_that_canopen_computes(facts: Facts) -> None:
     node = facts["canopen"]["nodes"][0]
     assert (node["esc"], node["node_id"]) == ("esc1", 1)
-    assert {0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x601, 0x701} <= {cob["id"] for cob in node["cob_ids"]}
+    assert {0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x601, 0x701} <= {
+        cob["id"] for cob in node["cob_ids"]
+    }
     dictionary: Any = canopen.import_od(str(EDS), node_id=1)
     tried: dict[int, int] = {n: dictionary[0x1800 + n][1].default for n in range(6)}
     assert {pdo["number"] - 1: pdo["cob_id"] for pdo in node["pdos"]} == {
@@ -127,9 +141,14 @@ def test_the_node_has_the_cob_ids_and_pdos_that_canopen_computes(facts: Facts) -
     for pdo in node["pdos"]:
         parameters, mapping = dictionary[0x17FF + pdo["number"]], dictionary[0x19FF + pdo["number"]]
         assert pdo["transmission_type"] == parameters[2].default
-        assert (pdo["inhibit_ms"], pdo["event_ms"]) == (parameters[3].default / 10, parameters[5].default)
+        assert (pdo["inhibit_ms"], pdo["event_ms"]) == (
+            parameters[3].default / 10,
+            parameters[5].default,
+        )
         mapped = [mapping[sub].default for sub in range(1, mapping[0].default + 1)]
-        assert [text.split()[0] for text in pdo["mapped"]] == [f"{m >> 16:04X}h:{m >> 8 & 0xFF:02X}" for m in mapped]
+        assert [text.split()[0] for text in pdo["mapped"]] == [
+            f"{m >> 16:04X}h:{m >> 8 & 0xFF:02X}" for m in mapped
+        ]
 
 
 def test_emergencies_are_those_that_the_eds_enables(facts: Facts) -> None:
@@ -141,7 +160,10 @@ def test_emergencies_are_those_that_the_eds_enables(facts: Facts) -> None:
     assert OperatingError.PROGRAMMING_ALLOWED not in {e["byte3"] for e in of_esc}
     found = {(e["code"], e["byte4"]) for e in told if e["byte3"] == 0xFF}
     assert found == {
-        *((error.value[0], None if error is GatewayError.HEARTBEAT_LOST else error.value[1]) for error in GatewayError),
+        *(
+            (error.value[0], None if error is GatewayError.HEARTBEAT_LOST else error.value[1])
+            for error in GatewayError
+        ),
         (0, 0),
     }
     assert all(e["meaning"] and e["remedy"].endswith(".") for e in told)
@@ -183,7 +205,12 @@ def test_of_two_escs_each_has_its_signals_and_cob_ids_and_the_objects_are_told_o
     }
     nodes = two["canopen"]["nodes"]
     assert [(node["esc"], node["node_id"]) for node in nodes] == [("left", 20), ("right", 21)]
-    assert [pdo["cob_id"] for pdo in nodes[1]["pdos"]] == [0x180 + 21, 0x280 + 21, 0x380 + 21, 0x480 + 21]
+    assert [pdo["cob_id"] for pdo in nodes[1]["pdos"]] == [
+        0x180 + 21,
+        0x280 + 21,
+        0x380 + 21,
+        0x480 + 21,
+    ]
     assert two["canopen"]["objects"] == facts["canopen"]["objects"]
 
 

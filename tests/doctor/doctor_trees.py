@@ -52,11 +52,24 @@ class Tree(System):
             self.folder(os.path.dirname(name))
         self.path(name).symlink_to(self.path(target))
 
-    def device(self, name: str, number: tuple[int, int], mode: int = 0o660, group: int = DIALOUT) -> None:
+    def device(
+        self, name: str, number: tuple[int, int], mode: int = 0o660, group: int = DIALOUT
+    ) -> None:
         """A character device of root's."""
         self.file(name, "")
         inode = 100 + len(self.devices)
-        values = (stat.S_IFCHR | mode, inode, os.makedev(0, _DEVICE_FOLDER), 1, 0, group, 0, 0, 0, 0)
+        values = (
+            stat.S_IFCHR | mode,
+            inode,
+            os.makedev(0, _DEVICE_FOLDER),
+            1,
+            0,
+            group,
+            0,
+            0,
+            0,
+            0,
+        )
         self.devices[name] = os.stat_result(values, {"st_rdev": os.makedev(*number)})
 
     def process(self, pid: int, *words: str, opens: Sequence[str] = ()) -> None:
@@ -66,7 +79,9 @@ class Tree(System):
         for number, name in enumerate(opens, 3):
             self.link(f"/proc/{pid}/fd/{number}", name)
 
-    def ftdi(self, tty: str = "ttyUSB0", serial: str = "A1234", latency: int = 1, minor: int = 0) -> None:
+    def ftdi(
+        self, tty: str = "ttyUSB0", serial: str = "A1234", latency: int = 1, minor: int = 0
+    ) -> None:
         """An FTDI adapter with its device node and udev's names."""
         usb = f"/sys/devices/pci0/usb1/1-{minor + 1}"
         port = f"{usb}/1-{minor + 1}:1.0/{tty}"
@@ -85,7 +100,9 @@ class Tree(System):
         self.link(f"/dev/serial/by-id/usb-FTDI_{serial or 'none'}-port0", f"/dev/{tty}")
         self.link(f"/dev/serial/by-path/pci-usb-0:{minor + 1}", f"/dev/{tty}")
 
-    def uart(self, tty: str, driver: str, compatible: str = "", number: tuple[int, int] = (4, 64)) -> None:
+    def uart(
+        self, tty: str, driver: str, compatible: str = "", number: tuple[int, int] = (4, 64)
+    ) -> None:
         """A UART on the board, as kernels since 6.6 show it: two devices of the serial core between it and the tty."""
         board = f"/sys/devices/platform/soc/{tty}.serial"
         core = f"{board}/{tty}:0/{tty}:0.0"
@@ -103,8 +120,11 @@ class Tree(System):
     def systemd(self, **shown: str) -> None:
         """systemd with our unit, which shows these properties besides the usual ones."""
         self.folder("/run/systemd/system")
-        self.folder("/run/kontronik-can-gw/lock", 0o777)  # for it cannot be given to the service's user
-        self.file("/etc/passwd", "root:x:0:0::/:/bin/sh\nkontronik-can-gw:x:990:990::/:/bin/false\n")
+        # for it cannot be given to the service's user
+        self.folder("/run/kontronik-can-gw/lock", 0o777)
+        self.file(
+            "/etc/passwd", "root:x:0:0::/:/bin/sh\nkontronik-can-gw:x:990:990::/:/bin/false\n"
+        )
         usual = {
             "LoadState": "loaded",
             "ActiveState": "active",
@@ -157,4 +177,8 @@ def only(findings: Sequence[Finding], check: str) -> Finding:
 
 def grave(findings: Sequence[Finding]) -> dict[str, Severity]:
     """What is not as it should be, by check."""
-    return {finding.check: finding.severity for finding in findings if finding.severity is not Severity.OK}
+    return {
+        finding.check: finding.severity
+        for finding in findings
+        if finding.severity is not Severity.OK
+    }

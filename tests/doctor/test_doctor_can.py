@@ -21,7 +21,14 @@ UP = "sudo ip link set can0 up type can bitrate 500000"
 
 def controller() -> dict[str, Any]:
     """An adapter with everything as it should be."""
-    counted = ("restarts", "bus_error", "arbitration_lost", "error_warning", "error_passive", "bus_off")
+    counted = (
+        "restarts",
+        "bus_error",
+        "arbitration_lost",
+        "error_warning",
+        "error_passive",
+        "bus_off",
+    )
     of_one_way = {"bytes": 0, "packets": 0, "errors": 0, "dropped": 0}
     data = {
         "state": "ERROR-ACTIVE",
@@ -86,13 +93,31 @@ DOWN = {"flags": ["NOARP"]}
         (info(restart_ms=0), PLAIN, "can.restart", ERROR, "restart-ms 100"),
         (info(restart_ms=5000), PLAIN, "can.restart", WARNING, "restart-ms 100"),
         ({"txqlen": 7}, PLAIN, "can.queue", WARNING, "txqueuelen 128"),
-        (info(berr_counter={"tx": 128, "rx": 7}), PLAIN, "can.state", OK, "transmit 128, receive 7"),
+        (
+            info(berr_counter={"tx": 128, "rx": 7}),
+            PLAIN,
+            "can.state",
+            OK,
+            "transmit 128, receive 7",
+        ),
         (info(state="ERROR-PASSIVE"), PLAIN, "can.state", WARNING, ""),
         (info(state="BUS-OFF"), PLAIN, "can.state", ERROR, ""),
-        (info(ctrlmode=["LISTEN-ONLY", "BERR-REPORTING"]), PLAIN, "can.mode", ERROR, "listen-only off"),
+        (
+            info(ctrlmode=["LISTEN-ONLY", "BERR-REPORTING"]),
+            PLAIN,
+            "can.mode",
+            ERROR,
+            "listen-only off",
+        ),
         (info(ctrlmode=["ONE-SHOT"]), PLAIN, "can.mode", WARNING, "one-shot off"),
         ({}, FD, "can.fd", ERROR, "dbitrate 2000000 fd on"),
-        ({"mtu": 72} | info(data_bittiming={"bitrate": 4000000}), FD, "can.data_bitrate", ERROR, ""),
+        (
+            {"mtu": 72} | info(data_bittiming={"bitrate": 4000000}),
+            FD,
+            "can.data_bitrate",
+            ERROR,
+            "",
+        ),
         ({"linkinfo": {"info_xstats": {"bus_off": 3}}}, PLAIN, "can.bus_off", WARNING, "3 times"),
         ({"stats64": {"tx": {"dropped": 9}}}, PLAIN, "can.statistics", NOTE, "9 tx dropped"),
         (info(termination=120), PLAIN, "can.termination", NOTE, "120 ohm"),
@@ -118,14 +143,19 @@ def test_what_is_not_as_it_should_be_is_told_with_the_command(
         ({"mtu": 72} | info(data_bittiming={"bitrate": 2000000}), FD),
     ],
 )
-def test_a_good_interface_has_nothing_but_ok(tree: Tree, change: dict[str, Any], can: CanConfig) -> None:
+def test_a_good_interface_has_nothing_but_ok(
+    tree: Tree, change: dict[str, Any], can: CanConfig
+) -> None:
     interface(tree, merged(controller(), change))
     assert grave(check_can(tree, can)) == {}
 
 
 def test_a_missing_interface_is_told_with_those_there_are(tree: Tree) -> None:
     found = only(check_can(tree, PLAIN), "can.exists")
-    assert (found.severity, found.command) == (ERROR, "sudo ip link add can0 type vcan && sudo ip link set can0 up")
+    assert (found.severity, found.command) == (
+        ERROR,
+        "sudo ip link add can0 type vcan && sudo ip link set can0 up",
+    )
     tree.file("/sys/class/net/can1/type", "280\n")
     tree.file("/sys/class/net/eth0/type", "1\n")
     assert only(check_can(tree, PLAIN), "can.exists").remedy == "Set can.channel: can1"
@@ -133,7 +163,13 @@ def test_a_missing_interface_is_told_with_those_there_are(tree: Tree) -> None:
 
 def test_slcan_cannot_restart_and_is_not_told_to(tree: Tree) -> None:
     """The kernel's slcan driver: fixed rates, no bit timing, no restart."""
-    change = info(bittiming=None, restart_ms=0, bittiming_bitrate=500000, bitrate_const=[250000, 500000], clock=0)
+    change = info(
+        bittiming=None,
+        restart_ms=0,
+        bittiming_bitrate=500000,
+        bitrate_const=[250000, 500000],
+        clock=0,
+    )
     interface(tree, merged(controller(), change), hardware=False)
     findings = check_can(tree, PLAIN)
     assert grave(findings) == {"can.restart": NOTE}
@@ -142,9 +178,16 @@ def test_slcan_cannot_restart_and_is_not_told_to(tree: Tree) -> None:
 
 
 @pytest.mark.parametrize("shown", [None, "[]", "Device does not exist.", '[{"linkinfo": []}]'])
-def test_without_ip_or_with_one_that_knows_no_json_sys_is_read(tree: Tree, shown: str | None) -> None:
+def test_without_ip_or_with_one_that_knows_no_json_sys_is_read(
+    tree: Tree, shown: str | None
+) -> None:
     folder = "/sys/class/net/can0"
-    for name, text in {"type": "280", "flags": "0x40041", "mtu": "16", "tx_queue_len": "10"}.items():
+    for name, text in {
+        "type": "280",
+        "flags": "0x40041",
+        "mtu": "16",
+        "tx_queue_len": "10",
+    }.items():
         tree.file(f"{folder}/{name}", text + "\n")
     tree.file(f"{folder}/statistics/tx_dropped", "4\n")
     if shown is not None:
@@ -168,8 +211,15 @@ def test_another_gateway_on_this_interface_is_noted(tree: Tree) -> None:
     interface(tree, controller())
     tree.file("/proc/self/ns/net", "")
     namespace = tree.path("/proc/self/ns/net").stat().st_ino
-    names = [node_lock("can0", 10), node_lock("can0", 2), messages_lock("can0", 0x680), node_lock("can1", 7)]
-    files = [file_name(name, namespace) for name in names] + [file_name(node_lock("can0", 3), namespace + 1)]
+    names = [
+        node_lock("can0", 10),
+        node_lock("can0", 2),
+        messages_lock("can0", 0x680),
+        node_lock("can1", 7),
+    ]
+    files = [file_name(name, namespace) for name in names] + [
+        file_name(node_lock("can0", 3), namespace + 1)
+    ]
     left = file_name(node_lock("can0", 4), namespace)
     lines = []
     for file in [*files, left]:
@@ -181,4 +231,7 @@ def test_another_gateway_on_this_interface_is_noted(tree: Tree) -> None:
     tree.process(90, "python3", "-m", "kontronik_can_gw", "run")
     found = only(check_can(tree, PLAIN), "can.gateway")
     assert found.severity is NOTE
-    assert found.text == "kontronik-can-gw (pid 90) already sends CANopen node 2, 10 and the messages from 680h on"
+    assert (
+        found.text
+        == "kontronik-can-gw (pid 90) already sends CANopen node 2, 10 and the messages from 680h on"
+    )

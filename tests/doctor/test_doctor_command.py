@@ -28,15 +28,28 @@ def document(file: Path, code: int) -> tuple[list[dict[str, str]], list[dict[str
     done = run("doctor", "-c", file, "--json")
     assert (done.code, done.err) == (code, "")
     found = json.loads(done.out)
-    assert set(found) == {"format", "version", "config", "exit_code", "errors", "warnings", "findings"}
-    assert all(set(f) == {"group", "check", "severity", "text", "remedy", "command"} for f in found["findings"])
+    assert set(found) == {
+        "format",
+        "version",
+        "config",
+        "exit_code",
+        "errors",
+        "warnings",
+        "findings",
+    }
+    assert all(
+        set(f) == {"group", "check", "severity", "text", "remedy", "command"}
+        for f in found["findings"]
+    )
     assert (found["format"], found["exit_code"]) == (1, code)
     for severity in ("error", "warning"):
         assert found[f"{severity}s"] == sum(f["severity"] == severity for f in found["findings"])
     return found["findings"], [f for f in found["findings"] if f["severity"] == "error"]
 
 
-def test_a_usable_set_up_has_exit_code_0_and_plain_text_in_a_pipe(tmp_path: Path, esc: PtyEsc) -> None:
+def test_a_usable_set_up_has_exit_code_0_and_plain_text_in_a_pipe(
+    tmp_path: Path, esc: PtyEsc
+) -> None:
     done = run("doctor", "-c", configuration(tmp_path, esc.path))
     assert (done.code, done.err) == (0, "")
     for group in ("Configuration", "Serial port of esc1", "CAN doctor", "Machine"):

@@ -43,7 +43,9 @@ def test_nothing_is_written_and_no_echo_stays(terminal: tuple[int, int, str]) ->
     assert not termios.tcgetattr(slave)[3] & (termios.ECHO | termios.ICANON)
 
 
-def test_a_port_that_somebody_may_have_set_up_is_not_touched(terminal: tuple[int, int, str]) -> None:
+def test_a_port_that_somebody_may_have_set_up_is_not_touched(
+    terminal: tuple[int, int, str],
+) -> None:
     _, slave, name = terminal
     tty.setraw(slave)
     before = termios.tcgetattr(slave)
@@ -68,10 +70,19 @@ def test_no_module_of_doctor_can_write_to_a_device() -> None:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
         methods = {call.attr for call in calls if isinstance(call, ast.Attribute)}
-        assert not methods & {"write", "writelines", "write_text", "write_bytes", "sendto", "tcsendbreak"}, path.name
+        assert not methods & {
+            "write",
+            "writelines",
+            "write_text",
+            "write_bytes",
+            "sendto",
+            "tcsendbreak",
+        }, path.name
         names = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
         assert not names & {"O_RDWR", "O_WRONLY", "O_CREAT"}, path.name
-        if "open" in methods or any(isinstance(call, ast.Name) and call.id == "open" for call in calls):
+        if "open" in methods or any(
+            isinstance(call, ast.Name) and call.id == "open" for call in calls
+        ):
             assert path.name == "line.py"
 
 

@@ -62,14 +62,32 @@ def test_a_good_machine_has_nothing_but_ok(tree: Tree) -> None:
     [
         ({CLOCK_SOURCE: "acpi_pm"}, "machine.clock_source", NOTE),
         ({"/proc/loadavg": "4000.0 0.20 0.30 1/100 999"}, "machine.load", WARNING),
-        ({"/proc/meminfo": "MemTotal: 900000 kB\nMemAvailable: 20000 kB"}, "machine.memory", WARNING),
-        ({f"{CPU}/scaling_governor": "powersave", f"{CPU}/scaling_driver": "cpufreq-dt"}, "machine.governor", NOTE),
+        (
+            {"/proc/meminfo": "MemTotal: 900000 kB\nMemAvailable: 20000 kB"},
+            "machine.memory",
+            WARNING,
+        ),
+        (
+            {f"{CPU}/scaling_governor": "powersave", f"{CPU}/scaling_driver": "cpufreq-dt"},
+            "machine.governor",
+            NOTE,
+        ),
         # there it is the one that adapts
-        ({f"{CPU}/scaling_governor": "powersave", f"{CPU}/scaling_driver": "intel_pstate"}, "machine.governor", OK),
-        ({f"{HWMON}/hwmon1/name": "rpi_volt", f"{HWMON}/hwmon1/in0_lcrit_alarm": "1"}, "machine.power", NOTE),
+        (
+            {f"{CPU}/scaling_governor": "powersave", f"{CPU}/scaling_driver": "intel_pstate"},
+            "machine.governor",
+            OK,
+        ),
+        (
+            {f"{HWMON}/hwmon1/name": "rpi_volt", f"{HWMON}/hwmon1/in0_lcrit_alarm": "1"},
+            "machine.power",
+            NOTE,
+        ),
     ],
 )
-def test_what_is_not_as_it_should_be_is_told(tree: Tree, files: dict[str, str], check: str, severity: Severity) -> None:
+def test_what_is_not_as_it_should_be_is_told(
+    tree: Tree, files: dict[str, str], check: str, severity: Severity
+) -> None:
     for name, text in files.items():
         tree.file(name, f"{text}\n")
     assert only(machine(tree), check).severity is severity
@@ -82,13 +100,19 @@ def test_what_is_not_as_it_should_be_is_told(tree: Tree, files: dict[str, str], 
     ("shown", "severity", "word"),
     [
         ({"LoadState": "not-found"}, NOTE, "service install"),
-        ({"ActiveState": "failed", "Result": "exit-code"}, ERROR, "journalctl -u kontronik-can-gw.service"),
+        (
+            {"ActiveState": "failed", "Result": "exit-code"},
+            ERROR,
+            "journalctl -u kontronik-can-gw.service",
+        ),
         ({"ActiveState": "inactive", "SubState": "dead"}, NOTE, "systemctl start"),
         ({"NRestarts": "7"}, WARNING, "journalctl"),
         ({}, OK, ""),
     ],
 )
-def test_how_the_service_fares_is_told(tree: Tree, shown: dict[str, str], severity: Severity, word: str) -> None:
+def test_how_the_service_fares_is_told(
+    tree: Tree, shown: dict[str, str], severity: Severity, word: str
+) -> None:
     assert "systemd does not run" in only(machine(tree), "machine.service").text
     tree.systemd(**shown)
     found = only(machine(tree), "machine.service")
@@ -131,7 +155,9 @@ def test_the_services_own_folder_is_made_by_systemd(tree: Tree) -> None:
     assert folder(tree, f"{STORE}-left", "/etc/kontronik-can-gw/left.toml").severity is OK
 
 
-def test_a_folder_of_ones_own_must_be_the_services_and_the_unit_must_let_it_write(tree: Tree) -> None:
+def test_a_folder_of_ones_own_must_be_the_services_and_the_unit_must_let_it_write(
+    tree: Tree,
+) -> None:
     tree.systemd()
     tree.folder("/data", 0o755)
     assert folder(tree, "/data").severity is ERROR
@@ -154,7 +180,9 @@ def test_a_folder_of_ones_own_must_be_the_services_and_the_unit_must_let_it_writ
         (FileSystem(False, 1 << 20, 1000), WARNING, "1024 kB"),
     ],
 )
-def test_a_full_or_read_only_file_system_is_told(tree: Tree, left: FileSystem, severity: Severity, word: str) -> None:
+def test_a_full_or_read_only_file_system_is_told(
+    tree: Tree, left: FileSystem, severity: Severity, word: str
+) -> None:
     tree.folder(STORE)
     tree.full[STORE] = left
     found = folder(tree)
@@ -172,7 +200,10 @@ def test_a_configuration_that_the_service_cannot_read_is_an_error(tree: Tree) ->
     assert readable(tree) == []
     tree.file("/srv/anna/gateway.toml", "")
     tree.path("/srv/anna").chmod(0o700)
-    assert "may not enter /srv/anna" in only(readable(tree, "/srv/anna/gateway.toml"), "config.readable").text
+    assert (
+        "may not enter /srv/anna"
+        in only(readable(tree, "/srv/anna/gateway.toml"), "config.readable").text
+    )
     tree.file("/home/anna/gateway.toml", "")
     assert "ProtectHome" in only(readable(tree, "/home/anna/gateway.toml"), "config.readable").text
     tree.systemd(ProtectHome="read-only")

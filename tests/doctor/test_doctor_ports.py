@@ -85,22 +85,52 @@ def uart(tty: str, driver: str = "uart-pl011", compatible: str = "") -> Set:
     return lambda tree: tree.uart(tty, driver, compatible)
 
 
-DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlock devices:\n188 other\n")
+DEVICES = file(
+    "/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlock devices:\n188 other\n"
+)
 
 
 @pytest.mark.parametrize(
     ("given", "port", "opened", "name", "severity", "said"),
     [
-        (ftdi, BY_ID, True, "port.exists", OK, "FT232R USB UART, driver ftdi_sio, serial number A1234"),
+        (
+            ftdi,
+            BY_ID,
+            True,
+            "port.exists",
+            OK,
+            "FT232R USB UART, driver ftdi_sio, serial number A1234",
+        ),
         (ftdi, "/dev/ttyUSB7", False, "port.exists", ERROR, BY_ID),
         (all_of(), USB0, False, "port.exists", ERROR, "Plug in the adapter"),
         (file("/dev/notes", "x"), "/dev/notes", False, "port.exists", ERROR, ""),
-        (device("/dev/pts/3", (136, 3), 0o620, 5), "/dev/pts/3", False, "port.exists", OK, "pseudo terminal"),
+        (
+            device("/dev/pts/3", (136, 3), 0o620, 5),
+            "/dev/pts/3",
+            False,
+            "port.exists",
+            OK,
+            "pseudo terminal",
+        ),
         (uart("ttyAMA0"), AMA0, True, "port.exists", OK, "driver uart-pl011"),
         (ftdi, USB0, True, "port.name", WARNING, f'port = "{BY_ID}"'),
-        (lambda t: t.ftdi(serial=""), USB0, True, "port.name", WARNING, "/dev/serial/by-path/pci-usb-0:1"),
+        (
+            lambda t: t.ftdi(serial=""),
+            USB0,
+            True,
+            "port.name",
+            WARNING,
+            "/dev/serial/by-path/pci-usb-0:1",
+        ),
         # who may open it
-        (all_of(ftdi, closed(BY_ID)), BY_ID, False, "port.permission", ERROR, "sudo usermod -aG dialout anna"),
+        (
+            all_of(ftdi, closed(BY_ID)),
+            BY_ID,
+            False,
+            "port.permission",
+            ERROR,
+            "sudo usermod -aG dialout anna",
+        ),
         (
             all_of(ftdi, device(USB0, (188, 0), 0o600, 0), closed(BY_ID)),
             *(BY_ID, False, "port.permission", ERROR, "chmod g+rw"),
@@ -111,17 +141,26 @@ DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlo
         ),
         (
             all_of(
-                ftdi, DEVICES, systemd(DevicePolicy="closed", DeviceAllow="char-ttyS rw\nDeviceAllow=char-ttyACM rw")
+                ftdi,
+                DEVICES,
+                systemd(
+                    DevicePolicy="closed", DeviceAllow="char-ttyS rw\nDeviceAllow=char-ttyACM rw"
+                ),
             ),
             *(BY_ID, True, "port.device_kind", ERROR, "DeviceAllow=char-ttyUSB rw"),
         ),
         # what else is on it
         (
-            all_of(uart("ttyAMA0"), process("/sbin/agetty", "115200", "ttyAMA0", "vt220", opens=[AMA0])),
+            all_of(
+                uart("ttyAMA0"), process("/sbin/agetty", "115200", "ttyAMA0", "vt220", opens=[AMA0])
+            ),
             *(AMA0, False, "port.getty", ERROR, "systemctl disable --now serial-getty@ttyAMA0"),
         ),
         (
-            all_of(uart("ttyAMA0"), file("/proc/cmdline", "console=tty1 console=ttyAMA0,115200 root=/dev/sda\n")),
+            all_of(
+                uart("ttyAMA0"),
+                file("/proc/cmdline", "console=tty1 console=ttyAMA0,115200 root=/dev/sda\n"),
+            ),
             *(AMA0, False, "port.console", ERROR, "Remove console=ttyAMA0"),
         ),
         (
@@ -140,22 +179,61 @@ DEVICES = file("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlo
             ),
             *(BY_ID, True, "port.modem_manager", OK, ""),
         ),
-        (all_of(ftdi, process("minicom", opens=[USB0])), BY_ID, False, "port.users", ERROR, "kill 78"),
-        (all_of(ftdi, process(*RUN, opens=[USB0])), BY_ID, False, "port.users", NOTE, "kontronik-can-gw (pid 78)"),
         (
-            all_of(ftdi, process("/usr/bin/python3", "/opt/bin/kontronik-can-gw", "run", "--wait", opens=[USB0])),
+            all_of(ftdi, process("minicom", opens=[USB0])),
+            BY_ID,
+            False,
+            "port.users",
+            ERROR,
+            "kill 78",
+        ),
+        (
+            all_of(ftdi, process(*RUN, opens=[USB0])),
+            BY_ID,
+            False,
+            "port.users",
+            NOTE,
+            "kontronik-can-gw (pid 78)",
+        ),
+        (
+            all_of(
+                ftdi,
+                process(
+                    "/usr/bin/python3", "/opt/bin/kontronik-can-gw", "run", "--wait", opens=[USB0]
+                ),
+            ),
             *(BY_ID, False, "port.users", NOTE, "kontronik-can-gw (pid 78)"),
         ),
         # the line itself
-        (uart("ttyS0", "serial8250", "brcm,bcm2835-aux-uart"), S0, False, "port.parity", ERROR, "dtoverlay=disable-bt"),
-        (lambda t: t.ftdi(latency=16), BY_ID, True, "port.latency", OK, "16 ms; the gateway asks for 1 ms"),
+        (
+            uart("ttyS0", "serial8250", "brcm,bcm2835-aux-uart"),
+            S0,
+            False,
+            "port.parity",
+            ERROR,
+            "dtoverlay=disable-bt",
+        ),
+        (
+            lambda t: t.ftdi(latency=16),
+            BY_ID,
+            True,
+            "port.latency",
+            OK,
+            "16 ms; the gateway asks for 1 ms",
+        ),
         (
             all_of(lambda t: t.ftdi(latency=16), process(*RUN, opens=[USB0])),
             *(BY_ID, False, "port.latency", WARNING, "latency_timer"),
         ),
         (
             all_of(ftdi, file("/sys/devices/pci0/usb1/1-1/power/control", "auto\n")),
-            *(BY_ID, True, "port.autosuspend", NOTE, "echo on | sudo tee /sys/devices/pci0/usb1/1-1/power/control"),
+            *(
+                BY_ID,
+                True,
+                "port.autosuspend",
+                NOTE,
+                "echo on | sudo tee /sys/devices/pci0/usb1/1-1/power/control",
+            ),
         ),
     ],
 )
@@ -179,7 +257,11 @@ def test_what_is_found_is_told_and_the_port_is_opened_only_where_nobody_else_nee
         (all_of(ftdi, file("/proc/cmdline", "console=ttyUSB01 console=tty1 quiet\n")), BY_ID),
         (
             all_of(
-                ftdi, DEVICES, systemd(DevicePolicy="closed", DeviceAllow="char-ttyUSB rw\nDeviceAllow=char-ttyS rw")
+                ftdi,
+                DEVICES,
+                systemd(
+                    DevicePolicy="closed", DeviceAllow="char-ttyUSB rw\nDeviceAllow=char-ttyS rw"
+                ),
             ),
             BY_ID,
         ),
@@ -217,7 +299,9 @@ def test_a_port_that_only_the_running_gateway_may_open_is_no_error(tree: Tree) -
         ),
     ],
 )
-def test_what_the_port_itself_answers_is_told(tree: Tree, line: Line, name: str, severity: Severity, word: str) -> None:
+def test_what_the_port_itself_answers_is_told(
+    tree: Tree, line: Line, name: str, severity: Severity, word: str
+) -> None:
     tree.ftdi()
     found = only(check(tree, look=Looked(line)), name)
     assert found.severity is severity
@@ -235,7 +319,9 @@ def test_a_lock_tells_who_has_the_port_where_nothing_else_may_be_seen(tree: Tree
     assert look.calls == []
 
 
-def test_where_not_all_programs_can_be_seen_it_is_said_and_the_port_is_not_thought_free(tree: Tree) -> None:
+def test_where_not_all_programs_can_be_seen_it_is_said_and_the_port_is_not_thought_free(
+    tree: Tree,
+) -> None:
     tree.ftdi()
     tree.path("/proc/1/comm").unlink()  # as with hidepid
     look = Looked()

@@ -10,7 +10,9 @@ from kontronik_can_gw.errors import UserError
 
 SHIPPED = (Path(__file__).parents[2] / "eds" / "kontronik_esc.eds").read_text("ascii")
 VARIABLE = "ParameterName=x\nDataType=0x0005\nAccessType=rw\n"
-COMPACT = "[{index:04X}]\nParameterName=x\nObjectType=8\nDataType=5\nAccessType=rw\nCompactSubObj=254\n"
+COMPACT = (
+    "[{index:04X}]\nParameterName=x\nObjectType=8\nDataType=5\nAccessType=rw\nCompactSubObj=254\n"
+)
 HUGE = "9" * 5_000
 
 
@@ -19,10 +21,22 @@ HUGE = "9" * 5_000
     [
         (SHIPPED + "\n" + ";" * reader.MAX_BYTES, "is larger than 2 MB"),
         (SHIPPED + "\n" * 100_001, "is larger than 2 MB or 100000 lines"),
-        (SHIPPED + "".join(COMPACT.format(index=index) for index in range(0x2800, 0x2900)), "more than 10000 objects"),
-        (SHIPPED + f"\n[2800]\n{VARIABLE}ObjectType=8\nCompactSubObj={HUGE}\n", "[2800] CompactSubObj=999"),
-        (SHIPPED + f"\n[2800]\n{VARIABLE}ObjectType=8\nSubNumber=0xFFFFFFFF\n", "[2800] SubNumber=4294967295"),
-        (SHIPPED.replace("SupportedObjects=", f"SupportedObjects={HUGE}", 1), "SupportedObjects=999"),
+        (
+            SHIPPED + "".join(COMPACT.format(index=index) for index in range(0x2800, 0x2900)),
+            "more than 10000 objects",
+        ),
+        (
+            SHIPPED + f"\n[2800]\n{VARIABLE}ObjectType=8\nCompactSubObj={HUGE}\n",
+            "[2800] CompactSubObj=999",
+        ),
+        (
+            SHIPPED + f"\n[2800]\n{VARIABLE}ObjectType=8\nSubNumber=0xFFFFFFFF\n",
+            "[2800] SubNumber=4294967295",
+        ),
+        (
+            SHIPPED.replace("SupportedObjects=", f"SupportedObjects={HUGE}", 1),
+            "SupportedObjects=999",
+        ),
         (SHIPPED.replace("SupportedObjects=3", f"SupportedObjects=3\n{HUGE}=0x1000"), "listed"),
         (
             SHIPPED + COMPACT.format(index=0x2800) + f"[2800Name]\nNrOfEntries=1\n{HUGE}=x\n",
@@ -43,7 +57,9 @@ HUGE = "9" * 5_000
 def test_what_is_out_of_bounds_is_said_shortly_and_canopen_is_not_called(
     text: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(canopen.objectdictionary.eds, "import_eds", lambda *_: pytest.fail("canopen was called"))
+    monkeypatch.setattr(
+        canopen.objectdictionary.eds, "import_eds", lambda *_: pytest.fail("canopen was called")
+    )
     with pytest.raises(UserError) as caught:
         reader.load(text.encode("ascii"), "mine.eds")
     assert any(said in line for line in caught.value.problems), caught.value.problems

@@ -59,7 +59,9 @@ def changed(section: str, old: str, new: str) -> str:
 
 def rows_of(name: str) -> Iterator[Any]:
     """The rows of a table, each by its number of line."""
-    for number, line in enumerate(Path(__file__).with_name(name).read_text("ascii").splitlines(), 1):
+    for number, line in enumerate(
+        Path(__file__).with_name(name).read_text("ascii").splitlines(), 1
+    ):
         if line and not line.startswith((";", "==")):
             yield pytest.param(*(cell.strip(" ") for cell in line.split("|")), id=f"line {number}")
 
@@ -74,7 +76,9 @@ def test_the_shipped_one_has_no_mistake() -> None:
 @pytest.mark.parametrize(("index", "name"), [(0x1000, "1000"), (0x1001, "1001"), (0x1018, "1018")])
 def test_mandatory_objects(index: int, name: str) -> None:
     shorter = reader.without(SHIPPED.encode(), {index})
-    assert problems(shorter) == (f"mine.eds: [{name}] this object is mandatory and is not there. Add it.",)
+    assert problems(shorter) == (
+        f"mine.eds: [{name}] this object is mandatory and is not there. Add it.",
+    )
 
 
 @pytest.mark.parametrize(("section", "old", "new", "message"), list(rows_of("mistakes.txt")))
@@ -90,7 +94,9 @@ def test_mistakes_by_section_and_key(section: str, old: str, new: str, message: 
 def test_letters_beyond_ascii_are_named_with_their_line() -> None:
     data = SHIPPED.replace("ParameterName=Throttle", "ParameterName=Gaß").encode("latin-1")
     line = SHIPPED[: SHIPPED.index("ParameterName=Throttle")].count("\n") + 1
-    assert problems(data) == (f"mine.eds: line {line} is not ASCII: ParameterName=Ga\\xdf. Write it in plain letters.",)
+    assert problems(data) == (
+        f"mine.eds: line {line} is not ASCII: ParameterName=Ga\\xdf. Write it in plain letters.",
+    )
 
 
 def test_all_mistakes_are_told_at_once() -> None:
@@ -102,7 +108,12 @@ def test_all_mistakes_are_told_at_once() -> None:
 
 
 def test_what_is_no_eds_at_all_is_one_line() -> None:
-    for data in (b"", bytes(range(256)) * 99, b'VERSION ""\nBO_ 1 A: 8 B', "[FileInfo]\r\n".encode("utf-16")):
+    for data in (
+        b"",
+        bytes(range(256)) * 99,
+        b'VERSION ""\nBO_ 1 A: 8 B',
+        "[FileInfo]\r\n".encode("utf-16"),
+    ):
         assert list(problems(data)) == [
             "mine.eds: is no EDS: it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects]."
         ]
@@ -116,23 +127,39 @@ def test_a_damaged_file_is_read_or_refused_and_nothing_else(data: st.DataObject)
         at = data.draw(st.integers(0, len(lines) - 1))
         key = lines[at].split("=")[0]
         value = data.draw(
-            st.one_of(st.sampled_from(["", "-1", "0", "255", "0x1FFFFFFFF", "9" * 30, "[", "$NODEID", "x"]), st.text())
+            st.one_of(
+                st.sampled_from(
+                    ["", "-1", "0", "255", "0x1FFFFFFFF", "9" * 30, "[", "$NODEID", "x"]
+                ),
+                st.text(),
+            )
         )
         lines[at : at + 1] = data.draw(
             st.sampled_from(
-                [[], [lines[at]] * 2, [f"{key}={value}"], [value], [f"[{value}]"], [lines[at], "CompactSubObj=2"]]
+                [
+                    [],
+                    [lines[at]] * 2,
+                    [f"{key}={value}"],
+                    [value],
+                    [f"[{value}]"],
+                    [lines[at], "CompactSubObj=2"],
+                ]
             )
         )
     text = "\r\n".join(lines).encode("utf-8", "replace")
     found = problems(text)
-    assert all(problem.startswith("mine.eds: ") and problem.endswith((".", ";'.")) for problem in found)
+    assert all(
+        problem.startswith("mine.eds: ") and problem.endswith((".", ";'.")) for problem in found
+    )
 
 
 def test_the_width_of_1022h_is_not_agreed_on_and_both_are_taken() -> None:
     assert problems(changed("1022", "DataType=0x0005", "DataType=0x0006")) == ()
 
 
-@pytest.mark.parametrize(("dropped", "named", "partner"), [(0x1A03, "1803", "1A03"), (0x1803, "1A03", "1803")])
+@pytest.mark.parametrize(
+    ("dropped", "named", "partner"), [(0x1A03, "1803", "1A03"), (0x1803, "1A03", "1803")]
+)
 def test_half_a_pdo_is_refused(dropped: int, named: str, partner: str) -> None:
     assert problems(reader.without(SHIPPED.encode(), {dropped})) == (
         f"mine.eds: [{named}] [{partner}] of the same PDO is not there. Add it or remove this object.",
@@ -141,39 +168,61 @@ def test_half_a_pdo_is_refused(dropped: int, named: str, partner: str) -> None:
 
 def test_dropping_an_object_that_a_pdo_carries_is_told() -> None:
     found = problems(reader.without(SHIPPED.encode(), {0x2020}))
-    assert [problem.split("] ")[0] for problem in found] == ["mine.eds: [1A03sub4", "mine.eds: [1A03sub5"]
+    assert [problem.split("] ")[0] for problem in found] == [
+        "mine.eds: [1A03sub4",
+        "mine.eds: [1A03sub5",
+    ]
 
 
 # --- what is allowed ------------------------------------------------------------------------------------------------
 
 
 def test_any_case_and_lf_are_taken() -> None:
-    text = SHIPPED.replace("\r\n", "\n").replace("AccessType=rw", "ACCESSTYPE=RW").replace("[1A00sub", "[1a00Sub")
-    text = text.replace("[DeviceInfo]", "[deviceinfo]").replace("ParameterName=", "parametername =  ")
+    text = (
+        SHIPPED.replace("\r\n", "\n")
+        .replace("AccessType=rw", "ACCESSTYPE=RW")
+        .replace("[1A00sub", "[1a00Sub")
+    )
+    text = text.replace("[DeviceInfo]", "[deviceinfo]").replace(
+        "ParameterName=", "parametername =  "
+    )
     ours = reader.load(text.encode(), "mine.eds")
     assert ours.entries == reader.load(SHIPPED.encode(), "kontronik_esc.eds").entries
 
 
 def test_comments_and_unknown_sections_are_passed_over() -> None:
     text = SHIPPED.replace("[1017]\r\n", "; a comment\r\n[1017]\r\n  ; another\r\n# a third\r\n")
-    text = text.replace("DefaultValue=0x03E8", "DefaultValue=0x03E8 ; one second") + "\r\n[Editor]\r\nColour=blue\r\n"
-    assert reader.load(text.encode(), "mine.eds").entries == reader.load(SHIPPED.encode(), "kontronik_esc.eds").entries
+    text = (
+        text.replace("DefaultValue=0x03E8", "DefaultValue=0x03E8 ; one second")
+        + "\r\n[Editor]\r\nColour=blue\r\n"
+    )
+    assert (
+        reader.load(text.encode(), "mine.eds").entries
+        == reader.load(SHIPPED.encode(), "kontronik_esc.eds").entries
+    )
 
 
 def test_keys_without_a_value_are_not_there_as_editors_write_them() -> None:
-    entry = entry_of(with_object(variable(0x06, LowLimit="", HighLimit="", DefaultValue="", PDOMapping="")))
+    entry = entry_of(
+        with_object(variable(0x06, LowLimit="", HighLimit="", DefaultValue="", PDOMapping=""))
+    )
     assert (entry.low, entry.high, entry.default, entry.mappable) == (None, None, None, False)
 
 
 def test_a_missing_object_type_is_a_variable() -> None:
-    assert entry_of(with_object(variable(0x06).replace("ObjectType=0x7\r\n", ""))).object_type == reader.VAR
+    assert (
+        entry_of(with_object(variable(0x06).replace("ObjectType=0x7\r\n", ""))).object_type
+        == reader.VAR
+    )
 
 
 @pytest.mark.parametrize(("data_type", "text", "read", "written"), list(rows_of("values.txt")))
 def test_values_of_every_type_as_an_eds_and_a_dcf_write_them(
     data_type: str, text: str, read: str, written: str
 ) -> None:
-    eds = reader.load(with_object(variable(int(data_type, 16), DefaultValue=text)).encode("ascii"), "mine.eds")
+    eds = reader.load(
+        with_object(variable(int(data_type, 16), DefaultValue=text)).encode("ascii"), "mine.eds"
+    )
     entry = next(entry for entry in eds.entries if entry.index == 0x2200)
     assert repr(entry.default) + (" + node-ID" if entry.relative else "") == read
     assert entry.default is not None
@@ -182,19 +231,23 @@ def test_values_of_every_type_as_an_eds_and_a_dcf_write_them(
 
 
 def test_signed_limits_in_twos_complement() -> None:
-    entry = entry_of(with_object(variable(0x02, LowLimit="0x9C", HighLimit="0x64", DefaultValue="-100")))
+    entry = entry_of(
+        with_object(variable(0x02, LowLimit="0x9C", HighLimit="0x64", DefaultValue="-100"))
+    )
     assert (entry.low, entry.high, entry.default) == (-100, 100, -100)
 
 
-COMPACT = (
-    "ParameterName=Cell\r\nObjectType=0x8\r\nDataType=0x0006\r\nAccessType=rw\r\nDefaultValue=0x10\r\nLowLimit=1\r\n"
-)
+COMPACT = "ParameterName=Cell\r\nObjectType=0x8\r\nDataType=0x0006\r\nAccessType=rw\r\nDefaultValue=0x10\r\nLowLimit=1\r\n"
 
 
 def test_compact_sub_objects() -> None:
     text = with_object(f"{COMPACT}CompactSubObj=3\r\n")
-    found = [entry for entry in reader.load(text.encode(), "mine.eds").entries if entry.index == 0x2200]
-    assert [(each.sub, each.name, each.data_type, each.access, each.default, each.low) for each in found] == [
+    found = [
+        entry for entry in reader.load(text.encode(), "mine.eds").entries if entry.index == 0x2200
+    ]
+    assert [
+        (each.sub, each.name, each.data_type, each.access, each.default, each.low) for each in found
+    ] == [
         (0, "Cell highest sub-index", 0x05, "const", 3, None),
         (1, "Cell1", 0x06, "rw", 0x10, 1),
         (2, "Cell2", 0x06, "rw", 0x10, 1),
@@ -204,8 +257,14 @@ def test_compact_sub_objects() -> None:
 
 
 def test_names_of_compact_sub_objects() -> None:
-    text = with_object(f"{COMPACT}CompactSubObj=3\r\n\r\n[2200Name]\r\nNrOfEntries=2\r\n1=First\r\n3=Last\r\n")
-    names = [entry.name for entry in reader.load(text.encode(), "mine.eds").entries if entry.index == 0x2200]
+    text = with_object(
+        f"{COMPACT}CompactSubObj=3\r\n\r\n[2200Name]\r\nNrOfEntries=2\r\n1=First\r\n3=Last\r\n"
+    )
+    names = [
+        entry.name
+        for entry in reader.load(text.encode(), "mine.eds").entries
+        if entry.index == 0x2200
+    ]
     assert names == ["Cell highest sub-index", "First", "Cell2", "Last"]
 
 
@@ -216,7 +275,9 @@ def test_a_compact_error_history_begins_empty() -> None:
         f"[OptionalObjects]\r\nSupportedObjects={count}",
         f"[OptionalObjects]\r\nSupportedObjects={count + 1}\r\n{count + 1}=0x1003",
     )
-    text += f"\r\n[1003]\r\n{variable(0x07, 'ro')}CompactSubObj=4\r\n".replace("ObjectType=0x7", "ObjectType=0x8")
+    text += f"\r\n[1003]\r\n{variable(0x07, 'ro')}CompactSubObj=4\r\n".replace(
+        "ObjectType=0x7", "ObjectType=0x8"
+    )
     assert (entry_of(text, 0x1003, 0).default, entry_of(text, 0x1003, 0).access) == (0, "rw")
     assert entry_of(text, 0x1003, 4).access == "ro"
 
@@ -233,7 +294,9 @@ def test_values_of_compact_sub_objects_stand_in_a_section_of_their_own() -> None
 @pytest.mark.parametrize("value", ["Gaß".encode("latin-1"), b"a\r\nb", b" a", b"a ; b", b"a\x00"])
 def test_a_text_that_a_dcf_cannot_hold_is_named(value: bytes) -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
-    with pytest.raises(UserError, match=r"kontronik_esc\.eds: \[2010sub6\] the text .* of Device name cannot stand"):
+    with pytest.raises(
+        UserError, match=r"kontronik_esc\.eds: \[2010sub6\] the text .* of Device name cannot stand"
+    ):
         reader.dcf(eds, 1, 500_000, {(0x2010, 6): value}, "left", "left.dcf")
 
 

@@ -48,7 +48,15 @@ def dcf_text(shipped: Eds, node_id: int) -> str:
 
 def dcfchk(file: Path, node_id: int) -> subprocess.CompletedProcess[str]:
     """dcf-tools' checker, PDO mappings printed. Without a node-ID it cannot take $NODEID."""
-    command = [sys.executable, "-c", "from dcf.cli import main; main()", "-p", "-n", str(node_id), str(file)]
+    command = [
+        sys.executable,
+        "-c",
+        "from dcf.cli import main; main()",
+        "-p",
+        "-n",
+        str(node_id),
+        str(file),
+    ]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
@@ -107,10 +115,15 @@ def test_npm_canopen_reads_every_entry_as_we_do(shipped: Eds, javascript: dict[s
     assert set(theirs) == {(entry.index, entry.sub) for entry in shipped.entries}
     for entry in shipped.entries:
         found = theirs[entry.index, entry.sub]
-        assert (found["name"], found["type"], found["access"]) == (entry.name, entry.data_type, entry.access)
+        assert (found["name"], found["type"], found["access"]) == (
+            entry.name,
+            entry.data_type,
+            entry.access,
+        )
         if entry.data_type != 0x0F:
             assert found["mappable"] == entry.mappable, entry.name
-        assert (found["low"] or 0, found["high"]) == (entry.low or 0, entry.high), entry.name  # it takes 0 for no limit
+        # it takes 0 for no limit
+        assert (found["low"] or 0, found["high"]) == (entry.low or 0, entry.high), entry.name
         if _has_value(entry):
             value = found["value"].encode() if isinstance(found["value"], str) else found["value"]
             assert value == entry.default, entry.name
@@ -126,7 +139,9 @@ def _has_value(entry: Entry) -> bool:
 
 
 @pytest.mark.parametrize("node_id", [1, 127])
-def test_canmatrix_makes_the_default_pdos_of_it(shipped: Eds, caplog: pytest.LogCaptureFixture, node_id: int) -> None:
+def test_canmatrix_makes_the_default_pdos_of_it(
+    shipped: Eds, caplog: pytest.LogCaptureFixture, node_id: int
+) -> None:
     from canmatrix.formats import eds  # type: ignore[import-untyped]  # missing in its list where asammdf loads it
 
     with caplog.at_level(logging.WARNING), SHIPPED.open("rb") as file:
@@ -137,8 +152,12 @@ def test_canmatrix_makes_the_default_pdos_of_it(shipped: Eds, caplog: pytest.Log
         frame = matrix.frame_by_name(f"TPDO_{number + 1}_communication_parameter")
         assert frame is not None
         assert (frame.arbitration_id.id, frame.size) == (0x180 + 0x100 * number + node_id, 8)
-        assert [signal.name for signal in frame.signals] == [name.replace(" ", "_") for name in names]
+        assert [signal.name for signal in frame.signals] == [
+            name.replace(" ", "_") for name in names
+        ]
         for signal in frame.signals:
             assert signal.is_signed == (numbers[signal.name].data_type in (0x02, 0x03, 0x04))
     sdo = matrix.frame_by_name("SDO_transmit")
-    assert {"Throttle", "Pole_pairs", "Reset_of_statistics"} < {signal.name for signal in sdo.signals}
+    assert {"Throttle", "Pole_pairs", "Reset_of_statistics"} < {
+        signal.name for signal in sdo.signals
+    }

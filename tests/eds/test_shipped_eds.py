@@ -24,7 +24,15 @@ LINES = TEXT.split("\r\n")
 U8, U16, U32, I32, TEXT_TYPE = 0x05, 0x06, 0x07, 0x04, 0x09
 TYPE_OF_WIRE = {"I": U32, "H": U16, "B": U8, "h": 0x03, "b": 0x02}
 # CiA 303-2: prefix as a power of ten, numerator, denominator
-UNIT_CODES = {"V": 0x260000, "A": 0x040000, "°C": 0x2D0000, "1/min": 0xB44700, "": 0, "µs": 0x030000, "%": 0}
+UNIT_CODES = {
+    "V": 0x260000,
+    "A": 0x040000,
+    "°C": 0x2D0000,
+    "1/min": 0xB44700,
+    "": 0,
+    "µs": 0x030000,
+    "%": 0,
+}
 PREFIX = {"µs": -6, "%": -2}
 
 
@@ -46,7 +54,10 @@ def title(field: str) -> str:
 
 def extremes() -> dict[str, Row]:
     found = rows(InfoData)
-    return {name: found[name] for name in InfoData._fields[InfoData._fields.index("max_electrical_speed") :]}
+    return {
+        name: found[name]
+        for name in InfoData._fields[InfoData._fields.index("max_electrical_speed") :]
+    }
 
 
 # --- the text -------------------------------------------------------------------------------------------------------
@@ -68,21 +79,27 @@ def test_numbers_of_objects_are_hexadecimal_and_the_node_id_stands_in_front() ->
     texts = {"KONTRONIK ESC gateway", "generic", "0"}
     found = [line.split("=", 1)[1] for line in LINES if line.split("=", 1)[0] in keys]
     assert len(found) > 500
-    assert {value for value in found if not re.fullmatch(r"(\$NODEID\+)?0x[0-9A-F]+", value)} == texts
+    assert {
+        value for value in found if not re.fullmatch(r"(\$NODEID\+)?0x[0-9A-F]+", value)
+    } == texts
 
 
 def test_names_are_unique_over_the_file_and_of_two_characters_or_more(shipped: Eds) -> None:
     names = [line.split("=", 1)[1] for line in LINES if line.startswith("ParameterName=")]
     assert [name for name, count in Counter(names).items() if count > 1] == []
     assert min(map(len, names)) >= 2
-    assert {entry.name for entry in shipped.entries} | set(shipped.object_names.values()) == set(names)
+    assert {entry.name for entry in shipped.entries} | set(shipped.object_names.values()) == set(
+        names
+    )
 
 
 def test_comments_are_numbered_and_counted() -> None:
     start = LINES.index("[Comments]")
     comments = LINES[start + 2 : LINES.index("", start)]
     assert LINES[start + 1] == f"Lines={len(comments)}"
-    assert [line.split("=")[0] for line in comments] == [f"Line{n}" for n in range(1, len(comments) + 1)]
+    assert [line.split("=")[0] for line in comments] == [
+        f"Line{n}" for n in range(1, len(comments) + 1)
+    ]
 
 
 def test_a_domain_has_no_pdo_mapping_key() -> None:
@@ -104,7 +121,16 @@ def test_it_is_accepted_and_keeps_its_bytes(shipped: Eds) -> None:
 
 def test_device_info(shipped: Eds, entries: dict[tuple[int, int], Entry]) -> None:
     device = shipped.device
-    assert device.bit_rates == (10_000, 20_000, 50_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+    assert device.bit_rates == (
+        10_000,
+        20_000,
+        50_000,
+        125_000,
+        250_000,
+        500_000,
+        800_000,
+        1_000_000,
+    )
     assert (device.tx_pdos, device.rx_pdos, device.lss) == (6, 0, True)
     assert device.vendor_number == entries[0x1018, 1].default == 0
     assert device.product_number == entries[0x1018, 2].default
@@ -113,16 +139,18 @@ def test_device_info(shipped: Eds, entries: dict[tuple[int, int], Entry]) -> Non
 
 
 def test_all_objects_of_the_design_are_there_and_no_other(shipped: Eds) -> None:
-    single = (
-        "1000 1001 1002 1003 1005 1008 1009 100A 1010 1011 1014 1015 1016 1017 1018 1019 1020 1021 1022 1029 1200 1F80"
-    )
+    single = "1000 1001 1002 1003 1005 1008 1009 100A 1010 1011 1014 1015 1016 1017 1018 1019 1020 1021 1022 1029 1200 1F80"
     own = "2000 2001 2002 2010 2011 2020 2021 2100 2101 2102 603F 606C 6079"
     pdos = [base + n for base in (0x1800, 0x1A00) for n in range(6)]
-    assert sorted(shipped.object_names) == sorted([int(text, 16) for text in f"{single} {own}".split()] + pdos)
+    assert sorted(shipped.object_names) == sorted(
+        [int(text, 16) for text in f"{single} {own}".split()] + pdos
+    )
 
 
 @pytest.mark.parametrize(
-    ("index", "data"), [(0x2000, LiveData), (0x2011, InfoData)], ids=["live frame", "logged extremes"]
+    ("index", "data"),
+    [(0x2000, LiveData), (0x2011, InfoData)],
+    ids=["live frame", "logged extremes"],
 )
 def test_fields_stand_in_wire_order_with_their_types(
     entries: dict[tuple[int, int], Entry], index: int, data: DataType
@@ -155,7 +183,9 @@ def test_unit_codes_agree_with_the_field_table(entries: dict[tuple[int, int], En
         assert entry.default == (power & 0xFF) << 24 | UNIT_CODES[row.unit], name
 
 
-def test_what_may_be_mapped_is_what_telemetry_and_gateway_tell(entries: dict[tuple[int, int], Entry]) -> None:
+def test_what_may_be_mapped_is_what_telemetry_and_gateway_tell(
+    entries: dict[tuple[int, int], Entry],
+) -> None:
     mappable = {index for (index, sub), entry in entries.items() if entry.mappable}
     assert mappable == {0x2000, 0x2001, 0x2011, 0x2020, 0x2021, 0x603F, 0x606C, 0x6079}
     for (index, sub), entry in entries.items():
@@ -170,7 +200,9 @@ def limits(entry: Entry) -> tuple[int, int]:
     return (0 if entry.low is None else entry.low, most if entry.high is None else entry.high)
 
 
-@pytest.mark.parametrize(("sub", "key"), [(1, "pole_pairs"), (4, "telemetry_timeout_ms"), (7, "cell_count")])
+@pytest.mark.parametrize(
+    ("sub", "key"), [(1, "pole_pairs"), (4, "telemetry_timeout_ms"), (7, "cell_count")]
+)
 def test_settings_have_the_ranges_and_defaults_of_the_configuration(
     entries: dict[tuple[int, int], Entry], sub: int, key: str
 ) -> None:
@@ -198,13 +230,33 @@ def as_bytes(value: object) -> object:
 def test_the_canopen_library_reads_every_entry_as_we_do(shipped: Eds, node_id: int) -> None:
     dictionary = canopen.import_od(str(SHIPPED), node_id=node_id)
     theirs = {
-        (v.index, v.subindex): (v.name, v.data_type, v.access_type, v.pdo_mappable, v.min, v.max, as_bytes(v.default))
+        (v.index, v.subindex): (
+            v.name,
+            v.data_type,
+            v.access_type,
+            v.pdo_mappable,
+            v.min,
+            v.max,
+            as_bytes(v.default),
+        )
         for v in variables(dictionary)
     }
     ours = {}
     for entry in shipped.entries:
-        default = entry.default + node_id if entry.relative and isinstance(entry.default, int) else entry.default
-        read = (entry.name, entry.data_type, entry.access, entry.mappable, entry.low, entry.high, default)
+        default = (
+            entry.default + node_id
+            if entry.relative and isinstance(entry.default, int)
+            else entry.default
+        )
+        read = (
+            entry.name,
+            entry.data_type,
+            entry.access,
+            entry.mappable,
+            entry.low,
+            entry.high,
+            default,
+        )
         ours[entry.index, entry.sub] = read
     assert ours == theirs
     assert {index: dictionary[index].name for index in dictionary} == shipped.object_names
@@ -244,7 +296,11 @@ def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
     source.name = "left.dcf"
     dictionary = canopen.import_od(source)
     assert (dictionary.node_id, dictionary.bitrate) == (5, 250_000)
-    read_back = {(v.index, v.subindex): as_bytes(v.value) for v in variables(dictionary) if v.value is not None}
+    read_back = {
+        (v.index, v.subindex): as_bytes(v.value)
+        for v in variables(dictionary)
+        if v.value is not None
+    }
     assert read_back == values
     assert "NodeName=left\r\n" in text
     assert "LSS_SerialNumber=0xDEADBEEF\r\n" in text

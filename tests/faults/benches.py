@@ -34,7 +34,8 @@ def run(*words: str) -> None:
 def make_pair(gateway_end: str, far_end: str, up: bool = True) -> None:
     """A CAN cable: what is sent at one end comes out at the other. ``up``: the gateway's end too."""
     run("ip", "link", "add", gateway_end, "type", "vxcan", "peer", "name", far_end)
-    run("ip", "link", "set", far_end, "up")  # first: what is sent while it is down is seen by nobody
+    # first: what is sent while it is down is seen by nobody
+    run("ip", "link", "set", far_end, "up")
     if up:
         run("ip", "link", "set", gateway_end, "up")
 
@@ -69,7 +70,10 @@ def bench_of(
     """A running gateway with these ESCs on a CAN cable; what nobody injected is accounted before it is handed out."""
     folder = Path(tempfile.mkdtemp(prefix="ports."))
     with pair() as (near, far):
-        ports = [PtyPort(folder / f"esc{i + 1}", identity, rate_hz) for i, identity in enumerate(identities)]
+        ports = [
+            PtyPort(folder / f"esc{i + 1}", identity, rate_hz)
+            for i, identity in enumerate(identities)
+        ]
         known = table(len(ports), canopen is not None)
         with Bench(near, far, ports, report, canopen=canopen, table=known, prefix=prefix) as bench:
             if started:
@@ -87,7 +91,8 @@ def two(report: Report) -> Iterator[Bench]:
 def eight(report: Report) -> Iterator[Bench]:
     layouts = (Layout.V4, Layout.LEGACY)
     identities = [Identity(i + 1, layouts[i % 2]) for i in range(8)]
-    with bench_of(report, identities, rate_hz=25, canopen=None) as bench:  # feeder and judge have the processor, too
+    with bench_of(report, identities, rate_hz=25, canopen=None) as bench:
+        # feeder and judge have the processor, too
         yield bench
 
 

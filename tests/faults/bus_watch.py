@@ -120,7 +120,8 @@ class Judge:
         self.last_ns = 0
         self._last_fresh_ns = [0 for _ in escs]
         self._suspects: list[Wrong] = []
-        self._newest: dict[int, int] = {}  # CAN id -> number of the newest live frame that it has carried
+        # CAN id -> number of the newest live frame that it has carried
+        self._newest: dict[int, int] = {}
         self._bits: dict[str, tuple[Message, int]] = {}  # message name -> message, content
         self._nodes = set(range(1, len(escs) + 1))
         self._live: list[dict[int, dict[str, float]]] = [{} for _ in escs]
@@ -135,7 +136,9 @@ class Judge:
                 self.boot_ups.append((at_ns, can_id - 0x700))
             return
         if 0x80 < can_id <= 0xFF and can_id - 0x80 in self._nodes and len(data) == 8:
-            self.emergencies.append(Emergency(at_ns, can_id - 0x80, int.from_bytes(data[:2], "little"), data))
+            self.emergencies.append(
+                Emergency(at_ns, can_id - 0x80, int.from_bytes(data[:2], "little"), data)
+            )
             return
         message = self.table.get(can_id)
         if message is None:
@@ -158,7 +161,14 @@ class Judge:
         start, mask = message.flags
         has_state = mask and any(name in ("operating_state", "device") for name, _, _ in present)
         assert message.esc is not None
-        said = Said(at_ns, message, message.esc, data, present, (bits >> start & mask) if has_state else None)
+        said = Said(
+            at_ns,
+            message,
+            message.esc,
+            data,
+            present,
+            (bits >> start & mask) if has_state else None,
+        )
         (self._judge_info if message.kind == "info" else self._judge_live)(said)
 
     def value(self, message: str, signal: str) -> int | None:
@@ -199,13 +209,19 @@ class Judge:
                 self.wrong_count += 1
                 self.old_count += each.since_ns is not None
                 if stood:
-                    each = each._replace(why=f"{each.why}; the machine stood still for {stood // MS} ms of it")
+                    each = each._replace(
+                        why=f"{each.why}; the machine stood still for {stood // MS} ms of it"
+                    )
                 self.wrong.append(each)
                 del self.wrong[:-KEPT]
 
     def forgive(self, most: int, begin_ns: int, end_ns: int) -> int:
         """Take back so many settled values of that time at most that were right but old; how many it were."""
-        old = [each for each in self.wrong if each.since_ns is not None and begin_ns <= each.at_ns <= end_ns][:most]
+        old = [
+            each
+            for each in self.wrong
+            if each.since_ns is not None and begin_ns <= each.at_ns <= end_ns
+        ][:most]
         for each in old:
             self.wrong.remove(each)
             self.wrong_count -= 1
@@ -243,7 +259,9 @@ class Judge:
             if follows == SPEED:
                 self.fresh[said.esc].append(Fresh(at_ns, n))
                 if last := self._last_fresh_ns[said.esc]:
-                    self.longest_silence_ns[said.esc] = max(self.longest_silence_ns[said.esc], at_ns - last)
+                    self.longest_silence_ns[said.esc] = max(
+                        self.longest_silence_ns[said.esc], at_ns - last
+                    )
                 self._last_fresh_ns[said.esc] = at_ns
 
     def _origin(self, said: Said, older: int, newest: int) -> Wrong:
@@ -401,7 +419,11 @@ class BusWatch(Judge):
     def catch_up(self, seconds: float = 90) -> None:
         """Wait until all that has come by now was judged: on a busy machine the judge may be seconds behind, which matters to nobody."""
         now, deadline = time.monotonic_ns(), time.monotonic() + seconds
-        while self._latest_ns < now and select.select([self._socket], [], [], 0)[0] and time.monotonic() < deadline:
+        while (
+            self._latest_ns < now
+            and select.select([self._socket], [], [], 0)[0]
+            and time.monotonic() < deadline
+        ):
             time.sleep(0.005)
         time.sleep(0.02)
 

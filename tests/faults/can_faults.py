@@ -23,7 +23,9 @@ def ip(*words: str) -> None:
 
 def wait_can_state(bench: Bench, state: int) -> None:
     """Wait until GatewayStatus says so."""
-    bench.wait_until(lambda: bench.watch.value("GatewayStatus", "can_state") == state, 3, f"CanState {state}")
+    bench.wait_until(
+        lambda: bench.watch.value("GatewayStatus", "can_state") == state, 3, f"CanState {state}"
+    )
 
 
 def boot_ups(injection: Injection) -> None:
@@ -129,7 +131,8 @@ def loaded(bench: Bench, fault: Fault, times: int) -> None:
             others.terminate()
             others.wait()
             limit(bench.interface, FREE)
-            with RawBus(bench.interface) as near:  # the limiter only looks at its queue when something comes
+            with RawBus(bench.interface) as near:
+                # the limiter only looks at its queue when something comes
                 near.send(0x7F0, wait=False)
             injection.cleared()
             injection.in_the_controller = MAX_IN_CONTROLLER, time.monotonic_ns() + SECOND

@@ -57,10 +57,15 @@ def disk_bench(report: Report) -> Iterator[Bench]:
     (site / "sitecustomize.py").write_text(SLOW_DISK)
     path = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
     with benches.pair() as (near, far):
-        ports = [PtyPort(folder / f"esc{i + 1}", identity) for i, identity in enumerate(benches.IDENTITIES)]
+        ports = [
+            PtyPort(folder / f"esc{i + 1}", identity)
+            for i, identity in enumerate(benches.IDENTITIES)
+        ]
         environment = {"PYTHONPATH": path, "KCG_SLOW": str(folder / "slow")}
         known = benches.table(len(ports), True)
-        with Bench(near, far, ports, report, table=known, store=store, environment=environment) as bench:
+        with Bench(
+            near, far, ports, report, table=known, store=store, environment=environment
+        ) as bench:
             bench.start()
             yield bench
 
@@ -88,7 +93,9 @@ def read_only(folder: Path) -> Iterator[None]:
     benches.run("umount", str(folder))
 
 
-def refused(bench: Bench, fault: Fault, times: int, bad: Callable[[Path], AbstractContextManager[None]]) -> None:
+def refused(
+    bench: Bench, fault: Fault, times: int, bad: Callable[[Path], AbstractContextManager[None]]
+) -> None:
     """A master's "save" is refused, and is possible again when the disk is good; telemetry goes on."""
     with RawBus(bench.watched) as master:
         for _ in range(times):
@@ -140,7 +147,9 @@ def damaged(bench: Bench, fault: Fault, times: int) -> None:
                 bench.stop()
                 (file,) = bench.store.glob("esc1*.params")
                 content = file.read_bytes()
-                file.write_bytes((b"", content[: len(content) // 2], bytes(x ^ 0x20 for x in content))[i % 3])
+                file.write_bytes(
+                    (b"", content[: len(content) // 2], bytes(x ^ 0x20 for x in content))[i % 3]
+                )
                 start_and_wait(injection)
                 assert bench.gateway is not None
                 bench.wait_log("Running on defaults")

@@ -91,7 +91,11 @@ def info(identity: Identity, m: int) -> InfoData:
 
 def live_values(data: LiveData, cells: int) -> dict[str, float]:
     """Physical values by the names that the DBC's signals have in snake case; derived ones computed anew here."""
-    speed, voltage, current = data.electrical_speed, data.battery_voltage / 100, data.battery_current / 10
+    speed, voltage, current = (
+        data.electrical_speed,
+        data.battery_voltage / 100,
+        data.battery_current / 10,
+    )
     values: dict[str, float] = {
         "electrical_speed": speed,
         "battery_voltage": voltage,

@@ -39,7 +39,9 @@ def in_order(machine: str | None = None) -> list[Fault]:
     """The faults of a machine, or all, in the order of the table."""
     chosen = [fault for fault in FAULTS if machine in (None, fault.machine)]
     areas = [*AREAS, *(fault.area for fault in FAULTS)]
-    return sorted(chosen, key=lambda fault: (MACHINES.index(fault.machine), areas.index(fault.area)))
+    return sorted(
+        chosen, key=lambda fault: (MACHINES.index(fault.machine), areas.index(fault.area))
+    )
 
 
 def fault(
@@ -128,11 +130,17 @@ class Report:
         """Each row as a test; one that was not judged as skipped."""
         suite = ET.Element("testsuite")
         for row in self.rows:
-            case = ET.SubElement(suite, "testcase", classname=f"faults.{row.machine}", name=str(row))
+            case = ET.SubElement(
+                suite, "testcase", classname=f"faults.{row.machine}", name=str(row)
+            )
             if row.state == FAILED:
                 ET.SubElement(case, "failure", message=line(row))
             elif row.state == NOT_JUDGED:
-                ET.SubElement(case, "skipped", message=f"{NOT_JUDGED}: {row.taken:.0%} of the processor time was taken")
+                ET.SubElement(
+                    case,
+                    "skipped",
+                    message=f"{NOT_JUDGED}: {row.taken:.0%} of the processor time was taken",
+                )
         ET.ElementTree(suite).write(path)
 
     @staticmethod
@@ -141,14 +149,18 @@ class Report:
         merged = Report()
         for path in paths:
             found = json.loads(path.read_text())
-            merged.rows += [Row(**{key: row[key] for key in row if key != "state"}) for row in found.pop("rows")]
+            merged.rows += [
+                Row(**{key: row[key] for key in row if key != "state"}) for row in found.pop("rows")
+            ]
             merged.about |= found
         return merged
 
 
 def line(row: Row) -> str:
     """One row for the terminal."""
-    recovery = "undisturbed" if row.limit_s is None else f"worst {row.worst_s:.2f} s of {row.limit_s:g} s"
+    recovery = (
+        "undisturbed" if row.limit_s is None else f"worst {row.worst_s:.2f} s of {row.limit_s:g} s"
+    )
     text = f"{row.state:10} {row.machine} {row}: {row.recovered} of {row.injected}, "
     text += f"{recovery}, wrong {row.wrong}, lost {row.lost}"
     if row.excused:
@@ -158,4 +170,8 @@ def line(row: Row) -> str:
     if row.taken > MAX_TAKEN:
         text += f", {row.taken:.0%} of the processor time was taken"
     figures = ", ".join(f"{name} {value:g}" for name, value in row.figures.items())
-    return text + (f"; {figures}" if figures else "") + "".join(f"\n       {note}" for note in row.notes[:8])
+    return (
+        text
+        + (f"; {figures}" if figures else "")
+        + "".join(f"\n       {note}" for note in row.notes[:8])
+    )

@@ -30,7 +30,11 @@ class FedEsc:
     """
 
     def __init__(
-        self, write: Callable[[bytes], bool], identity: Identity, rate_hz: float = 50, info_every: int = 100
+        self,
+        write: Callable[[bytes], bool],
+        identity: Identity,
+        rate_hz: float = 50,
+        info_every: int = 100,
     ) -> None:
         self.write = write
         self.rate_hz = rate_hz
@@ -58,10 +62,14 @@ class FedEsc:
         self._identities.append((len(self.sent), len(self.info_sent), identity))
 
     def identity_of_live(self, n: int) -> Identity:
-        return self._identities[bisect_right(self._identities, n, key=lambda entry: entry[0]) - 1][2]
+        return self._identities[bisect_right(self._identities, n, key=lambda entry: entry[0]) - 1][
+            2
+        ]
 
     def identity_of_info(self, m: int) -> Identity:
-        return self._identities[bisect_right(self._identities, m, key=lambda entry: entry[1]) - 1][2]
+        return self._identities[bisect_right(self._identities, m, key=lambda entry: entry[1]) - 1][
+            2
+        ]
 
     def live(self, n: int) -> LiveData:
         return live(self.identity_of_live(n), n)

@@ -58,7 +58,17 @@ class Gateway:
     """
 
     def __init__(self, config: Path, prefix: Sequence[str], environment: Mapping[str, str]) -> None:
-        command = [*AHEAD, *prefix, sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), "--wait"]
+        command = [
+            *AHEAD,
+            *prefix,
+            sys.executable,
+            "-m",
+            "kontronik_can_gw",
+            "run",
+            "-c",
+            str(config),
+            "--wait",
+        ]
         self.started_ns = time.monotonic_ns()
         self.process = subprocess.Popen(
             command,
@@ -108,7 +118,9 @@ def growth(row: Row, before: dict[str, int], after: dict[str, int], rss_kib: int
     """Note in a row what a gateway has more of than before, memory above so much; the names of what has grown."""
     row.figures |= {f"{name} before": before[name] for name in before}
     row.figures |= {f"{name} after": after[name] for name in after}
-    grown = [name for name in before if after[name] > before[name] + (rss_kib if name == "rss" else 0)]
+    grown = [
+        name for name in before if after[name] > before[name] + (rss_kib if name == "rss" else 0)
+    ]
     row.notes += [f"the gateway has more {name} than before" for name in grown]
     return grown
 
@@ -194,7 +206,9 @@ class Metronome:
     def __init__(self, step_s: float) -> None:
         self.stalls: list[tuple[int, int]] = []
         command = ["chrt", "-f", "20", sys.executable, "-S", "-E", "-c", _METRONOME, str(step_s)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
@@ -261,7 +275,9 @@ class Bench:
         self.config.write_text(self.configuration(options))
         if table is None:
             table = table_of_configuration(self.config, canopen is not None, len(ports))
-        self.watch = BusWatch(watched, table, self.fed, slack_ns=slack_ns, ignore_local=watched != interface).start()
+        self.watch = BusWatch(
+            watched, table, self.fed, slack_ns=slack_ns, ignore_local=watched != interface
+        ).start()
         self.metronome = Metronome(self.metronome_step_s)
         self.feeder = Feeder(self.fed).start()
         self.gateway: Gateway | None = None
@@ -274,9 +290,7 @@ class Bench:
     def configuration(self, options: str = "") -> str:
         text = f'[can]\ninterface = "socketcan"\nchannel = "{self.interface}"\nbitrate = 1000000\n'
         if self._canopen is not None:
-            text += (
-                f'[canopen]\nenabled = true\nnode_id = 1\nserial = 1050112\nstore = "{self.store}"\n{self._canopen}\n'
-            )
+            text += f'[canopen]\nenabled = true\nnode_id = 1\nserial = 1050112\nstore = "{self.store}"\n{self._canopen}\n'
         text += f"{options}\n"
         for i, port in enumerate(self.ports):
             text += f'[[esc]]\nname = "esc{i + 1}"\nport = "{port.path}"\npole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n'
@@ -307,7 +321,9 @@ class Bench:
         finally:
             gateway.kill()
 
-    def wait_fresh(self, escs: Sequence[int], after_ns: int, seconds: float, sent_after_ns: int = 0) -> int:
+    def wait_fresh(
+        self, escs: Sequence[int], after_ns: int, seconds: float, sent_after_ns: int = 0
+    ) -> int:
         """Wait until each of these ESCs has had a right value on the bus after a time; when the last of them came first."""
 
         def found() -> list[Fresh | None]:
@@ -334,18 +350,26 @@ class Bench:
         """Wait for a line with this text in the gateway's log, from that line on."""
         assert self.gateway is not None
         lines = self.gateway.lines
-        self.wait_until(lambda: any(text in line for line in lines[since:]), seconds, f"the log says {text!r}")
+        self.wait_until(
+            lambda: any(text in line for line in lines[since:]), seconds, f"the log says {text!r}"
+        )
 
     def check_alive(self) -> None:
         if self.gateway is not None and not self.gateway.alive:
-            raise NotRecovered(f"the gateway ended with {self.gateway.process.returncode}; {self.last_words()}")
+            raise NotRecovered(
+                f"the gateway ended with {self.gateway.process.returncode}; {self.last_words()}"
+            )
         for failure in (self.feeder.error, self.watch.failure):
             if failure is not None:
                 raise failure
 
     def last_words(self) -> str:
         lines = self.gateway.lines[-6:] if self.gateway is not None else []
-        return "the gateway's last lines: " + " | ".join(lines) if lines else "the gateway said nothing"
+        return (
+            "the gateway's last lines: " + " | ".join(lines)
+            if lines
+            else "the gateway said nothing"
+        )
 
     def running_s(self, begin_ns: int, end_ns: int) -> float:
         """Seconds of that time in which the machine did not stand still."""
@@ -380,8 +404,16 @@ class Bench:
                     excused += 1
                 else:
                     lost += 1
-                    seen = "only EscSpeed" if fed.seen[n] == SPEED else "only EscCurrent" if fed.seen[n] else "nothing"
-                    self.losses.append((at, f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came"))
+                    seen = (
+                        "only EscSpeed"
+                        if fed.seen[n] == SPEED
+                        else "only EscCurrent"
+                        if fed.seen[n]
+                        else "nothing"
+                    )
+                    self.losses.append(
+                        (at, f"esc{index + 1} frame {n} of {len(fed.sent)}: {seen} came")
+                    )
             self._accounted[index] = max(self._accounted[index], last + 1)
             self._excluded[index] = [x for x in self._excluded[index] if x[1] > until_ns]
         return lost, excused
@@ -417,7 +449,10 @@ class Bench:
             row.excused += excused
             if injection.in_the_controller:
                 most, end_ns = injection.in_the_controller
-                row.peak("values in the controller already", self.watch.forgive(most, injection.begin_ns, end_ns))
+                row.peak(
+                    "values in the controller already",
+                    self.watch.forgive(most, injection.begin_ns, end_ns),
+                )
             fresh_wrong = self.watch.wrong_count - wrong
             row.wrong += fresh_wrong
             row.old += self.watch.old_count - old
@@ -427,7 +462,10 @@ class Bench:
                     what = f"{each.message} {each.data}: {each.why}"
                     row.notes.append(f"wrong value {late:.3f} s after the injection: {what}")
             if lost:
-                when = [f"{(at - injection.begin_ns) / SECOND:.3f} s {what}" for at, what in self.losses[-lost:]]
+                when = [
+                    f"{(at - injection.begin_ns) / SECOND:.3f} s {what}"
+                    for at, what in self.losses[-lost:]
+                ]
                 row.notes.append(
                     f"{lost} values lost, cleared at {injection.after(injection.cleared_ns)}, recovered at "
                     f"{injection.after(injection.recovered_ns)}: {'; '.join(when[:4])}"
@@ -437,7 +475,9 @@ class Bench:
                 row.transmitted += self._received - received
             echoed, self._echoed = self._echoed, sum(port.echoed for port in self.ports)
             if self._echoed > echoed:
-                row.count("bytes echoed by the kernel before the port was set", self._echoed - echoed)
+                row.count(
+                    "bytes echoed by the kernel before the port was set", self._echoed - echoed
+                )
             if not failed and injection.in_time:
                 row.recovered += 1
             row.worst_s = max(row.worst_s, injection.recovery_s)
@@ -484,7 +524,9 @@ class Injection:
         """Wait for the first right value of each disturbed ESC that was sent since ``cleared``."""
         assert self.cleared_ns is not None
         limit = self.fault.limit_s or 1.0
-        self.recovered_ns = self.bench.wait_fresh(self.escs, self.cleared_ns, limit * 3 + 2, self.cleared_ns)
+        self.recovered_ns = self.bench.wait_fresh(
+            self.escs, self.cleared_ns, limit * 3 + 2, self.cleared_ns
+        )
         self.recovery_s = self.bench.running_s(self.cleared_ns, self.recovered_ns)
 
     def healed_at(self, at_ns: int) -> None:
@@ -496,14 +538,22 @@ class Injection:
         """Wait for a boot-up message of a node since the injection."""
 
         def seen() -> list[int]:
-            return [at_ns for at_ns, found in self.bench.watch.boot_ups[self.boot_ups :] if found == node]
+            return [
+                at_ns
+                for at_ns, found in self.bench.watch.boot_ups[self.boot_ups :]
+                if found == node
+            ]
 
         self.bench.wait_until(lambda: bool(seen()), 3, f"boot-up of node {node}")
         self.healed_at(seen()[0])
 
     def emergency_codes(self, node: int) -> list[int]:
         """Codes of the EMCYs of a node since the injection."""
-        return [each.code for each in self.bench.watch.emergencies[self.emergencies :] if each.node == node]
+        return [
+            each.code
+            for each in self.bench.watch.emergencies[self.emergencies :]
+            if each.node == node
+        ]
 
     def wait_emergency(self, node: int, code: int) -> None:
         """Wait for an EMCY of a node since the injection."""

@@ -56,7 +56,9 @@ def worst_share(samples: Sequence[Sample], begin_s: float, end_s: float) -> floa
     for last in range(1, len(inside)):
         while inside[last].at_s - inside[first + 1].at_s >= WINDOW_S:
             first += 1
-        if inside[last].at_s - inside[first].at_s < min(WINDOW_S, 0.9 * (inside[-1].at_s - inside[0].at_s)):
+        if inside[last].at_s - inside[first].at_s < min(
+            WINDOW_S, 0.9 * (inside[-1].at_s - inside[0].at_s)
+        ):
             continue
         worst = max(worst, inside[last].share(inside[first]))
     return worst
@@ -88,12 +90,15 @@ class Load:
         mine: list[str] = []  # it starts another one that watches over it
         for stat in Path("/proc").glob("[0-9]*/stat") if self.machine else ():
             with contextlib.suppress(OSError):
-                _, parent, _, session, *_ = stat.read_text(errors="replace").rpartition(")")[2].split()
+                _, parent, _, session, *_ = (
+                    stat.read_text(errors="replace").rpartition(")")[2].split()
+                )
                 sessions.setdefault(session, []).append(stat.parent)
                 if parent == str(self.machine):
                     mine.append(session)
         for process in (each for session in mine for each in sessions[session]):
-            with contextlib.suppress(OSError, IndexError):  # it may end meanwhile, even while its threads are listed
+            with contextlib.suppress(OSError, IndexError):
+                # it may end meanwhile, even while its threads are listed
                 for file in process.glob("task/*/schedstat"):
                     waited = int(file.read_text().split()[1])
                     self._waited_ns += waited - self.waits.get(str(file), 0)
@@ -129,7 +134,12 @@ class Load:
 
 
 def run_inside(
-    load: Load, script: str, words: Sequence[str], backend: str, timeout_s: float, prepare: Callable[[Path], None]
+    load: Load,
+    script: str,
+    words: Sequence[str],
+    backend: str,
+    timeout_s: float,
+    prepare: Callable[[Path], None],
 ) -> Report:
     """Run a script of this folder in a virtual machine; its rows, with what was taken from us meanwhile."""
     shares: dict[str, float] = {}
@@ -137,15 +147,25 @@ def run_inside(
 
     def ended(name: str) -> None:
         load.take()
-        shares[name] = max(shares.get(name, 0.0), worst_share(load.samples, begun.pop(name), time.monotonic()))
+        shares[name] = max(
+            shares.get(name, 0.0), worst_share(load.samples, begun.pop(name), time.monotonic())
+        )
 
     with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
         prepare(Path(folder))
         machine = [sys.executable, str(PROJECT / "tests" / "vm" / "vm_run.py")]
         machine += [f"--backend={backend}", f"--timeout={timeout_s:g}", f"--rw={folder}", "--"]
-        inside = [sys.executable, "-B", str(Path(__file__).with_name(script)), f"--inside={folder}", *words]
+        inside = [
+            sys.executable,
+            "-B",
+            str(Path(__file__).with_name(script)),
+            f"--inside={folder}",
+            *words,
+        ]
         pipe = subprocess.PIPE
-        with subprocess.Popen([*machine, *inside], stdin=subprocess.DEVNULL, stdout=pipe, text=True) as process:
+        with subprocess.Popen(
+            [*machine, *inside], stdin=subprocess.DEVNULL, stdout=pipe, text=True
+        ) as process:
             assert process.stdout
             load.machine = process.pid
             for text in process.stdout:
@@ -198,11 +218,15 @@ def conclude(report: Report, out: Path | None, junit: Path | None) -> int:
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
     """The options that all parts of the programme have."""
-    made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     made.add_argument("--out", type=Path, help="what came of it, as JSON")
     made.add_argument("--junit", type=Path, help="the same as a JUnit report")
     made.add_argument("--long", action="store_true", help="each fault more often, and longer")
-    made.add_argument("--only", action="append", default=[], help="faults whose area or name holds this text")
+    made.add_argument(
+        "--only", action="append", default=[], help="faults whose area or name holds this text"
+    )
     made.add_argument("--inside", type=Path, help=argparse.SUPPRESS)
     return made
 

@@ -55,7 +55,10 @@ def killed(bench: Bench, fault: Fault, times: int) -> None:
         for i in range(times + 1):
             with bench.injection(fault) as injection:
                 value = 200 + generator.randrange(90)
-                injection.expect(master.write(1, *TIMEOUT_OBJECT, value, 2) == 0, "the master cannot set the time-out")
+                injection.expect(
+                    master.write(1, *TIMEOUT_OBJECT, value, 2) == 0,
+                    "the master cannot set the time-out",
+                )
                 known.add(value)
                 if i % 2:
                     injection.expect(master.store(1) == 0, "the master cannot store")
@@ -69,7 +72,9 @@ def killed(bench: Bench, fault: Fault, times: int) -> None:
                 time.sleep(generator.random() * 0.3)
                 start_and_wait(injection)
                 found = master.read(1, *TIMEOUT_OBJECT)
-                injection.expect(found in known, f"the stored time-out is {found}, not one of {sorted(known)}")
+                injection.expect(
+                    found in known, f"the stored time-out is {found}, not one of {sorted(known)}"
+                )
                 assert found is not None
                 known = {found}
         master.write(1, *TIMEOUT_OBJECT, 250, 2)
@@ -89,7 +94,9 @@ def ended(bench: Bench, fault: Fault, times: int) -> None:
             state = bench.watch.value("GatewayStatus", "gateway_state")
             injection.expect(state == STOPPING, f"its last state is {state}, not Stopping")
             bench.report.row(fault).peak("s to its end", round(took, 2))
-            injection.expect(took < 0.8, f"it took {took:.2f} s to end; 0.5 s, and 0.3 s for a Python's end here")
+            injection.expect(
+                took < 0.8, f"it took {took:.2f} s to end; 0.5 s, and 0.3 s for a Python's end here"
+            )
             start_and_wait(injection)
 
 
@@ -112,10 +119,18 @@ def second(bench: Bench, fault: Fault, times: int) -> None:
             with bench.injection(fault, []) as injection:
                 other.write_text(text)
                 command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(other)]
-                done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+                done = subprocess.run(
+                    command, capture_output=True, text=True, timeout=30, check=False
+                )
                 said = done.stderr.strip()
-                injection.expect(done.returncode == 1, f"it ended with {done.returncode}, not by {reason!r}: {said}")
-                injection.expect(len(said.splitlines()) == 1 and reason in said, f"not {reason!r} was said: {said}")
+                injection.expect(
+                    done.returncode == 1,
+                    f"it ended with {done.returncode}, not by {reason!r}: {said}",
+                )
+                injection.expect(
+                    len(said.splitlines()) == 1 and reason in said,
+                    f"not {reason!r} was said: {said}",
+                )
                 injection.cleared()
     finally:
         extra.close()
@@ -175,10 +190,15 @@ def frozen(bench: Bench, fault: Fault, times: int) -> None:
                     gateway = bench.start(wait=False)
                     bench.wait_fresh(injection.escs, gateway.started_ns, 20)
                 assert bench.gateway is not None
-                injection.expect(not supervisor.is_hungry_within(3), "the watchdog of a healthy gateway was not fed")
+                injection.expect(
+                    not supervisor.is_hungry_within(3),
+                    "the watchdog of a healthy gateway was not fed",
+                )
                 injection.expect(supervisor.ready, "it never said READY=1")
                 bench.gateway.process.send_signal(signal.SIGSTOP)
-                injection.expect(supervisor.is_hungry_within(4), "the watchdog of a frozen gateway was fed on")
+                injection.expect(
+                    supervisor.is_hungry_within(4), "the watchdog of a frozen gateway was fed on"
+                )
                 bench.gateway.process.send_signal(signal.SIGABRT)
                 bench.gateway.process.send_signal(signal.SIGCONT)
                 bench.gateway.kill()

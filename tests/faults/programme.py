@@ -30,7 +30,11 @@ TIMEOUT_S = {False: 1500, True: 4 * 3600}
 
 
 def run(
-    faults: list[Fault], report: Report, times: int, out: Path, made: Mapping[str, benches.MakesBench] = benches.BENCHES
+    faults: list[Fault],
+    report: Report,
+    times: int,
+    out: Path,
+    made: Mapping[str, benches.MakesBench] = benches.BENCHES,
 ) -> None:
     """All faults, those with the same bench on one bench; a bench that a fault has broken is made anew."""
     for kind in dict.fromkeys(fault.bench for fault in faults):

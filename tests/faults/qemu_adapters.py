@@ -107,7 +107,8 @@ class SerialAdapter(UsbDevice):
         """Bytes from an ESC whose UART is set to ``line``."""
         if not self.plugged:
             return
-        if line == self.line:  # the usual case, and slow to work out: what comes out is what went in
+        if line == self.line:
+            # the usual case, and slow to work out: what comes out is what went in
             self._pass_on(data, 0)
         else:
             self._sample(levels(data, line), line.baud)
@@ -144,7 +145,8 @@ class SerialAdapter(UsbDevice):
             self._overrun = 0
 
     def before_answer(self) -> None:
-        if self._just_reset:  # by the port's opening: what does not fill a packet waits for the latency timer
+        if self._just_reset:
+            # by the port's opening: what does not fill a packet waits for the latency timer
             self._just_reset = False
             time.sleep(self.latency_ms / 1000)
 
@@ -217,7 +219,9 @@ class CanAdapter(UsbDevice):
 
     def __init__(self, port: int, bus: CanBus, serial_number: str) -> None:
         strings = ("edevices", "USB2CAN converter", serial_number)
-        super().__init__(port, descriptors((0x0483, 0x1234, 0x0100), strings, (0x81, 0x02, 0x83, 0x04)))
+        super().__init__(
+            port, descriptors((0x0483, 0x1234, 0x0100), strings, (0x81, 0x02, 0x83, 0x04))
+        )
         self.bus = bus
         bus.adapters.append(self)
         self.bitrate = 0
@@ -287,7 +291,8 @@ class CanAdapter(UsbDevice):
             if self.bus.acknowledged(self, data):
                 self.tx_errors = max(0, self.tx_errors - 1)
                 self._follow()
-            elif self.tx_errors < 128:  # an error passive node does not count missing acknowledgement
+            elif self.tx_errors < 128:
+                # an error passive node does not count missing acknowledgement
                 self.disturb(_STATUS_ACK, transmit=8)
 
     def _command(self, data: bytes) -> None:

@@ -56,7 +56,13 @@ def link_down(bench: "MachineBench", fault: Fault, times: int) -> None:
             wait_back(injection)
 
 
-@fault("CAN", "controller taken from its driver and given back", CAN_LIMIT_S, machine="QEMU", bench="machine")
+@fault(
+    "CAN",
+    "controller taken from its driver and given back",
+    CAN_LIMIT_S,
+    machine="QEMU",
+    bench="machine",
+)
 def rebound(bench: "MachineBench", fault: Fault, times: int) -> None:
     """The interface is gone, and another one with the same name comes."""
     slot = pci_slot("can0")
@@ -113,7 +119,11 @@ def bus_off(bench: "AdapterBench", fault: Fault, times: int) -> None:
 
 
 @fault(
-    "CAN", "bus-off, restart-ms 0, `ip link set can2 type can restart`", CAN_LIMIT_S, machine="QEMU", bench="adapter"
+    "CAN",
+    "bus-off, restart-ms 0, `ip link set can2 type can restart`",
+    CAN_LIMIT_S,
+    machine="QEMU",
+    bench="adapter",
 )
 def bus_off_for_good(bench: "AdapterBench", fault: Fault, times: int) -> None:
     """In the end the other way out: down and up."""
@@ -138,8 +148,13 @@ def error_passive(bench: "AdapterBench", fault: Fault, times: int) -> None:
     adapter = bench.adapter
     for _ in range(2 * times):
         with bench.injection(fault, escs=()):
-            adapter.disturb(STATUS_BIT, transmit=250 - adapter.tx_errors)  # a good frame takes one off
-            bench.wait_until(lambda: controller_state("can2") == "ERROR-PASSIVE", 2, "the driver says error passive")
+            # a good frame takes one off
+            adapter.disturb(STATUS_BIT, transmit=250 - adapter.tx_errors)
+            bench.wait_until(
+                lambda: controller_state("can2") == "ERROR-PASSIVE",
+                2,
+                "the driver says error passive",
+            )
             wait_can_state(bench, PASSIVE)
             adapter.heal()
             wait_can_state(bench, ACTIVE)
@@ -166,14 +181,17 @@ def wrong_bitrate(bench: "AdapterBench", fault: Fault, times: int) -> None:
             wait_back(injection)
 
 
-@fault("CAN", "adapter hangs with a full queue, is reset", CAN_LIMIT_S, machine="QEMU", bench="adapter")
+@fault(
+    "CAN", "adapter hangs with a full queue, is reset", CAN_LIMIT_S, machine="QEMU", bench="adapter"
+)
 def stalled(bench: "AdapterBench", fault: Fault, times: int) -> None:
     """Set down while it hangs: else the frames that the kernel holds for it, five or so, come out late, which nobody can prevent."""
     for pause in [2.0, 5.0] * times:
         with bench.injection(fault) as injection:
             bench.adapter.stall(True)
             time.sleep(pause)
-            subprocess.run(["ip", "link", "set", "can2", "down"], check=False)  # the driver says that it gets no answer
+            # the driver says that it gets no answer
+            subprocess.run(["ip", "link", "set", "can2", "down"], check=False)
             bench.adapter.stall(False)
             can_up("can2")
             wait_back(injection)

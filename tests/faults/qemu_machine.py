@@ -51,7 +51,9 @@ class Monitor:
 
     def ask(self, command: str, **arguments: object) -> dict[str, Any]:
         """The answer: with the key "return" or "error"."""
-        self._stream.write(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
+        self._stream.write(
+            json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n"
+        )
         while True:
             while b"\n" not in self._buffer:
                 self._buffer += self._stream.read(4096) or b""
@@ -151,7 +153,9 @@ def line_setting(device: str) -> LineSetting:
     baud = {termios.B9600: 9600, termios.B115200: 115200}.get(speed, 0)
     bits = {termios.CS5: 5, termios.CS6: 6, termios.CS7: 7, termios.CS8: 8}[control & termios.CSIZE]
     parity = "N" if not control & termios.PARENB else "O" if control & termios.PARODD else "E"
-    return LineSetting(baud, bits, parity, 2 if control & termios.CSTOPB else 1, bool(local & termios.ECHO))
+    return LineSetting(
+        baud, bits, parity, 2 if control & termios.CSTOPB else 1, bool(local & termios.ECHO)
+    )
 
 
 def hold(device: str) -> int:
@@ -177,11 +181,24 @@ def ip(*words: str) -> None:
 def can_up(name: str, bitrate: int = BITRATE, restart_ms: int = 100) -> None:
     ip("link", "set", name, "down")
     ip("link", "set", name, "txqueuelen", "100")
-    ip("link", "set", name, "up", "type", "can", "bitrate", str(bitrate), "restart-ms", str(restart_ms))
+    ip(
+        "link",
+        "set",
+        name,
+        "up",
+        "type",
+        "can",
+        "bitrate",
+        str(bitrate),
+        "restart-ms",
+        str(restart_ms),
+    )
 
 
 def _can_details(name: str) -> Any:
-    done = subprocess.run(["ip", "-d", "-s", "-j", "link", "show", name], check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        ["ip", "-d", "-s", "-j", "link", "show", name], check=True, capture_output=True, text=True
+    )
     return json.loads(done.stdout)[0]
 
 

@@ -37,7 +37,9 @@ class FarPort:
     until the process that ``reader`` names has the port open.
     """
 
-    def __init__(self, name: str, device: str, identity: Identity, reader: Callable[[], int | None]) -> None:
+    def __init__(
+        self, name: str, device: str, identity: Identity, reader: Callable[[], int | None]
+    ) -> None:
         self.far = FarEnd(name)
         self.path = self.device = device
         self.fed = FedEsc(self.write, identity, RATE_HZ, INFO_EVERY)
@@ -82,7 +84,9 @@ class FarPort:
 class UsbPort(FarPort):
     """QEMU's USB serial adapter, unplugged and plugged in by the monitor."""
 
-    def __init__(self, identity: Identity, reader: Callable[[], int | None], monitor: Monitor) -> None:
+    def __init__(
+        self, identity: Identity, reader: Callable[[], int | None], monitor: Monitor
+    ) -> None:
         if not serial_ports():
             monitor.plug_serial()
         wait_until(serial_ports, 5, "the adapter's device file")

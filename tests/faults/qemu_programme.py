@@ -46,7 +46,9 @@ class EmulatedBench(Bench):
 
     metronome_step_s = 0.03
 
-    def __init__(self, interface: str, watched: str, ports: Sequence[Port], report: Report, tables: Path) -> None:
+    def __init__(
+        self, interface: str, watched: str, ports: Sequence[Port], report: Report, tables: Path
+    ) -> None:
         stem = tables / str(len(ports))
         super().__init__(
             interface,
@@ -68,7 +70,12 @@ class EmulatedBench(Bench):
             for n in range(fed.newest(time.monotonic_ns()), self._accounted[index] - 1, -1):
                 if fed.seen[n] == SPEED | CURRENT:
                     newer = fed.sent[n]
-                elif fed.whole[n] and fed.sent[n] <= until_ns and newer and newer - fed.sent[n] <= SLACK_NS:
+                elif (
+                    fed.whole[n]
+                    and fed.sent[n] <= until_ns
+                    and newer
+                    and newer - fed.sent[n] <= SLACK_NS
+                ):
                     fed.seen[n] = SPEED | CURRENT
         return super().account(until_ns)
 
@@ -79,7 +86,9 @@ class MachineBench(EmulatedBench):
     def __init__(self, report: Report, tables: Path) -> None:
         self.monitor = Monitor()
         self.uart = FarPort("com1", "/dev/ttyS1", Identity(1, Layout.V4), self._reader)
-        self.usb = UsbPort(Identity(2, Layout.LEGACY, Device.JIVEPRO, 12), self._reader, self.monitor)
+        self.usb = UsbPort(
+            Identity(2, Layout.LEGACY, Device.JIVEPRO, 12), self._reader, self.monitor
+        )
         self.wire = WirePort(SerialAdapter(0, "ESC0003"), Identity(3, Layout.V4, Device.KOLIBRI, 8))
         for name in ("can0", "can1"):
             can_up(name)
@@ -155,7 +164,9 @@ def main() -> int:
     mine = outside.chosen(in_order("QEMU"), args.only)
     if args.inside is None:
         timeout_s = TIMEOUT_S[args.long]
-        return outside.main(args, "qemu_programme.py", mine, backend="qemu", timeout_s=timeout_s, prepare=prepare)
+        return outside.main(
+            args, "qemu_programme.py", mine, backend="qemu", timeout_s=timeout_s, prepare=prepare
+        )
     kinds = {"machine": MachineBench, "adapter": AdapterBench}
     made = {name: functools.partial(running, kind, args.inside) for name, kind in kinds.items()}
     programme.run(mine, Report(), LONG_TIMES if args.long else 1, args.inside / "report.json", made)

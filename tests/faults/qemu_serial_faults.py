@@ -25,7 +25,9 @@ PORT_LIMIT_S = 2.0
 """By the issue: after a port's return."""
 
 
-@fault("Start", "interface missing and port in use at the start", 3.0, machine="QEMU", bench="machine")
+@fault(
+    "Start", "interface missing and port in use at the start", 3.0, machine="QEMU", bench="machine"
+)
 def hampered_start(bench: "MachineBench", fault: Fault, times: int) -> None:
     """Both come later: the gateway has to wait for each by itself."""
     for _ in range(min(times, 3)):
@@ -33,7 +35,8 @@ def hampered_start(bench: "MachineBench", fault: Fault, times: int) -> None:
         slot = pci_slot("can0")
         pci_bind(slot, False)
         held = hold(bench.uart.path)
-        bench.leave_out(range(len(bench.ports)), 0, time.monotonic_ns())  # nobody was there to pass it on
+        # nobody was there to pass it on
+        bench.leave_out(range(len(bench.ports)), 0, time.monotonic_ns())
         with bench.injection(fault) as injection:
             bench.start(wait=False)
             for words in (f"{bench.uart.path}: is in use", "CAN interface can0"):
@@ -60,7 +63,13 @@ def replug(bench: "MachineBench", fault: Fault, times: int) -> None:
             injection.wait_recovery()
 
 
-@fault("Serial", "USB adapter back under another ttyUSB number", PORT_LIMIT_S, machine="QEMU", bench="machine")
+@fault(
+    "Serial",
+    "USB adapter back under another ttyUSB number",
+    PORT_LIMIT_S,
+    machine="QEMU",
+    bench="machine",
+)
 def renumbered(bench: "MachineBench", fault: Fault, times: int) -> None:
     """And back under its first one: while another program has not let go of the old one, its number stays taken."""
     for _ in range(2 * times):
@@ -77,13 +86,20 @@ def renumbered(bench: "MachineBench", fault: Fault, times: int) -> None:
                 os.close(held)
 
 
-@fault("Serial", "USB adapter in use by another program at its return", PORT_LIMIT_S, machine="QEMU", bench="machine")
+@fault(
+    "Serial",
+    "USB adapter in use by another program at its return",
+    PORT_LIMIT_S,
+    machine="QEMU",
+    bench="machine",
+)
 def busy_at_return(bench: "MachineBench", fault: Fault, times: int) -> None:
     wire = bench.wire
     for _ in range(2 * times):
         with bench.injection(fault, escs=(WIRE,)) as injection:
             wire.unplug()
-            wire.send = wire.silent  # until echo is off: what that program would echo is not the gateway's doing
+            # until echo is off: what that program would echo is not the gateway's doing
+            wire.send = wire.silent
             wire.plug()
             held = hold(wire.device)
             try:
@@ -107,7 +123,9 @@ def slow_stream(bench: "MachineBench", fault: Fault, times: int) -> None:
     misread(bench, fault, times, Line(9600, "N"), ("framing", "breaks"))
 
 
-def misread(bench: "MachineBench", fault: Fault, times: int, line: Line, counters: tuple[str, ...]) -> None:
+def misread(
+    bench: "MachineBench", fault: Fault, times: int, line: Line, counters: tuple[str, ...]
+) -> None:
     """An ESC that sends by other settings for a while; the driver has to count it."""
     wire = bench.wire
     for _ in range(2 * times):
@@ -123,7 +141,13 @@ def misread(bench: "MachineBench", fault: Fault, times: int, line: Line, counter
             injection.expect(counted, f"no {counters} counted: {after}")
 
 
-@fault("Serial", "bit errors on the line, each tenth frame", PORT_LIMIT_S, machine="QEMU", bench="machine")
+@fault(
+    "Serial",
+    "bit errors on the line, each tenth frame",
+    PORT_LIMIT_S,
+    machine="QEMU",
+    bench="machine",
+)
 def bit_errors(bench: "MachineBench", fault: Fault, times: int) -> None:
     """Only the frames that were hit may be missing."""
     wire = bench.wire
@@ -165,7 +189,9 @@ def line_break(bench: "MachineBench", fault: Fault, times: int) -> None:
                 bench.monitor.must("chardev-send-break", id="com1s")
             injection.cleared()
             injection.wait_recovery()
-            injection.expect(line_counts(bench.uart.device).breaks >= before + 10, "no break counted")
+            injection.expect(
+                line_counts(bench.uart.device).breaks >= before + 10, "no break counted"
+            )
 
 
 @fault("Serial", "all ports are set to 8E1, without echo", None, machine="QEMU", bench="machine")
@@ -176,10 +202,18 @@ def port_setting(bench: "MachineBench", fault: Fault, times: int) -> None:
             setting = line_setting(device)
             injection.expect(setting == AS_SET, f"{device}: {setting}")
         injection.expect(adapter.line == ESC_LINE, f"the chip: {adapter.line}")
-        injection.expect(adapter.latency_ms == 1, f"the chip's latency timer: {adapter.latency_ms} ms")
+        injection.expect(
+            adapter.latency_ms == 1, f"the chip's latency timer: {adapter.latency_ms} ms"
+        )
 
 
-@fault("Serial", "16550A flooded with garbage at the full line rate", PORT_LIMIT_S, machine="QEMU", bench="machine")
+@fault(
+    "Serial",
+    "16550A flooded with garbage at the full line rate",
+    PORT_LIMIT_S,
+    machine="QEMU",
+    bench="machine",
+)
 def flood(bench: "MachineBench", fault: Fault, times: int) -> None:
     """Three seconds without a gap; the other ESCs must not notice."""
     chunk = bytes((i * 37 + i // 251) & 0xFF for i in range(115_200 // 11 // 20))
@@ -194,7 +228,13 @@ def flood(bench: "MachineBench", fault: Fault, times: int) -> None:
             injection.wait_recovery()
 
 
-@fault("Serial", "receive overrun while the process is stopped", PORT_LIMIT_S, machine="QEMU", bench="machine")
+@fault(
+    "Serial",
+    "receive overrun while the process is stopped",
+    PORT_LIMIT_S,
+    machine="QEMU",
+    bench="machine",
+)
 def overrun(bench: "MachineBench", fault: Fault, times: int) -> None:
     """More than the kernel and the chip hold; what is read first afterwards is old and must not be sent."""
     assert bench.gateway is not None
@@ -233,10 +273,17 @@ def reset_by_other(bench: "MachineBench", fault: Fault, times: int) -> None:
             termios.tcsetattr(fd, termios.TCSANOW, mode)
             os.close(fd)
             if index == WIRE:
-                injection.expect(bench.wire.adapter.line == Line(9600, "N"), f"the chip: {bench.wire.adapter.line}")
+                injection.expect(
+                    bench.wire.adapter.line == Line(9600, "N"),
+                    f"the chip: {bench.wire.adapter.line}",
+                )
             injection.cleared()
             bench.wait_log(port.device, said)
-            bench.wait_until(lambda: line_setting(port.device) == AS_SET, 10, "the settings are restored")  # noqa: B023
+            bench.wait_until(
+                lambda: line_setting(port.device) == AS_SET,  # noqa: B023
+                10,
+                "the settings are restored",
+            )
             restored_ns = time.monotonic_ns()
             injection.wait_recovery()
             injection.healed_at(restored_ns)

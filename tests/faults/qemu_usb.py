@@ -28,13 +28,17 @@ _DEVICE, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT = 1, 2, 3, 4, 5
 _BULK = 2
 
 
-def descriptors(product: tuple[int, int, int], strings: Sequence[str], endpoints: Sequence[int]) -> dict[int, bytes]:
+def descriptors(
+    product: tuple[int, int, int], strings: Sequence[str], endpoints: Sequence[int]
+) -> dict[int, bytes]:
     """By wValue, of a device with one configuration and one interface. ``product``: vendor, product, release."""
     device = struct.pack("<BBHBBBBHHHBBBB", 18, _DEVICE, 0x200, 0, 0, 0, 8, *product, 1, 2, 3, 1)
     parts = struct.pack("<9B", 9, _INTERFACE, 0, 0, len(endpoints), 0xFF, 0xFF, 0xFF, 0)
     for endpoint in endpoints:
         parts += struct.pack("<4BHB", 7, _ENDPOINT, endpoint, _BULK, PACKET_SIZE, 0)
-    configuration = struct.pack("<BBH5B", 9, _CONFIGURATION, 9 + len(parts), 1, 1, 0, 0x80, 50) + parts
+    configuration = (
+        struct.pack("<BBH5B", 9, _CONFIGURATION, 9 + len(parts), 1, 1, 0, 0x80, 50) + parts
+    )
     english = bytes((4, _STRING, 9, 4))
     found = {_DEVICE << 8: device, _CONFIGURATION << 8: configuration, _STRING << 8: english}
     for number, string in enumerate(strings, 1):
@@ -52,10 +56,13 @@ class UsbDevice:
         self._lock = threading.RLock()
         self._ours: socket.socket | None = None
         self._thread: threading.Thread | None = None
-        self._asked: dict[int, deque[int]] = defaultdict(deque)  # endpoint: requests that wait for data
-        self._ready: dict[int, deque[bytes]] = defaultdict(deque)  # endpoint: packets that wait to be asked for
+        # endpoint: requests that wait for data
+        self._asked: dict[int, deque[int]] = defaultdict(deque)
+        # endpoint: packets that wait to be asked for
+        self._ready: dict[int, deque[bytes]] = defaultdict(deque)
         self._stalled = False
-        self._held: list[tuple[int, int]] = []  # (request, length) of what was not taken while stalled
+        # (request, length) of what was not taken while stalled
+        self._held: list[tuple[int, int]] = []
 
     # --- what a hand does
 
@@ -80,7 +87,9 @@ class UsbDevice:
             self._ready.clear()
             self._held.clear()
             self._ours = ours
-        self._thread = threading.Thread(target=self._serve, args=(ours,), daemon=True, name=f"usb{self.port}")
+        self._thread = threading.Thread(
+            target=self._serve, args=(ours,), daemon=True, name=f"usb{self.port}"
+        )
         self._thread.start()
 
     def unplug(self) -> None:
@@ -197,7 +206,12 @@ class UsbDevice:
 
     def _answer(self, number: int, data: bytes = b"", taken: int = 0, status: int = 0) -> None:
         """Complete a request: with data to the host, or with so many bytes taken from it."""
-        self._send(struct.pack(">5I5i8x", _RET_SUBMIT, number, 0, 0, 0, status, len(data) or taken, 0, 0, 0) + data)
+        self._send(
+            struct.pack(
+                ">5I5i8x", _RET_SUBMIT, number, 0, 0, 0, status, len(data) or taken, 0, 0, 0
+            )
+            + data
+        )
 
     def _unlink(self, number: int, victim: int) -> None:
         """The host takes a request back."""

@@ -55,9 +55,15 @@ class RawBus:
         self._filter(None)
         return answer
 
-    def write(self, node: int, index: int, sub: int, value: int, size: int, seconds: float = 2) -> int | None:
+    def write(
+        self, node: int, index: int, sub: int, value: int, size: int, seconds: float = 2
+    ) -> int | None:
         """SDO download of a number: 0, the abort code, or None without an answer."""
-        request = bytes([0x23 | (4 - size) << 2]) + struct.pack("<HB", index, sub) + value.to_bytes(4, "little")
+        request = (
+            bytes([0x23 | (4 - size) << 2])
+            + struct.pack("<HB", index, sub)
+            + value.to_bytes(4, "little")
+        )
         answer = self._ask(node, request, seconds)
         if answer is None:
             return None

@@ -30,7 +30,9 @@ def port_of(bench: Bench) -> PtyPort:
 def lost(bench: Bench) -> None:
     """Wait until the link is said to be lost."""
     bench.wait_until(
-        lambda: bench.watch.value("Esc1Link", "link_state") in (LOST, PORT_ERROR), 5, "the link is said to be lost"
+        lambda: bench.watch.value("Esc1Link", "link_state") in (LOST, PORT_ERROR),
+        5,
+        "the link is said to be lost",
     )
 
 
@@ -112,7 +114,9 @@ def other_name(bench: Bench, fault: Fault, times: int) -> None:
                 time.sleep(0.3)
                 injection.cleared()
                 port.plug(other=True)
-                injection.expect(port.device != before, "the bench gave the port its old name again")
+                injection.expect(
+                    port.device != before, "the bench gave the port its old name again"
+                )
                 injection.wait_recovery()
             finally:
                 os.close(held)
@@ -154,12 +158,16 @@ def line_break(_generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
 
 def parity(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
     """8N1 for 8E1 reads the parity bit as the next byte's start: what comes out is different from byte to byte."""
-    return bytes(x ^ (0x80 if x.bit_count() & 1 else generator.choice((0, 1, 0x80))) for x in wire), False
+    return bytes(
+        x ^ (0x80 if x.bit_count() & 1 else generator.choice((0, 1, 0x80))) for x in wire
+    ), False
 
 
 def slow_stream(generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
     """Read twelve times too fast, each bit is a run of equal bits."""
-    return bytes(generator.choice((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0)) for _ in range(12)), False
+    return bytes(
+        generator.choice((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0)) for _ in range(12)
+    ), False
 
 
 def undisturbed(bench: Bench, fault: Fault, times: int, how: Mangle) -> None:
@@ -222,7 +230,9 @@ def swapped(bench: Bench, fault: Fault, times: int) -> None:
             fed.on = True
             injection.wait_recovery()
             bench.wait_until(
-                lambda: bench.watch.info_device(0) == fed.identity.device.value, 5, "the new ESC's device on the bus"
+                lambda: bench.watch.info_device(0) == fed.identity.device.value,
+                5,
+                "the new ESC's device on the bus",
             )
 
 

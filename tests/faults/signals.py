@@ -62,7 +62,9 @@ def _message(message: Any, count: int) -> Message:
     places: list[Place] = []
     flags: list[Place] = []
     for signal in sorted(message.signals, key=lambda s: int(s.start)):
-        assert signal.byte_order == "little_endian" and not signal.offset and not signal.is_multiplexer
+        assert (
+            signal.byte_order == "little_endian" and not signal.offset and not signal.is_multiplexer
+        )
         choices = {str(text): raw for raw, text in (signal.choices or {}).items()}
         place = Place(
             _snake(signal.name.removeprefix(prefix)),

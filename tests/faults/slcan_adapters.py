@@ -43,7 +43,9 @@ class Adapter:
 
     def up(self, bitrate: int) -> None:
         """Set the bit rate and bring the interface up."""
-        subprocess.run(["ip", "link", "set", self.name, "type", "can", "bitrate", str(bitrate)], check=True)
+        subprocess.run(
+            ["ip", "link", "set", self.name, "type", "can", "bitrate", str(bitrate)], check=True
+        )
         subprocess.run(["ip", "link", "set", self.name, "up"], check=True)
 
     def down(self) -> None:
@@ -110,7 +112,12 @@ class Bus:
     def carry(self, source: Adapter, frame: bytes) -> None:
         acknowledged = False
         for adapter in self.adapters:
-            if adapter is not source and adapter.is_open and adapter.rate == source.rate and not adapter.silent:
+            if (
+                adapter is not source
+                and adapter.is_open
+                and adapter.rate == source.rate
+                and not adapter.silent
+            ):
                 acknowledged = True
                 if not adapter.stalled:
                     adapter.tell(frame.decode())

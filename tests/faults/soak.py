@@ -30,13 +30,19 @@ IDENTITIES = (
     Identity(4, Layout.LEGACY, Device.KOSMIK, 8, alarms=True),
 )
 MAX_GROWTH_KIB = 2048
-GROWTH = Fault("UML", "Process", "memory, descriptors and threads after it all", None, lambda: None, "two")
+GROWTH = Fault(
+    "UML", "Process", "memory, descriptors and threads after it all", None, lambda: None, "two"
+)
 
 
 def run(bench: Bench, report: Report, generator: random.Random, end: float) -> None:
     """Faults until then, of those that the same gateway process lives through; then the figures."""
     assert bench.gateway is not None
-    faults = [f for f in in_order("UML") if f.bench == "two" and not any(text in f.name for text in NEW_PROCESS)]
+    faults = [
+        f
+        for f in in_order("UML")
+        if f.bench == "two" and not any(text in f.name for text in NEW_PROCESS)
+    ]
     quiet_ns, longest_ns, injected = 0, 0, 0
     before = bench.gateway.figures()
     while time.monotonic() < end:
@@ -59,7 +65,9 @@ def run(bench: Bench, report: Report, generator: random.Random, end: float) -> N
         "values lost": sum(each.lost for each in report.rows),
         "longest silence of an ESC in s": round(longest_ns / SECOND, 3),
         "longest silence of an ESC between faults in s": round(quiet_ns / SECOND, 3),
-        "s that the machine stood still": round(sum(e - b for b, e in bench.metronome.stalls) / SECOND, 2),
+        "s that the machine stood still": round(
+            sum(e - b for b, e in bench.metronome.stalls) / SECOND, 2
+        ),
     }
     row.injected = 1
     row.recovered = int(not growth(row, before, bench.gateway.figures(), MAX_GROWTH_KIB))
@@ -73,7 +81,9 @@ def main() -> int:
     if args.inside is None:
         seed = random.SystemRandom().randrange(1 << 32) if args.seed is None else args.seed
         words = [f"--minutes={args.minutes:g}", f"--seed={seed}"]
-        return outside.main(args, "soak.py", [GROWTH], timeout_s=60 * args.minutes + 300, words=words)
+        return outside.main(
+            args, "soak.py", [GROWTH], timeout_s=60 * args.minutes + 300, words=words
+        )
     print(f"seed {args.seed}", flush=True)
     generator = random.Random(args.seed)
     count = generator.randrange(2, 5)

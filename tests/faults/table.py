@@ -16,17 +16,31 @@ import qemu_serial_faults  # noqa: F401
 from fault_report import WITH_PYTHON, Report, Row, in_order
 
 BEGIN, END = "<!-- faults begin -->", "<!-- faults end -->"
-COLUMNS = ("machine", "fault", "injected", "recovered", "worst recovery", "wrong values", "values lost", "state")
+COLUMNS = (
+    "machine",
+    "fault",
+    "injected",
+    "recovered",
+    "worst recovery",
+    "wrong values",
+    "values lost",
+    "state",
+)
 HEAD = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|\n"
 
 
 def table(rows: Sequence[Row]) -> str:
     """The table in Markdown, in the order of the programme."""
     order = [(fault.machine, fault.name) for fault in in_order()]
-    order += [(row.machine, row.name) for row in rows]  # also of a run of faults that there are no longer
+    # also of a run of faults that there are no longer
+    order += [(row.machine, row.name) for row in rows]
     text = HEAD
     for row in sorted(rows, key=lambda row: order.index((row.machine, row.name))):
-        worst = "undisturbed" if row.limit_s is None else f"{row.worst_s:.2f} s (limit {row.limit_s:g} s)"
+        worst = (
+            "undisturbed"
+            if row.limit_s is None
+            else f"{row.worst_s:.2f} s (limit {row.limit_s:g} s)"
+        )
         if WITH_PYTHON in row.figures:
             worst += f", {row.figures[WITH_PYTHON]:.2f} {WITH_PYTHON}"
         text += f"| {row.machine} | {row} | {row.injected} | {row.recovered} | {worst} "

@@ -74,7 +74,9 @@ def test_right_and_fresh_values_are_right_and_noted(judge: Judge) -> None:
 
 def test_values_marked_as_not_available_are_never_wrong(judge: Judge) -> None:
     codes = {place.name: place.not_available or 0 for place in judge.table[SPEED_ID].places}
-    bits = sum((codes[place.name] & place.mask) << place.start for place in judge.table[SPEED_ID].places)
+    bits = sum(
+        (codes[place.name] & place.mask) << place.start for place in judge.table[SPEED_ID].places
+    )
     judge.take(SPEED_ID, bits.to_bytes(8, "little"), START + 5 * SECOND)
     assert settled(judge) == []
     assert judge.marked == 1
@@ -148,7 +150,10 @@ def test_no_two_frames_of_an_esc_look_alike_in_any_message_within_the_time_out()
     for a, b in pairwise(range(400)):
         first, second = live(one, a), live(one, b)
         assert first.electrical_speed != second.electrical_speed
-        assert (first.power_stage_temperature, first.timing) != (second.power_stage_temperature, second.timing)
+        assert (first.power_stage_temperature, first.timing) != (
+            second.power_stage_temperature,
+            second.timing,
+        )
     assert len({mix(n, 8) for n in range(100_000)}) > 99_990
 
 

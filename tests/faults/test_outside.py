@@ -14,7 +14,9 @@ from outside import Load, Sample, conclude, judge, sample, worst_share
 
 
 def row(name: str = "x", taken: float = 0.0, **counts: Any) -> Row:
-    return Row("UML", "Serial", name, 2.0, **{"injected": 3, "recovered": 3, "taken": taken, **counts})
+    return Row(
+        "UML", "Serial", name, 2.0, **{"injected": 3, "recovered": 3, "taken": taken, **counts}
+    )
 
 
 @pytest.mark.parametrize(
@@ -55,12 +57,19 @@ def reports(*rounds: list[Row]) -> tuple[list[Sequence[str]], Any]:
 
 
 def test_only_what_was_not_judged_is_deferred_and_only_once() -> None:
-    first = [row("good"), row("failed", lost=1), row("late", 0.3, recovered=2), row("lost", 0.3, lost=1)]
+    first = [
+        row("good"),
+        row("failed", lost=1),
+        row("late", 0.3, recovered=2),
+        row("lost", 0.3, lost=1),
+    ]
     asked, run = reports(first, [row("late"), row("lost", 0.4, lost=2)])
     report = judge(run, lambda: True)
     assert asked == [(), ["Serial: late", "Serial: lost"]]
     assert [each.state for each in report.rows] == [GOOD, FAILED, GOOD, NOT_JUDGED]
-    assert report.rows[2].notes == ["deferred to a quieter moment: 30% of the processor time was taken at first"]
+    assert report.rows[2].notes == [
+        "deferred to a quieter moment: 30% of the processor time was taken at first"
+    ]
 
 
 def test_without_a_quiet_moment_it_stays_not_judged() -> None:
@@ -100,7 +109,9 @@ def test_the_worst_five_seconds_count() -> None:
 
 
 def test_waiting_behind_other_work_counts_like_steal() -> None:
-    assert worst_share([Sample(n / 2, 0, 100 * n, 0, 0.1 * n) for n in range(40)], 0, 19) == pytest.approx(0.2)
+    assert worst_share(
+        [Sample(n / 2, 0, 100 * n, 0, 0.1 * n) for n in range(40)], 0, 19
+    ) == pytest.approx(0.2)
 
 
 def test_all_that_the_virtual_machine_started_in_sessions_of_its_own_is_watched() -> None:

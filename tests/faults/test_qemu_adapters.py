@@ -39,7 +39,9 @@ def test_each_error_is_told_by_the_levels() -> None:
     assert errors(levels(DATA, Line(9600, "N")), 9600) & {STATUS_FRAMING, STATUS_BREAK}
 
 
-def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gateways_from_then_on() -> None:
+def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gateways_from_then_on() -> (
+    None
+):
     adapter = SerialAdapter(0, "x")
 
     def set_line(divisor: int, parity_and_bits: int) -> None:

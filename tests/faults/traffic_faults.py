@@ -21,7 +21,9 @@ def still_answers(injection: Injection) -> None:
 
 def cangen(bench: Bench, words: str) -> None:
     """Frames from the far end, however full its queue is."""
-    subprocess.run(["cangen", bench.watched, "-i", *words.split()], check=True, stderr=subprocess.DEVNULL)
+    subprocess.run(
+        ["cangen", bench.watched, "-i", *words.split()], check=True, stderr=subprocess.DEVNULL
+    )
 
 
 @fault("Traffic", "random frames", None)
@@ -55,7 +57,11 @@ def sdo_flood(bench: Bench, fault: Fault, times: int) -> None:
             end = time.monotonic() + 1.5
             sent = 0
             while time.monotonic() < end:
-                request = generator.choice(requests) if generator.random() < 0.8 else generator.randbytes(8)
+                request = (
+                    generator.choice(requests)
+                    if generator.random() < 0.8
+                    else generator.randbytes(8)
+                )
                 vandal.send(0x601 + (sent & 1), request)
                 sent += 1
                 time.sleep(0.001)
@@ -75,7 +81,9 @@ def sync(bench: Bench, fault: Fault, times: int) -> None:
             still_answers(injection)
 
 
-def conflicts(bench: Bench, fault: Fault, times: int, frames: Callable[[int], list[tuple[int, bytes]]]) -> None:
+def conflicts(
+    bench: Bench, fault: Fault, times: int, frames: Callable[[int], list[tuple[int, bytes]]]
+) -> None:
     """Another node sends these frames, in turn as if it were node 1 and node 2."""
     gateway = bench.gateway
     assert gateway is not None
@@ -95,14 +103,18 @@ def conflicts(bench: Bench, fault: Fault, times: int, frames: Callable[[int], li
             injection.wait_emergency(node, CONFLICT)
             said = len(gateway.lines) - lines
             bench.report.row(fault).peak("lines in the log", said)
-            injection.expect(1 <= said <= 2 * len(frames(node)), f"{said} lines in the log for one condition")
+            injection.expect(
+                1 <= said <= 2 * len(frames(node)), f"{said} lines in the log for one condition"
+            )
             still_answers(injection)
 
 
 @fault("Traffic", "another node sends with our identifiers", None)
 def foreign_ids(bench: Bench, fault: Fault, times: int) -> None:
     """Noticed, said once in the log, EMCY 8150h; ours go on."""
-    conflicts(bench, fault, times, lambda node: [(0x687 + node, bytes(8)), (0x180 + node, bytes(8))])
+    conflicts(
+        bench, fault, times, lambda node: [(0x687 + node, bytes(8)), (0x180 + node, bytes(8))]
+    )
 
 
 @fault("Traffic", "a second node with our node-ID", None)
@@ -110,7 +122,11 @@ def duplicate_node(bench: Bench, fault: Fault, times: int) -> None:
     """Its boot-up, heartbeat and answers are noticed as a conflict; our node stays as it is."""
 
     def frames(node: int) -> list[tuple[int, bytes]]:
-        return [(0x700 + node, b"\0"), (0x700 + node, b"\x7f"), (0x580 + node, bytes([0x80, 0, 0x10, 0, 0, 0, 4, 5]))]
+        return [
+            (0x700 + node, b"\0"),
+            (0x700 + node, b"\x7f"),
+            (0x580 + node, bytes([0x80, 0, 0x10, 0, 0, 0, 4, 5])),
+        ]
 
     conflicts(bench, fault, times, frames)
 

@@ -14,7 +14,11 @@ from kontronik_can_gw.gateway import Gateway
 
 
 def gateway() -> Gateway:
-    tables = {"canopen": {"enabled": True, "store": "/nowhere"}, "dbc": {"enabled": False}, "esc": [{"port": "a"}]}
+    tables = {
+        "canopen": {"enabled": True, "store": "/nowhere"},
+        "dbc": {"enabled": False},
+        "esc": [{"port": "a"}],
+    }
     loaded = assemble(parse(tables, "test"))
     return Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
 
@@ -27,7 +31,9 @@ def test_an_outage_later_on_does_not_boot_the_nodes_again() -> None:
     assert 0x701 not in [f.can_id for f in made.take_frames()]
 
 
-def test_an_interface_that_goes_down_again_before_a_frame_was_sent_makes_the_nodes_boot_when_it_is_up() -> None:
+def test_an_interface_that_goes_down_again_before_a_frame_was_sent_makes_the_nodes_boot_when_it_is_up() -> (
+    None
+):
     made = gateway()
     made.start(0)
     made.set_can_state(CanState.ERROR_ACTIVE, 0)
@@ -67,13 +73,22 @@ def test_an_eds_that_gives_two_nodes_one_cob_id_is_refused(tmp_path: Path) -> No
     assert "COB-ID 0A0h is that of 1014h:00 of node 1 and of 1014h:00 of node 2" in said
 
 
-def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(tmp_path: Path) -> None:
+def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(
+    tmp_path: Path,
+) -> None:
     eds = shipped("eds/kontronik_esc.eds").read_bytes()
     head, register, tail = eds.partition(b"[1001]")
     eds = head + register + tail.replace(b"PDOMapping=0", b"PDOMapping=1", 1)
     (tmp_path / "my.eds").write_bytes(eds)
-    canopen = {"enabled": True, "store": str(tmp_path), "eds": str(tmp_path / "my.eds"), "self_start": True}
-    loaded = assemble(parse({"canopen": canopen, "dbc": {"enabled": False}, "esc": [{"port": "a"}]}, "test"))
+    canopen = {
+        "enabled": True,
+        "store": str(tmp_path),
+        "eds": str(tmp_path / "my.eds"),
+        "self_start": True,
+    }
+    loaded = assemble(
+        parse({"canopen": canopen, "dbc": {"enabled": False}, "esc": [{"port": "a"}]}, "test")
+    )
     made = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
     made.start(0)
     for request in (
@@ -85,7 +100,9 @@ def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(
         made.take_frames()
         made.receive_frame(CanFrame(0x601, bytes.fromhex(request)), 0, 0)
         assert [f.data[0] for f in made.take_frames() if f.can_id == 0x581] == [0x60]
-    live = bytes.fromhex("4B4F444C 00000000 8A09" + "0000" * 5 + "581F E903 00 00 1D 20 00000200 0C 00 39234C14")
+    live = bytes.fromhex(
+        "4B4F444C 00000000 8A09" + "0000" * 5 + "581F E903 00 00 1D 20 00000200 0C 00 39234C14"
+    )
     made.receive_bytes(0, live, SECOND, SECOND)
     made.take_frames()
     made.advance(2 * SECOND)

@@ -26,7 +26,9 @@ SPEED = ' SG_ ElectricalSpeed : 0|32@1+ (1,0) [0|0] "1/min" Car\n'
 
 
 def layout_of(text: str) -> Layout:
-    return prepare(parse_database(text.encode(), "t.dbc"), "t.dbc", (ESC,), DbcSettings(), fd_allowed=True)[1]
+    return prepare(
+        parse_database(text.encode(), "t.dbc"), "t.dbc", (ESC,), DbcSettings(), fd_allowed=True
+    )[1]
 
 
 def wire(**values: int) -> bytes:
@@ -48,7 +50,12 @@ class Bench:
         return self.gateway.message_bits(0, self.now)
 
     def info(self, device: Device) -> None:
-        self.read(encode(InfoData(device_and_variant=device_and_variant(device, 120), cell_count=6), codec.Layout.V4))
+        self.read(
+            encode(
+                InfoData(device_and_variant=device_and_variant(device, 120), cell_count=6),
+                codec.Layout.V4,
+            )
+        )
 
     def read(self, data: bytes) -> list[bytes]:
         """A period later bytes come; the frames sent until and with them."""
@@ -75,7 +82,9 @@ NO_BEC_CURRENT = 0xFFFF
 
 
 @pytest.mark.parametrize(("device", "then"), [(Device.JIVEPRO, NO_BEC_CURRENT), (Device.KOSMIK, 5)])
-def test_a_jivepros_bec_current_stays_unavailable_when_its_information_has_expired(device: Device, then: int) -> None:
+def test_a_jivepros_bec_current_stays_unavailable_when_its_information_has_expired(
+    device: Device, then: int
+) -> None:
     bench = Bench(BEC_CURRENT)
     bench.info(device)
     assert bench.live(bec_current=50) & 0xFFFF == then
@@ -87,7 +96,15 @@ def test_a_jivepros_bec_current_stays_unavailable_when_its_information_has_expir
 
 def test_energy_is_what_was_drawn_between_two_frames_and_nothing_that_was_fed_back() -> None:
     bench = Bench(' SG_ EnergyUsed : 0|32@1+ (0.001,0) [0|4000000] "Wh" Car\n')
-    steps = [(2400, 1000), (2400, 1000), (2000, -500), (2000, -500), (0, 1000), (2400, 0), (1000, 3000)]
+    steps = [
+        (2400, 1000),
+        (2400, 1000),
+        (2000, -500),
+        (2000, -500),
+        (0, 1000),
+        (2400, 0),
+        (1000, 3000),
+    ]
     drawn = 0  # 10 mV times 0.1 A times a period of 10 ms
     for n in range(7 * 400):
         voltage, current = steps[n % 7]
@@ -99,9 +116,12 @@ def test_energy_is_what_was_drawn_between_two_frames_and_nothing_that_was_fed_ba
 
 
 @pytest.mark.parametrize(("throttle", "raw"), [(99, 99), (100, 101), (101, 101), (102, 102)])
-def test_a_value_that_equals_the_code_for_not_available_is_sent_as_the_error_code(throttle: int, raw: int) -> None:
+def test_a_value_that_equals_the_code_for_not_available_is_sent_as_the_error_code(
+    throttle: int, raw: int
+) -> None:
     bench = Bench(
-        ' SG_ PwmInput : 0|16@1+ (1,0) [0|65535] "us" Car\n', 'VAL_ 256 PwmInput 100 "NotAvailable" 101 "Error" ;\n'
+        ' SG_ PwmInput : 0|16@1+ (1,0) [0|65535] "us" Car\n',
+        'VAL_ 256 PwmInput 100 "NotAvailable" 101 "Error" ;\n',
     )
     assert bench.gateway.message_bits(0, 0) & 0xFFFF == 100, "before the first frame"
     assert bench.live(pwm_input=throttle) & 0xFFFF == raw
@@ -115,8 +135,12 @@ def test_after_an_outage_of_the_bus_what_has_no_cycle_is_sent_again() -> None:
     assert [data[:4] for data in bench.take()] == [b"\xff\xff\xff\xff"]
 
 
-@pytest.mark.parametrize(("kind", "name", "per_second"), [("", "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)])
-def test_counters_in_messages_without_a_cycle_do_not_go_stale(kind: str, name: str, per_second: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "name", "per_second"), [("", "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)]
+)
+def test_counters_in_messages_without_a_cycle_do_not_go_stale(
+    kind: str, name: str, per_second: int
+) -> None:
     unit = "s" if name == "Uptime" else ""
     bench = Bench(f' SG_ {name} : 0|32@1+ (1,0) [0|0] "{unit}" Car\n', kind)
     good = wire(battery_voltage=5000)
@@ -141,12 +165,16 @@ def test_a_read_of_many_old_frames_is_no_flood_of_link_changes() -> None:
 
 def pages(*names: str) -> str:
     """A multiplexed message: page n has the n-th of the names."""
-    signals = (f' SG_ {name} m{n} : 8|16@1+ (0.01,0) [0|0] "V" Car\n' for n, name in enumerate(names))
+    signals = (
+        f' SG_ {name} m{n} : 8|16@1+ (0.01,0) [0|0] "V" Car\n' for n, name in enumerate(names)
+    )
     return ' SG_ Page M : 0|4@1+ (1,0) [0|0] "" Car\n' + "".join(signals)
 
 
 def test_a_page_that_changes_often_does_not_starve_the_cycle_of_the_others() -> None:
-    bench = Bench(pages("BatteryVoltage", "BecVoltage", "MinBatteryVoltage"), EACH_CHANGE_AND_100_MS)
+    bench = Bench(
+        pages("BatteryVoltage", "BecVoltage", "MinBatteryVoltage"), EACH_CHANGE_AND_100_MS
+    )
     sent: list[int] = []
     for n in range(300):
         sent += [data[0] for data in bench.read(wire(battery_voltage=n))]
@@ -156,7 +184,9 @@ def test_a_page_that_changes_often_does_not_starve_the_cycle_of_the_others() -> 
 
 def test_information_that_runs_out_is_not_available_on_every_page() -> None:
     bench = Bench(pages("MinBatteryVoltage", "MaxBatteryVoltage"))
-    sent = bench.read(encode(InfoData(min_battery_voltage=1, max_battery_voltage=2), codec.Layout.V4))
+    sent = bench.read(
+        encode(InfoData(min_battery_voltage=1, max_battery_voltage=2), codec.Layout.V4)
+    )
     while bench.now < INFO_TIMEOUT_NS + SECOND:
         sent += bench.read(wire())
     for page, value in ((0, b"\1\0"), (1, b"\2\0")):

@@ -128,7 +128,11 @@ def _run(line: str, folder: Path) -> Iterator[str]:
                 print(f"Traceback: {error!r}", file=err)
     out.flush()
     data = out.buffer.getvalue()
-    shown = meaning.FORMS[how](data) if how and data and code == 0 else data.decode("utf-8").splitlines()
+    shown = (
+        meaning.FORMS[how](data)
+        if how and data and code == 0
+        else data.decode("utf-8").splitlines()
+    )
     talk = [text for text in err.getvalue().splitlines() if not text.startswith(("usage: ", "  "))]
     if len(talk) > LINES:
         talk[LINES:] = [f"... and {len(talk) - LINES} more lines"]
@@ -141,7 +145,8 @@ def _neutral(text: str, folder: Path) -> str:
     """Without what depends on this machine or on the version."""
     for real, instead in ((f"{folder}/", ""), (str(folder), "."), *drive.FOLDERS.items()):
         text = text.replace(real, instead)
-    text = re.sub(r"\(choose from .*\)", lambda found: found[0].replace("'", ""), text)  # Python's versions differ
+    # Python's versions differ
+    text = re.sub(r"\(choose from .*\)", lambda found: found[0].replace("'", ""), text)
     text = re.sub(r", in [\d.]+ s\b", ", in TIME", text)
     return re.sub(rf"\b{re.escape(drive.VERSION)}\b", "VERSION", text)
 
@@ -163,7 +168,13 @@ def _place() -> Iterator[Path]:
         ):
             os.environ.pop(key, None)
         os.environ.update(
-            {"HOME": name, "XDG_STATE_HOME": f"{name}/state", "COLUMNS": "100", "TZ": "UTC0", "LC_ALL": "C"}
+            {
+                "HOME": name,
+                "XDG_STATE_HOME": f"{name}/state",
+                "COLUMNS": "100",
+                "TZ": "UTC0",
+                "LC_ALL": "C",
+            }
         )
         time.tzset()
         os.chdir(folder)

@@ -69,7 +69,10 @@ class Drive:
 
     def __init__(self, tables: Mapping[str, Any], file: Path) -> None:
         loaded = assemble(parse(dict(tables), str(file)))
-        self.warnings = [line.replace(f"{file.parent}/", "") for line in (*loaded.layout.warnings, *loaded.warnings)]
+        self.warnings = [
+            line.replace(f"{file.parent}/", "")
+            for line in (*loaded.layout.warnings, *loaded.warnings)
+        ]
         silent = loaded.config.dbc.on_loss == "silent"
         self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.canopen)
         self._waiting = TransmitQueue()
@@ -144,8 +147,13 @@ class Drive:
         for esc, stored in gateway.take_saves():
             content = json.loads(encode(stored).split(b"\n")[1])
             found.append(f"store {esc + 1} {json.dumps(content, sort_keys=True)}")
-        found += [f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}" for esc, key in gateway.take_misfits()]
+        found += [
+            f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}"
+            for esc, key in gateway.take_misfits()
+        ]
         for conflict in gateway.take_conflicts():
-            found.append(f"conflict {conflict.can_id:03X} {conflict.whose}{' is over' if conflict.over else ''}")
+            found.append(
+                f"conflict {conflict.can_id:03X} {conflict.whose}{' is over' if conflict.over else ''}"
+            )
         gateway.take_link_changes()
         return found

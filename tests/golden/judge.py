@@ -80,7 +80,11 @@ class Esc:
     def expire(self, now: int) -> bool:
         """Forget what is too old."""
         before = self.state
-        if before.live is not None and before.live_ns is not None and now - before.live_ns > self.timeout:
+        if (
+            before.live is not None
+            and before.live_ns is not None
+            and now - before.live_ns > self.timeout
+        ):
             self.lose()
         if self.state.info is not None and now - self.state.info_ns > INFO_NS:
             self.state = self.state._replace(info=None)
@@ -97,7 +101,9 @@ class Esc:
         if kind == "info":
             self.state = self.state._replace(info=values, info_ns=when, last_info=values)
         else:
-            self.state = self.state._replace(live=values, live_ns=max(when, self.state.live_ns or 0))
+            self.state = self.state._replace(
+                live=values, live_ns=max(when, self.state.live_ns or 0)
+            )
 
 
 def found_frames(inputs: list[Bytes], timeout: int) -> list[Arrivals | None]:
@@ -113,7 +119,10 @@ def found_frames(inputs: list[Bytes], timeout: int) -> list[Arrivals | None]:
         if end > begin:
             _search(inputs, begin, end, timeout, found)
         begin = end if end > begin else end + 1
-    return [None if data is None else arrivals for (_, data), arrivals in zip(inputs, found, strict=True)]
+    return [
+        None if data is None else arrivals
+        for (_, data), arrivals in zip(inputs, found, strict=True)
+    ]
 
 
 def _search(inputs: list[Bytes], begin: int, end: int, timeout: int, found: list[Arrivals]) -> None:
@@ -133,7 +142,9 @@ def _search(inputs: list[Bytes], begin: int, end: int, timeout: int, found: list
         now = inputs[begin + index][0]
         when = now - (ends[index] - frame.end) * NS_PER_BYTE
         if now - when <= timeout:
-            found[begin + index].append((frame.kind, frame.layout, fields_of(frame.kind, frame.raw), when))
+            found[begin + index].append(
+                (frame.kind, frame.layout, fields_of(frame.kind, frame.raw), when)
+            )
 
 
 def fields_of(kind: str, raw: bytes) -> Values:
@@ -162,13 +173,28 @@ def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | No
             return Fraction(known[plain], listed[plain].steps)
     if name in ("MotorSpeed", "OutputSpeed", "MeanCellVoltage") and not esc.sure:
         raise KeyError(name)
-    if name in ("OperatingState", "OperatingStateRaw", "MotorSpeed", "OutputSpeed", "BatteryPower", "MeanCellVoltage"):
-        return None if live is None else _of_live(name, esc, live, esc.cells or (info or {}).get("cell_count", 0))
+    if name in (
+        "OperatingState",
+        "OperatingStateRaw",
+        "MotorSpeed",
+        "OutputSpeed",
+        "BatteryPower",
+        "MeanCellVoltage",
+    ):
+        return (
+            None
+            if live is None
+            else _of_live(name, esc, live, esc.cells or (info or {}).get("cell_count", 0))
+        )
     if name in ("Device", "DeviceRaw", "Variant", "FirmwareMain", "FirmwareSub"):
         if info is None:
             return None
         pair, firmware = info["device_and_variant"], info["firmware_word"]
-        parts = {"Variant": pair & 1023, "FirmwareMain": firmware >> 8, "FirmwareSub": firmware & 255}
+        parts = {
+            "Variant": pair & 1023,
+            "FirmwareMain": firmware >> 8,
+            "FirmwareSub": firmware & 255,
+        }
         return parts.get(name, pair >> 10)
     if name == "Layout":
         return state.layout
@@ -217,7 +243,9 @@ def fits(signal: Signal, raw: float, value: Fraction | int | None, unit: str) ->
 class Judge:
     """One golden file. ``wrong``: what does not agree; ``count``: what was judged."""
 
-    def __init__(self, escs: list[Esc], database: Database | None, node_ids: list[int], steady: bool) -> None:
+    def __init__(
+        self, escs: list[Esc], database: Database | None, node_ids: list[int], steady: bool
+    ) -> None:
         self.escs = escs
         self.database = database
         self.node_ids = node_ids
@@ -284,13 +312,26 @@ class Judge:
             self._answer(now, frame)
         node = frame.can_id & 0x7F
         if not frame.extended and 0x180 < frame.can_id < 0x400 and node in self.node_ids:
-            self._message(now, frame, self._pdos, frame.can_id - node + 1, self.escs[self.node_ids.index(node)])
+            self._message(
+                now,
+                frame,
+                self._pdos,
+                frame.can_id - node + 1,
+                self.escs[self.node_ids.index(node)],
+            )
         elif self.database is not None:
             self._message(now, frame, self.database, frame.can_id, None)
 
-    def _message(self, now: int, frame: drive.Frame, database: Database, can_id: int, owner: Esc | None) -> None:
+    def _message(
+        self, now: int, frame: drive.Frame, database: Database, can_id: int, owner: Esc | None
+    ) -> None:
         message = next(
-            (m for m in database.messages if (m.frame_id, m.is_extended_frame) == (can_id, frame.extended)), None
+            (
+                m
+                for m in database.messages
+                if (m.frame_id, m.is_extended_frame) == (can_id, frame.extended)
+            ),
+            None,
         )
         if message is None:
             return
@@ -301,13 +342,16 @@ class Judge:
         for signal in message.signals:
             if signal.name in raw:
                 esc = owner or next(
-                    (e for e in self.escs if e.prefix and signal.name.startswith(e.prefix)), self.escs[0]
+                    (e for e in self.escs if e.prefix and signal.name.startswith(e.prefix)),
+                    self.escs[0],
                 )
                 self._signal(now, message.name, signal, raw[signal.name], esc, owner is not None)
         if owner is None:
             self._rhythm(now, message, raw)
 
-    def _signal(self, now: int, message: str, signal: Signal, raw: float, esc: Esc, pdo: bool) -> None:
+    def _signal(
+        self, now: int, message: str, signal: Signal, raw: float, esc: Esc, pdo: bool
+    ) -> None:
         name = signal.name.removeprefix(esc.prefix)
         states = esc.passed or [esc.state]
         if name in self._flags:
@@ -322,17 +366,25 @@ class Judge:
             row = (LIVE | INFO).get(plain, LIVE["battery_voltage"])
             unit = row.unit.replace("µ", "u")
             try:
-                good = any(fits(signal, raw, expected(name, esc, state, now), unit) for state in states)
+                good = any(
+                    fits(signal, raw, expected(name, esc, state, now), unit) for state in states
+                )
                 # CiA 301 has no code for what is not available: as it stands on the wire
-                good = good or (pdo and any(s.live is not None and raw == s.live.get(plain) for s in states))
+                good = good or (
+                    pdo and any(s.live is not None and raw == s.live.get(plain) for s in states)
+                )
             except KeyError:
                 return
         self.count["values"] += 1
         if not good:
-            self.wrong.append(f"{scenario.seconds(now)} {message}.{signal.name} = {raw} with {states}")
+            self.wrong.append(
+                f"{scenario.seconds(now)} {message}.{signal.name} = {raw} with {states}"
+            )
 
     def _rhythm(self, now: int, message: Any, raw: Mapping[str, Any]) -> None:
-        alive = next((s for s in message.signals if s.name.endswith(("Alive", "AliveCounter"))), None)
+        alive = next(
+            (s for s in message.signals if s.name.endswith(("Alive", "AliveCounter"))), None
+        )
         counter = -1 if alive is None else int(raw[alive.name])
         before, last = self._last.get(message.name, (-1, now))
         self._last[message.name] = counter, now
@@ -340,16 +392,27 @@ class Judge:
             return
         self.count["distances"] += 1
         if alive is not None and before >= 0 and counter != (before + 1) % 15:
-            self.wrong.append(f"{scenario.seconds(now)} {message.name}: alive counter {before} -> {counter}")
+            self.wrong.append(
+                f"{scenario.seconds(now)} {message.name}: alive counter {before} -> {counter}"
+            )
         attributes = message.dbc.attributes
         delay = attributes["GenMsgDelayTime"].value if "GenMsgDelayTime" in attributes else 0
-        if (message.cycle_time and now - last > message.cycle_time * 10**6 + 10**6) or now - last < delay * 10**6:
-            self.wrong.append(f"{scenario.seconds(now)} {message.name}: {(now - last) / 1e6} ms after the one before")
+        if (
+            message.cycle_time and now - last > message.cycle_time * 10**6 + 10**6
+        ) or now - last < delay * 10**6:
+            self.wrong.append(
+                f"{scenario.seconds(now)} {message.name}: {(now - last) / 1e6} ms after the one before"
+            )
 
     def _answer(self, now: int, frame: drive.Frame) -> None:
         node, data = frame.can_id - 0x580, frame.data
         request = self._requests.pop(node, None)
-        if request is not None and data[0] == 0x60 and request[1:3] == b"\x00\x21" and request[0] & 0xE2 == 0x22:
+        if (
+            request is not None
+            and data[0] == 0x60
+            and request[1:3] == b"\x00\x21"
+            and request[0] & 0xE2 == 0x22
+        ):
             self.setting(node, request[3], request[4 : 8 - (request[0] >> 2 & 3)])
         if data[0] & 0xE2 == 0x42:
             self.read(now, node, data[2] << 8 | data[1], data[3], data[4 : 8 - (data[0] >> 2 & 3)])
@@ -362,22 +425,38 @@ class Judge:
         state = esc.state
         live, info = state.live, state.last_info
         wanted: bytes | None = None
-        row = sheet.LIVE_FIELDS[min(sub, 16) - 1] if index == 0x2000 else sheet.INFO_FIELDS[min(sub, 14) + 3]
+        row = (
+            sheet.LIVE_FIELDS[min(sub, 16) - 1]
+            if index == 0x2000
+            else sheet.INFO_FIELDS[min(sub, 14) + 3]
+        )
         if index == 0x2000 and sub <= 16:
             if live is not None and (row.name != "bec_current" or bec_current_supplied(state)):
                 wanted = struct.pack(f"<{row.code}", live[row.name])
         elif index == 0x2011 and sub <= 14:
-            if info is not None and (row.name != "max_bec_current" or info["device_and_variant"] >> 10 != JIVEPRO):
+            if info is not None and (
+                row.name != "max_bec_current" or info["device_and_variant"] >> 10 != JIVEPRO
+            ):
                 wanted = struct.pack(f"<{row.code}", info[row.name])
         elif index == 0x2010 and sub <= 5:
-            names = ("device_and_variant", "device_and_variant", "firmware_word", "selftest_errors", "cell_count")
+            names = (
+                "device_and_variant",
+                "device_and_variant",
+                "firmware_word",
+                "selftest_errors",
+                "cell_count",
+            )
             if info is not None:
                 value = info[names[sub - 1]]
-                wanted = struct.pack(f"<{'BHHIB'[sub - 1]}", {1: value >> 10, 2: value & 1023}.get(sub, value))
+                wanted = struct.pack(
+                    f"<{'BHHIB'[sub - 1]}", {1: value >> 10, 2: value & 1023}.get(sub, value)
+                )
         elif index == 0x2001 and sub <= 2 and esc.sure:
             if live is not None:
                 ratio = esc.pole_pairs * (esc.gear if sub == 2 else 1)
-                wanted = struct.pack("<i", int(live["electrical_speed"] / Fraction(ratio) + Fraction(1, 2)))
+                wanted = struct.pack(
+                    "<i", int(live["electrical_speed"] / Fraction(ratio) + Fraction(1, 2))
+                )
         else:
             return
         self.count["SDO answers"] += 1
@@ -410,7 +489,9 @@ def _flags() -> dict[str, tuple[str, int]]:
         signals = [s for s in _dbc([]).get_message_by_name(message).signals if s.length == 1]
         for bit, signal in zip(bits, sorted(signals, key=lambda s: s.start), strict=True):
             plain = [re.sub("[^a-z]", "", text).removesuffix("s") for text in bit.words]
-            assert any(text in signal.name.lower() for text in plain), f"{signal.name} is not {bit.words}"
+            assert any(text in signal.name.lower() for text in plain), (
+                f"{signal.name} is not {bit.words}"
+            )
             found[signal.name] = (word, bit.number)
     return found
 
@@ -419,7 +500,9 @@ def follow(found: Judge, steps: list[tuple[int, str, Any]]) -> Judge:
     """What happened, in order: bytes (ESC, what; None: the port is lost), frames <- and ->, SDO transfers."""
     queues = []
     for index, esc in enumerate(found.escs):
-        inputs = [(now, what[1]) for now, verb, what in steps if verb == "bytes" and what[0] == index]
+        inputs = [
+            (now, what[1]) for now, verb, what in steps if verb == "bytes" and what[0] == index
+        ]
         queues.append(iter(found_frames(inputs, esc.timeout)))
     for now, verb, what in steps:
         if verb == "bytes":
@@ -446,12 +529,16 @@ def judge_scenario(file: Path) -> Judge:
         gear = Fraction(str(esc.get("gear", 1)))
         escs.append(Esc(prefix, esc.get("pole_pairs", 1), gear, esc.get("cell_count", 0), timeout))
     canopen, dbc = tables.get("canopen", {}), tables.get("dbc", {})
-    node_ids = [canopen.get("node_id", 1) + n for n in range(len(escs))] if canopen.get("enabled") else []
+    node_ids = (
+        [canopen.get("node_id", 1) + n for n in range(len(escs))] if canopen.get("enabled") else []
+    )
     database = None
     if dbc.get("enabled", True):
         with tempfile.TemporaryDirectory() as folder:
             plain = re.sub(r"^\[golden[^\[]*", "", header, flags=re.MULTILINE)
-            (Path(folder) / "a.toml").write_text(plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"'))
+            (Path(folder) / "a.toml").write_text(
+                plain.replace('"my_car.dbc"', f'"{scenario.INPUTS}/my_car.dbc"')
+            )
             database = _dbc(["-c", f"{folder}/a.toml"])
     steps: list[tuple[int, str, Any]] = []
     steady = dbc.get("on_loss") != "silent"
@@ -467,7 +554,16 @@ def judge_scenario(file: Path) -> Judge:
             node, index, sub = int(words[0]), int(words[1][:4], 16), int(words[1][5:], 16)
             if verb == "read":
                 steps.append(
-                    (now, verb, (node, index, sub, None if "!" in words else bytes.fromhex("".join(words[3:4]))))
+                    (
+                        now,
+                        verb,
+                        (
+                            node,
+                            index,
+                            sub,
+                            None if "!" in words else bytes.fromhex("".join(words[3:4])),
+                        ),
+                    )
                 )
             elif index == 0x2100 and "!" not in words:
                 steps.append((now, verb, (node, sub, bytes.fromhex(words[2]))))
@@ -480,7 +576,12 @@ def blocks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     while (at := data.find(b"KCB1", at)) >= 0:
         head = data[at : at + 24]
         if len(head) == 24:
-            kind, packed, _, stored = head[4:5], head[5], head[6:8], int.from_bytes(head[8:12], "little")
+            kind, packed, _, stored = (
+                head[4:5],
+                head[5],
+                head[6:8],
+                int.from_bytes(head[8:12], "little"),
+            )
             payload = data[at + 24 : at + 24 + stored]
             if zlib.crc32(payload, zlib.crc32(head[:20])) == int.from_bytes(head[20:], "little"):
                 yield kind, zlib.decompress(payload) if packed else payload
@@ -500,13 +601,23 @@ def judge_capture(file: Path) -> Judge:
             at = 4 + 16 * int.from_bytes(payload[:4], "little")
             for now, what, _, index, size in struct.iter_unpack("<QBBHI", payload[4:at]):
                 if what in (1, 7):
-                    steps.append((now, "bytes", (index, payload[at : at + size] if what == 1 else None)))
+                    steps.append(
+                        (now, "bytes", (index, payload[at : at + size] if what == 1 else None))
+                    )
                 at += size
     listed = header["escs"]
     escs = []
     for esc in listed:
         prefix = esc["name"].title() if len(listed) > 1 else ""
-        escs.append(Esc(prefix, esc["pole_pairs"], Fraction(esc["gear"]), esc["cell_count"], esc["timeout_ns"]))
+        escs.append(
+            Esc(
+                prefix,
+                esc["pole_pairs"],
+                Fraction(esc["gear"]),
+                esc["cell_count"],
+                esc["timeout_ns"],
+            )
+        )
     database = meaning.database(header["dbc"]["text"].encode("latin-1"))
     if len(listed) > 1:
         database = _dbc([word for esc in listed for word in ("--name", esc["name"])])
@@ -535,19 +646,43 @@ def judge_decoded(file: Path) -> Judge:
             for name, row in listed.items():
                 columns[name] = []
                 for frame in frames:
-                    value = Fraction(fields_of(kind, frame.raw)[name], row.steps) if frame.kind == kind else None
-                    columns[name].append("" if value is None else meaning.spelled(str(float(value))))
-        for name in ("operating_state", "device_and_variant", "firmware_word", "bec_current", "max_bec_current"):
+                    value = (
+                        Fraction(fields_of(kind, frame.raw)[name], row.steps)
+                        if frame.kind == kind
+                        else None
+                    )
+                    columns[name].append(
+                        "" if value is None else meaning.spelled(str(float(value)))
+                    )
+        for name in (
+            "operating_state",
+            "device_and_variant",
+            "firmware_word",
+            "bec_current",
+            "max_bec_current",
+        ):
             del columns[name]  # shown as texts, or not on every device
         wanted = meaning.column_lines(columns)[1:]
         shown = Counter(line.removeprefix("| ") for line in lines)
-        always = [line.removeprefix("always ").partition(": ") for line in shown if line.startswith("always ")]
+        always = [
+            line.removeprefix("always ").partition(": ")
+            for line in shown
+            if line.startswith("always ")
+        ]
         for line in wanted:
             found.count["columns"] += 1
             if line.startswith("always "):
                 same_value, _, names = line.removeprefix("always ").partition(": ")
-                same = {name for other, _, these in always if other == same_value for name in these.split(", ")}
-                found.wrong += [f"{title}: {name} is not always {same_value}" for name in {*names.split(", ")} - same]
+                same = {
+                    name
+                    for other, _, these in always
+                    if other == same_value
+                    for name in these.split(", ")
+                }
+                found.wrong += [
+                    f"{title}: {name} is not always {same_value}"
+                    for name in {*names.split(", ")} - same
+                ]
             elif shown[line] != 2:  # as JSON lines and as CSV
                 found.wrong.append(f"{title}: not so: {line}")
     return found
@@ -555,7 +690,11 @@ def judge_decoded(file: Path) -> Judge:
 
 def files() -> list[Path]:
     """Each file that can be judged."""
-    found = [*HERE.glob("flights/*.txt"), *HERE.glob("dialogues/*.txt"), *HERE.glob("captures/*.kcap")]
+    found = [
+        *HERE.glob("flights/*.txt"),
+        *HERE.glob("dialogues/*.txt"),
+        *HERE.glob("captures/*.kcap"),
+    ]
     found = [file for file in sorted(found) if file.name not in NOT_JUDGED]
     return [*found, HERE / "commands/decode.txt"]
 

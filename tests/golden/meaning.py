@@ -54,21 +54,25 @@ def _message(message: Message) -> list[str]:
         f"{head}{' FD' if message.is_fd else ''} from {','.join(message.senders)}{_attributes(message)} ; {message.comment}"
     ]
     for s in sorted(message.signals, key=lambda signal: signal.name):
-        form = (
-            f"{s.start}|{s.length}@{'big' if s.byte_order == 'big_endian' else 'little'}{'-' if s.is_signed else '+'}"
-        )
+        form = f"{s.start}|{s.length}@{'big' if s.byte_order == 'big_endian' else 'little'}{'-' if s.is_signed else '+'}"
         form += f"{' float' if s.is_float else ''}{' M' if s.is_multiplexer else ''}{f' m{s.multiplexer_ids}' if s.multiplexer_ids else ''}"
         scale = f"({s.scale:g},{s.offset:g}) [{s.minimum}|{s.maximum}] {s.unit or '-'} raw start {s.raw_initial}"
-        lines.append(f"  {s.name} {form} {scale} to {','.join(s.receivers)}{_attributes(s)} ; {s.comment}")
+        lines.append(
+            f"  {s.name} {form} {scale} to {','.join(s.receivers)}{_attributes(s)} ; {s.comment}"
+        )
         if s.choices:
-            lines.append("    " + " ".join(f"{number}={text}" for number, text in sorted(s.choices.items())))
+            lines.append(
+                "    " + " ".join(f"{number}={text}" for number, text in sorted(s.choices.items()))
+            )
     return lines
 
 
 def dbc(data: bytes) -> list[str]:
     """Everything: a line for each message, signal and value table, sorted by id and name."""
     found = database(data)
-    lines = [f"database{_attributes(found)}"] + [f"node {node.name} ; {node.comment}" for node in found.nodes]
+    lines = [f"database{_attributes(found)}"] + [
+        f"node {node.name} ; {node.comment}" for node in found.nodes
+    ]
     for message in sorted(found.messages, key=lambda m: (m.is_extended_frame, m.frame_id)):
         lines += _message(message)
     return lines
@@ -85,13 +89,22 @@ def dbc_short(data: bytes) -> list[str]:
 
 
 def _sections(data: bytes) -> configparser.ConfigParser:
-    found = configparser.ConfigParser(strict=True, interpolation=None, comment_prefixes=(";",), delimiters=("=",))
+    found = configparser.ConfigParser(
+        strict=True, interpolation=None, comment_prefixes=(";",), delimiters=("=",)
+    )
     found.optionxform = str  # type: ignore[assignment, method-assign]
     found.read_string(data.decode("latin-1"))
     return found
 
 
-_OF_THE_DAY = {"CreationDate", "CreationTime", "ModificationDate", "ModificationTime", "CreatedBy", "ModifiedBy"}
+_OF_THE_DAY = {
+    "CreationDate",
+    "CreationTime",
+    "ModificationDate",
+    "ModificationTime",
+    "CreatedBy",
+    "ModifiedBy",
+}
 
 
 def eds(data: bytes) -> list[str]:
@@ -99,8 +112,14 @@ def eds(data: bytes) -> list[str]:
     found = _sections(data)
     lines = []
     for name in sorted(found.sections(), key=str.upper):
-        keys = {key: spelled(value) for key, value in found[name].items() if key not in _OF_THE_DAY and value}
-        lines.append(f"[{name.upper()}] " + " ".join(f"{key}={value}" for key, value in sorted(keys.items())))
+        keys = {
+            key: spelled(value)
+            for key, value in found[name].items()
+            if key not in _OF_THE_DAY and value
+        }
+        lines.append(
+            f"[{name.upper()}] " + " ".join(f"{key}={value}" for key, value in sorted(keys.items()))
+        )
     return lines
 
 
@@ -109,9 +128,13 @@ def dcf(data: bytes) -> list[str]:
     found = _sections(data)
     lines = [line for line in eds(data) if line.startswith(("[DEVICECOM", "[FILEINFO"))]
     for name in sorted(found.sections(), key=str.upper):
-        values = {key: found[name][key] for key in ("ParameterValue", "Denotation") if key in found[name]}
+        values = {
+            key: found[name][key] for key in ("ParameterValue", "Denotation") if key in found[name]
+        }
         if values and "Com" not in name:
-            lines.append(f"[{name.upper()}] " + " ".join(f"{key}={spelled(v)}" for key, v in values.items()))
+            lines.append(
+                f"[{name.upper()}] " + " ".join(f"{key}={spelled(v)}" for key, v in values.items())
+            )
     return lines
 
 
@@ -178,10 +201,19 @@ def _log(suffix: str) -> Callable[[bytes], list[str]]:
                 found = list(reader)
         first = found[0].timestamp
         ids = Counter(f"{m.arbitration_id:03X}" for m in found)
-        frames = [(m.arbitration_id, m.is_extended_id, m.is_fd, m.is_rx, bytes(m.data)) for m in found]
-        lines = [f"{len(found)} frames in {found[-1].timestamp - first:.4f} s, content {_digest(frames)}"]
-        lines.append(f"times in 0.1 ms {_digest(round((m.timestamp - first) * 1e4) for m in found)}")
-        return [*lines, "ids " + " ".join(f"{can_id}*{count}" for can_id, count in sorted(ids.items()))]
+        frames = [
+            (m.arbitration_id, m.is_extended_id, m.is_fd, m.is_rx, bytes(m.data)) for m in found
+        ]
+        lines = [
+            f"{len(found)} frames in {found[-1].timestamp - first:.4f} s, content {_digest(frames)}"
+        ]
+        lines.append(
+            f"times in 0.1 ms {_digest(round((m.timestamp - first) * 1e4) for m in found)}"
+        )
+        return [
+            *lines,
+            "ids " + " ".join(f"{can_id}*{count}" for can_id, count in sorted(ids.items())),
+        ]
 
     return form
 
@@ -192,10 +224,14 @@ FORMS: dict[str, Callable[[bytes], list[str]]] = {
     "eds": eds,
     "dcf": dcf,
     "table": table,
-    "keys": lambda data: [f"{key}: {_cell(value)}" for key, value in sorted(json.loads(data).items())],
+    "keys": lambda data: [
+        f"{key}: {_cell(value)}" for key, value in sorted(json.loads(data).items())
+    ],
     "last line": lambda data: data.decode("utf-8").splitlines()[-1:],
     "nothing": lambda data: [],
-    "columns": lambda data: [re.sub(" {2,}", "  ", line) for line in data.decode("utf-8").splitlines()],
+    "columns": lambda data: [
+        re.sub(" {2,}", "  ", line) for line in data.decode("utf-8").splitlines()
+    ],
     "size": lambda data: [f"{len(data)} bytes, {zlib.crc32(data):08X}"],
     "log": _log(".log"),
     "asc": _log(".asc"),

@@ -25,9 +25,17 @@ LINES = 12
 
 def files(words: Sequence[str] = ()) -> list[Path]:
     """The golden files, those whose names hold one of the words."""
-    found = [*HERE.glob("flights/*.txt"), *HERE.glob("dialogues/*.txt"), *HERE.glob("commands/*.txt")]
+    found = [
+        *HERE.glob("flights/*.txt"),
+        *HERE.glob("dialogues/*.txt"),
+        *HERE.glob("commands/*.txt"),
+    ]
     found += [capture.with_suffix(".txt") for capture in HERE.glob("captures/*.kcap")]
-    return [file for file in sorted(found) if not words or any(word in str(file.relative_to(HERE)) for word in words)]
+    return [
+        file
+        for file in sorted(found)
+        if not words or any(word in str(file.relative_to(HERE)) for word in words)
+    ]
 
 
 def made(file: Path) -> str:
@@ -50,12 +58,17 @@ def differences(file: Path, old: str, new: str) -> list[str]:
     name = str(file.relative_to(HERE))
     if file.parent.name == "commands":
         return [f"{name}: {line}" for line in _in_cases(old, new)]
-    return [f"{name}: {line}" for line in [*_in_frames(old, new), *_in_lines(old.splitlines(), new.splitlines())]]
+    return [
+        f"{name}: {line}"
+        for line in [*_in_frames(old, new), *_in_lines(old.splitlines(), new.splitlines())]
+    ]
 
 
 def _in_frames(old: str, new: str) -> Iterator[str]:
     """How many frames of which ids are gone or new."""
-    before, after = (Counter(re.findall(r"^[\d.]+ -> \w+#.*", text, re.MULTILINE)) for text in (old, new))
+    before, after = (
+        Counter(re.findall(r"^[\d.]+ -> \w+#.*", text, re.MULTILINE)) for text in (old, new)
+    )
     for what, lines in (("gone", before - after), ("new", after - before)):
         if lines:
             ids = Counter(re.findall(r"-> (\w+)", " ".join(lines)))
@@ -64,7 +77,11 @@ def _in_frames(old: str, new: str) -> Iterator[str]:
 
 
 def _in_lines(old: Sequence[str], new: Sequence[str]) -> Iterator[str]:
-    found = [line for line in unified_diff(old, new, n=0, lineterm="") if not re.match(r"---|\+\+\+|@@", line)]
+    found = [
+        line
+        for line in unified_diff(old, new, n=0, lineterm="")
+        if not re.match(r"---|\+\+\+|@@", line)
+    ]
     for line in found[:LINES]:
         shown = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in line)
         yield shown if len(shown) < 300 else shown[:297] + "..."
@@ -77,13 +94,17 @@ def _in_cases(old: str, new: str) -> Iterator[str]:
     for title in dict.fromkeys([*before, *after]):
         if before.get(title) != after.get(title):
             yield title
-            yield from (f"    {line}" for line in _in_lines(before.get(title, []), after.get(title, [])))
+            yield from (
+                f"    {line}" for line in _in_lines(before.get(title, []), after.get(title, []))
+            )
 
 
 def main() -> int:
     """Record, or check."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 if anything is different")
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; exit code 1 if anything is different"
+    )
     parser.add_argument("words", nargs="*", help="only files whose names hold one of these")
     args = parser.parse_args()
     begun = time.process_time()
@@ -97,7 +118,9 @@ def main() -> int:
         if found and not args.check:
             file.write_text(new, encoding="utf-8")
     done = "differ" if args.check else "were written"
-    print(f"{differing} of {len(chosen)} golden files {done} ({time.process_time() - begun:.0f} s of CPU)")
+    print(
+        f"{differing} of {len(chosen)} golden files {done} ({time.process_time() - begun:.0f} s of CPU)"
+    )
     return int(args.check and differing > 0)
 
 

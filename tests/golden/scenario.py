@@ -38,7 +38,13 @@ def read_frame(text: str) -> Frame:
     can_id, _, data = text.partition("#")
     fd = data.startswith("#")
     remote = data.startswith("R")
-    return Frame(int(can_id, 16), b"" if remote else bytes.fromhex(data[2 if fd else 0 :]), len(can_id) > 3, fd, remote)
+    return Frame(
+        int(can_id, 16),
+        b"" if remote else bytes.fromhex(data[2 if fd else 0 :]),
+        len(can_id) > 3,
+        fd,
+        remote,
+    )
 
 
 def uart_bytes(words: list[str]) -> bytes:
@@ -50,7 +56,8 @@ def uart_bytes(words: list[str]) -> bytes:
     fields = sheet.LIVE_FIELDS if kind == "live" else sheet.INFO_FIELDS
     assert set(given) <= {field.name for field in fields}, f"no field of the sheet: {given}"
     body = struct.pack(
-        sheet.LIVE_STRUCT if kind == "live" else sheet.INFO_STRUCT, *(given.get(f.name, 0) for f in fields)
+        sheet.LIVE_STRUCT if kind == "live" else sheet.INFO_STRUCT,
+        *(given.get(f.name, 0) for f in fields),
     )
     row = reference.form_row(kind, layout or "v4")
     return reference.seal(row, body.ljust(row.crc_at - 4, b"\0"))
@@ -124,7 +131,9 @@ class Player:
         if verb == "read":
             answer = self._ask(node, b"\x40" + multiplexer + bytes(4))
         elif 1 <= len(data) <= 4:
-            answer = self._ask(node, bytes((0x23 | 4 - len(data) << 2,)) + multiplexer + data.ljust(4, b"\0"))
+            answer = self._ask(
+                node, bytes((0x23 | 4 - len(data) << 2,)) + multiplexer + data.ljust(4, b"\0")
+            )
         else:
             answer = self._ask(node, b"\x21" + multiplexer + len(data).to_bytes(4, "little"))
         if answer is None:
@@ -139,7 +148,9 @@ class Player:
             request = bytes((0x60 | toggle,)) + bytes(7)
             if verb == "write":
                 part = parts[number]
-                request = bytes((toggle | (7 - len(part)) << 1 | (number == len(parts) - 1),)) + part.ljust(7, b"\0")
+                request = bytes(
+                    (toggle | (7 - len(part)) << 1 | (number == len(parts) - 1),)
+                ) + part.ljust(7, b"\0")
             answer = self._ask(node, request)
             if answer is None or answer[0] == 0x80:
                 return f" ! {int.from_bytes((answer or bytes(8))[4:], 'little'):08X}"
@@ -154,7 +165,9 @@ def changed_eds(changes: Mapping[str, Mapping[str, str]]) -> str:
     """The shipped EDS with other keys in some sections; a key with an empty text goes, a section without keys too."""
     text = shipped_eds()
     for section, keys in changes.items():
-        found = re.search(rf"^\[{section}\]\r?\n(?:(?!\[).*\r?\n)*", text, re.MULTILINE | re.IGNORECASE)
+        found = re.search(
+            rf"^\[{section}\]\r?\n(?:(?!\[).*\r?\n)*", text, re.MULTILINE | re.IGNORECASE
+        )
         assert found is not None, f"no section {section}"
         body = found[0]
         for key, value in keys.items():
@@ -176,7 +189,9 @@ def play(text: str) -> str:
             (Path(folder) / "changed.eds").write_bytes(changed_eds(golden["eds"]).encode("latin-1"))
             tables["canopen"]["eds"] = f"{folder}/changed.eds"
         player = Player(Drive(tables, INPUTS / "scenario.toml"))
-    player.out = header.splitlines() + [f"; warning: {warning}" for warning in player.drive.warnings]
+    player.out = header.splitlines() + [
+        f"; warning: {warning}" for warning in player.drive.warnings
+    ]
     if golden.get("start", True):
         for esc in range(len(tables["esc"])):
             player.drive.happen("port_opened", [str(esc + 1)], 0)

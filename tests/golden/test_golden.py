@@ -13,7 +13,9 @@ HERE = record.HERE
 @pytest.mark.parametrize("file", record.files(), ids=lambda file: str(file.relative_to(HERE)))
 def test_nothing_has_changed(file: Path) -> None:
     found = record.changes(file, record.made(file))
-    assert not found, "\n".join([*found, "If this is meant: make golden, and commit what it says with the change."])
+    assert not found, "\n".join(
+        [*found, "If this is meant: make golden, and commit what it says with the change."]
+    )
 
 
 @pytest.mark.parametrize("file", judge.files(), ids=lambda file: str(file.relative_to(HERE)))
@@ -59,9 +61,15 @@ def test_a_change_is_said_in_words(tmp_path: Path) -> None:
     ]
     case = "## one\n$ check\n! old\n=> 2\n\n## two\n$ check\n=> 0\n"
     found = record.differences(record.HERE / "commands/none.txt", case, case.replace("old", "new"))
-    assert found == ["commands/none.txt: one", "commands/none.txt:     -! old", "commands/none.txt:     +! new"]
+    assert found == [
+        "commands/none.txt: one",
+        "commands/none.txt:     -! old",
+        "commands/none.txt:     +! new",
+    ]
 
 
 def test_only_the_adapter_knows_the_product() -> None:
     knowing = re.compile(r"^\s*(from|import) kontronik_can_gw", re.MULTILINE)
-    assert [file.name for file in HERE.glob("*.py") if knowing.search(file.read_text(encoding="utf-8"))] == ["drive.py"]
+    assert [
+        file.name for file in HERE.glob("*.py") if knowing.search(file.read_text(encoding="utf-8"))
+    ] == ["drive.py"]

@@ -37,7 +37,14 @@ ALIVE_MODULUS = 15
 """Alive counters run from 0 to 14."""
 LOGS = ("log", "asc", "blf", "trc")
 FLAGS = (*OPERATING_ERRORS, *SELFTEST_ERRORS)
-BESIDE_FLAGS = ("OperatingState", "OperatingStateRaw", "PowerStageTemperature", "Variant", "FirmwareMain", "DeviceRaw")
+BESIDE_FLAGS = (
+    "OperatingState",
+    "OperatingStateRaw",
+    "PowerStageTemperature",
+    "Variant",
+    "FirmwareMain",
+    "DeviceRaw",
+)
 """Where all of these that a message has are not available, its flags are not either."""
 _UNKNOWN_TEXT = -999.0
 
@@ -69,10 +76,13 @@ class Verdict:
         if len(bad):
             first = bad[0]
             self.say(
-                len(bad), f"{what}: {len(bad)} times differ; row {first}: {got[first]} ns, must be {expected[first]} ns"
+                len(bad),
+                f"{what}: {len(bad)} times differ; row {first}: {got[first]} ns, must be {expected[first]} ns",
             )
 
-    def column(self, name: str, got: Floats, low: Floats, high: Floats, first_row: int, slack: float = 0.0) -> None:
+    def column(
+        self, name: str, got: Floats, low: Floats, high: Floats, first_row: int, slack: float = 0.0
+    ) -> None:
         """Compare values."""
         self.values += len(got)
         nothing = np.isnan(low)
@@ -82,7 +92,8 @@ class Verdict:
             one = bad[0]
             wanted = f"{low[one]:.10g}" + (f" to {high[one]:.10g}" if high[one] > low[one] else "")
             self.say(
-                len(bad), f"{name}: {len(bad)} values differ; row {first_row + one}: {got[one]:.10g}, must be {wanted}"
+                len(bad),
+                f"{name}: {len(bad)} values differ; row {first_row + one}: {got[one]:.10g}, must be {wanted}",
             )
 
 
@@ -104,7 +115,9 @@ def check_table(truth: Truth, path: Path) -> Verdict:
     wall_ns = truth.recording.wall_ns(truth.row_ns)
     if path.suffix == ".mf4":  # it has one start, and goes on with the clock as it began
         wall_ns = wall_ns[0] + truth.row_ns - truth.row_ns[0]
-    return check_rows(path, chunks, truth.row_ns, truth.rows(), wall_ns, WALL_TOLERANCE[path.suffix])
+    return check_rows(
+        path, chunks, truth.row_ns, truth.rows(), wall_ns, WALL_TOLERANCE[path.suffix]
+    )
 
 
 def check_rows(
@@ -141,7 +154,9 @@ def check_rows(
 
 def _texts(values: Sequence[Any], numbers: Mapping[str, int]) -> Floats:
     codes = {text: float(number) for text, number in numbers.items()}
-    return np.array([np.nan if v is None or v != v else codes.get(v, _UNKNOWN_TEXT) for v in values])
+    return np.array(
+        [np.nan if v is None or v != v else codes.get(v, _UNKNOWN_TEXT) for v in values]
+    )
 
 
 def _split(header: str, truth: Truth) -> str:
@@ -172,7 +187,9 @@ def _wall(frame: Any) -> Times | None:
 
     if "Utc" not in frame:
         return None
-    found = pd.to_datetime(frame["Utc"], format="ISO8601").dt.tz_convert(None).astype("datetime64[ns]")
+    found = (
+        pd.to_datetime(frame["Utc"], format="ISO8601").dt.tz_convert(None).astype("datetime64[ns]")
+    )
     wall: Times = found.astype(np.int64).to_numpy()
     return wall
 
@@ -182,9 +199,13 @@ def csv_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
     import pandas as pd
 
     names: dict[str, str] | None = None
-    exact: dict[str, Any] = {"float_precision": "round_trip"} if int(pd.__version__.partition(".")[0]) < 3 else {}
+    exact: dict[str, Any] = (
+        {"float_precision": "round_trip"} if int(pd.__version__.partition(".")[0]) < 3 else {}
+    )
     # only what is empty is missing: a word such as NotAvailable in its place would be a mistake
-    for frame in pd.read_csv(path, chunksize=ROWS, keep_default_na=False, na_values=[""], low_memory=False, **exact):
+    for frame in pd.read_csv(
+        path, chunksize=ROWS, keep_default_na=False, na_values=[""], low_memory=False, **exact
+    ):
         if names is None:
             names = {head: _split(head, truth) for head in frame.columns[1:] if head != "Utc"}
             assert frame.columns[0] == "Time [s]"
@@ -199,7 +220,11 @@ def jsonl_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
     with path.open(encoding="utf-8") as file:
         while lines := list(islice(file, ROWS)):
             frame = pd.DataFrame([json.loads(line) for line in lines])
-            values = {name: _column(frame[name], name, truth) for name in frame.columns if name not in ("Time", "Utc")}
+            values = {
+                name: _column(frame[name], name, truth)
+                for name in frame.columns
+                if name not in ("Time", "Utc")
+            }
             yield Chunk(_ns(frame["Time"]), _wall(frame), values)
 
 
@@ -220,7 +245,9 @@ def parquet_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
             if hasattr(column, "dictionary"):
                 codes = _texts(column.dictionary.to_pylist(), truth.texts[name])
                 at = column.indices.cast("float64").to_numpy(zero_copy_only=False)
-                values[name] = np.where(np.isnan(at), np.nan, codes[np.nan_to_num(at).astype(np.int64)])
+                values[name] = np.where(
+                    np.isnan(at), np.nan, codes[np.nan_to_num(at).astype(np.int64)]
+                )
             else:
                 values[name] = column.cast("float64").to_numpy(zero_copy_only=False)
         yield Chunk(_ns(batch.column("Time [s]").to_numpy()), wall, values)
@@ -245,7 +272,9 @@ def mf4_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
             if signal.samples.dtype.kind in "SUO":
                 kinds, at = np.unique(signal.samples, return_inverse=True)
                 words = [kind.decode() if isinstance(kind, bytes) else str(kind) for kind in kinds]
-                values[name] = _texts([None if w == "NotAvailable" else w for w in words], truth.texts[name])[at]
+                values[name] = _texts(
+                    [None if w == "NotAvailable" else w for w in words], truth.texts[name]
+                )[at]
             else:
                 values[name] = signal.samples.astype(np.float64)
     yield Chunk(_ns(times), _ns(times) + start, values)
@@ -253,7 +282,12 @@ def mf4_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
 
 TABLES = {"csv": "pandas", "jsonl": "json, pandas", "parquet": "pyarrow", "mf4": "asammdf"}
 """Forms, and by what they are read."""
-READERS = {".csv": csv_chunks, ".jsonl": jsonl_chunks, ".parquet": parquet_chunks, ".mf4": mf4_chunks}
+READERS = {
+    ".csv": csv_chunks,
+    ".jsonl": jsonl_chunks,
+    ".parquet": parquet_chunks,
+    ".mf4": mf4_chunks,
+}
 # text cuts at a microsecond, Parquet keeps nanoseconds, MF4 counts on from a start in microseconds
 WALL_TOLERANCE = {".csv": 999, ".jsonl": 999, ".parquet": 0, ".mf4": 1500}
 
@@ -281,7 +315,9 @@ def read_log(path: Path) -> Frames:
     more: dict[str, Any] = {"relative_timestamp": False} if path.suffix == ".asc" else {}
     with can.LogReader(path, **more) as reader:
         for message in reader:
-            assert message.dlc == 8 and not message.is_extended_id and not message.is_rx, f"{path.name}: {message}"
+            assert message.dlc == 8 and not message.is_extended_id and not message.is_rx, (
+                f"{path.name}: {message}"
+            )
             times.append(message.timestamp)
             ids.append(message.arbitration_id)
             data.append(bytes(message.data))
@@ -341,7 +377,8 @@ def check_log(path: Path, truth: Truth, decoded: Decoded) -> tuple[Verdict, Fram
         bad = np.flatnonzero(mine != theirs)
         if len(bad):
             verdict.say(
-                len(bad), f"{what}: {len(bad)} differ; frame {bad[0]}: {mine[bad[0]]:X}, must be {theirs[bad[0]]:X}"
+                len(bad),
+                f"{what}: {len(bad)} differ; frame {bad[0]}: {mine[bad[0]]:X}, must be {theirs[bad[0]]:X}",
             )
     if verdict.differences:
         return verdict, got
@@ -356,7 +393,9 @@ def check_log(path: Path, truth: Truth, decoded: Decoded) -> tuple[Verdict, Fram
                 verdict.values += len(values)
                 steps = np.flatnonzero((np.diff(values) - 1) % ALIVE_MODULUS)
                 if len(steps):
-                    verdict.say(len(steps), f"{name}: does not count by one at its frame {steps[0] + 1}")
+                    verdict.say(
+                        len(steps), f"{name}: does not count by one at its frame {steps[0] + 1}"
+                    )
             else:
                 verdict.column(name, values, wanted[name].low, wanted[name].high, 0, SLACK)
     return verdict, got
@@ -374,7 +413,9 @@ def check_table_of_log(path: Path, truth: Truth, frames: Frames, decoded: Decode
         fresh = (at >= 0) & ((life is None) | (until - seen <= (life or 0)))
         table = decoded.table(can_id, frames.data[of_it])
         flags = [name for name in names if name.endswith(FLAGS)]
-        beside = [table[name] for name in names if name.endswith(BESIDE_FLAGS) and name not in flags]
+        beside = [
+            table[name] for name in names if name.endswith(BESIDE_FLAGS) and name not in flags
+        ]
         valid = ~np.all(np.isnan(beside), axis=0) if beside else None
         for name in names:
             if name in flags and valid is not None:
@@ -432,7 +473,10 @@ def _groups(truth: Truth, frames: Frames) -> tuple[Times, Times]:
 def check_bytes(truth: Truth, esc: int, path: Path) -> Verdict:
     """The UART bytes of one ESC."""
     verdict = Verdict()
-    got, wanted = np.fromfile(path, np.uint8), np.frombuffer(bytes(truth.recording.escs[esc].wire), np.uint8)
+    got, wanted = (
+        np.fromfile(path, np.uint8),
+        np.frombuffer(bytes(truth.recording.escs[esc].wire), np.uint8),
+    )
     verdict.values = len(got)
     if len(got) != len(wanted):
         verdict.say(1, f"{path.name}: has {len(got)} bytes, must have {len(wanted)}")
@@ -465,9 +509,12 @@ def check_decoded(truth: Truth, esc: int, path: Path) -> Verdict:
             if name in ("device_and_variant", "firmware_word"):
                 continue
             key = _WIRE_NAMES.get(name, name)
-            got = np.array([np.nan if r[key] is None else r[key] for r in records], dtype=np.float64)
+            got = np.array(
+                [np.nan if r[key] is None else r[key] for r in records], dtype=np.float64
+            )
             wanted = raw / _WIRE_STEPS.get(name, 1)
-            if name == "bec_current":  # of a JIVEPro none, as soon as an info frame has told what it is
+            if name == "bec_current":
+                # of a JIVEPro none, as soon as an info frame has told what it is
                 wanted = np.where((one.devices == JIVEPRO) & np.isnan(got), np.nan, wanted)
             elif name == "max_bec_current":
                 wanted = np.where(fields["device_and_variant"] >> 10 == JIVEPRO, np.nan, wanted)
@@ -493,13 +540,23 @@ def check_last(truth: Truth, decoded: Decoded, path: Path) -> Verdict:
     for prefix, esc in zip(truth.prefixes, told["escs"], strict=True):
         values = esc["values"]
         for name, wanted in expected.items():
-            key = "".join(f"_{c.lower()}" if c.isupper() else c for c in name.removeprefix(prefix)).lstrip("_")
-            key = {"throttle_percent": "throttle", "output_opening_percent": "output_opening"}.get(key, key)
+            key = "".join(
+                f"_{c.lower()}" if c.isupper() else c for c in name.removeprefix(prefix)
+            ).lstrip("_")
+            key = {"throttle_percent": "throttle", "output_opening_percent": "output_opening"}.get(
+                key, key
+            )
             if not name.startswith(prefix) or key not in values or key == "data_age":  # it goes on
                 continue
             value = values[key]
             texts = truth.texts[name]
-            number = np.nan if value is None else texts.get(value, _UNKNOWN_TEXT) if isinstance(value, str) else value
+            number = (
+                np.nan
+                if value is None
+                else texts.get(value, _UNKNOWN_TEXT)
+                if isinstance(value, str)
+                else value
+            )
             verdict.column(name, np.array([number], np.float64), wanted, wanted, 0, 1e-9)
     verdict.rows = len(told["escs"])
     return verdict

@@ -73,14 +73,19 @@ class Runner:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _RUNNER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", _RUNNER],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
 
     def submit(self, arguments: list[str], output: Path) -> None:
         """Run ``kontronik-can-gw`` with these arguments when the ones before are done."""
         assert self._process.stdin is not None
         command = [sys.executable, "-m", "kontronik_can_gw", *arguments]
-        self._process.stdin.write(json.dumps([command, str(output), str(self._folder / "errors.txt")]) + "\n")
+        self._process.stdin.write(
+            json.dumps([command, str(output), str(self._folder / "errors.txt")]) + "\n"
+        )
         self._process.stdin.flush()
 
     def result(self) -> tuple[float, float, float]:
@@ -91,7 +96,9 @@ class Runner:
             raise RuntimeError("the runner has ended")
         code, seconds, cpu, peak = json.loads(line)
         if code:
-            raise RuntimeError(f"exit code {code}: {(self._folder / 'errors.txt').read_text().strip()}")
+            raise RuntimeError(
+                f"exit code {code}: {(self._folder / 'errors.txt').read_text().strip()}"
+            )
         return seconds, cpu, peak
 
     def close(self) -> None:
@@ -111,11 +118,17 @@ def steps_of(folder: Path, truth: Any) -> list[Step]:
     frames: dict[str, check.Frames] = {}
     steps: list[Step] = []
 
-    def step(name: str, words: list[str], output: str, read_by: str, compare: Callable[[Path], Any]) -> None:
+    def step(
+        name: str, words: list[str], output: str, read_by: str, compare: Callable[[Path], Any]
+    ) -> None:
         """A command whose words have OUT for the file that it makes; one without it prints what is to be there."""
         path = folder / output
         arguments = [str(path) if word == "OUT" else word for word in words]
-        steps.append(Step(name, arguments, path, read_by, partial(compare, path), to_output="OUT" not in words))
+        steps.append(
+            Step(
+                name, arguments, path, read_by, partial(compare, path), to_output="OUT" not in words
+            )
+        )
 
     def compare_log(path: Path) -> Any:
         verdict, frames[path.suffix] = check.check_log(path, truth, decoded)
@@ -134,22 +147,50 @@ def steps_of(folder: Path, truth: Any) -> list[Step]:
         )
     library = "python-can, cantools"
     for form in check.LOGS:
-        step(f"convert to {form}", ["convert", capture, "OUT"], f"hour.{form}", library, compare_log)
+        step(
+            f"convert to {form}", ["convert", capture, "OUT"], f"hour.{form}", library, compare_log
+        )
     for form in check.LOGS if one_esc else ():
         words = ["convert", str(folder / f"hour.{form}"), "OUT"]
         compare = partial(compare_table_of_log, form)
-        step(f"convert {form} to csv", words, f"of_{form}.csv", f"pandas against {library}", compare)
-    step("replay to log", ["replay", capture, "--to", "log", "-o", "OUT"], "replayed.log", library, compare_log)
+        step(
+            f"convert {form} to csv", words, f"of_{form}.csv", f"pandas against {library}", compare
+        )
+    step(
+        "replay to log",
+        ["replay", capture, "--to", "log", "-o", "OUT"],
+        "replayed.log",
+        library,
+        compare_log,
+    )
     for index in range(len(truth.escs)):
         name = f"esc{index + 1}"
         more = [] if one_esc else ["--esc", name]
         compare = partial(check.check_bytes, truth, index)
         step("convert to bin", ["convert", capture, "OUT", *more], f"{name}.bin", "numpy", compare)
         words = ["decode", str(folder / f"{name}.bin")]
-        step("decode the bin", words, f"{name}.decoded.jsonl", "json", partial(check.check_decoded, truth, index))
-    step("report", ["report", capture, "-o", "OUT"], "hour.html", "its text", partial(check.check_report, truth))
+        step(
+            "decode the bin",
+            words,
+            f"{name}.decoded.jsonl",
+            "json",
+            partial(check.check_decoded, truth, index),
+        )
+    step(
+        "report",
+        ["report", capture, "-o", "OUT"],
+        "hour.html",
+        "its text",
+        partial(check.check_report, truth),
+    )
     compare = partial(check.check_last, truth, decoded)
-    step("monitor --once", ["monitor", capture, "--once"], "last.json", "json against cantools", compare)
+    step(
+        "monitor --once",
+        ["monitor", capture, "--once"],
+        "last.json",
+        "json against cantools",
+        compare,
+    )
     return steps
 
 
@@ -178,12 +219,29 @@ def run(steps: list[Step], folder: Path, say: Callable[[str], None] = print) -> 
 
 def table(results: list[Result]) -> str:
     """The results as a Markdown table."""
-    heads = ("", "seconds", "CPU s", "rows/CPU s", "peak MB", "size MB", "values compared", "read back by")
+    heads = (
+        "",
+        "seconds",
+        "CPU s",
+        "rows/CPU s",
+        "peak MB",
+        "size MB",
+        "values compared",
+        "read back by",
+    )
     lines = ["| " + " | ".join(heads) + " |", "|---" + "|---:" * 6 + "|---|"]
     for one in results:
         rate = f"{one.rows / one.cpu_seconds:,.0f}".replace(",", " ") if one.rows > 10 else ""
-        values = f"{one.values:,}".replace(",", " ") + (f" ({one.differences} differ)" if one.differences else "")
-        cells = [one.name, f"{one.seconds:.1f}", f"{one.cpu_seconds:.1f}", rate, f"{one.peak_mb:.0f}"]
+        values = f"{one.values:,}".replace(",", " ") + (
+            f" ({one.differences} differ)" if one.differences else ""
+        )
+        cells = [
+            one.name,
+            f"{one.seconds:.1f}",
+            f"{one.cpu_seconds:.1f}",
+            rate,
+            f"{one.peak_mb:.0f}",
+        ]
         lines.append("| " + " | ".join([*cells, f"{one.size_mb:.1f}", values, one.read_by]) + " |")
     return "\n".join(lines)
 

@@ -16,7 +16,14 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from kontronik_can_gw.capture.format import Entry, Kind, block, data_payload, json_payload, number_data
+from kontronik_can_gw.capture.format import (
+    Entry,
+    Kind,
+    block,
+    data_payload,
+    json_payload,
+    number_data,
+)
 from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli.recording import setup_of
@@ -25,7 +32,14 @@ from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
-from kontronik_can_gw.esc.simulator import Dropout, ErrorWindow, EscOptions, Faults, SimulatedEsc, Swap
+from kontronik_can_gw.esc.simulator import (
+    Dropout,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    SimulatedEsc,
+    Swap,
+)
 from kontronik_can_gw.esc.simulator import Sent as Wired
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
@@ -142,7 +156,12 @@ def made(escs: int) -> tuple[CaptureSetup, Layout]:
             {
                 "can": {"interface": "virtual"},
                 "esc": [
-                    {"port": f"/dev/ttyUSB{n}", "name": f"esc{n + 1}", "pole_pairs": 5 + 2 * n, "gear": "17/2"}
+                    {
+                        "port": f"/dev/ttyUSB{n}",
+                        "name": f"esc{n + 1}",
+                        "pole_pairs": 5 + 2 * n,
+                        "gear": "17/2",
+                    }
                     for n in range(escs)
                 ],
             },
@@ -161,9 +180,13 @@ class _Writer:
         self._entries: list[Entry] = []
         self._begun = START
         header = setup.header() | {"run": "a1b2c3d4e5f60718", "part": 0, "created_ns": START}
-        self._block(b"H", json_payload(header | {"monotonic_ns": START, "wall_ns": WALL, "devices": []}))
+        self._block(
+            b"H", json_payload(header | {"monotonic_ns": START, "wall_ns": WALL, "devices": []})
+        )
 
-    def put(self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None) -> None:
+    def put(
+        self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None
+    ) -> None:
         if time_ns - self._begun >= _BLOCK_NS:
             self._begun = time_ns
             self.flush()
@@ -269,7 +292,10 @@ def _reads(recording: Recording, seconds: float, rng: random.Random) -> Iterator
     """What is read, in order of time; notes in ``recording`` what was meant. Frames come whole, in two pieces, or two at once."""
     plans = [options_of(index, seconds) for index in range(len(recording.escs))]
     starts = [START + 5 * MS + index * 1_700_000 for index in range(len(plans))]
-    simulated = [SimulatedEsc(plans[index], seed=index + 1, start_ns=starts[index]) for index in range(len(plans))]
+    simulated = [
+        SimulatedEsc(plans[index], seed=index + 1, start_ns=starts[index])
+        for index in range(len(plans))
+    ]
     held: list[_Read] = []
     end = START + int(seconds * SECOND)
     slice_end = START
@@ -287,14 +313,19 @@ def _reads(recording: Recording, seconds: float, rng: random.Random) -> Iterator
                 (meant.live_ns if live else meant.info_ns).append(last)
                 (meant.lives if live else meant.infos).extend(one.data)
                 if live:
-                    swaps = [swap for swap in plans[index].faults.swaps if one.time_ns - starts[index] >= swap.time_ns]
+                    swaps = [
+                        swap
+                        for swap in plans[index].faults.swaps
+                        if one.time_ns - starts[index] >= swap.time_ns
+                    ]
                     meant.devices.append(int(swaps[-1].device if swaps else plans[index].device))
                     meant.legacy.append(len(one.wire) == 38)
                 meant.wire += one.wire
                 behind = frames[place + 1 : place + 2]
                 if live and behind and behind[0].time_ns == last and rng.random() < 0.5:
                     unread = one.wire
-                    meant.read_ns.append(last + len(behind[0].wire) * BYTE_NS - 1)  # it stands in front
+                    # it stands in front
+                    meant.read_ns.append(last + len(behind[0].wire) * BYTE_NS - 1)
                     continue
                 if live:
                     meant.read_ns.append(last)
@@ -313,4 +344,6 @@ def _reads(recording: Recording, seconds: float, rng: random.Random) -> Iterator
 
 def _arrives(one: Wired, meant: Meant, end: int) -> bool:
     last = one.time_ns + len(one.wire) * BYTE_NS
-    return last < end and not any(lost <= last and one.time_ns <= again for lost, again in meant.unplugged)
+    return last < end and not any(
+        lost <= last and one.time_ns <= again for lost, again in meant.unplugged
+    )

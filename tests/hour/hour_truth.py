@@ -64,15 +64,36 @@ OPERATING_ERRORS = (
     *("Undervoltage", "Overvoltage", "OvercurrentIntegralError", "OvercurrentIntegralWarning"),
     *("PowerStageOvertempWarning", "PowerStageOvertempError", "BecUndervoltage", "BecOvervoltage"),
     *("BecOvercurrent", "BecOvertemperature", "SwitchedOffByRunningDown", "CapacityLimitReached"),
-    *("OperatingErrorFound", "OperatingWarningFound", "SelftestError", "EepromError", "WatchdogErrorTripped"),
-    *("ProgrammingAllowed", "LimitBatteryVoltageMinimum", "LimitCurrentMaximum", "LimitPowerStageTemperature"),
+    *(
+        "OperatingErrorFound",
+        "OperatingWarningFound",
+        "SelftestError",
+        "EepromError",
+        "WatchdogErrorTripped",
+    ),
+    *(
+        "ProgrammingAllowed",
+        "LimitBatteryVoltageMinimum",
+        "LimitCurrentMaximum",
+        "LimitPowerStageTemperature",
+    ),
     *("LimitBecTemperature", "LimitBecCurrent", "LimitDischargedCapacity"),
 )
 SELFTEST_ERRORS = (
     *("TestPhaseLowSide", "TestPhaseHighSide", "TestShortToGround", "TestBackEmfOffset"),
     *("TestCurrentZeroPoint", "TestUndervoltage", "TestOvervoltage", "TestBecUndervoltage"),
-    *("TestBecOvervoltage", "TestReversePolarityFuse", "TestOvervoltageFuse", "TestPowerStageOvertemp"),
-    *("TestBecOvertemperature", "TestMotorPhaseMissing", "TestEepromEmpty", "TestEepromStickPositions"),
+    *(
+        "TestBecOvervoltage",
+        "TestReversePolarityFuse",
+        "TestOvervoltageFuse",
+        "TestPowerStageOvertemp",
+    ),
+    *(
+        "TestBecOvertemperature",
+        "TestMotorPhaseMissing",
+        "TestEepromEmpty",
+        "TestEepromStickPositions",
+    ),
     *("TestEepromChecksum", "TestEepromSize", "TestEepromVersion"),
 )
 ALIVE = "Alive"
@@ -110,7 +131,9 @@ class _Steps:
     def __init__(self, events: list[tuple[int, int]]) -> None:
         events = sorted(events)
         self._times = np.array([at for at, _ in events], dtype=np.int64)
-        self._values = np.array([np.nan if value < 0 else value for _, value in events], dtype=np.float64)
+        self._values = np.array(
+            [np.nan if value < 0 else value for _, value in events], dtype=np.float64
+        )
 
     def __call__(self, times: Times) -> Floats:
         return self._values[np.searchsorted(self._times, times, "right") - 1]
@@ -130,7 +153,9 @@ class EscTruth:
         self.legacy = np.array(meant.legacy)
         following = np.append(self.live_ns[1:], end_ns)
         silent = self.live_ns[following - self.live_ns > TIMEOUT_NS] + TIMEOUT_NS + 1
-        self.timed_out_ns = np.array([at for at in silent if at < end_ns and not self._is_out(int(at))], dtype=np.int64)
+        self.timed_out_ns = np.array(
+            [at for at in silent if at < end_ns and not self._is_out(int(at))], dtype=np.int64
+        )
         self.out_ns = np.array([lost for lost, _ in meant.unplugged], dtype=np.int64)
         self.lost_ns = np.sort(np.concatenate((self.timed_out_ns, self.out_ns)))
         """When fresh data ended."""
@@ -158,7 +183,9 @@ class EscTruth:
         return energies
 
     def _links(self) -> None:
-        returns = self.live_ns[np.searchsorted(self.live_ns, self.lost_ns[self.lost_ns < self.live_ns[-1]])]
+        returns = self.live_ns[
+            np.searchsorted(self.live_ns, self.lost_ns[self.lost_ns < self.live_ns[-1]])
+        ]
         events = [(START - SECOND, NEVER_SEEN), (int(self.live_ns[0]), OK)]
         events += [(int(at), OK) for at in returns]
         events += [(int(at), LOST) for at in self.timed_out_ns]
@@ -194,7 +221,9 @@ class EscTruth:
         newest = np.searchsorted(self.read_ns, times, "right") - 1
         at = np.maximum(newest, 0)
         lost = np.searchsorted(self.lost_ns, times, "right")
-        fresh = (newest >= 0) & ((lost == 0) | (self.live_ns[at] > self.lost_ns[np.maximum(lost - 1, 0)]))
+        fresh = (newest >= 0) & (
+            (lost == 0) | (self.live_ns[at] > self.lost_ns[np.maximum(lost - 1, 0)])
+        )
         told = times if told_ns is None else told_ns
         found: dict[str, Expected] = {}
 
@@ -222,7 +251,9 @@ class EscTruth:
         info = np.maximum(newest, 0)
         forgotten = np.searchsorted(self.forgotten_ns, times, "right")
         known = (newest >= 0) & (times - self.info_ns[info] <= INFO_TIMEOUT_NS)
-        known &= (forgotten == 0) | (self.info_ns[info] > self.forgotten_ns[np.maximum(forgotten - 1, 0)])
+        known &= (forgotten == 0) | (
+            self.info_ns[info] > self.forgotten_ns[np.maximum(forgotten - 1, 0)]
+        )
 
         def put(name: str, values: Any) -> None:
             found[name] = _one(np.where(known, values, np.nan))
@@ -237,13 +268,25 @@ class EscTruth:
         put("FirmwareMain", firmware >> 8)
         put("FirmwareSub", firmware & 255)
         for bit, name in enumerate(SELFTEST_ERRORS):
-            found[name] = _one(np.where(known, self.info["selftest_errors"][info] >> bit & 1, np.nan))
+            found[name] = _one(
+                np.where(known, self.info["selftest_errors"][info] >> bit & 1, np.nan)
+            )
         cells = _rounded(self.live["battery_voltage"][at] * 10, CELLS)
         found["MeanCellVoltage"] = _one(np.where(fresh & known, cells / 1000, np.nan))
 
-    def _link(self, times: Times, told: Times, rows: bool, newest: Any, at: Any, found: dict[str, Expected]) -> None:
+    def _link(
+        self,
+        times: Times,
+        told: Times,
+        rows: bool,
+        newest: Any,
+        at: Any,
+        found: dict[str, Expected],
+    ) -> None:
         step = Fraction(3_600_000 * SECOND, 10)  # 0.1 Wh in mW ns
-        tenths = np.array([(2 * e + int(step)) // (2 * int(step)) for e in self.energy], dtype=np.int64)
+        tenths = np.array(
+            [(2 * e + int(step)) // (2 * int(step)) for e in self.energy], dtype=np.int64
+        )
         found["EnergyUsed"] = _one(np.where(newest >= 0, tenths[at] / 10, 0.0))
         found["Losses"] = _one(np.searchsorted(self.timed_out_ns, times, "right"))
         found["Layout"] = _one(np.where(newest >= 0, 1 + self.legacy[at], 0))
@@ -266,7 +309,9 @@ class Truth:
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self.escs = [EscTruth(meant, recording.end_ns) for meant in recording.escs]
-        self.prefixes = [""] if len(self.escs) == 1 else [f"Esc{n + 1}" for n in range(len(self.escs))]
+        self.prefixes = (
+            [""] if len(self.escs) == 1 else [f"Esc{n + 1}" for n in range(len(self.escs))]
+        )
         self.sent_ns = np.array(recording.sent.times, dtype=np.int64)
         self.database = database_of(recording)
         self.texts = {
@@ -274,7 +319,9 @@ class Truth:
             for message in self.database.messages
             for signal in message.signals
         }
-        self.units = {s.name: s.unit or "" for message in self.database.messages for s in message.signals}
+        self.units = {
+            s.name: s.unit or "" for message in self.database.messages for s in message.signals
+        }
         self._row_times()
 
     def _row_times(self) -> None:
@@ -295,7 +342,9 @@ class Truth:
         told: list[list[tuple[int, int]]] = [[] for _ in self.escs]
         seen: set[int] | None = None
         for read, esc_index, info, at in sorted(events):
-            if seen is not None and (at - rows[-1] > SAME_ROW_NS or (esc_index in seen and not info)):
+            if seen is not None and (
+                at - rows[-1] > SAME_ROW_NS or (esc_index in seen and not info)
+            ):
                 seen = None
             if seen is None and not info:
                 rows.append(at)
@@ -352,7 +401,9 @@ class Truth:
             "SendFailures": _one(np.zeros(len(times))),
         }
         if not late_ns:  # the frames of the same moment are counted before them or behind them
-            found["SentFrames"].low = np.searchsorted(self.sent_ns, times, "left").astype(np.float64)
+            found["SentFrames"].low = np.searchsorted(self.sent_ns, times, "left").astype(
+                np.float64
+            )
         return found
 
     def at(self, times: Times) -> dict[str, Expected]:

@@ -30,7 +30,9 @@ class Minute:
         self.folder = folder
         self.truth = Truth(record(folder / "hour.kcap", 60))
         self.told: list[str] = []
-        self.results = {one.name: one for one in run(steps_of(folder, self.truth), folder, self.told.append)}
+        self.results = {
+            one.name: one for one in run(steps_of(folder, self.truth), folder, self.told.append)
+        }
         self.decoded = Decoded(self.truth)
 
     def log_of(self, path: Path) -> Verdict:
@@ -69,7 +71,9 @@ def test_it_reads_back_equal(name: str, minute: Minute) -> None:
     rows = len(minute.truth.row_ns)
     least = {"report": 5, "monitor --once": 40, "convert to bin": 190_000, "decode the bin": 80_000}
     frames = 9 * len(minute.truth.sent_ns)
-    assert result.values >= least.get(name, 99 * rows if name[-3:] in ("csv", "onl", "uet", "mf4") else frames)
+    assert result.values >= least.get(
+        name, 99 * rows if name[-3:] in ("csv", "onl", "uet", "mf4") else frames
+    )
 
 
 def test_nothing_is_left_out(minute: Minute) -> None:
@@ -112,7 +116,9 @@ TABLE_FAULTS: dict[str, Callable[[list[str]], object]] = {
     "value": _changed_value,
     "value in a gap": _old_value_in_a_gap,
     "row": lambda lines: lines.pop(3000),
-    "time": lambda lines: _edit(lines, 3000, "Time [s]", lambda text: f"{float(text) + 0.000005:.6f}"),
+    "time": lambda lines: _edit(
+        lines, 3000, "Time [s]", lambda text: f"{float(text) + 0.000005:.6f}"
+    ),
     "clock": lambda lines: _edit(lines, 3000, "Utc", lambda _: lines[2000].split(",")[1]),
     "text": lambda lines: _edit(lines, 3000, "OperatingState", lambda _: "StandBy"),
     "value of a JIVEPro": _bec_current_of_a_jivepro,
@@ -130,7 +136,9 @@ def _mutilated(path: Path, fault: Callable[[list[str]], object], folder: Path) -
 
 @pytest.mark.parametrize("fault", TABLE_FAULTS)
 def test_a_mutilated_table_is_found_out(fault: str, minute: Minute, tmp_path: Path) -> None:
-    verdict = check_table(minute.truth, _mutilated(minute.folder / "hour.csv", TABLE_FAULTS[fault], tmp_path))
+    verdict = check_table(
+        minute.truth, _mutilated(minute.folder / "hour.csv", TABLE_FAULTS[fault], tmp_path)
+    )
     assert not verdict.ok
     assert verdict.differences >= 1
     assert verdict.problems
@@ -138,7 +146,11 @@ def test_a_mutilated_table_is_found_out(fault: str, minute: Minute, tmp_path: Pa
 
 def test_a_wrong_unit_is_found_out(minute: Minute, tmp_path: Path) -> None:
     path = tmp_path / "bad.csv"
-    path.write_text((minute.folder / "hour.csv").read_text().replace("BatteryVoltage [V]", "BatteryVoltage [mV]", 1))
+    path.write_text(
+        (minute.folder / "hour.csv")
+        .read_text()
+        .replace("BatteryVoltage [V]", "BatteryVoltage [mV]", 1)
+    )
     with pytest.raises(AssertionError, match="the unit of BatteryVoltage"):
         check_table(minute.truth, path)
 
@@ -151,7 +163,9 @@ def test_a_mutilated_file_of_each_other_format_is_found_out(minute: Minute, tmp_
     found = parquet.read_table(minute.folder / "hour.parquet")
     place = found.schema.names.index("MotorCurrent [A]")
     other = compute.add(found.column(place), 0.1)
-    parquet.write_table(found.set_column(place, found.schema.field(place), other), tmp_path / "bad.parquet")
+    parquet.write_table(
+        found.set_column(place, found.schema.field(place), other), tmp_path / "bad.parquet"
+    )
     with MDF(minute.folder / "hour.mf4") as mdf:
         mdf.cut(start=10, stop=50).save(tmp_path / "bad.mf4")
     for name in ("bad.jsonl", "bad.parquet", "bad.mf4"):
@@ -182,7 +196,9 @@ LOG_FAULTS: dict[str, Callable[[list[str]], Any]] = {
     "doubled frame": lambda lines: lines.insert(9000, lines[9000]),
     "shifted time": lambda lines: lines.__setitem__(9000, _later(lines[9000])),
     "another id": lambda lines: lines.__setitem__(9000, lines[9000].replace(" can0 6", " can0 5")),
-    "two frames change places": lambda lines: lines.__setitem__(slice(9000, 9002), [lines[9001], lines[9000]]),
+    "two frames change places": lambda lines: lines.__setitem__(
+        slice(9000, 9002), [lines[9001], lines[9000]]
+    ),
 }
 
 
@@ -231,7 +247,10 @@ def test_mutilated_bytes_and_records_are_found_out(minute: Minute, tmp_path: Pat
     (tmp_path / "bad.bin").write_bytes(data)
     assert not hour_check.check_bytes(minute.truth, 0, tmp_path / "bad.bin").ok
     faults: list[Callable[[list[str]], object]] = [lambda lines: lines.pop()]
-    faults += [partial(_add, row=2000, key=key) for key in ("throttle", "operating_errors", "battery_current")]
+    faults += [
+        partial(_add, row=2000, key=key)
+        for key in ("throttle", "operating_errors", "battery_current")
+    ]
     for fault in faults:
         path = _mutilated(minute.folder / "esc1.decoded.jsonl", fault, tmp_path)
         assert not hour_check.check_decoded(minute.truth, 0, path).ok, fault

@@ -54,7 +54,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return made
 
 
-def test_it_is_tried_at_most_each_half_second(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_tried_at_most_each_half_second(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
     listener = BusListener(CanConfig("pcan", "PCAN_USBBUS1"), frozenset({0x123}))
     looked: list[float] = []
 

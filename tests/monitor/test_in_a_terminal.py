@@ -16,7 +16,9 @@ from kontronik_can_gw.esc.kontronik.states import OperatingError
 
 pytestmark = [
     pytest.mark.extended,
-    pytest.mark.skipif(shutil.which("tmux") is None, reason="tmux is not installed: apt-get install tmux"),
+    pytest.mark.skipif(
+        shutil.which("tmux") is None, reason="tmux is not installed: apt-get install tmux"
+    ),
 ]
 
 
@@ -25,21 +27,30 @@ class Terminal:
 
     def __init__(self, folder: Path) -> None:
         self._socket = str(folder / "tmux")
-        self._environment = {"PATH": os.environ["PATH"], "HOME": str(folder), "LANG": "C.UTF-8", "SHELL": "/bin/sh"}
+        self._environment = {
+            "PATH": os.environ["PATH"],
+            "HOME": str(folder),
+            "LANG": "C.UTF-8",
+            "SHELL": "/bin/sh",
+        }
         self._environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
         self.tmux("-f", "/dev/null", "new-session", "-d", "-x", "80", "-y", "24", "/bin/sh")
         self.tmux("set", "-g", "status", "off")
 
     def tmux(self, *words: str) -> str:
         command = ["tmux", "-u", "-S", self._socket, *words]
-        done = subprocess.run(command, capture_output=True, text=True, env=self._environment, timeout=60, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, env=self._environment, timeout=60, check=False
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     def lines(self) -> list[str]:
         return [line.rstrip() for line in self.tmux("capture-pane", "-p").split("\n")[:-1]]
 
-    def until(self, wanted: Callable[[list[str]], object], what: str, seconds: float = 60) -> list[str]:
+    def until(
+        self, wanted: Callable[[list[str]], object], what: str, seconds: float = 60
+    ) -> list[str]:
         end = time.monotonic() + seconds
         while not wanted(lines := self.lines()):
             assert time.monotonic() < end, f"{what}: not within {seconds} s:\n" + "\n".join(lines)
@@ -56,13 +67,21 @@ def terminal(tmp_path: Path) -> Iterator[Terminal]:
 
 def test_values_move_and_keys_are_obeyed(terminal: Terminal, tmp_path: Path) -> None:
     names = [f"esc{number}" for number in range(1, 9)]
-    log = write_log(tmp_path / "8.log", flight(layout_of(names), 30, [with_errors(OperatingError.UNDERVOLTAGE)]))
-    escs = "".join(f'[[esc]]\nname = "{name}"\nport = "/dev/ttyX{name}"\npole_pairs = 7\n' for name in names)
+    log = write_log(
+        tmp_path / "8.log", flight(layout_of(names), 30, [with_errors(OperatingError.UNDERVOLTAGE)])
+    )
+    escs = "".join(
+        f'[[esc]]\nname = "{name}"\nport = "/dev/ttyX{name}"\npole_pairs = 7\n' for name in names
+    )
     toml = tmp_path / "8.toml"
     toml.write_text(f"[can]\nbitrate = 1000000\n{escs}")
-    command = shlex.join([sys.executable, "-m", "kontronik_can_gw", "monitor", str(log), "-c", str(toml)])
+    command = shlex.join(
+        [sys.executable, "-m", "kontronik_can_gw", "monitor", str(log), "-c", str(toml)]
+    )
     terminal.tmux("send-keys", "-l", f"{command}; echo code $?\n")
-    terminal.until(lambda lines: sum(line.startswith("ok 100 Hz") for line in lines) == 8, "a table")
+    terminal.until(
+        lambda lines: sum(line.startswith("ok 100 Hz") for line in lines) == 8, "a table"
+    )
     before = terminal.lines()[3]
     terminal.until(lambda lines: lines[3] != before, "another speed")
     terminal.tmux("send-keys", "3")
@@ -74,4 +93,7 @@ def test_values_move_and_keys_are_obeyed(terminal: Terminal, tmp_path: Path) -> 
     terminal.tmux("send-keys", "q")
     terminal.until(lambda lines: "code 0" in lines, "the end")
     terminal.tmux("send-keys", "-l", "echo still he''re\n")
-    terminal.until(lambda lines: "still here" in lines and any("echo still" in line for line in lines), "an echo")
+    terminal.until(
+        lambda lines: "still here" in lines and any("echo still" in line for line in lines),
+        "an echo",
+    )

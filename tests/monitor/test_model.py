@@ -23,9 +23,13 @@ from kontronik_can_gw.frames import CanFrame
 ONE = layout_of(["esc1"])
 TWO = layout_of(["left", "right"])
 LINK_ID = next(
-    plan.can_id for plan in ONE.layout.messages if any(s.source and s.source.name == "link_state" for s in plan.signals)
+    plan.can_id
+    for plan in ONE.layout.messages
+    if any(s.source and s.source.name == "link_state" for s in plan.signals)
 )
-FLIGHT_OF_TWO = flight(TWO, 12, [EscOptions(device=Device.JIVEPRO), with_errors(OperatingError.UNDERVOLTAGE)])
+FLIGHT_OF_TWO = flight(
+    TWO, 12, [EscOptions(device=Device.JIVEPRO), with_errors(OperatingError.UNDERVOLTAGE)]
+)
 
 
 def watched(bus: BusLayout, frames: Timed, until: float | None = None) -> Monitor:
@@ -40,7 +44,11 @@ def watched(bus: BusLayout, frames: Timed, until: float | None = None) -> Monito
     return monitor
 
 
-@given(st.lists(st.one_of(st.none(), st.integers(0, 65533), st.integers(-200, 200)), min_size=1, max_size=30))
+@given(
+    st.lists(
+        st.one_of(st.none(), st.integers(0, 65533), st.integers(-200, 200)), min_size=1, max_size=30
+    )
+)
 @settings(max_examples=50, deadline=None)
 def test_extremes_and_availability_hold_for_any_values(values: list[int | None]) -> None:
     """Frames packed by cantools; None is sent as NotAvailable."""
@@ -55,7 +63,9 @@ def test_extremes_and_availability_hold_for_any_values(values: list[int | None])
         monitor.take(CanFrame(message.frame_id, message.encode(data)), step * STEP_NS)
         if current is not None:
             sent.append(current)
-        assert esc.number("battery_current") == (None if current is None else pytest.approx(current))
+        assert esc.number("battery_current") == (
+            None if current is None else pytest.approx(current)
+        )
         spread = esc.spreads["battery_current"]
         if sent:
             assert [spread.low, spread.high] == pytest.approx([min(sent), max(sent)])
@@ -65,9 +75,16 @@ def test_extremes_and_availability_hold_for_any_values(values: list[int | None])
     assert (esc.spreads["battery_current"].low, esc.spreads["battery_current"].high) == (None, None)
 
 
-@given(st.lists(st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans()), max_size=40), st.data())
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans()), max_size=40
+    ),
+    st.data(),
+)
 @settings(max_examples=50, deadline=None)
-def test_any_frames_are_borne(frames: Sequence[tuple[int, bytes, bool]], data: st.DataObject) -> None:
+def test_any_frames_are_borne(
+    frames: Sequence[tuple[int, bytes, bool]], data: st.DataObject
+) -> None:
     """Foreign ids, short data, any bits; times that jump."""
     monitor = Monitor(ONE)
     ids = sorted(key for key in monitor.keys)
@@ -78,7 +95,10 @@ def test_any_frames_are_borne(frames: Sequence[tuple[int, bytes, bool]], data: s
         monitor.advance(now)
         json.dumps(monitor.document(), allow_nan=False)
         for esc in monitor.escs:
-            assert all(esc.value(source) is None or not isinstance(esc.value(source), bool) for source in esc.units)
+            assert all(
+                esc.value(source) is None or not isinstance(esc.value(source), bool)
+                for source in esc.units
+            )
             for spread in esc.spreads.values():
                 assert (spread.low is None) == (spread.high is None)
                 assert spread.low is None or spread.high is None or spread.low <= spread.high
@@ -101,7 +121,9 @@ def test_nothing_old_is_shown_when_frames_stay_away() -> None:
 def test_a_link_is_not_lost_beside_a_value_because_its_message_comes_later() -> None:
     """Of the link's messages one was on its way when the values came, and the next comes a cycle later."""
     lost = [frame for _, frame in flight(ONE, 3, until=1) if frame.can_id == LINK_ID][-1]
-    monitor = watched(ONE, [(now, frame) for now, frame in flight(ONE, 2) if frame.can_id != LINK_ID])
+    monitor = watched(
+        ONE, [(now, frame) for now, frame in flight(ONE, 2) if frame.can_id != LINK_ID]
+    )
     (esc,) = monitor.escs
     assert esc.number("battery_voltage") is not None
     for link in ("ok", "lost"):  # what it says twice is believed
@@ -161,7 +183,10 @@ def users(tmp_path: Path) -> BusLayout:
         "PackVolt": "battery_voltage", "StageTemp": "power_stage_temperature", "ErrorWord": "operating_errors",
         "Zustand": "operating_state", "Zellen": "cell_count",
     }  # fmt: skip
-    tables = {"dbc": {"file": str(tmp_path / "car.dbc"), "bind": bind}, "esc": [{"port": "/dev/ttyX"}]}
+    tables = {
+        "dbc": {"file": str(tmp_path / "car.dbc"), "bind": bind},
+        "esc": [{"port": "/dev/ttyX"}],
+    }
     loaded = assemble(parse(tables, str(tmp_path / "c.toml")))
     assert loaded.database is not None
     return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)

@@ -106,7 +106,9 @@ def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) 
 
 def test_plain_bytes_of_a_uart_are_watched(tmp_path: Path) -> None:
     esc = SimulatedEsc(EscOptions(), seed=1)
-    file = written(tmp_path / "bytes.bin", b"".join(sent.wire for sent in esc.frames_until(9 * SECOND_NS)))
+    file = written(
+        tmp_path / "bytes.bin", b"".join(sent.wire for sent in esc.frames_until(9 * SECOND_NS))
+    )
     found = document(run("monitor", file, "--once"))
     assert found["time"] is None
     assert found["escs"][0]["link"] == "Ok"
@@ -122,7 +124,9 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
         while not recording.ended:
             recording.pump(lambda _frame, now: taken.append((clock.now, now)), clock.now + 0.1)
     assert len(taken) == len(flight(ONE, 12))
-    assert all(-1e-6 <= when - 100 - (now - first) / SECOND_NS / speed <= 0.11 for when, now in taken)
+    assert all(
+        -1e-6 <= when - 100 - (now - first) / SECOND_NS / speed <= 0.11 for when, now in taken
+    )
     assert "END OF FILE" in recording.where().progress
 
 

@@ -35,7 +35,9 @@ def seen(count: int, kind: str = "good") -> Monitor:
     monitor.advance(0)
     frames: Timed = []
     if kind != "none":
-        frames = flight(bus, 3.2, [first], replay=kind == "replay", until=1.5 if kind == "lost" else 9)
+        frames = flight(
+            bus, 3.2, [first], replay=kind == "replay", until=1.5 if kind == "lost" else 9
+        )
     for now, frame in frames:
         monitor.take(frame, now)
         monitor.advance(now)
@@ -43,7 +45,9 @@ def seen(count: int, kind: str = "good") -> Monitor:
     return monitor
 
 
-def texts(monitor: Monitor, size: tuple[int, int], where: Where = LIVE, choice: Choice | None = None) -> list[str]:
+def texts(
+    monitor: Monitor, size: tuple[int, int], where: Where = LIVE, choice: Choice | None = None
+) -> list[str]:
     """The words alone."""
     lines = screen(monitor, where, size, choice or Choice(), UNICODE)
     return ["".join(piece.text for piece in line).rstrip() for line in lines]
@@ -75,7 +79,9 @@ def test_what_matters_is_never_cut(size: tuple[int, int], count: int) -> None:
             ("battery_current", 1),
             ("power_stage_temperature", 0),
         ):
-            assert re.search(rf"(?<![\d.]){re.escape(number(esc.number(source), digits))}(?![\d.])", whole), source
+            assert re.search(
+                rf"(?<![\d.]){re.escape(number(esc.number(source), digits))}(?![\d.])", whole
+            ), source
     assert whole.count("spool up") + whole.count("RPM control") == count
     assert "…" not in whole
     assert "ERROR: battery voltage too low" in whole

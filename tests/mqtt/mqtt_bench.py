@@ -52,11 +52,15 @@ def wait_for(condition: Callable[[], object], what: object) -> None:
 class Mosquitto:
     """A broker with a configuration of its own, that can be stopped and started again on the same port."""
 
-    def __init__(self, folder: Path, lines: str = "allow_anonymous true\n", port: int | None = None) -> None:
+    def __init__(
+        self, folder: Path, lines: str = "allow_anonymous true\n", port: int | None = None
+    ) -> None:
         self._program = need_mosquitto()
         self.port = port or free_port()
         self._file = folder / f"mosquitto{self.port}.conf"
-        self._file.write_text(f"listener {self.port} 127.0.0.1\n{lines}persistence false\nuser {_user()}\n")
+        self._file.write_text(
+            f"listener {self.port} 127.0.0.1\n{lines}persistence false\nuser {_user()}\n"
+        )
         self._log = folder / f"mosquitto{self.port}.log"
         self._process: subprocess.Popen[bytes] | None = None
         self.start()
@@ -67,7 +71,9 @@ class Mosquitto:
 
     def start(self) -> None:
         with self._log.open("ab") as log:
-            self._process = subprocess.Popen([self._program, "-v", "-c", str(self._file)], stdout=log, stderr=log)
+            self._process = subprocess.Popen(
+                [self._program, "-v", "-c", str(self._file)], stdout=log, stderr=log
+            )
         wait_for(self._listens, self._log.read_text)
 
     def _listens(self) -> bool:
@@ -124,7 +130,9 @@ class Subscriber:
         assert self._subscribed.wait(PATIENCE)
 
     def _take(self, _client: object, _data: object, message: paho.MQTTMessage) -> None:
-        self.heard.append(Heard(time.monotonic(), message.topic, bytes(message.payload), message.retain))
+        self.heard.append(
+            Heard(time.monotonic(), message.topic, bytes(message.payload), message.retain)
+        )
 
     def of(self, topic: str) -> list[Heard]:
         return [heard for heard in list(self.heard) if heard.topic == topic]
@@ -133,7 +141,9 @@ class Subscriber:
         """Wait for so many messages of a topic (with this payload)."""
 
         def found() -> list[Heard]:
-            return [heard for heard in self.of(topic) if payload is None or heard.payload == payload]
+            return [
+                heard for heard in self.of(topic) if payload is None or heard.payload == payload
+            ]
 
         wait_for(lambda: len(found()) >= count, lambda: f"{topic} {payload!r} in {self.heard}")
         return found()[count - 1]

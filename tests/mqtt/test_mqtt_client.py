@@ -81,7 +81,9 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
     ]
 
 
-def test_a_broker_that_takes_nothing_makes_nothing_pile_up(tmp_path: Path, said: pytest.LogCaptureFixture) -> None:
+def test_a_broker_that_takes_nothing_makes_nothing_pile_up(
+    tmp_path: Path, said: pytest.LogCaptureFixture
+) -> None:
     """It stands still for some seconds: that is said, what waits is replaced, what then comes is new, and the end comes in time."""
     made = Mosquitto(tmp_path)
     try:
@@ -97,7 +99,12 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(tmp_path: Path, said:
                 return False
 
             made.freeze(True)
-            wait_for(lambda: offer() or "takes messages too slowly: only the newest are sent" in said.text, "a line")
+            wait_for(
+                lambda: (
+                    offer() or "takes messages too slowly: only the newest are sent" in said.text
+                ),
+                "a line",
+            )
             assert client.replaced > 100
             assert len(client._waiting) <= 1
             assert client.published < 120  # what the kernel took, of several hundred
@@ -123,7 +130,10 @@ def test_two_with_one_client_id_do_not_throw_each_other_out_for_ever(
 ) -> None:
     """This broker does not say why it ends a connection."""
     text = "maybe another program uses the client id 'same'. Give each gateway a name of its own (--gateway)."
-    with connecting(to(broker.port, "same")) as first, connecting(to(broker.port, "same")) as second:
+    with (
+        connecting(to(broker.port, "same")) as first,
+        connecting(to(broker.port, "same")) as second,
+    ):
         wait_for(lambda: text in first.problem or text in second.problem, lambda: said.text)
         loser, winner = (first, second) if text in first.problem else (second, first)
         wait_for(lambda: winner.connected, lambda: said.text)
@@ -155,7 +165,9 @@ OLD = b"\x20\x02\x00\x00"
 """Accepted, in MQTT 3."""
 
 
-@pytest.mark.parametrize("refusal", [b"\x20\x02\x00\x01", b"\x20\x03\x00\x84\x00", b""], ids=["v3", "v5", "closed"])
+@pytest.mark.parametrize(
+    "refusal", [b"\x20\x02\x00\x01", b"\x20\x03\x00\x84\x00", b""], ids=["v3", "v5", "closed"]
+)
 def test_a_broker_that_knows_only_mqtt_3_is_spoken_to_in_it(refusal: bytes) -> None:
     listener, port, got = served(refusal, OLD, pause_s=0.3)
     with listener, connecting(to(port)) as client:
@@ -165,7 +177,12 @@ def test_a_broker_that_knows_only_mqtt_3_is_spoken_to_in_it(refusal: bytes) -> N
 
 def test_rubbish_instead_of_an_answer_ends_nothing() -> None:
     rng = random.Random(1)
-    rubbish = [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x00" * 100, b"\x20\x7f\x00", bytes(range(256))]
+    rubbish = [
+        b"HTTP/1.1 400 Bad Request\r\n\r\n",
+        b"\x00" * 100,
+        b"\x20\x7f\x00",
+        bytes(range(256)),
+    ]
     rubbish += [b"\x20" + rng.randbytes(rng.randrange(1, 60)) for _ in range(6)]
     rubbish += [rng.randbytes(rng.randrange(1, 200)) for _ in range(6)]
     for answer in rubbish:
@@ -174,7 +191,9 @@ def test_rubbish_instead_of_an_answer_ends_nothing() -> None:
             wait_for(lambda got=got: len(got) == 2, answer)  # type: ignore[misc]  # it tries again
 
 
-def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_takes_connections_and_says_nothing_holds_up_no_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(mqtt_client, "CONNECT_S", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as mute:
         client = MqttClient(to(mute.getsockname()[1]), ONLINE)
@@ -202,7 +221,9 @@ class Authority:
 
     def issue(self, name: str, days: int = 2) -> tuple[Path, Path]:
         """A certificate for a name, and its key."""
-        key, request, made, more = (self._folder / f"{name}.{end}" for end in ("key", "csr", "pem", "ext"))
+        key, request, made, more = (
+            self._folder / f"{name}.{end}" for end in ("key", "csr", "pem", "ext")
+        )
         more.write_text(f"subjectAltName=DNS:{name}\n")
         openssl("req", *NEW_KEY, "-subj", f"/CN={name}", "-keyout", key, "-out", request)
         signing = ("-CA", self.certificate, "-CAkey", self._key, "-CAcreateserial", "-days", days)
@@ -214,7 +235,9 @@ NEW_KEY = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
 
 
 @pytest.fixture(scope="module")
-def encrypted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Mosquitto, Broker, Authority]]:
+def encrypted(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[Mosquitto, Broker, Authority]]:
     """A broker that wants TLS and a certificate, how to connect to it, and a stranger's authority."""
     folder = tmp_path_factory.mktemp("tls")
     authority, stranger = Authority(folder, "authority"), Authority(folder, "stranger")
@@ -235,7 +258,8 @@ def test_tls_with_an_authority_of_ones_own(encrypted: tuple[Mosquitto, Broker, A
     assert check(right) == []
     with connecting(right) as client:
         wait_for(lambda: client.connected, lambda: client.problem)
-        client.offer("k/tls/big", b"x" * 300_000)  # more than a record of TLS, and than the kernel takes at once
+        # more than a record of TLS, and than the kernel takes at once
+        client.offer("k/tls/big", b"x" * 300_000)
         wait_for(lambda: client.published >= 2, "the message")
 
 

@@ -29,7 +29,17 @@ from kontronik_can_gw.signals.unpacker import SignalReader
 
 TOPICS = Topics("fleet", "boat")
 MS = 1_000_000
-OWN_KEYS = {"time", "available", "age", "motor", "errors", "problem", "selftest", "link_state", "firmware"}
+OWN_KEYS = {
+    "time",
+    "available",
+    "age",
+    "motor",
+    "errors",
+    "problem",
+    "selftest",
+    "link_state",
+    "firmware",
+}
 QUIET = EscOptions(profile=(Phase("off", 1000, 0, OperatingState.MotorOff, 0),))
 
 
@@ -61,7 +71,9 @@ def states(published: Published, esc: str | None = "esc1") -> list[tuple[int, di
 
 
 def snake(signal: str, prefix: str) -> str:
-    return re.sub(r"(?<!^)(?=[A-Z])", "_", signal.removeprefix(prefix).removesuffix("Percent")).lower()
+    return re.sub(
+        r"(?<!^)(?=[A-Z])", "_", signal.removeprefix(prefix).removesuffix("Percent")
+    ).lower()
 
 
 def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any]:
@@ -74,7 +86,11 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
             if name.startswith(prefix):
                 text = str(value)
                 found[snake(name, prefix)] = (
-                    None if text in ("NotAvailable", "Error") else value if isinstance(value, (int, float)) else text
+                    None
+                    if text in ("NotAvailable", "Error")
+                    else value
+                    if isinstance(value, (int, float))
+                    else text
                 )
     return found
 
@@ -112,7 +128,11 @@ def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str
 
 
 def test_errors_have_name_severity_and_meaning_and_make_a_problem() -> None:
-    bits = (OperatingError.UNDERVOLTAGE, OperatingError.POWER_STAGE_OVERTEMP_WARNING, SelfTestError.TEST_UNDERVOLTAGE)
+    bits = (
+        OperatingError.UNDERVOLTAGE,
+        OperatingError.POWER_STAGE_OVERTEMP_WARNING,
+        SelfTestError.TEST_UNDERVOLTAGE,
+    )
     options = EscOptions(faults=Faults(errors=tuple(ErrorWindow(bit, 0) for bit in bits)))
     found = states(run(publisher("esc1"), flight(layout_of(["esc1"]), 4, [options]), 4))[-1][1]
     named = {error["name"]: (error["severity"], error["meaning"]) for error in found["errors"]}
@@ -138,7 +158,9 @@ def test_the_rate_is_held_whenever_it_is_asked(rate: float, steps: list[int]) ->
     expected: dict[int, int] = {}
     for step in [0, *steps]:
         now += step * MS
-        told += [now for message in made.messages(now, now) if message.topic == TOPICS.state("esc1")]
+        told += [
+            now for message in made.messages(now, now) if message.topic == TOPICS.state("esc1")
+        ]
         if now >= first:
             expected.setdefault((now - first) // period, now)
     assert told == list(expected.values())
@@ -166,7 +188,10 @@ def test_an_error_is_told_at_once_however_slow_the_rate() -> None:
 
 def test_a_new_kind_of_state_and_a_lost_link_are_told_at_once_and_a_new_speed_is_not() -> None:
     options = EscOptions(
-        profile=(Phase("off", 2, 0, OperatingState.MotorOff, 0), Phase("go", 90, 60, OperatingState.Forward, 5))
+        profile=(
+            Phase("off", 2, 0, OperatingState.MotorOff, 0),
+            Phase("go", 90, 60, OperatingState.Forward, 5),
+        )
     )
     frames = flight(layout_of(["esc1"]), 8, [options], until=6)
     published = run(publisher("esc1", rate=0.01), frames, 8)
@@ -182,7 +207,8 @@ def test_a_new_kind_of_state_and_a_lost_link_are_told_at_once_and_a_new_speed_is
 
 def test_what_comes_and_goes_is_bounded() -> None:
     windows = tuple(
-        ErrorWindow(OperatingError.OVERVOLTAGE, start, 30 * MS) for start in range(0, 60 * SECOND_NS, 60 * MS)
+        ErrorWindow(OperatingError.OVERVOLTAGE, start, 30 * MS)
+        for start in range(0, 60 * SECOND_NS, 60 * MS)
     )
     options = EscOptions(profile=QUIET.profile, faults=Faults(errors=windows))
     frames = flight(layout_of(["esc1"]), 60, [options])
@@ -235,14 +261,30 @@ DEVICE_CLASSES: dict[str | None, tuple[set[str | None], set[str | None]]] = {
     None: ({"rpm", "%", "mAh", "µs", None}, {*ANY, None}),
 }
 COMPONENT_KEYS = {
-    *("platform", "name", "unique_id", "value_template", "device_class", "state_class", "unit_of_measurement"),
-    *("options", "entity_category", "suggested_display_precision", "availability", "availability_mode"),
+    *(
+        "platform",
+        "name",
+        "unique_id",
+        "value_template",
+        "device_class",
+        "state_class",
+        "unit_of_measurement",
+    ),
+    *(
+        "options",
+        "entity_category",
+        "suggested_display_precision",
+        "availability",
+        "availability_mode",
+    ),
 }
 
 
 def discovered(published: Published) -> dict[str, dict[str, Any]]:
     """Topic and content of the discovery."""
-    return {m.topic: json.loads(m.payload) for _, m in published if m.topic.startswith("homeassistant/")}
+    return {
+        m.topic: json.loads(m.payload) for _, m in published if m.topic.startswith("homeassistant/")
+    }
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +300,9 @@ def components(found: dict[str, dict[str, Any]]) -> Iterator[tuple[str, str, dic
             yield topic, key, component
 
 
-def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_the_state(of_two: Published) -> None:
+def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_the_state(
+    of_two: Published,
+) -> None:
     found = discovered(of_two)
     newest = {esc: states(of_two, esc)[-1][1] for esc in ("left", "right", None)}
     ids = [component["unique_id"] for _, _, component in components(found)]
@@ -268,7 +312,9 @@ def test_every_entity_keeps_to_the_rules_of_home_assistant_and_shows_what_is_in_
         assert component["unique_id"] == f"{topic.split('/')[2]}_{key}"
         assert component["name"]
         shown = re.findall(r"value_json\.(\w+)", component["value_template"])
-        assert shown and set(shown) <= set(newest[next((esc for esc in ("left", "right") if esc in topic), None)]), key
+        assert shown and set(shown) <= set(
+            newest[next((esc for esc in ("left", "right") if esc in topic), None)]
+        ), key
         assert component["platform"] in ("sensor", "binary_sensor")
         assert component.get("entity_category") in (None, "diagnostic")
         if component["platform"] == "binary_sensor":
@@ -310,7 +356,9 @@ def test_an_esc_is_told_of_once_when_it_is_known() -> None:
 def test_an_esc_that_does_not_tell_what_it_is_is_told_of_all_the_same() -> None:
     """Info frames are missing; what was published before a restart is not overwritten too soon."""
     bus = layout_of(["esc1"])
-    info = {c.key for c in SignalReader(bus.layout).columns if c.source in ("device", "firmware_main")}
+    info = {
+        c.key for c in SignalReader(bus.layout).columns if c.source in ("device", "firmware_main")
+    }
     frames = [entry for entry in flight(bus, 10) if entry[1].key not in info]
     ((now, found),) = discoveries(run(publisher("esc1", discovery="ha"), frames, 10))
     assert found["device"]["model"] == "ESC"
@@ -325,5 +373,13 @@ def test_only_the_discovery_of_this_gateway_is_ours(of_two: Published) -> None:
     assert is_ours(other, TOPICS)
     assert not is_ours(mine, Topics("fleet", "boat2"))
     assert not is_ours(mine, Topics("fleet2", "boat"))
-    for text in (b"", b"{}", b"[]", b"3", b"x", b'{"origin": 3}', b'{"origin": {"name": "x"}, "availability": []}'):
+    for text in (
+        b"",
+        b"{}",
+        b"[]",
+        b"3",
+        b"x",
+        b'{"origin": 3}',
+        b'{"origin": {"name": "x"}, "availability": []}',
+    ):
         assert not is_ours(text, TOPICS)

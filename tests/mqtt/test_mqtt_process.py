@@ -51,14 +51,31 @@ def talk(*words: object) -> tuple[object, str]:
 def put(port: int, messages: Mapping[str, bytes]) -> None:
     """Let the broker keep something that is not ours."""
     for topic, payload in messages.items():
-        command = ["mosquitto_pub", "-h", "127.0.0.1", "-p", str(port), "-r", "-q", "1", "-t", topic, "-s"]
+        command = [
+            "mosquitto_pub",
+            "-h",
+            "127.0.0.1",
+            "-p",
+            str(port),
+            "-r",
+            "-q",
+            "1",
+            "-t",
+            topic,
+            "-s",
+        ]
         subprocess.run(command, input=payload, check=True)
 
 
-def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(bus: Path, broker: Mosquitto) -> None:
+def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(
+    bus: Path, broker: Mosquitto
+) -> None:
     with live(bus, broker, "term") as program:
         program.wait_for_line("connected as kontronik-can-gw-term")
-        wait_for(lambda: kept(broker.port, "kontronik/term/#").get("kontronik/term/online") == b"online", "online")
+        wait_for(
+            lambda: kept(broker.port, "kontronik/term/#").get("kontronik/term/online") == b"online",
+            "online",
+        )
         assert program.end() == 0
     found = kept(broker.port, "kontronik/term/#")
     assert found["kontronik/term/online"] == b"offline"
@@ -66,7 +83,10 @@ def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(bus: Path, b
 
 
 def test_the_last_will_says_offline_where_it_was_killed(bus: Path, broker: Mosquitto) -> None:
-    with live(bus, broker, "killed") as program, Subscriber(broker.port, "kontronik/killed/online") as heard:
+    with (
+        live(bus, broker, "killed") as program,
+        Subscriber(broker.port, "kontronik/killed/online") as heard,
+    ):
         heard.wait("kontronik/killed/online", b"online")
         program.end(signal.SIGKILL)
         heard.wait("kontronik/killed/online", b"offline")
@@ -80,14 +100,22 @@ def test_discovery_is_kept_and_can_be_removed_again(tmp_path: Path, broker: Mosq
     log = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 2))
     with Process(log, "--broker", broker.address, "--gateway", "ha", "--discovery") as program:
         assert program.process.wait(PATIENCE) == 0
-    found = {topic: json.loads(text) for topic, text in kept(broker.port, "homeassistant/#").items()}
-    mine = {"homeassistant/device/kontronik_ha/config", "homeassistant/device/kontronik_ha_esc1/config"}
+    found = {
+        topic: json.loads(text) for topic, text in kept(broker.port, "homeassistant/#").items()
+    }
+    mine = {
+        "homeassistant/device/kontronik_ha/config",
+        "homeassistant/device/kontronik_ha_esc1/config",
+    }
     assert set(found) == mine
     esc = found["homeassistant/device/kontronik_ha_esc1/config"]
     assert esc["device"]["sw_version"] == "4.17"
     assert esc["components"]["battery_voltage"]["unique_id"] == "kontronik_ha_esc1_battery_voltage"
     # what others have there: a gateway whose name begins alike, and another program
-    theirs = {"homeassistant/device/kontronik_ha_2/config": b"", "homeassistant/device/x/config": b'{"a": 1}'}
+    theirs = {
+        "homeassistant/device/kontronik_ha_2/config": b"",
+        "homeassistant/device/x/config": b'{"a": 1}',
+    }
     theirs["homeassistant/device/kontronik_ha_2/config"] = (
         json.dumps(found[min(mine)]).replace("/ha/", "/ha_2/").encode()
     )
@@ -98,7 +126,10 @@ def test_discovery_is_kept_and_can_be_removed_again(tmp_path: Path, broker: Mosq
     assert code == 0
     assert "homeassistant/device/kontronik_ha_esc1/config: cleared" in said
     # it is offline: nothing of it remains
-    assert {**kept(broker.port, "homeassistant/#"), **kept(broker.port, "kontronik/+/online")}.items() >= theirs.items()
+    assert {
+        **kept(broker.port, "homeassistant/#"),
+        **kept(broker.port, "kontronik/+/online"),
+    }.items() >= theirs.items()
     assert not mine & set(kept(broker.port, "homeassistant/#"))
     assert kept(broker.port, "kontronik/ha/#") == {}
     code, said = talk(*words)
@@ -112,7 +143,9 @@ def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path, bus: Path
     port = free_port()
     words = ("-c", bus, "--gateway", "late", "--rate", 20)
     with Process(*words, "--broker", f"127.0.0.1:{port}") as program:
-        program.wait_for_line(f"MQTT broker 127.0.0.1:{port}: connection refused. Does it run, and is the port right?")
+        program.wait_for_line(
+            f"MQTT broker 127.0.0.1:{port}: connection refused. Does it run, and is the port right?"
+        )
         made = Mosquitto(tmp_path, port=port)
         try:
             program.wait_for_line("connected as kontronik-can-gw-late")
@@ -131,17 +164,28 @@ def test_a_broker_that_comes_late_goes_and_comes_again(tmp_path: Path, bus: Path
     assert "Traceback" not in program.log
 
 
-def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(tmp_path: Path, bus: Path) -> None:
+def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
+    tmp_path: Path, bus: Path
+) -> None:
     users = tmp_path / "users"
-    subprocess.run(["mosquitto_passwd", "-b", "-c", str(users), "boat", "right horse"], check=True, capture_output=True)
+    subprocess.run(
+        ["mosquitto_passwd", "-b", "-c", str(users), "boat", "right horse"],
+        check=True,
+        capture_output=True,
+    )
     made = Mosquitto(tmp_path, f"allow_anonymous false\npassword_file {users}\n")
     secret = tmp_path / "password"
     secret.write_text("wrong donkey\nmore\n")
     secret.chmod(0o644)
     try:
         with live(bus, made, "pw", "--username", "boat", "--password-file", secret) as program:
-            program.wait_for_line("refuses user 'boat': not authorized. Check user name and password.")
-            assert f"{secret}: can be read by everybody on this machine. Run: chmod o= {secret}" in program.log
+            program.wait_for_line(
+                "refuses user 'boat': not authorized. Check user name and password."
+            )
+            assert (
+                f"{secret}: can be read by everybody on this machine. Run: chmod o= {secret}"
+                in program.log
+            )
             secret.write_text("right horse\n")
             program.wait_for_line(f"MQTT broker {made.address}: connected")
             command = Path(f"/proc/{program.process.pid}/cmdline").read_bytes()
@@ -151,7 +195,9 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
             assert text not in program.log
             assert text.encode() not in command
         with live(bus, made, "nobody") as program:
-            program.wait_for_line("refuses us without a user name: not authorized. Check --username, --password-file.")
+            program.wait_for_line(
+                "refuses us without a user name: not authorized. Check --username, --password-file."
+            )
     finally:
         made.stop()
 
@@ -159,24 +205,36 @@ def test_a_wrong_password_is_said_once_and_a_new_one_is_taken_without_a_restart(
 # --- systemd
 
 
-def test_the_same_gateway_twice_on_a_machine_is_refused(bus: Path, broker: Mosquitto, tmp_path: Path) -> None:
+def test_the_same_gateway_twice_on_a_machine_is_refused(
+    bus: Path, broker: Mosquitto, tmp_path: Path
+) -> None:
     file = write_log(tmp_path / "a.log", flight(layout_of(["esc1"]), 1))
     with live(bus, broker, "twice") as program:
         program.wait_for_line("connected as")
         said = refused(1, "mqtt", file, "--broker", broker.address, "--gateway", "twice")
-        assert f"another process on this machine publishes as twice to MQTT broker {broker.address}" in said
+        assert (
+            f"another process on this machine publishes as twice to MQTT broker {broker.address}"
+            in said
+        )
         assert program.process.poll() is None
 
 
-def test_the_service_manager_is_told_and_the_watchdog_fed(tmp_path: Path, bus: Path, broker: Mosquitto) -> None:
+def test_the_service_manager_is_told_and_the_watchdog_fed(
+    tmp_path: Path, bus: Path, broker: Mosquitto
+) -> None:
     told: list[str] = []
     path = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(path)
         manager.settimeout(PATIENCE)
         words = ("-c", bus, "--broker", broker.address, "--gateway", "sd")
-        with Process(*words, environment={"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "1000000"}) as program:
-            while not any("STATUS=connected" in text for text in told) or sum("WATCHDOG=1" in t for t in told) < 5:
+        with Process(
+            *words, environment={"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "1000000"}
+        ) as program:
+            while (
+                not any("STATUS=connected" in text for text in told)
+                or sum("WATCHDOG=1" in t for t in told) < 5
+            ):
                 told.append(manager.recv(4096).decode())
             assert program.end() == 0
             while "STOPPING=1" not in told[-1]:

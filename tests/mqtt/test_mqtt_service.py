@@ -27,10 +27,14 @@ def root(tmp_path: Path) -> Path:
 
 
 def install(root: Path, *words: str) -> int:
-    return main(["service", "install", "--root", str(root), "--executable", "/opt/kontronik-can-gw", *words])
+    return main(
+        ["service", "install", "--root", str(root), "--executable", "/opt/kontronik-can-gw", *words]
+    )
 
 
-def configuration(root: Path, name: str = "gateway", mqtt: str = '[mqtt]\nbroker = "broker.example"\n') -> None:
+def configuration(
+    root: Path, name: str = "gateway", mqtt: str = '[mqtt]\nbroker = "broker.example"\n'
+) -> None:
     file = root / f"etc/kontronik-can-gw/{name}.toml"
     file.write_text(f'{mqtt}[[esc]]\nport = "/dev/ttyAMA0"\npole_pairs = 7\n')
 
@@ -40,7 +44,12 @@ def analyze(*words: str) -> "subprocess.CompletedProcess[str]":
         pytest.skip("no systemd-analyze on this machine: sudo apt-get install systemd")
     environment = os.environ | {"SYSTEMD_COLORS": "0", "LC_ALL": "C.UTF-8"}
     return subprocess.run(
-        ["systemd-analyze", *words], capture_output=True, text=True, check=False, timeout=60, env=environment
+        ["systemd-analyze", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env=environment,
     )
 
 
@@ -56,7 +65,10 @@ def units(folder: Path) -> list[Path]:
 
 def test_systemd_finds_nothing_to_complain_about_and_hardly_any_exposure(tmp_path: Path) -> None:
     found = units(tmp_path)
-    assert [unit.name for unit in found] == ["kontronik-can-gw-mqtt.service", "kontronik-can-gw-mqtt@left.service"]
+    assert [unit.name for unit in found] == [
+        "kontronik-can-gw-mqtt.service",
+        "kontronik-can-gw-mqtt@left.service",
+    ]
     for unit in found:
         done = analyze("verify", "--man=no", str(unit))
         ours = [line for line in (done.stdout + done.stderr).splitlines() if "kontronik" in line]
@@ -67,7 +79,9 @@ def test_systemd_finds_nothing_to_complain_about_and_hardly_any_exposure(tmp_pat
         assert float(level[1]) <= 2.0
 
 
-def test_it_is_installed_and_enabled_on_request_only(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_installed_and_enabled_on_request_only(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     configuration(root)
     assert install(root) == 0
     assert not list(root.glob(f"{UNITS}/*mqtt*"))
@@ -80,9 +94,14 @@ def test_it_is_installed_and_enabled_on_request_only(root: Path, capsys: pytest.
     assert not list(root.glob(f"{UNITS}/**/*kontronik*"))
 
 
-def test_without_a_broker_it_is_installed_but_not_enabled(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_broker_it_is_installed_but_not_enabled(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     configuration(root, mqtt="")
     assert install(root, "--mqtt") == 0
     said = capsys.readouterr().err
-    assert "gateway.toml: mqtt.broker is not set. kontronik-can-gw-mqtt.service was not enabled." in said
+    assert (
+        "gateway.toml: mqtt.broker is not set. kontronik-can-gw-mqtt.service was not enabled."
+        in said
+    )
     assert [path.name for path in (root / WANTS).iterdir()] == ["kontronik-can-gw.service"]

@@ -97,7 +97,9 @@ def limit_cpu(seconds: float) -> None:
     signal.setitimer(signal.ITIMER_PROF, seconds)
 
 
-def in_child(watch: Watch, tests: Sequence[str], mutant: Mutation | None = None) -> tuple[int, Result]:
+def in_child(
+    watch: Watch, tests: Sequence[str], mutant: Mutation | None = None
+) -> tuple[int, Result]:
     """Runs pytest in a forked process: the status of that, and without a mutant what has been seen."""
     with tempfile.TemporaryFile() as result:
         sys.stdout.flush()
@@ -119,7 +121,14 @@ def _run(watch: Watch, tests: Sequence[str], mutant: Mutation | None, result: in
         for stream in (0, 1, 2) if mutant else (0, 1):
             os.dup2(os.open(os.devnull, os.O_RDWR), stream)
         _import_otherwise(watch, mutant)
-        options = ["-q", "-p", "no:cacheprovider", "--assert=plain", "--tb=no", *(["-x"] if mutant else [])]
+        options = [
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "--assert=plain",
+            "--tb=no",
+            *(["-x"] if mutant else []),
+        ]
         status = int(pytest.main([*options, *tests], plugins=[watch]))
         if not mutant:
             others = [name for name, module in sys.modules.items() if _is_of_others(module)]
@@ -171,7 +180,9 @@ def unmutated(tests: Sequence[str]) -> Result:
         status, timed = in_child(Watch(dict.fromkeys(order, COLLECTION_LIMIT_S)), tests)
         known |= {"seconds": timed.get("seconds"), "failed": timed.get("failed")}
     if status:
-        raise SystemExit(f"The tests fail without a mutant, pytest's status {status}: {known.get('failed')}")
+        raise SystemExit(
+            f"The tests fail without a mutant, pytest's status {status}: {known.get('failed')}"
+        )
     return known
 
 
@@ -218,7 +229,10 @@ def compare(old: Result, new: Result) -> bool:
     for package, now in new.items():
         was = old[package]
         killed = [set(each["killed"].split()) for each in (was, now)]
-        shares = [len(k) / (len(k) + len(each["survived"])) for k, each in zip(killed, (was, now), strict=True)]
+        shares = [
+            len(k) / (len(k) + len(each["survived"]))
+            for k, each in zip(killed, (was, now), strict=True)
+        ]
         lost |= shares[1] < shares[0]
         print(f"{package}: share killed {shares[0]:.0%} -> {shares[1]:.0%}")
         for key, text in now["survived"].items():
@@ -228,24 +242,38 @@ def compare(old: Result, new: Result) -> bool:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("packages", nargs="*", metavar="PACKAGE", help=", ".join(PACKAGES))
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write what was killed and what survived")
-    parser.add_argument("--compare", type=Path, metavar="OLD", help="a file of --json to compare with")
-    parser.add_argument("--only", nargs="+", default=[], metavar="KEY", help="only these mutants of the sample")
+    parser.add_argument(
+        "--json", type=Path, metavar="OUT", help="write what was killed and what survived"
+    )
+    parser.add_argument(
+        "--compare", type=Path, metavar="OLD", help="a file of --json to compare with"
+    )
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="KEY", help="only these mutants of the sample"
+    )
     options = parser.parse_args()
     packages = options.packages or list(PACKAGES)
     if wrong := set(packages) - set(PACKAGES):
         parser.error(f"{', '.join(wrong)}: no such package; there are {', '.join(PACKAGES)}")
     if os.environ.get("PYTHONHASHSEED") != "0":
-        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, "PYTHONHASHSEED": "0"})
+        os.execve(
+            sys.executable, [sys.executable, *sys.argv], {**os.environ, "PYTHONHASHSEED": "0"}
+        )
     os.chdir(PROJECT)
     sys.path.insert(0, str(PROJECT))
     warnings.simplefilter("ignore")
     found = {package: judge(package, options.only) for package in packages}
     if options.json:
         options.json.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
-    return 0 if options.compare is None or compare(json.loads(options.compare.read_text()), found) else 1
+    return (
+        0
+        if options.compare is None or compare(json.loads(options.compare.read_text()), found)
+        else 1
+    )
 
 
 if __name__ == "__main__":

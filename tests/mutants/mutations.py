@@ -23,10 +23,13 @@ _OTHER: dict[type[ast.AST], type[ast.AST]] = {
 }
 # fmt: on
 _SYMMETRIC = frozenset({"min", "max", "gcd", "isinstance", "issubclass", "cast", "isclose"})
-_UNTOUCHED = frozenset({"annotation", "returns", "decorator_list", "type_params", "bases", "format_spec"})
+_UNTOUCHED = frozenset(
+    {"annotation", "returns", "decorator_list", "type_params", "bases", "format_spec"}
+)
 _PROSE = re.compile(r"[a-z]{3,} [a-z]{3,}")
 _THEN = ast.Constant(...)
-_Place = tuple[ast.AST, str, int | None, ast.AST]  # the parent, its field, the index in it, the node there
+# the parent, its field, the index in it, the node there
+_Place = tuple[ast.AST, str, int | None, ast.AST]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +80,9 @@ def noting_lines(source: str, file: str, name: str) -> ast.Module:
                 noted: list[ast.stmt] = []
                 for at, statement in enumerate(body):
                     is_docstring = (
-                        at == 0 and isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+                        at == 0
+                        and isinstance(statement, ast.Expr)
+                        and isinstance(statement.value, ast.Constant)
                     )
                     call = f"{name}(({file!r}, {statement.lineno}))"
                     noted += [statement] if is_docstring else [*ast.parse(call).body, statement]
@@ -109,7 +114,11 @@ def _is_for_people(node: ast.AST) -> bool:
         case ast.JoinedStr(values=values):
             return bool(
                 _PROSE.search(
-                    "".join(str(getattr(part, "value", "")) for part in values if isinstance(part, ast.Constant))
+                    "".join(
+                        str(getattr(part, "value", ""))
+                        for part in values
+                        if isinstance(part, ast.Constant)
+                    )
                 )
             )
     return False
@@ -144,7 +153,9 @@ def _instead(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
         case ast.UnaryOp(op=ast.Not(), operand=operand):
             yield "not", operand
         case ast.Call(func=func, args=[first, second, *rest]):
-            is_odd = any(isinstance(each, ast.Starred) or _is_for_people(each) for each in (first, second))
+            is_odd = any(
+                isinstance(each, ast.Starred) or _is_for_people(each) for each in (first, second)
+            )
             is_symmetric = getattr(func, "id", getattr(func, "attr", "")) in _SYMMETRIC
             if not is_odd and not is_symmetric and ast.dump(first) != ast.dump(second):
                 yield "arguments", _with(node, args=[second, first, *rest])
@@ -157,7 +168,11 @@ def _instead(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
         case ast.AugAssign(op=op):
             yield "operator", _with(node, op=_OTHER[type(op)]())
             yield "statement", nothing
-        case ast.Assign(targets=[ast.Attribute() | ast.Subscript(), *_]) | ast.Delete() | ast.Expr(value=ast.Call()):
+        case (
+            ast.Assign(targets=[ast.Attribute() | ast.Subscript(), *_])
+            | ast.Delete()
+            | ast.Expr(value=ast.Call())
+        ):
             yield "statement", nothing
         case ast.Raise() | ast.Break() | ast.Continue():
             yield "statement", nothing
@@ -176,6 +191,8 @@ def _coin(node: ast.AST) -> bool:
 
 def _text(node: ast.AST, limit: int = 1000) -> str:
     """Source of a node in one line; of a compound statement its head."""
-    head: ast.AST = ast.IfExp(node.test, _THEN, _THEN) if isinstance(node, ast.If | ast.While) else node
+    head: ast.AST = (
+        ast.IfExp(node.test, _THEN, _THEN) if isinstance(node, ast.If | ast.While) else node
+    )
     text = " ".join(ast.unparse(head).split()).removeprefix("... ").removesuffix(" else ...")
     return text if len(text) <= limit else f"{text[: limit - 1]}…"

@@ -21,7 +21,17 @@ from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("faults.toml")
-NOT_COPIED = (".git", ".venv", ".cache", ".*_cache", ".hypothesis", "__pycache__", "node_modules", "build", "dist")
+NOT_COPIED = (
+    ".git",
+    ".venv",
+    ".cache",
+    ".*_cache",
+    ".hypothesis",
+    "__pycache__",
+    "node_modules",
+    "build",
+    "dist",
+)
 LIMIT_FACTOR, MIN_LIMIT_S = 20, 60
 """CPU time for tests with a fault, in proportion to that without."""
 BLOCKED_S = 900
@@ -42,7 +52,11 @@ class Fault:
 
     def put_in(self, package: Path) -> tuple[Path, str]:
         """The file it is in and the text that this is to have. ValueError where it cannot be put in."""
-        found = [(file, match) for file in package.rglob("*.py") for match in self.pattern.finditer(file.read_text())]
+        found = [
+            (file, match)
+            for file in package.rglob("*.py")
+            for match in self.pattern.finditer(file.read_text())
+        ]
         if len(found) != 1:
             raise ValueError(
                 f"its text stands in {len(found)} places instead of one: write it anew for the present code"
@@ -64,15 +78,25 @@ def faults(path: Path = LIST) -> list[Fault]:
     listed = tomllib.loads(path.read_text())["fault"]
     for number, each in enumerate(listed):
         if set(each) != {"what", "search", "replace", "seen_by"} or not each["seen_by"]:
-            raise ValueError(f"{path.name}: fault {number + 1} needs what, search, replace, seen_by, and nothing else")
-    return [Fault(each["what"], each["search"], each["replace"], tuple(each["seen_by"])) for each in listed]
+            raise ValueError(
+                f"{path.name}: fault {number + 1} needs what, search, replace, seen_by, and nothing else"
+            )
+    return [
+        Fault(each["what"], each["search"], each["replace"], tuple(each["seen_by"]))
+        for each in listed
+    ]
 
 
 def run(tests: tuple[str, ...], folder: Path, limit_s: float) -> tuple[int, float]:
     """pytest's status in a copy of the project, and the CPU time it took."""
     options = ["-x", "-q", "-p", "no:cacheprovider", "--tb=no", "-m", "not extended"]
     command = [sys.executable, "-m", "pytest", *options, *tests]
-    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(folder),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONHASHSEED": "0",
+    }
     before = _children_s()
     process = subprocess.run(
         command,
@@ -81,7 +105,9 @@ def run(tests: tuple[str, ...], folder: Path, limit_s: float) -> tuple[int, floa
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         timeout=BLOCKED_S,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s), int(limit_s) + 5)),
+        preexec_fn=lambda: resource.setrlimit(
+            resource.RLIMIT_CPU, (int(limit_s), int(limit_s) + 5)
+        ),
         check=False,
     )
     return process.returncode, _children_s() - before
@@ -122,17 +148,26 @@ class Copy:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("words", nargs="*", metavar="WORDS")
     options = parser.parse_args()
-    chosen = [fault for fault in faults() if not options.words or any(word in fault.what for word in options.words)]
+    chosen = [
+        fault
+        for fault in faults()
+        if not options.words or any(word in fault.what for word in options.words)
+    ]
     wrong = 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))
         for fault in chosen:
             problem = copy.try_out(fault)
             wrong += problem is not None
-            print(f"{'caught' if problem is None else problem}: {fault.what}  [{' '.join(fault.seen_by)}]", flush=True)
+            print(
+                f"{'caught' if problem is None else problem}: {fault.what}  [{' '.join(fault.seen_by)}]",
+                flush=True,
+            )
     print(f"{len(chosen) - wrong} of {len(chosen)} faults caught")
     return int(wrong > 0)
 

@@ -57,7 +57,9 @@ def test_error_texts_and_texts_of_objects_are_left_out() -> None:
         def __repr__(self):
             return f"{self.a + 1}"
     """
-    assert mutated(source) == {ast.unparse(ast.parse(textwrap.dedent(source).replace("raise", "pass #")))}
+    assert mutated(source) == {
+        ast.unparse(ast.parse(textwrap.dedent(source).replace("raise", "pass #")))
+    }
 
 
 def test_a_key_does_not_depend_on_what_stands_elsewhere() -> None:
@@ -88,7 +90,10 @@ def test_each_statement_that_is_executed_is_noted() -> None:
             v = 3
     """
     seen: list[tuple[str, int]] = []
-    exec(compile(noting_lines(textwrap.dedent(source), "f", "note"), "f", "exec"), {"note": seen.append})
+    exec(
+        compile(noting_lines(textwrap.dedent(source), "f", "note"), "f", "exec"),
+        {"note": seen.append},
+    )
     assert seen == [("f", line) for line in (2, 3, 8, 9, 11)]
 
 

@@ -19,7 +19,9 @@ S = 1_000_000_000
 
 # Recorded from a JIVE PRO 120, firmware 1.14, idle.
 LIVE = bytes.fromhex(
-    "4B4F444C 00000000 8A09 0000 0000 0000 0000 0000 581F E903 00 00 1D 20 00000200 0C 00 39234C14".replace(" ", "")
+    "4B4F444C 00000000 8A09 0000 0000 0000 0000 0000 581F E903 00 00 1D 20 00000200 0C 00 39234C14".replace(
+        " ", ""
+    )
 )
 INFO = bytes.fromhex(
     "4B4F4449 780C 0E01 00000000 06 00000000 6E09 0000 0000 0000 0000 0000 DF15 00 00 1B 1E 1C 21 904AE8A9".replace(
@@ -52,8 +54,12 @@ def decode(data: bytes) -> list[Record]:
 
 def spoiled_stream() -> bytes:
     """Both layouts, rubbish, a device swap."""
-    faults = Faults(noise=2, lost_bytes=0.002, flipped_bits=0.0002, swaps=(Swap(12 * S, Device.JIVEPRO),))
-    return b"".join(sent.wire for sent in SimulatedEsc(EscOptions(faults=faults)).frames_until(25 * S))
+    faults = Faults(
+        noise=2, lost_bytes=0.002, flipped_bits=0.0002, swaps=(Swap(12 * S, Device.JIVEPRO),)
+    )
+    return b"".join(
+        sent.wire for sent in SimulatedEsc(EscOptions(faults=faults)).frames_until(25 * S)
+    )
 
 
 def test_the_recorded_frames_give_exactly_this_json() -> None:
@@ -62,7 +68,9 @@ def test_the_recorded_frames_give_exactly_this_json() -> None:
 
 def test_bec_current_is_null_once_a_jivepro_is_known_and_until_the_device_changes() -> None:
     v4 = encode(LiveData(bec_current=1500), Layout.V4)
-    kosmik = encode(InfoData(device_and_variant(Device.KOSMIK, 1), max_bec_current=2500), Layout.LEGACY)
+    kosmik = encode(
+        InfoData(device_and_variant(Device.KOSMIK, 1), max_bec_current=2500), Layout.LEGACY
+    )
     stream = LIVE + INFO + LIVE + v4 + LIVE + INFO + LIVE + kosmik + LIVE
     currents = [record["bec_current"] for record in decode(stream) if record["kind"] == "live"]
     assert currents == [0.0, None, 1.5, 0.0, None, 0.0]

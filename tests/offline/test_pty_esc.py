@@ -64,7 +64,8 @@ def test_an_echo_switched_on_by_the_gateway_is_noticed(esc: PtyEsc) -> None:
 
 def test_what_nobody_reads_is_dropped_and_counted_and_never_blocks(esc: PtyEsc) -> None:
     written = refused = 0
-    while refused < 20:  # the kernel moves bytes between its buffers meanwhile, so some may be taken after a refusal
+    while refused < 20:
+        # the kernel moves bytes between its buffers meanwhile, so some may be taken after a refusal
         refused += not esc.write(bytes(1000))
         written += 1000
         assert written < 10_000_000
@@ -74,7 +75,9 @@ def test_what_nobody_reads_is_dropped_and_counted_and_never_blocks(esc: PtyEsc) 
     assert read_exactly(esc.path, 5) == b"again"
 
 
-def test_a_link_is_replaced_leads_to_the_terminal_and_goes_with_it_unless_another_took_it(tmp_path: Path) -> None:
+def test_a_link_is_replaced_leads_to_the_terminal_and_goes_with_it_unless_another_took_it(
+    tmp_path: Path,
+) -> None:
     link = tmp_path / "esc1"
     link.symlink_to("/nowhere/at/all")
     with PtyEsc(link) as terminal:

@@ -16,7 +16,13 @@ SHORTEST_FIRST = sorted(FORM_ROWS, key=lambda row: row.length)
 LONG_RUNS = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
 COUNTED = [
     *("live_v4", "live_legacy", "info_v4", "info_legacy", "headers", "crc_errors", "unknown_kinds"),
-    *("dropped_noise", "dropped_crc", "dropped_unknown_kind", "dropped_incomplete", "long_run_bytes"),
+    *(
+        "dropped_noise",
+        "dropped_crc",
+        "dropped_unknown_kind",
+        "dropped_incomplete",
+        "long_run_bytes",
+    ),
 ]
 
 
@@ -65,7 +71,8 @@ def fits(stream: bytes, at: int, row: FormRow) -> bool:
     return (
         len(frame) == row.length
         and frame[:4] == row.header
-        and crc32(frame[: row.covered]) == int.from_bytes(frame[row.crc_at : row.crc_at + 4], "little")
+        and crc32(frame[: row.covered])
+        == int.from_bytes(frame[row.crc_at : row.crc_at + 4], "little")
     )
 
 

@@ -8,7 +8,20 @@ from . import sheet
 from .reference import ambiguous, random_frame, seal
 from .sheet import FORM_ROWS, FormRow
 
-FRAGMENTS = [b"K", b"KO", b"KOD", b"KODL", b"KODI", b"KODK", b"KODX", b"KOKO", b"KKOD", b"KODKODI", b"\0", b"\xff"]
+FRAGMENTS = [
+    b"K",
+    b"KO",
+    b"KOD",
+    b"KODL",
+    b"KODI",
+    b"KODK",
+    b"KODX",
+    b"KOKO",
+    b"KKOD",
+    b"KODKODI",
+    b"\0",
+    b"\xff",
+]
 
 
 def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: random.Random) -> bytes:
@@ -19,7 +32,9 @@ def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: rando
     body[start - 4 : start] = second.header
     outer = seal(first, bytes(body))
     inner_begin = outer[start + 4 :]
-    return outer[:start] + seal(second, inner_begin + source.randbytes(second.crc_at - 4 - len(inner_begin)))
+    return outer[:start] + seal(
+        second, inner_begin + source.randbytes(second.crc_at - 4 - len(inner_begin))
+    )
 
 
 def random_piece(source: random.Random) -> bytes:
@@ -42,7 +57,9 @@ def random_piece(source: random.Random) -> bytes:
         return source.choice([b"KODL", b"KODI", b"KOD"]) * source.randrange(1, 12)
     if choice == 11:
         shared = source.randrange(8, 32)
-        first = source.choice([row for row in FORM_ROWS if 4 <= row.length - shared <= row.covered - 4])
+        first = source.choice(
+            [row for row in FORM_ROWS if 4 <= row.length - shared <= row.covered - 4]
+        )
         return overlapping_pair(first, row, shared, source)
     if choice == 12:
         return source.randbytes(source.randrange(0, 60))
@@ -112,7 +129,12 @@ class Uart:
     def send(self, data: bytes, slower: int = 1, parity: bool = True) -> None:
         """Start bit, eight data bits lowest first, even parity if asked for, stop bit; ``slower`` 12 is 9600 baud."""
         for byte in data:
-            bits = [0, *(byte >> bit & 1 for bit in range(8)), *([byte.bit_count() & 1] if parity else []), 1]
+            bits = [
+                0,
+                *(byte >> bit & 1 for bit in range(8)),
+                *([byte.bit_count() & 1] if parity else []),
+                1,
+            ]
             for bit in bits:
                 self.levels += [bit] * (self.STEPS * slower)
 
@@ -131,7 +153,9 @@ class Uart:
                 continue
             while True:  # at is where a start bit begins
                 middle = at + self.STEPS // 2
-                result.append(sum(levels[middle + (1 + bit) * self.STEPS] << bit for bit in range(8)))
+                result.append(
+                    sum(levels[middle + (1 + bit) * self.STEPS] << bit for bit in range(8))
+                )
                 at += stop * self.STEPS
                 if levels[at + self.STEPS // 2] == 1 or not resume_at_low_stop:
                     break

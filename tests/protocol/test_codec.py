@@ -8,7 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.esc.kontronik import Deframer, Form, InfoData, Kind, Layout, LiveData, encode, rows
+from kontronik_can_gw.esc.kontronik import (
+    Deframer,
+    Form,
+    InfoData,
+    Kind,
+    Layout,
+    LiveData,
+    encode,
+    rows,
+)
 from kontronik_can_gw.esc.kontronik.codec import FORMS
 from kontronik_can_gw.esc.kontronik.fields import Data, DataType, device_and_variant
 
@@ -104,7 +113,9 @@ SYNTHETIC_V4_INFO_FRAME = bytes.fromhex(
 
 
 def form_of(row: FormRow) -> Form:
-    return next(form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout))
+    return next(
+        form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout)
+    )
 
 
 def fields_of(kind: str) -> list[Field]:
@@ -140,7 +151,9 @@ def raw_strategy(kind: str) -> st.SearchStrategy[tuple[int, ...]]:
     return st.tuples(*(st.integers(*sheet.TYPE_RANGES[field.code]) for field in fields_of(kind)))
 
 
-form_rows = pytest.mark.parametrize("row", sheet.FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
+form_rows = pytest.mark.parametrize(
+    "row", sheet.FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}"
+)
 
 
 def test_the_references_crc_is_the_standard_one() -> None:
@@ -165,7 +178,9 @@ def test_a_recorded_frame_is_that_of_the_stated_values(
     form = form_in(frame)
     assert (form.kind, form.layout) == (kind, Layout.LEGACY)
     decoded = physical_values(form.decode(frame))
-    assert {name: repr(value) for name, value in decoded.items()} == {n: repr(value) for n, value in values.items()}
+    assert {name: repr(value) for name, value in decoded.items()} == {
+        n: repr(value) for n, value in values.items()
+    }
     assert encode(raw_values(data_type, values), Layout.LEGACY) == frame
 
 
@@ -173,7 +188,9 @@ def test_the_recorded_info_frame_tells_device_variant_and_firmware() -> None:
     info = decode(sheet.RECORDED_INFO)
     assert isinstance(info, InfoData)
     assert (info.device, info.variant, info.firmware) == (3, 120, "1.14")
-    assert info.max_battery_voltage < info.min_battery_voltage, "as recorded before the motor has run"
+    assert info.max_battery_voltage < info.min_battery_voltage, (
+        "as recorded before the motor has run"
+    )
     assert info.device_and_variant == device_and_variant(3, 120)
 
 
@@ -192,7 +209,9 @@ def test_the_synthetic_v4_vectors_in_both_directions(data: Data, frame_without_c
 @form_rows
 @PROPERTY
 @given(choice=st.data())
-def test_every_combination_of_raw_values_survives_the_round_trip(row: FormRow, choice: st.DataObject) -> None:
+def test_every_combination_of_raw_values_survives_the_round_trip(
+    row: FormRow, choice: st.DataObject
+) -> None:
     values = choice.draw(raw_strategy(row.kind))
     data_type: DataType = LiveData if row.kind == "live" else InfoData
     data = data_type(*values)
@@ -212,14 +231,18 @@ def test_a_value_that_does_not_fit_is_refused_by_the_name_of_its_field(row: Form
     for field in fields_of(row.kind):
         low, high = sheet.TYPE_RANGES[field.code]
         for value in (low - 1, high + 1, 1 << 70):
-            with pytest.raises(ValueError, match=f"^{field.name}: {value} is outside {low}\\.\\.{high}$"):
+            with pytest.raises(
+                ValueError, match=f"^{field.name}: {value} is outside {low}\\.\\.{high}$"
+            ):
                 encode(data_type(**{field.name: value}), Layout(row.layout))
 
 
 @form_rows
 @PROPERTY
 @given(choice=st.data())
-def test_the_reserved_bytes_are_sent_as_zero_and_accepted_with_any_value(row: FormRow, choice: st.DataObject) -> None:
+def test_the_reserved_bytes_are_sent_as_zero_and_accepted_with_any_value(
+    row: FormRow, choice: st.DataObject
+) -> None:
     size = row.crc_at - row.body_end
     reserved = choice.draw(st.binary(min_size=size, max_size=size))
     values = choice.draw(raw_strategy(row.kind))
@@ -251,7 +274,9 @@ def test_every_flipped_bit_under_the_crc_is_found(row: FormRow) -> None:
         (sheet.RECORDED_INFO, 36, "max_bec_temperature"),
     ],
 )
-def test_an_altered_unprotected_byte_of_a_recorded_frame_is_delivered(frame: bytes, offset: int, name: str) -> None:
+def test_an_altered_unprotected_byte_of_a_recorded_frame_is_delivered(
+    frame: bytes, offset: int, name: str
+) -> None:
     whole = decode(frame)
     for value in range(256):
         altered = frame[:offset] + bytes([value]) + frame[offset + 1 :]
@@ -271,7 +296,11 @@ def test_no_other_frame_is_suspect_whatever_it_holds() -> None:
 @form_rows
 def test_a_frame_is_found_only_where_it_stands_and_only_whole(row: FormRow) -> None:
     source = random.Random(11)
-    frame = next(frame for frame in iter(lambda: reference.random_frame(row, source), b"") if frame.endswith(b"\0"))
+    frame = next(
+        frame
+        for frame in iter(lambda: reference.random_frame(row, source), b"")
+        if frame.endswith(b"\0")
+    )
     form = form_of(row)
     buffer = b"\x4b\x4f\x44" + frame + b"\x4b"
     assert [(found.offset, found.form) for found in Deframer().feed(buffer)] == [(3, form)]
@@ -281,9 +310,15 @@ def test_a_frame_is_found_only_where_it_stands_and_only_whole(row: FormRow) -> N
 
 
 @form_rows
-def test_a_frame_without_its_last_byte_is_no_frame_even_where_that_byte_is_zero(row: FormRow) -> None:
+def test_a_frame_without_its_last_byte_is_no_frame_even_where_that_byte_is_zero(
+    row: FormRow,
+) -> None:
     source = random.Random(12)
-    frame = next(frame for frame in iter(lambda: reference.random_frame(row, source), b"") if frame.endswith(b"\0"))
+    frame = next(
+        frame
+        for frame in iter(lambda: reference.random_frame(row, source), b"")
+        if frame.endswith(b"\0")
+    )
     assert form_in(frame) is form_of(row)
     assert Deframer().feed(frame[:-1]) == []
 
@@ -293,7 +328,9 @@ def test_where_both_layouts_fit_the_shorter_is_taken(kind: str) -> None:
     frame = reference.ambiguous(kind)
     fitting = [row for row in sheet.FORM_ROWS if reference.fits(frame, 0, row)]
     assert {(row.kind, row.layout) for row in fitting} == {(kind, "legacy"), (kind, "v4")}
-    assert [found.form for found in Deframer().feed(frame)] == [form_of(reference.form_row(kind, "legacy"))]
+    assert [found.form for found in Deframer().feed(frame)] == [
+        form_of(reference.form_row(kind, "legacy"))
+    ]
 
 
 def test_the_crc_is_sent_little_endian() -> None:

@@ -28,7 +28,9 @@ from kontronik_can_gw.esc.kontronik.states import (
 from . import sheet
 from .sheet import Bit, Field, FormRow
 
-ALL_FIELDS = [(LiveData, field) for field in sheet.LIVE_FIELDS] + [(InfoData, field) for field in sheet.INFO_FIELDS]
+ALL_FIELDS = [(LiveData, field) for field in sheet.LIVE_FIELDS] + [
+    (InfoData, field) for field in sheet.INFO_FIELDS
+]
 
 
 def row_of(data: DataType, field: Field) -> Row:
@@ -36,7 +38,9 @@ def row_of(data: DataType, field: Field) -> Row:
 
 
 def form_of(row: FormRow) -> Form:
-    return next(form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout))
+    return next(
+        form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout)
+    )
 
 
 def bit_of(names: type[ErrorBit], number: int) -> ErrorBit:
@@ -48,7 +52,9 @@ def text_of(names: type[ErrorBit], number: int) -> str:
     return f"{bit.text} {bit.meaning}".lower()
 
 
-@pytest.mark.parametrize(("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", ""))
+@pytest.mark.parametrize(
+    ("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", "")
+)
 def test_a_field_has_the_type_unit_and_step_of_the_sheet(data: DataType, field: Field) -> None:
     row = row_of(data, field)
     assert (row.wire, row.unit, row.per_unit) == (field.code, field.unit, field.steps)
@@ -66,7 +72,9 @@ def test_a_field_is_read_from_its_own_bytes_and_no_others(form_row: FormRow) -> 
         changed[offset] = 0x5A
         data = form.decode(bytes(changed))
         differing = [field for field in fields if getattr(data, field.name) != 0]
-        owners = [f for f in fields if f.offset <= offset < f.offset + struct.calcsize("<" + f.code)]
+        owners = [
+            f for f in fields if f.offset <= offset < f.offset + struct.calcsize("<" + f.code)
+        ]
         assert differing == owners, f"byte {offset}"
         for owner in owners:
             assert getattr(data, owner.name) == 0x5A << 8 * (offset - owner.offset), "little-endian"
@@ -79,20 +87,30 @@ def test_a_stated_range_is_that_of_the_sheet(name: str, expected: tuple[int, int
 
 
 def test_bec_current_alone_is_not_supplied_and_only_on_the_jivepro() -> None:
-    absent = {field.name: row_of(data, field).not_on for data, field in ALL_FIELDS if row_of(data, field).not_on}
+    absent = {
+        field.name: row_of(data, field).not_on
+        for data, field in ALL_FIELDS
+        if row_of(data, field).not_on
+    }
     assert absent == {"bec_current": {3}, "max_bec_current": {3}}
 
 
 def test_devices_and_states_have_the_names_of_the_sheet_and_no_others() -> None:
-    assert [device_text(number) for number in range(64)] == [sheet.DEVICES.get(number) for number in range(64)]
+    assert [device_text(number) for number in range(64)] == [
+        sheet.DEVICES.get(number) for number in range(64)
+    ]
     assert {device.value: device.text for device in Device} == sheet.DEVICES
-    assert [state_text(number) for number in range(256)] == [sheet.OPERATING_STATES.get(n) for n in range(256)]
+    assert [state_text(number) for number in range(256)] == [
+        sheet.OPERATING_STATES.get(n) for n in range(256)
+    ]
     assert {state.value: state.text for state in OperatingState} == sheet.OPERATING_STATES
     assert LARGEST_STATE == 26
 
 
 def test_the_peak_current_belongs_to_motor_or_battery_by_device() -> None:
-    assert [peak_current_of(number) for number in range(64)] == [sheet.PEAK_CURRENT_OF.get(n) for n in range(64)]
+    assert [peak_current_of(number) for number in range(64)] == [
+        sheet.PEAK_CURRENT_OF.get(n) for n in range(64)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -100,7 +118,9 @@ def test_the_peak_current_belongs_to_motor_or_battery_by_device() -> None:
     [(sheet.OPERATING_BITS, OperatingError, 24), (sheet.SELFTEST_BITS, SelfTestError, 19)],
     ids=["operating", "selftest"],
 )
-def test_the_error_words_have_the_stated_number_of_bits(bits: list[Bit], names: type[ErrorBit], used: int) -> None:
+def test_the_error_words_have_the_stated_number_of_bits(
+    bits: list[Bit], names: type[ErrorBit], used: int
+) -> None:
     assert [bit.number for bit in bits] == list(range(used))
     assert [int(bit) for bit in names] == list(range(used))
     assert [bit.value for bit in names] == list(range(used))
@@ -108,7 +128,8 @@ def test_the_error_words_have_the_stated_number_of_bits(bits: list[Bit], names: 
 
 @pytest.mark.parametrize(
     ("names", "bit"),
-    [(OperatingError, bit) for bit in sheet.OPERATING_BITS] + [(SelfTestError, bit) for bit in sheet.SELFTEST_BITS],
+    [(OperatingError, bit) for bit in sheet.OPERATING_BITS]
+    + [(SelfTestError, bit) for bit in sheet.SELFTEST_BITS],
     ids=lambda value: str(value.number) if isinstance(value, Bit) else value.__name__,
 )
 def test_an_error_bit_means_what_the_sheet_says(names: type[ErrorBit], bit: Bit) -> None:
@@ -144,14 +165,21 @@ def test_there_are_four_forms_the_shorter_of_a_kind_first() -> None:
 @pytest.mark.parametrize("row", sheet.FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
 def test_a_form_has_the_length_and_crc_of_the_sheet(row: FormRow) -> None:
     form = form_of(row)
-    assert (form.header, form.length, form.covered, form.crc_at) == (row.header, row.length, row.covered, row.crc_at)
+    assert (form.header, form.length, form.covered, form.crc_at) == (
+        row.header,
+        row.length,
+        row.covered,
+        row.crc_at,
+    )
     assert form.data_type is (LiveData if row.kind == "live" else InfoData)
 
 
 @pytest.mark.parametrize(
     ("device", "variant", "word"), [(3, 120, 0x0C78), (0, 0, 0), (63, 1023, 0xFFFF), (1, 0, 0x400)]
 )
-def test_device_and_variant_share_a_word_six_bits_high_ten_low(device: int, variant: int, word: int) -> None:
+def test_device_and_variant_share_a_word_six_bits_high_ten_low(
+    device: int, variant: int, word: int
+) -> None:
     assert device_and_variant(device, variant) == word
     info = InfoData(device_and_variant=word)
     assert (info.device, info.variant) == (device, variant)
@@ -163,16 +191,24 @@ def test_a_device_or_variant_that_does_not_fit_is_refused(device: int, variant: 
         device_and_variant(device, variant)
 
 
-@pytest.mark.parametrize(("word", "text"), [(0x010E, "1.14"), (0x0411, "4.17"), (0x0300, "3.0"), (0xFFFF, "255.255")])
+@pytest.mark.parametrize(
+    ("word", "text"), [(0x010E, "1.14"), (0x0411, "4.17"), (0x0300, "3.0"), (0xFFFF, "255.255")]
+)
 def test_the_firmware_is_main_and_sub_version(word: int, text: str) -> None:
     assert InfoData(firmware_word=word).firmware == text
 
 
-@pytest.mark.parametrize(("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", ""))
+@pytest.mark.parametrize(
+    ("data", "field"), ALL_FIELDS, ids=lambda value: getattr(value, "name", "")
+)
 def test_every_step_survives_the_way_to_the_unit_and_back(data: DataType, field: Field) -> None:
     row = row_of(data, field)
     low, high = sheet.TYPE_RANGES[field.code]
-    steps = range(low, high + 1) if high < 1 << 16 else [low, low + 1, 1 << 31, (1 << 24) + 1, high - 1, high]
+    steps = (
+        range(low, high + 1)
+        if high < 1 << 16
+        else [low, low + 1, 1 << 31, (1 << 24) + 1, high - 1, high]
+    )
     for raw in steps:
         assert row.raw(row.physical(raw)) == raw
 
@@ -194,7 +230,9 @@ def test_every_step_survives_the_way_to_the_unit_and_back(data: DataType, field:
         ("throttle", -100, -100),
     ],
 )
-def test_a_value_in_its_unit_is_the_nearest_float_and_is_not_clipped(field: str, raw: int, physical: float) -> None:
+def test_a_value_in_its_unit_is_the_nearest_float_and_is_not_clipped(
+    field: str, raw: int, physical: float
+) -> None:
     row = rows(LiveData)[field]
     assert row.physical(raw) == physical
     assert str(row.physical(raw)) == str(physical)

@@ -27,7 +27,8 @@ from kontronik_can_gw.esc.values import Group, sources
 
 PROJECT = Path(__file__).resolve().parents[2]
 PAGES = {
-    path: path.read_text(encoding="utf-8") for path in [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
+    path: path.read_text(encoding="utf-8")
+    for path in [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 }
 _FOLDED = {*range(0x1800, 0x1C00), 0x2002}
 _TYPES = {2: "i8", 3: "i16", 4: "i32", 5: "u8", 6: "u16", 7: "u32", 9: "text", 15: "domain"}
@@ -71,7 +72,9 @@ def configuration() -> str:
                 span += f", {limits['also']}"
             if "choices" in limits:
                 span = ", ".join(f'"{choice}"' for choice in limits["choices"])
-            default = "**required**" if f.default is MISSING and f.default_factory is MISSING else ""
+            default = (
+                "**required**" if f.default is MISSING and f.default_factory is MISSING else ""
+            )
             if f.default is not MISSING and f.default not in (None, ""):
                 value = float(f.default) if isinstance(f.default, Fraction) else f.default
                 default = str(value).lower() if isinstance(value, bool) else str(value)
@@ -95,14 +98,20 @@ def messages() -> str:
         for s in message.signals:
             if s in flags:
                 continue
-            span = f"{s.minimum:.10g} … {s.maximum:.10g}" if s.minimum is not None and s.maximum is not None else ""
+            span = (
+                f"{s.minimum:.10g} … {s.maximum:.10g}"
+                if s.minimum is not None and s.maximum is not None
+                else ""
+            )
             kind = "i" if s.is_signed else "u"
             place = f"{s.start}+{s.length} {kind}"
             step = f" × {s.scale:.10g}" if s.scale != 1 else ""
             lines.append(f"| {s.name} | {place}{step} | {s.unit or ''} | {span} | {s.comment} |")
         if flags:
             names = ", ".join(f"{s.start} {s.name}" for s in flags)
-            lines.append(f"| flags | {flags[0].start}…{flags[-1].start} | | 0, 1 | bit and name: {names} |")
+            lines.append(
+                f"| flags | {flags[0].start}…{flags[-1].start} | | 0, 1 | bit and name: {names} |"
+            )
         lines.append("")
     return "\n".join(lines).rstrip()
 
@@ -129,7 +138,9 @@ def emergencies() -> str:
             lines.append(f"| {code_of_bit(bit):04X}h | {int(bit)} | {bit.meaning} |")
     for error in GatewayError:
         code, which = error.value
-        lines.append(f"| {code:04X}h | FFh{f', byte 4 = {which}' if which else ''} | {_FOUND_BY_GATEWAY[error]} |")
+        lines.append(
+            f"| {code:04X}h | FFh{f', byte 4 = {which}' if which else ''} | {_FOUND_BY_GATEWAY[error]} |"
+        )
     lines.append("| 0000h | FFh | no error any more |")
     return "\n".join(lines)
 
@@ -137,7 +148,10 @@ def emergencies() -> str:
 def objects() -> str:
     eds = load(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
     live = bindings(EscSettings())
-    lines = ["| object | name | type | access | default | limits | PDO |", "|---|---|---|---|---|---|---|"]
+    lines = [
+        "| object | name | type | access | default | limits | PDO |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for entry in eds.entries:
         index, sub = entry.index, entry.sub
         several = entry.object_type in (ARRAY, RECORD)
@@ -148,8 +162,14 @@ def objects() -> str:
             continue
         where = f"{index:04X}h:{sub:02X}" if several else f"**{index:04X}h**"
         name = entry.name if several else f"**{entry.name}**"
-        limits = "" if entry.low is entry.high is None else f"{_number(entry.low)} … {_number(entry.high)}"
-        default = f"$NODEID + {_number(entry.default)}" if entry.relative else _number(entry.default)
+        limits = (
+            ""
+            if entry.low is entry.high is None
+            else f"{_number(entry.low)} … {_number(entry.high)}"
+        )
+        default = (
+            f"$NODEID + {_number(entry.default)}" if entry.relative else _number(entry.default)
+        )
         if (entry.index, entry.sub) in live:  # a formal 0
             default = ""
         mappable = "yes" if entry.mappable else ""

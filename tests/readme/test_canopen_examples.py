@@ -27,7 +27,9 @@ from kontronik_can_gw.runtime.store import ParameterStore
 PROJECT = Path(__file__).resolve().parents[2]
 PAGE = (PROJECT / "docs" / "canopen.md").read_text(encoding="utf-8")
 CONNECT = 'network.connect(interface="socketcan", channel="can0")'
-EXAMPLES = [block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if CONNECT in block]
+EXAMPLES = [
+    block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if CONNECT in block
+]
 POLL, PDOS, EMERGENCIES, STORE, LSS = EXAMPLES
 pytestmark = pytest.mark.extended
 
@@ -42,7 +44,10 @@ def patient_master() -> Iterator[None]:
 @contextmanager
 def gateway(channel: str, store: Path, node_id: int) -> Iterator[None]:
     """A gateway with one simulated ESC that has an error for a second in every three."""
-    windows = tuple(ErrorWindow(OperatingError.BEC_OVERCURRENT, (1 + 3 * n) * SECOND_NS, SECOND_NS) for n in range(100))
+    windows = tuple(
+        ErrorWindow(OperatingError.BEC_OVERCURRENT, (1 + 3 * n) * SECOND_NS, SECOND_NS)
+        for n in range(100)
+    )
     stop = threading.Event()
     with pty.PtyEsc() as esc:
         tables = {
@@ -61,7 +66,8 @@ def gateway(channel: str, store: Path, node_id: int) -> Iterator[None]:
         gc.freeze()  # what thousands of tests before left behind must not be walked through while the gateway is to answer
         feeder.start()
         runner.start()
-        until(lambda: loop._look_due > 0)  # it has come round: a node that waits for LSS does not say when it listens
+        # it has come round: a node that waits for LSS does not say when it listens
+        until(lambda: loop._look_due > 0)
         try:
             yield
         finally:

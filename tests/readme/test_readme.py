@@ -30,13 +30,19 @@ def test_its_configuration_table_has_every_key_of_every_table() -> None:
     keys = set()
     for name, table in schema()["properties"].items():
         head, table = (f"[{name}]", table["items"]) if table["type"] == "array" else (name, table)
-        keys |= {f"{head}.{key}" for key, entry in table["properties"].items() if "deprecated" not in entry}
+        keys |= {
+            f"{head}.{key}"
+            for key, entry in table["properties"].items()
+            if "deprecated" not in entry
+        }
     assert rows == keys
 
 
 def anchors(text: str) -> set[str]:
     """Those that a page has, as GitHub makes them of its headings."""
-    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    headings = re.findall(
+        r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE
+    )
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
@@ -60,7 +66,8 @@ def test_every_page_is_found_from_the_front() -> None:
 
 def test_configurations_are_valid() -> None:
     for block in re.findall(r"```toml\n(.*?)```", ALL, re.DOTALL):
-        parse({"esc": [{"port": "/dev/ttyUSB0"}]} | tomllib.loads(block), "README.md")  # some show a table alone
+        # some show a table alone
+        parse({"esc": [{"port": "/dev/ttyUSB0"}]} | tomllib.loads(block), "README.md")
 
 
 def test_every_command_is_named() -> None:
@@ -82,19 +89,27 @@ def test_every_make_target_that_is_named_exists() -> None:
 def test_a_wheel_carries_dbc_and_example_and_finds_them(tmp_path: Path) -> None:
     source = tmp_path / "source"
     shutil.copytree(
-        PROJECT, source, ignore=shutil.ignore_patterns(".venv", ".git", ".cache", "__pycache__", ".*_cache", "tests")
+        PROJECT,
+        source,
+        ignore=shutil.ignore_patterns(
+            ".venv", ".git", ".cache", "__pycache__", ".*_cache", "tests"
+        ),
     )
 
     def python(*words: object) -> str:
         command = [sys.executable, *map(str, words)]
-        return subprocess.run(command, cwd=source, check=True, capture_output=True, text=True).stdout
+        return subprocess.run(
+            command, cwd=source, check=True, capture_output=True, text=True
+        ).stdout
 
     python("-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
     installed = tmp_path / "installed"
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
         wheel.extractall(installed)
     begin = f"import sys; sys.path.insert(0, {str(installed)!r}); "
-    assert str(installed) in python("-I", "-c", f"{begin} import kontronik_can_gw as k; print(k.__file__)")
+    assert str(installed) in python(
+        "-I", "-c", f"{begin} import kontronik_can_gw as k; print(k.__file__)"
+    )
     command = f"{begin} from kontronik_can_gw.cli import main; sys.exit(main())"
     loaded = cantools.database.load_string(python("-I", "-c", command, "dbc"), "dbc")
     original = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))

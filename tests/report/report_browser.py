@@ -38,14 +38,25 @@ class Browser:
         self._process = subprocess.Popen(
             [
                 PROGRAM,
-                *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+                *(
+                    "--headless",
+                    "--no-sandbox",
+                    "--disable-gpu",
+                    "--disable-quic",
+                    "--no-first-run",
+                ),
                 *(
                     "--disable-background-networking",
                     "--disable-component-update",
                     "--disable-sync",
                     "--disable-dev-shm-usage",
                 ),
-                *("--hide-scrollbars", "--remote-debugging-pipe", f"--user-data-dir={profile}", "about:blank"),
+                *(
+                    "--hide-scrollbars",
+                    "--remote-debugging-pipe",
+                    f"--user-data-dir={profile}",
+                    "about:blank",
+                ),
             ],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
@@ -99,7 +110,9 @@ class Browser:
     def _receive(self) -> dict[str, Any]:
         end = time.monotonic() + _TIMEOUT_S
         while b"\0" not in self._buffer:
-            assert select.select([self._in], [], [], max(0.0, end - time.monotonic()))[0], "the browser does not answer"
+            assert select.select([self._in], [], [], max(0.0, end - time.monotonic()))[0], (
+                "the browser does not answer"
+            )
             data = os.read(self._in, 1 << 20)
             assert data, "the browser has gone"
             self._buffer += data
@@ -113,7 +126,9 @@ class Browser:
         match message.get("method"):
             case "Runtime.exceptionThrown":
                 details = params["exceptionDetails"]
-                self.errors.append(details.get("exception", {}).get("description") or details["text"])
+                self.errors.append(
+                    details.get("exception", {}).get("description") or details["text"]
+                )
             case "Log.entryAdded" if params["entry"]["level"] == "error":
                 self.errors.append(params["entry"]["text"])
             case "Runtime.consoleAPICalled" if params["type"] in ("error", "assert"):
@@ -124,7 +139,13 @@ class Browser:
                 self._loaded = True
 
     def open(
-        self, page: Path, width: int = 1280, height: int = 900, *, dark: bool = False, phone: bool = False
+        self,
+        page: Path,
+        width: int = 1280,
+        height: int = 900,
+        *,
+        dark: bool = False,
+        phone: bool = False,
     ) -> None:
         """Show a file in a window of this size, and wait until it is loaded and drawn."""
         self.call(
@@ -147,11 +168,15 @@ class Browser:
 
     def settle(self) -> None:
         """Two frames are drawn."""
-        self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(0))))")
+        self.run(
+            "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(0))))"
+        )
 
     def run(self, script: str) -> Any:
         """The value of an expression (of a promise: what it becomes)."""
-        found = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        found = self.call(
+            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
+        )
         assert "exceptionDetails" not in found, found["exceptionDetails"].get("exception", found)
         return found["result"].get("value")
 
@@ -159,5 +184,11 @@ class Browser:
         """One event: ``Moved``, ``Pressed`` or ``Released``."""
         button = "left" if kind != "Moved" else "none"
         self.call(
-            "Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, button=button, buttons=buttons, clickCount=clicks
+            "Input.dispatchMouseEvent",
+            type=f"mouse{kind}",
+            x=x,
+            y=y,
+            button=button,
+            buttons=buttons,
+            clickCount=clicks,
         )

@@ -27,7 +27,11 @@ def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()
     gateway.start(start_ns)
     view = View(SignalReader(bus.layout))
     escs = [
-        SimulatedEsc(options[i] if i < len(options) else EscOptions(), seed=7 + i, start_ns=start_ns + i * 1_234_567)
+        SimulatedEsc(
+            options[i] if i < len(options) else EscOptions(),
+            seed=7 + i,
+            start_ns=start_ns + i * 1_234_567,
+        )
         for i in range(len(bus.escs))
     ]
     due = [(esc.next_ns, index) for index, esc in enumerate(escs)]

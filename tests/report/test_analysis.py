@@ -31,7 +31,9 @@ FAULTS = Faults(
 OPTIONS = (EscOptions(faults=FAULTS), EscOptions(device=Device.JIVEPRO, max_current=80))
 
 
-def analysed(bus: BusLayout, rows: list[Row], points: int = 2000, **more: tuple[float | None, float | None]) -> Flight:
+def analysed(
+    bus: BusLayout, rows: list[Row], points: int = 2000, **more: tuple[float | None, float | None]
+) -> Flight:
     analysis = Analysis(bus, points, **more)
     for time_ns, values in rows:
         if not analysis.take(time_ns, values):
@@ -57,16 +59,27 @@ def flight(bus: BusLayout, rows: list[Row]) -> Flight:
 def table(bus: BusLayout, rows: list[Row], esc: int, *sources: str) -> pd.DataFrame:
     """Rows by source, with the time that each holds (0 in front of a gap)."""
     places = {source: column(bus, source, esc) for source in sources}
-    frame = pd.DataFrame({source: [values[at] for _, values in rows] for source, at in places.items()})
+    frame = pd.DataFrame(
+        {source: [values[at] for _, values in rows] for source, at in places.items()}
+    )
     times = np.array([time_ns for time_ns, _ in rows])
     held = np.append(np.diff(times), 0)
     return frame.assign(time_ns=times, held=np.where(held > GAP_NS, 0, held))
 
 
 @pytest.mark.parametrize("esc", [0, 1])
-def test_time_and_energy_are_those_of_pandas(bus: BusLayout, rows: list[Row], flight: Flight, esc: int) -> None:
+def test_time_and_energy_are_those_of_pandas(
+    bus: BusLayout, rows: list[Row], flight: Flight, esc: int
+) -> None:
     data = table(
-        bus, rows, esc, "battery_power", "battery_voltage", "electrical_speed", "energy_used", "consumed_charge"
+        bus,
+        rows,
+        esc,
+        "battery_power",
+        "battery_voltage",
+        "electrical_speed",
+        "energy_used",
+        "consumed_charge",
     )
     summary = flight.summaries[esc]
     live = data[data.battery_voltage.notna()]
@@ -76,7 +89,9 @@ def test_time_and_energy_are_those_of_pandas(bus: BusLayout, rows: list[Row], fl
     power = live.battery_power.fillna(0).to_numpy(float)
     assert summary.energy_drawn == pytest.approx((power.clip(min=0) * live.held).sum() / 3.6e12)
     assert summary.energy_returned == pytest.approx((-power.clip(max=0) * live.held).sum() / 3.6e12)
-    assert summary.power_turning == pytest.approx((turning.battery_power * turning.held).sum() / turning.held.sum())
+    assert summary.power_turning == pytest.approx(
+        (turning.battery_power * turning.held).sum() / turning.held.sum()
+    )
     counter = data.energy_used.dropna().to_numpy(float)
     assert summary.energy_counter == pytest.approx(counter[-1] - counter[0])
     assert summary.energy == summary.energy_counter
@@ -86,7 +101,9 @@ def test_time_and_energy_are_those_of_pandas(bus: BusLayout, rows: list[Row], fl
 
 
 @pytest.mark.parametrize("esc", [0, 1])
-def test_charge_goes_on_over_resets(bus: BusLayout, rows: list[Row], flight: Flight, esc: int) -> None:
+def test_charge_goes_on_over_resets(
+    bus: BusLayout, rows: list[Row], flight: Flight, esc: int
+) -> None:
     data = table(bus, rows, esc, "consumed_charge")
     counter = data.consumed_charge.dropna().to_numpy(float)
     steps = np.diff(counter)
@@ -101,7 +118,12 @@ def test_extremes_are_those_of_pandas_with_their_time(
     bus: BusLayout, rows: list[Row], flight: Flight, esc: int
 ) -> None:
     found = flight.summaries[esc].extremes
-    assert {"max battery_power", "max motor_current", "min battery_voltage", "min bec_voltage"} <= found.keys()
+    assert {
+        "max battery_power",
+        "max motor_current",
+        "min battery_voltage",
+        "min bec_voltage",
+    } <= found.keys()
     for key, extreme in found.items():
         which, source = key.split()
         data = table(bus, rows, esc, source).dropna()
@@ -140,7 +162,9 @@ def test_the_fit_is_that_of_numpy() -> None:
     found = fit.finish()
     assert found is not None
     assert found.value == pytest.approx(np.median(slopes))
-    assert found.spread == pytest.approx((np.quantile(slopes, 0.75) - np.quantile(slopes, 0.25)) / 2)
+    assert found.spread == pytest.approx(
+        (np.quantile(slopes, 0.75) - np.quantile(slopes, 0.25)) / 2
+    )
     assert found.stretches == 7
 
 
@@ -156,7 +180,8 @@ def test_errors_begin_and_end_when_they_did(flight: Flight) -> None:
     assert (warning.severity, warning.text) == ("warning", "power stage hot")
     (error,) = of("undervoltage")
     assert (error.severity, error.end_ns is not None) == ("error", True)
-    selftest = of("test_eeprom_size")  # set for ever: it comes again after each loss and with each info frame
+    # set for ever: it comes again after each loss and with each info frame
+    selftest = of("test_eeprom_size")
     assert len(selftest) >= 2
     assert selftest[0].note == "until telemetry was lost"
     assert selftest[-1].text == "self-test: EEPROM size"
@@ -164,7 +189,9 @@ def test_errors_begin_and_end_when_they_did(flight: Flight) -> None:
     assert not [e for e in flight.events if e.name == "programming_allowed"]
 
 
-def test_losses_are_gaps_in_lines_and_events(bus: BusLayout, rows: list[Row], flight: Flight) -> None:
+def test_losses_are_gaps_in_lines_and_events(
+    bus: BusLayout, rows: list[Row], flight: Flight
+) -> None:
     lost = [e for e in flight.events if e.name == "telemetry_lost"]
     assert {e.esc for e in lost} == {0}
     assert [round((e.begin_ns - flight.origin_ns) / S, 1) for e in lost] == [29.2, 60.2, 91.2]
@@ -177,7 +204,11 @@ def test_losses_are_gaps_in_lines_and_events(bus: BusLayout, rows: list[Row], fl
     line = next(li for li in power.lines if li.esc == 0)
     for event in lost:
         assert event.end_ns is not None
-        inside = [v for t, v in zip(flight.times, line.values, strict=True) if event.begin_ns < t < event.end_ns]
+        inside = [
+            v
+            for t, v in zip(flight.times, line.values, strict=True)
+            if event.begin_ns < t < event.end_ns
+        ]
         assert None in inside
         assert all(v is None for v in inside[5:-5])
 
@@ -211,7 +242,9 @@ def test_counters_that_roll_go_on_and_those_that_begin_again_too() -> None:
 
 def test_many_events_and_states_stay_bounded() -> None:
     bus = shipped_bus()
-    state, flag, live = (column(bus, s) for s in ("operating_state", "undervoltage", "battery_voltage"))
+    state, flag, live = (
+        column(bus, s) for s in ("operating_state", "undervoltage", "battery_voltage")
+    )
     blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
     analysis = Analysis(bus, 1000)
     for number in range(30_000):
@@ -239,7 +272,9 @@ def test_rows_far_apart_are_not_joined_even_without_a_row_that_tells_the_loss(po
         values[live] = 20 + number % 7
         analysis.take(time_ns, values)
     flight = analysis.finish()
-    (line,) = [line for plot in flight.plots for line in plot.lines if line.source == "battery_voltage"]
+    (line,) = [
+        line for plot in flight.plots for line in plot.lines if line.source == "battery_voltage"
+    ]
     drawn = [
         (t0, t1)
         for (t0, t1), (a, b) in zip(pairwise(flight.times), pairwise(line.values), strict=True)

@@ -36,7 +36,13 @@ def assert_gaps_are_kept(rows: Sequence[Sequence[Number]], times: list[int], fou
 SPARSE = st.lists(st.tuples(st.integers(0, 3999), st.integers(0, 2)), max_size=60)
 
 
-@given(ROWS, STEPS, st.integers(1, 64), st.sampled_from([2, 10, 40, 1000]), st.lists(st.integers(0, 40), max_size=10))
+@given(
+    ROWS,
+    STEPS,
+    st.integers(1, 64),
+    st.sampled_from([2, 10, 40, 1000]),
+    st.lists(st.integers(0, 40), max_size=10),
+)
 def test_gaps_and_extremes_are_kept_however_the_rows_are_cut(
     rows: list[tuple[Number, Number]], steps: list[int], points: int, most: int, cuts: list[int]
 ) -> None:

@@ -41,7 +41,9 @@ COUNT = """((key, colour) => {
 def flown(*names: str) -> Flight:
     bus = shipped_bus(*names)
     analysis = Analysis(bus, 2000)
-    for time_ns, values in simulated(bus, 60, [EscOptions(faults=FAULTS), EscOptions(max_current=80)]):
+    for time_ns, values in simulated(
+        bus, 60, [EscOptions(faults=FAULTS), EscOptions(max_current=80)]
+    ):
         analysis.take(time_ns, values)
     return analysis.finish()
 
@@ -57,7 +59,13 @@ def pages(tmp_path_factory: pytest.TempPathFactory, one: Flight) -> dict[str, Pa
     written = {}
     for name, flight, title in (("one", one, "One"), ("two", flown("left", "right"), EVIL)):
         written[name] = folder / f"{name}.html"
-        html = render(flight, title=title, source="flight.kcap", provenance={EVIL: EVIL}, wall_ns=1_763_751_137 * S)
+        html = render(
+            flight,
+            title=title,
+            source="flight.kcap",
+            provenance={EVIL: EVIL},
+            wall_ns=1_763_751_137 * S,
+        )
         written[name].write_text(html, encoding="utf-8")
     return written
 
@@ -79,7 +87,9 @@ def nothing_fails(browser: Browser) -> Iterator[None]:
 
 def centre(browser: Browser, key: str, share: float = 0.5) -> tuple[float, float]:
     """A point in a plot's data area, on the screen."""
-    browser.run(f"document.getElementById('plot-{key}').scrollIntoView({{behavior: 'instant', block: 'center'}})")
+    browser.run(
+        f"document.getElementById('plot-{key}').scrollIntoView({{behavior: 'instant', block: 'center'}})"
+    )
     browser.settle()
     box: dict[str, float] = browser.run(
         f"(() => {{ const r = flight.plots.find((p) => p.key === '{key}').u.over.getBoundingClientRect(); "
@@ -98,10 +108,15 @@ def test_every_plot_is_drawn_and_the_page_fits(
     assert keys == ["states", *(PLOTS[p.plot].key for p in one.plots)]
     theme = "dark" if look == "dark" else "light"
     for key in keys[1:]:
-        colours = browser.run(f"flight.data.styles.slice(0, {1 if name == 'one' else 2}).map((s) => s.{theme})")
+        colours = browser.run(
+            f"flight.data.styles.slice(0, {1 if name == 'one' else 2}).map((s) => s.{theme})"
+        )
         drawn = [browser.run(f"{COUNT}('{key}', '{colour}')") for colour in colours]
         assert sum(drawn) > 100, (key, drawn)
-    bands = [browser.run(f"{COUNT}('states', flight.data.classes[{group}].{theme})") for group in (0, 3, 4, 5)]
+    bands = [
+        browser.run(f"{COUNT}('states', flight.data.classes[{group}].{theme})")
+        for group in (0, 3, 4, 5)
+    ]
     assert min(bands) > 100, bands
     assert browser.run("document.documentElement.scrollWidth") == width
     assert browser.run("window.hit") is None
@@ -110,10 +125,17 @@ def test_every_plot_is_drawn_and_the_page_fits(
 def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Path]) -> None:
     """Telemetry is lost from 29 to 31 s: what came before and comes after is not the value of the time between."""
     browser.open(pages["one"])
-    for share, is_known in ((28.5 / 60, True), (30.4 / 60, False), (30.9 / 60, False), (40 / 60, True)):
+    for share, is_known in (
+        (28.5 / 60, True),
+        (30.4 / 60, False),
+        (30.9 / 60, False),
+        (40 / 60, True),
+    ):
         x, y = centre(browser, "battery_voltage", share)
         browser.mouse("Moved", x, y)
         browser.settle()
-        shown = browser.run("[...document.querySelectorAll('.legend td')].map((c) => c.textContent)")
+        shown = browser.run(
+            "[...document.querySelectorAll('.legend td')].map((c) => c.textContent)"
+        )
         assert len(shown) >= 10
         assert all((text != "–") == is_known for text in shown), (share, shown)

@@ -62,7 +62,9 @@ class Tags(HTMLParser):
 
 
 def data_of(html: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(next(t for _, a, t in Tags(html).raw if a.get("id") == "data"))
+    found: dict[str, Any] = json.loads(
+        next(t for _, a, t in Tags(html).raw if a.get("id") == "data")
+    )
     return found
 
 
@@ -73,12 +75,18 @@ def test_the_page_asks_for_nothing_and_its_policy_names_what_may_run(flight: Fli
         assert tag not in ("link", "img", "iframe", "object", "embed", "base", "form"), tag
         assert not {"src", "href", "style"} & attributes.keys(), (tag, attributes)
         assert not any(name.startswith("on") for name in attributes), (tag, attributes)
-    policy = next(a["content"] or "" for t, a in tags.found if a.get("http-equiv") == "Content-Security-Policy")
+    policy = next(
+        a["content"] or ""
+        for t, a in tags.found
+        if a.get("http-equiv") == "Content-Security-Policy"
+    )
     assert policy.startswith("default-src 'none';")
     assert "unsafe" not in policy
     for tag, attributes, text in tags.raw:
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-        assert (f"'sha256-{digest}'" in policy) == (attributes.get("type") != "application/json"), tag
+        assert (f"'sha256-{digest}'" in policy) == (attributes.get("type") != "application/json"), (
+            tag
+        )
     assert "@import" not in html
     assert "url(" not in html
 
@@ -90,7 +98,12 @@ def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
     flight.missing.append(EVIL)
     flight.events[0].text = flight.events[0].remedy = EVIL
     html = render(
-        flight, title=EVIL, source=EVIL, provenance={EVIL: EVIL, "program": EVIL}, wall_ns=1, damage=[f"{EVIL} damaged"]
+        flight,
+        title=EVIL,
+        source=EVIL,
+        provenance={EVIL: EVIL, "program": EVIL},
+        wall_ns=1,
+        damage=[f"{EVIL} damaged"],
     )
     tags = Tags(html)
     assert [t for t, _ in tags.found].count("script") == 3
@@ -104,7 +117,9 @@ def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
 
 
 def test_the_same_input_gives_the_same_bytes(flight: Flight) -> None:
-    assert render(flown(), title="x", source="y", wall_ns=5) == render(flown(), title="x", source="y", wall_ns=5)
+    assert render(flown(), title="x", source="y", wall_ns=5) == render(
+        flown(), title="x", source="y", wall_ns=5
+    )
 
 
 def test_the_data_in_the_page_are_those_of_the_lines(flight: Flight) -> None:
@@ -142,7 +157,12 @@ def test_encoding_is_exact(values: list[Number]) -> None:
 def test_what_the_dbc_does_not_have_is_left_out_and_told(tmp_path: Path) -> None:
     text = shipped("dbc/kontronik_esc.dbc").read_text(encoding="utf-8")
     text = re.sub(r"^ SG_ Bec(Current|Voltage) .*\n", "", text, flags=re.MULTILINE)
-    text = re.sub(r"^(CM_ SG_|VAL_|BA_ \"\w+\" SG_) \d+ Bec(Current|Voltage) [^;]*;\n", "", text, flags=re.MULTILINE)
+    text = re.sub(
+        r"^(CM_ SG_|VAL_|BA_ \"\w+\" SG_) \d+ Bec(Current|Voltage) [^;]*;\n",
+        "",
+        text,
+        flags=re.MULTILINE,
+    )
     file = tmp_path / "lean.dbc"
     file.write_text(text, encoding="utf-8")
     bus = layout_of_dbc(file)

@@ -77,7 +77,9 @@ class FakeSocket:
             raise OSError(errno.ENOBUFS, "No buffer space available")
         self.sent.append(data)
 
-    def recvmsg(self, _size: int, _ancillary_size: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, None]:
+    def recvmsg(
+        self, _size: int, _ancillary_size: int
+    ) -> tuple[bytes, list[tuple[int, int, bytes]], int, None]:
         if not self.inbox:
             raise BlockingIOError
         data = self.inbox.pop(0)
@@ -125,7 +127,9 @@ def test_a_filter_names_each_id_and_shuts_out_its_29_bit_and_remote_twins(
 @example(set(range(0, 0x800, 2)), set())
 @example(set(range(100, 612)), set())
 @example(set(range(0, 3 * 513, 3)), set())
-def test_any_set_of_ids_fits_into_the_kernels_filters(short_ids: set[int], long_ids: set[int]) -> None:
+def test_any_set_of_ids_fits_into_the_kernels_filters(
+    short_ids: set[int], long_ids: set[int]
+) -> None:
     ids = short_ids | {each | EXTENDED for each in long_ids}
     filters = can_port._kernel_filters(frozenset(ids))
     assert len(filters) <= 512
@@ -150,7 +154,9 @@ def test_what_is_no_id_is_refused(socket_port: tuple[CanPort, FakeSocket], wrong
         socket_port[0].set_receive_ids([0x601, wrong])
 
 
-def test_only_data_frames_with_the_wanted_ids_are_handed_on(socket_port: tuple[CanPort, FakeSocket]) -> None:
+def test_only_data_frames_with_the_wanted_ids_are_handed_on(
+    socket_port: tuple[CanPort, FakeSocket],
+) -> None:
     port, fake = socket_port
     port.set_receive_ids({0x601, 0, 0x602 | EXTENDED})
     fake.inbox = [
@@ -201,7 +207,9 @@ def test_each_way_into_bus_off_is_counted_once(socket_port: tuple[CanPort, FakeS
     assert port.bus_off_count == 3
 
 
-def test_lost_frames_are_noticed_in_the_controller_and_in_the_socket(socket_port: tuple[CanPort, FakeSocket]) -> None:
+def test_lost_frames_are_noticed_in_the_controller_and_in_the_socket(
+    socket_port: tuple[CanPort, FakeSocket],
+) -> None:
     port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox = [packet(ERROR | 0x04, b"\0\x01" + bytes(6))]
@@ -222,7 +230,9 @@ def test_lost_frames_are_noticed_in_the_controller_and_in_the_socket(socket_port
 
 
 @pytest.mark.parametrize("number", [errno.ENETDOWN, errno.ENODEV, errno.EIO])
-def test_an_error_does_not_end_reception(socket_port: tuple[CanPort, FakeSocket], number: int) -> None:
+def test_an_error_does_not_end_reception(
+    socket_port: tuple[CanPort, FakeSocket], number: int
+) -> None:
     port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox = [packet(1, b"a"), number, packet(1, b"b")]
@@ -233,7 +243,9 @@ def test_an_error_does_not_end_reception(socket_port: tuple[CanPort, FakeSocket]
     assert port.send(CanFrame(2, b"")) is (Sent.GONE if number == errno.ENODEV else Sent.OK)
 
 
-def test_an_interface_that_goes_while_filters_are_set_is_gone(socket_port: tuple[CanPort, FakeSocket]) -> None:
+def test_an_interface_that_goes_while_filters_are_set_is_gone(
+    socket_port: tuple[CanPort, FakeSocket],
+) -> None:
     port, fake = socket_port
     fake.fault = errno.ENODEV
     port.set_receive_ids({1})
@@ -253,7 +265,10 @@ def test_a_remote_frame_is_sent_as_one(socket_port: tuple[CanPort, FakeSocket]) 
         ([(socket.SOL_SOCKET, 64, struct.pack("=qq", 1_700_000_000, 250_000_000))], 41_750 * MS),
         ([(socket.SOL_SOCKET, 35, struct.pack("=ii", 1_700_000_000, 250_000_000))], 41_750 * MS),
         (
-            [(socket.SOL_SOCKET, 40, bytes(4)), (socket.SOL_SOCKET, 35, struct.pack("=qq", 1_700_000_000, 0))],
+            [
+                (socket.SOL_SOCKET, 40, bytes(4)),
+                (socket.SOL_SOCKET, 35, struct.pack("=qq", 1_700_000_000, 0)),
+            ],
             41_500 * MS,
         ),
         ([(socket.SOL_SOCKET, 64, bytes(3))], None),
@@ -267,7 +282,9 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
     ancillary: list[tuple[int, int, bytes]],
     came: int | None,
 ) -> None:
-    clock = SimpleNamespace(time_ns=lambda: 1_700_000_000_500_000_000, monotonic_ns=lambda: 42 * SECOND)
+    clock = SimpleNamespace(
+        time_ns=lambda: 1_700_000_000_500_000_000, monotonic_ns=lambda: 42 * SECOND
+    )
     monkeypatch.setattr(can_port, "time", clock)
     port, fake = socket_port
     port.set_receive_ids({1})
@@ -296,7 +313,9 @@ def test_what_became_late_in_the_middle_of_a_turn_stays(
 
 
 @pytest.mark.parametrize("full", range(6))
-def test_a_queue_that_is_full_is_not_taken_for_lateness(socket_port: tuple[CanPort, FakeSocket], full: int) -> None:
+def test_a_queue_that_is_full_is_not_taken_for_lateness(
+    socket_port: tuple[CanPort, FakeSocket], full: int
+) -> None:
     port, fake = socket_port
     fake.full = full
     assert port.send_all(FRAMES, lambda: 0, 1000) == (full, Sent.BUSY)
@@ -359,7 +378,9 @@ def receive(port: CanPort, count: int) -> list[CanFrame]:
 
 
 def message(can_id: int, data: bytes = b"", **flags: Any) -> can.Message:
-    return can.Message(arbitration_id=can_id, data=data, is_extended_id=flags.pop("is_extended_id", False), **flags)
+    return can.Message(
+        arbitration_id=can_id, data=data, is_extended_id=flags.pop("is_extended_id", False), **flags
+    )
 
 
 def test_without_ids_there_is_no_thread_and_nothing_to_wait_for() -> None:
@@ -405,7 +426,9 @@ def test_the_threads_queue_is_bounded_keeps_the_oldest_and_tells_the_loss() -> N
             assert 0 < len(part) <= RECEIVE_LIMIT
             frames += part
         assert not readable(port, 0)
-        assert [int.from_bytes(frame.data, "little") for frame in frames] == list(range(QUEUE_LENGTH))
+        assert [int.from_bytes(frame.data, "little") for frame in frames] == list(
+            range(QUEUE_LENGTH)
+        )
         assert port.overruns == 1
 
 
@@ -439,8 +462,12 @@ def test_own_frames_do_not_come_back_even_where_the_driver_is_told_to_return_the
         port.close()
 
 
-@pytest.mark.parametrize("error", [can.CanOperationError("unplugged"), OSError(errno.EIO, "I/O"), TypeError("closed")])
-def test_an_adapter_that_fails_in_the_thread_is_gone(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+@pytest.mark.parametrize(
+    "error", [can.CanOperationError("unplugged"), OSError(errno.EIO, "I/O"), TypeError("closed")]
+)
+def test_an_adapter_that_fails_in_the_thread_is_gone(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     with virtual() as (port, other):
         port.set_receive_ids({1})
         other.send(message(1, b"before"))
@@ -494,7 +521,9 @@ def test_closing_ends_a_thread_that_waits_and_gives_back_every_descriptor() -> N
     assert descriptors() == before
 
 
-def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     held = threading.Event()
     with virtual() as (port, other):
         other.send(message(1))
@@ -510,7 +539,8 @@ def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(monkeypatch:
         port.set_receive_ids({1})
         assert waiting.wait(120)
         port.close()
-        others = [os.eventfd(0, os.EFD_NONBLOCK) for _ in range(8)]  # one has the number that the thread's had
+        # one has the number that the thread's had
+        others = [os.eventfd(0, os.EFD_NONBLOCK) for _ in range(8)]
         (left,) = readers()
         held.set()
         left.join(120)

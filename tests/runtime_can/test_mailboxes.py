@@ -111,7 +111,9 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
         if both:
             lines = [frame.queued for frame in now_sent]
             shorter = min(Counter(lines).values()) if len(set(lines)) == 2 else 0
-            assert all(a != b for a, b in pairwise(lines[: 2 * shorter])), "no turns while both waited"
+            assert all(a != b for a, b in pairwise(lines[: 2 * shorter])), (
+                "no turns while both waited"
+            )
     mailboxes.flush(taking(sent, 1000))
     assert [f for f in sent if f.queued] == [f for f in put if f.queued]
     slots_put, slots_sent = sum(not f.queued for f in put), sum(not f.queued for f in sent)

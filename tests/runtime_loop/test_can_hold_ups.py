@@ -87,9 +87,24 @@ def of(frames: list[tuple[int, bytes]], *ids: int) -> list[tuple[int, str]]:
         (0x000, "80 00", [], NmtState.PRE_OPERATIONAL),
         (0x000, "81 01", [(HEARTBEAT, "00")], NmtState.OPERATIONAL),
         (0x000, "82 01", [(HEARTBEAT, "00")], NmtState.OPERATIONAL),
-        (REQUEST, "40 00 10 00 00 00 00 00", [(ANSWER, "43 00 10 00 00 00 00 00")], NmtState.OPERATIONAL),
-        (REQUEST, "40 99 99 00 00 00 00 00", [(ANSWER, "80 99 99 00 00 00 02 06")], NmtState.OPERATIONAL),
-        (0x7E5, "04 01 00 00 00 00 00 00", [(0x7E4, "5e 01 00 00 00 00 00 00")], NmtState.OPERATIONAL),
+        (
+            REQUEST,
+            "40 00 10 00 00 00 00 00",
+            [(ANSWER, "43 00 10 00 00 00 00 00")],
+            NmtState.OPERATIONAL,
+        ),
+        (
+            REQUEST,
+            "40 99 99 00 00 00 00 00",
+            [(ANSWER, "80 99 99 00 00 00 02 06")],
+            NmtState.OPERATIONAL,
+        ),
+        (
+            0x7E5,
+            "04 01 00 00 00 00 00 00",
+            [(0x7E4, "5e 01 00 00 00 00 00 00")],
+            NmtState.OPERATIONAL,
+        ),
     ],
 )
 def test_a_command_that_waited_is_obeyed_and_answered_once(
@@ -97,13 +112,17 @@ def test_a_command_that_waited_is_obeyed_and_answered_once(
 ) -> None:
     bench.world.bus.came(can_id, bytes.fromhex(request_hex), bench.world.now + MS)
     if can_id == 0x7E5:
-        bench.world.bus.came(can_id, bytes.fromhex("5e 00 00 00 00 00 00 00"), bench.world.now + 2 * MS)
+        bench.world.bus.came(
+            can_id, bytes.fromhex("5e 00 00 00 00 00 00 00"), bench.world.now + 2 * MS
+        )
     bench.hold_up()
     assert of(bench.take(), HEARTBEAT, ANSWER, 0x7E4) == answers
     assert bench.state is state
 
 
-def test_an_interface_that_takes_long_to_open_is_no_hold_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interface_that_takes_long_to_open_is_no_hold_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     made = Bench(monkeypatch, opening_ns=HELD_UP_NS)
     world = made.world
     assert of(made.take(), HEARTBEAT)[0] == (HEARTBEAT, "00")
@@ -117,9 +136,13 @@ def test_an_interface_that_takes_long_to_open_is_no_hold_up(monkeypatch: pytest.
 def test_requests_that_waited_are_answered_all_in_their_order(bench: Bench) -> None:
     """More than are read at once."""
     for n in range(300):
-        bench.world.bus.came(REQUEST, bytes((0x40, n & 255, 0x99, 0, 0, 0, 0, 0)), bench.world.now + n * MS)
+        bench.world.bus.came(
+            REQUEST, bytes((0x40, n & 255, 0x99, 0, 0, 0, 0, 0)), bench.world.now + n * MS
+        )
     bench.hold_up()
-    assert [data[1] for can_id, data in bench.take() if can_id == ANSWER] == [n & 255 for n in range(300)]
+    assert [data[1] for can_id, data in bench.take() if can_id == ANSWER] == [
+        n & 255 for n in range(300)
+    ]
 
 
 def test_a_block_upload_goes_on(bench: Bench) -> None:
@@ -130,7 +153,9 @@ def test_a_block_upload_goes_on(bench: Bench) -> None:
     assert 1 <= len(begun) < 127
     bench.world.now += HELD_UP_NS
     bench.run(SECOND)
-    assert begun + [data[0] for can_id, data in bench.take() if can_id == ANSWER] == list(range(1, 128))
+    assert begun + [data[0] for can_id, data in bench.take() if can_id == ANSWER] == list(
+        range(1, 128)
+    )
 
 
 def test_a_transfer_that_cannot_go_on_is_aborted(bench: Bench) -> None:
@@ -153,7 +178,9 @@ def test_syncs_that_waited_are_counted_and_not_answered(bench: Bench) -> None:
     assert of(bench.take(), TPDO) == []
     bench.world.bus.came(sync)
     bench.run(10 * MS)
-    assert len(of(bench.take(), TPDO)) == 1, "the fourth is an even one: those that waited were counted"
+    assert len(of(bench.take(), TPDO)) == 1, (
+        "the fourth is an even one: those that waited were counted"
+    )
     for expected in (0, 1):
         bench.world.bus.came(sync)
         bench.run(10 * MS)
@@ -169,7 +196,9 @@ def test_syncs_that_waited_are_counted_and_not_answered(bench: Bench) -> None:
         ([], ["3081"]),
     ],
 )
-def test_heartbeats_are_judged_by_when_they_came(bench: Bench, came_ms: Iterable[int], codes: list[str]) -> None:
+def test_heartbeats_are_judged_by_when_they_came(
+    bench: Bench, came_ms: Iterable[int], codes: list[str]
+) -> None:
     """Held up for the first second. Beside them comes more than one call reads."""
     bench.write(*WATCH)
     bench.world.bus.came(0x705, b"\x05")
@@ -191,7 +220,9 @@ def test_a_wall_clock_that_was_set_moves_no_heartbeat(bench: Bench) -> None:
         bench.world.bus.came(0x705, b"\x05")
         bench.run(200 * MS)
     bench.run(250 * MS)
-    assert of(bench.take(), EMCY) == [(EMCY, "30 81 11 ff 05 00 00 00")], "when it ceased, and not before"
+    assert of(bench.take(), EMCY) == [(EMCY, "30 81 11 ff 05 00 00 00")], (
+        "when it ceased, and not before"
+    )
 
 
 def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench: Bench) -> None:
@@ -218,7 +249,9 @@ def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench
     assert 0x123 not in {can_id for can_id, _ in sent}, "what nothing replaces is dropped too"
 
 
-def test_in_the_middle_of_a_turn_the_rest_is_late_too_but_answers_are_not_lost(bench: Bench) -> None:
+def test_in_the_middle_of_a_turn_the_rest_is_late_too_but_answers_are_not_lost(
+    bench: Bench,
+) -> None:
     world = bench.world
     seen: list[object] = []
 
@@ -238,5 +271,9 @@ def test_in_the_middle_of_a_turn_the_rest_is_late_too_but_answers_are_not_lost(b
     sent = [(at, frame.can_id, frame.data) for at, frame in world.bus.sent]
     late = [(can_id, data) for at, can_id, data in sent if at > world.now - SECOND]
     assert [data[1] for _, can_id, data in sent if can_id == ANSWER] == list(range(5))
-    assert [can_id for can_id, data in late if int.from_bytes(data[:3], "little") == number and can_id == SPEED] == []
+    assert [
+        can_id
+        for can_id, data in late
+        if int.from_bytes(data[:3], "little") == number and can_id == SPEED
+    ] == []
     assert any(can_id == SPEED for can_id, _ in late), "and told that there is nothing"

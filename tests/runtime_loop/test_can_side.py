@@ -82,7 +82,9 @@ class Bench:
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         self.kernel, self.now, self.clock = kernel, 0, 0
-        self.can = CanLink(loaded.config.can, self.gateway, World(), FaultLog(), clock=lambda: self.clock)
+        self.can = CanLink(
+            loaded.config.can, self.gateway, World(), FaultLog(), clock=lambda: self.clock
+        )
 
     @property
     def port(self) -> Port:
@@ -135,7 +137,9 @@ def bench(kernel: Kernel) -> Iterator["Bench"]:
 def told(frames: list[tuple[int, bytes]]) -> list[str]:
     """Boot-ups and emergencies, in words."""
     words = {BOOT_UP: "boot-up"}
-    named = [words.get(frame) or (frame[1][1::-1].hex() if frame[0] == 0x081 else "") for frame in frames]
+    named = [
+        words.get(frame) or (frame[1][1::-1].hex() if frame[0] == 0x081 else "") for frame in frames
+    ]
     return [name for name in named if name]
 
 
@@ -200,7 +204,9 @@ def test_a_controller_that_nobody_restarts_costs_nothing_and_is_said_with_the_re
     assert sum("restart-ms is 0" in line for line in caplog.messages) == 1
 
 
-def test_an_interface_that_is_missing_at_start_makes_one_boot_up_when_it_comes(bench: Bench, kernel: Kernel) -> None:
+def test_an_interface_that_is_missing_at_start_makes_one_boot_up_when_it_comes(
+    bench: Bench, kernel: Kernel
+) -> None:
     kernel.facts = LinkFacts(exists=False)
     Port.there = False
     bench.start()
@@ -214,7 +220,9 @@ def test_an_interface_that_is_missing_at_start_makes_one_boot_up_when_it_comes(b
     assert told(bench.take()) == []
 
 
-def test_old_news_of_a_link_that_was_down_does_not_close_what_was_opened_since(bench: Bench, kernel: Kernel) -> None:
+def test_old_news_of_a_link_that_was_down_does_not_close_what_was_opened_since(
+    bench: Bench, kernel: Kernel
+) -> None:
     kernel.facts = ACTIVE
     bench.start()
     bench.turn(100)
@@ -234,7 +242,9 @@ def test_old_news_of_a_link_that_was_down_does_not_close_what_was_opened_since(b
     assert bench.can.port is port
 
 
-def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(bench: Bench, kernel: Kernel) -> None:
+def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(
+    bench: Bench, kernel: Kernel
+) -> None:
     kernel.facts = ACTIVE
     bench.start()
     bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now, bench.now)
@@ -271,15 +281,28 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
 
 
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(kernel: Kernel) -> None:
-    loaded = assemble(parse({"can": {"interface": "slcan", "channel": "/dev/ttyUSB1"}, "esc": [{"port": "p"}]}, "test"))
+    loaded = assemble(
+        parse(
+            {"can": {"interface": "slcan", "channel": "/dev/ttyUSB1"}, "esc": [{"port": "p"}]},
+            "test",
+        )
+    )
     gateway = Gateway(loaded.escs, loaded.layout, 0)
-    side = CanLink(loaded.config.can, gateway, World(), FaultLog(), lambda path: "left" if "USB1" in path else None)
+    side = CanLink(
+        loaded.config.can,
+        gateway,
+        World(),
+        FaultLog(),
+        lambda path: "left" if "USB1" in path else None,
+    )
     with pytest.raises(RunError, match="is the port of left: nothing may be sent to an ESC"):
         side.open(0, wait=False)
     side.close()
 
 
-def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(bench: Bench, kernel: Kernel) -> None:
+def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
+    bench: Bench, kernel: Kernel
+) -> None:
     kernel.facts = ACTIVE
     bench.start()
     bench.turn(100)
@@ -302,7 +325,9 @@ def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     kernel.facts = ACTIVE
     bench.start()
-    bench.gateway.receive_bytes(0, encode(LiveData(battery_voltage=2400), Layout.V4), bench.now, bench.now)
+    bench.gateway.receive_bytes(
+        0, encode(LiveData(battery_voltage=2400), Layout.V4), bench.now, bench.now
+    )
     bench.turn(100)
     bench.take()
     bench.port.answer = Sent.BUSY
@@ -315,11 +340,15 @@ def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
     assert [data for can_id, data in sent if can_id == 0x701] in ([], [b"\5"])
     assert told(sent) == ["7510"], "telemetry was lost: told while nothing went, and told again"
     said = [message for message in caplog.messages if "no frame can be sent" in message]
-    assert said == ["CAN can0: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."]
+    assert said == [
+        "CAN can0: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."
+    ]
     assert "CAN can0: frames are sent again, after 4.0 s" in caplog.messages
 
 
-def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
     monkeypatch.setattr(Port, "tells_busy_from_gone", False)
     bench.start()
@@ -349,13 +378,17 @@ def test_bus_off_and_lost_frames_are_counted_once(bench: Bench, kernel: Kernel) 
     assert told(bench.take()) == ["8110", "0000"]
 
 
-def test_answers_that_an_interface_that_is_down_does_not_take_are_dropped_and_counted(bench: Bench) -> None:
+def test_answers_that_an_interface_that_is_down_does_not_take_are_dropped_and_counted(
+    bench: Bench,
+) -> None:
     bench.start()
     bench.turn(100)
     bench.port.answer = Sent.DOWN
     Port.there = False
     for n in range(3):
-        bench.gateway.receive_frame(CanFrame(0x601, bytes((0x40, n, 0x99, 0, 0, 0, 0, 0))), bench.now, bench.now)
+        bench.gateway.receive_frame(
+            CanFrame(0x601, bytes((0x40, n, 0x99, 0, 0, 0, 0, 0))), bench.now, bench.now
+        )
     before = bench.gateway.status.dropped_frames
     bench.can.transmit(bench.now)
     assert bench.gateway.status.can_state is CanState.DOWN

@@ -18,7 +18,9 @@ def told(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
     return caplog
 
 
-def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(told: pytest.LogCaptureFixture) -> None:
+def test_a_condition_is_one_line_at_each_end_with_how_long_it_lasted(
+    told: pytest.LogCaptureFixture,
+) -> None:
     conditions = FaultLog()
     for now in range(10):
         conditions.begin("port", "gone", now * SECOND)
@@ -44,7 +46,9 @@ def test_another_reason_is_said_and_the_time_runs_on_also_after_a_quiet_beginnin
     assert told.messages == ["no permission", "back, after 10.0 s"]
 
 
-def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(told: pytest.LogCaptureFixture) -> None:
+def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(
+    told: pytest.LogCaptureFixture,
+) -> None:
     conditions = FaultLog()
     now = 0
     for _ in range(300):  # ten minutes, each second lost and found
@@ -56,7 +60,10 @@ def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(told: p
     assert len(told.messages) == 2 * FLAPPING - 1 + 9
     assert "summed up" in told.messages[2 * FLAPPING - 2]
     sums = [message for message in told.messages if "more times" in message]
-    assert sums[3] == "esc1: telemetry: 30 more times in the last minute, 30.0 s in all; the last: lost"
+    assert (
+        sums[3]
+        == "esc1: telemetry: 30 more times in the last minute, 30.0 s in all; the last: lost"
+    )
     while conditions.due is not None:
         now = conditions.due
         conditions.advance(now)
@@ -65,7 +72,9 @@ def test_what_comes_and_goes_is_summed_up_once_a_minute_until_it_is_calm(told: p
     assert told.messages[-1] == "lost"
 
 
-def test_a_condition_that_lasts_while_it_is_summed_up_is_said_to_last(told: pytest.LogCaptureFixture) -> None:
+def test_a_condition_that_lasts_while_it_is_summed_up_is_said_to_last(
+    told: pytest.LogCaptureFixture,
+) -> None:
     conditions = FaultLog()
     for n in range(FLAPPING):
         conditions.begin("x", "bad", n * SECOND)
@@ -81,10 +90,15 @@ def test_events_are_said_one_by_one_and_then_summed_up(told: pytest.LogCaptureFi
         conditions.event("suspended", f"suspended for {n} s", n * SECOND)
     assert len(told.messages) == FLAPPING
     conditions.advance(MINUTE + 20 * SECOND)
-    assert told.messages[-1] == "suspended: 14 more times in the last minute; the last: suspended for 19 s"
+    assert (
+        told.messages[-1]
+        == "suspended: 14 more times in the last minute; the last: suspended for 19 s"
+    )
 
 
-def test_lines_can_be_held_back_and_the_last_ones_are_remembered(told: pytest.LogCaptureFixture) -> None:
+def test_lines_can_be_held_back_and_the_last_ones_are_remembered(
+    told: pytest.LogCaptureFixture,
+) -> None:
     conditions = FaultLog()
     conditions.hold()
     conditions.say(logging.INFO, "open")
@@ -93,7 +107,9 @@ def test_lines_can_be_held_back_and_the_last_ones_are_remembered(told: pytest.Lo
     assert told.messages == ["open"]
     for n in range(50):
         conditions.say(logging.INFO, str(n))
-    assert [line.split(" ", 2)[2] for line in conditions.recent] == [str(n) for n in range(50 - REMEMBERED, 50)]
+    assert [line.split(" ", 2)[2] for line in conditions.recent] == [
+        str(n) for n in range(50 - REMEMBERED, 50)
+    ]
 
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))
@@ -113,7 +129,8 @@ def test_however_it_flaps_the_lines_are_few(happenings: list[tuple[str, bool, in
 
 
 @pytest.mark.parametrize(
-    ("ns", "text"), [(0, "0.0 s"), (99_940_000_000, "99.9 s"), (120 * SECOND, "2 min"), (7200 * SECOND, "2.0 h")]
+    ("ns", "text"),
+    [(0, "0.0 s"), (99_940_000_000, "99.9 s"), (120 * SECOND, "2 min"), (7200 * SECOND, "2.0 h")],
 )
 def test_durations_read_well(ns: int, text: str) -> None:
     assert duration(ns) == text

@@ -82,7 +82,8 @@ class Bench:
         self.selector = Poller(lambda: 0)
         self.lost: set[EscPort] = set()
         self.escs = [
-            EscPort(n, path, self.gateway, self.selector, self.conditions, self.lost) for n, path in enumerate(paths)
+            EscPort(n, path, self.gateway, self.selector, self.conditions, self.lost)
+            for n, path in enumerate(paths)
         ]
         for esc in self.escs:
             esc.open(0, wait=False)
@@ -111,12 +112,16 @@ def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
     ports: dict[str, Identity | None] = {}
     Port.there = ports
     monkeypatch.setattr(esc_input, "SerialPort", Port)
-    monkeypatch.setattr(serial_port, "_adapters", lambda: [(p, i) for p, i in ports.items() if i is not None])
+    monkeypatch.setattr(
+        serial_port, "_adapters", lambda: [(p, i) for p, i in ports.items() if i is not None]
+    )
     return ports
 
 
 @pytest.fixture
-def opened(there: dict[str, Identity | None]) -> Iterator[Callable[[Mapping[str, Identity | None]], Bench]]:
+def opened(
+    there: dict[str, Identity | None],
+) -> Iterator[Callable[[Mapping[str, Identity | None]], Bench]]:
     """Plugs adapters in, and makes a bench with an ESC on each."""
     made: list[Bench] = []
 
@@ -140,9 +145,21 @@ USB0, USB1, USB2, USB3 = (f"/dev/ttyUSB{n}" for n in range(4))
 BY_ID, BY_PATH = "/dev/serial/by-id/usb-FTDI", "/dev/serial/by-path/usb-0:1"
 REPLUGGED: dict[str, tuple[dict[str, Identity], dict[str, Identity], list[str | None]]] = {
     "an adapter under another number is found": ({USB0: LEFT}, {USB3: LEFT}, [USB3]),
-    "two in the other order stay with their ESCs": ({USB0: LEFT, USB1: RIGHT}, {USB0: RIGHT, USB1: LEFT}, [USB1, USB0]),
-    "left does not show the values of right": ({USB0: LEFT, USB1: RIGHT}, {USB0: RIGHT}, [None, USB0]),
-    "of one serial number the path tells which": ({USB0: LEFT, USB1: LEFT}, {USB1: LEFT}, [None, USB1]),
+    "two in the other order stay with their ESCs": (
+        {USB0: LEFT, USB1: RIGHT},
+        {USB0: RIGHT, USB1: LEFT},
+        [USB1, USB0],
+    ),
+    "left does not show the values of right": (
+        {USB0: LEFT, USB1: RIGHT},
+        {USB0: RIGHT},
+        [None, USB0],
+    ),
+    "of one serial number the path tells which": (
+        {USB0: LEFT, USB1: LEFT},
+        {USB1: LEFT},
+        [None, USB1],
+    ),
     "another one on the path is a replacement": ({USB0: LEFT}, {USB0: RIGHT}, [USB0]),
     "a stable name by id is followed as it is": ({BY_ID: LEFT}, {USB0: LEFT}, [None]),
     "a stable name by path is followed as it is": ({BY_PATH: LEFT}, {USB0: LEFT}, [None]),
@@ -175,7 +192,9 @@ def test_after_plugging_in_again_each_esc_has_its_own_adapter(
         assert path is None or esc.identity == after[path]
 
 
-def test_an_esc_is_found_behind_every_name_of_its_adapter(there: dict[str, Identity | None], bench: Bench) -> None:
+def test_an_esc_is_found_behind_every_name_of_its_adapter(
+    there: dict[str, Identity | None], bench: Bench
+) -> None:
     there.clear()
     bench.lose(0, SECOND)
     there["/dev/ttyUSB1"] = LEFT
@@ -202,11 +221,19 @@ def test_a_port_that_is_away_for_a_day_is_tried_once_a_second_and_said_once(
     assert len(said) == 2, "lost, and no such port"
 
 
-def test_line_errors_are_counted_by_kind_from_the_opening_on_and_over_every_plugging_in(bench: Bench) -> None:
+def test_line_errors_are_counted_by_kind_from_the_opening_on_and_over_every_plugging_in(
+    bench: Bench,
+) -> None:
     esc = bench.escs[0]
     bench.port().counts = {"parity": 8, "framing": 2, "break": 2, "overrun": 0, "buffer_overrun": 0}
     esc.report(SECOND)
-    assert esc.line_errors == {"parity": 3, "framing": 2, "break": 2, "overrun": 0, "buffer_overrun": 0}
+    assert esc.line_errors == {
+        "parity": 3,
+        "framing": 2,
+        "break": 2,
+        "overrun": 0,
+        "buffer_overrun": 0,
+    }
     assert bench.gateway.escs[0].line_errors == 5, "a break is a framing error already"
     bench.lose(0, 2 * SECOND)
     bench.reopen(3 * SECOND)
@@ -218,7 +245,9 @@ def test_line_errors_are_counted_by_kind_from_the_opening_on_and_over_every_plug
     assert bench.gateway.escs[0].line_errors == 13
 
 
-def test_a_diagnosis_is_said_once_and_names_the_drivers_counts(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_diagnosis_is_said_once_and_names_the_drivers_counts(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     esc = bench.escs[0]
     for n in range(1, 400):
@@ -251,7 +280,9 @@ def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(bench:
     assert not esc.is_stuck(), "not open: known to be lost"
 
 
-def test_a_usb_adapter_is_known_by_vendor_product_serial_number_and_interface(tmp_path: Path) -> None:
+def test_a_usb_adapter_is_known_by_vendor_product_serial_number_and_interface(
+    tmp_path: Path,
+) -> None:
     def plug(tty: str, place: str, serial_number: str) -> None:
         usb = tmp_path / "sys/devices/pci0/usb1" / place
         interface = usb / f"{place}:1.0"
@@ -291,7 +322,9 @@ def test_settings_that_another_program_changes_are_set_again() -> None:
             port.close()
 
 
-def test_settings_are_looked_at_twice_a_second(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+def test_settings_are_looked_at_twice_a_second(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
     """While another program has echo on, an ESC hears what it sends."""
     looks = []
     for now in range(0, 3 * SECOND, 100 * MS):
@@ -301,10 +334,14 @@ def test_settings_are_looked_at_twice_a_second(bench: Bench, caplog: pytest.LogC
         if bench.port().looks > before:
             looks.append(now // MS)
     assert looks == [0, 500, 1000, 1500, 2000, 2500]
-    assert sum("changed the settings of /dev/ttyUSB0" in message for message in caplog.messages) == 1
+    assert (
+        sum("changed the settings of /dev/ttyUSB0" in message for message in caplog.messages) == 1
+    )
 
 
-def test_echo_is_off_before_anything_else_is_done_to_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_echo_is_off_before_anything_else_is_done_to_a_port(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A terminal that was just made echoes; what comes before that is off goes back to the ESC."""
     done: list[str] = []
 
@@ -314,7 +351,9 @@ def test_echo_is_off_before_anything_else_is_done_to_a_port(monkeypatch: pytest.
         def call(*words: Any, **more: Any) -> Any:
             on_port = words[0] == esc.path or (isinstance(words[0], int) and words[0] in opened)
             if on_port and name == "tcsetattr":
-                done.append("echo on" if words[2][3] & (termios.ECHO | termios.ECHONL) else "echo off")
+                done.append(
+                    "echo on" if words[2][3] & (termios.ECHO | termios.ECHONL) else "echo off"
+                )
             elif on_port:
                 done.append(name)
             result = real(*words, **more)
@@ -340,16 +379,22 @@ def test_echo_is_off_before_anything_else_is_done_to_a_port(monkeypatch: pytest.
         port.close()
     assert done[:3] == ["open", "tcgetattr", "echo off"]
     assert "echo on" not in done
-    assert done.count("open") == 2, "once to switch echo off, once to use it: the first stays open until then"
+    assert done.count("open") == 2, (
+        "once to switch echo off, once to use it: the first stays open until then"
+    )
     assert "close" not in done[: [n for n, name in enumerate(done) if name == "open"][1]]
 
 
-def test_an_adapter_that_is_pulled_out_while_it_is_set_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_adapter_that_is_pulled_out_while_it_is_set_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     opened = serial_port._open
 
     def gone(*arguments: Any) -> Any:
         port = opened(*arguments)
-        monkeypatch.setattr(termios, "tcgetattr", lambda _fd: (_ for _ in ()).throw(termios.error(errno.EIO, "I/O")))
+        monkeypatch.setattr(
+            termios, "tcgetattr", lambda _fd: (_ for _ in ()).throw(termios.error(errno.EIO, "I/O"))
+        )
         return port
 
     monkeypatch.setattr(serial_port, "_open", gone)

@@ -37,7 +37,10 @@ START = range(1, 100)
 """Turns in which the nodes boot and what is made once is made."""
 STEADY = range(100, 100 + FRAMES)
 LIVE = [
-    encode(LiveData(electrical_speed=n * 100, battery_voltage=2000 + n, operating_errors=n % 3), Layout.V4)
+    encode(
+        LiveData(electrical_speed=n * 100, battery_voltage=2000 + n, operating_errors=n % 3),
+        Layout.V4,
+    )
     for n in range(50)
 ]
 INFO = encode(InfoData(device_and_variant=1 << 10, firmware_word=0x0203), Layout.V4)
@@ -72,7 +75,11 @@ def loaded(folder: Path, canopen: bool) -> Loaded:
     return assemble(parse(tables, "test"))
 
 
-def drive(gateway: Gateway, turns: range, each_turn: Callable[[int, int], object] = lambda _turn, _now: None) -> int:
+def drive(
+    gateway: Gateway,
+    turns: range,
+    each_turn: Callable[[int, int], object] = lambda _turn, _now: None,
+) -> int:
     """Live and info frames, damaged ones, silence, an unplugged port, a bus in trouble, a master; the CAN frames that came of it."""
     sent = 0
     for turn in turns:
@@ -183,7 +190,12 @@ def test_the_loop_leaves_no_garbage(tmp_path: Path) -> None:
     clock = [0]
     with ExitStack() as ends:
         escs = [ends.enter_context(PtyEsc()) for _ in setup.escs]
-        loop = Loop(gateway, [esc.path for esc in escs], CanConfig("virtual", "garbage"), clock=lambda: clock[0])
+        loop = Loop(
+            gateway,
+            [esc.path for esc in escs],
+            CanConfig("virtual", "garbage"),
+            clock=lambda: clock[0],
+        )
         loop.open()
         loop.begin()
         try:

@@ -128,7 +128,9 @@ def test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true(
         at += max(4 * MS, period + (rng.randrange(2 * timeout) if gap else rng.randrange(-MS, MS)))
     if neighbour:
         world.wires[1].stream(start, start + 4 * SECOND, 17 * MS)
-    world.hold_up = lambda: rng.randrange(400 * MS) if rng.random() < stops else rng.randrange(MS // 10)
+    world.hold_up = lambda: (
+        rng.randrange(400 * MS) if rng.random() < stops else rng.randrange(MS // 10)
+    )
     with pytest.MonkeyPatch.context() as patch:
         loop = loop_in(world, patch, escs, LAYOUTS[len(escs)])
         loop.open()
@@ -144,8 +146,13 @@ def test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true(
         if bundled:  # what the adapter held back came sooner than the wire allows
             truth -= 40 * NS_PER_BYTE
         assert truth <= timeout
-        assert (age + 1) * MS >= truth - period - 2 * MS  # ages are shown in whole ms, the period has jitter
-    for when, looked in lost:  # none is given up earlier than by the time between the two looks between which it came
+        # ages are shown in whole ms, the period has jitter
+        assert (age + 1) * MS >= truth - period - 2 * MS
+    for (
+        when,
+        looked,
+    ) in lost:
+        # none is given up earlier than by the time between the two looks between which it came
         newest = max(whole for whole in wire.frames if whole <= looked)
         look = bisect_left(world.looks, newest)
         between = world.looks[look] - world.looks[look - 1]
@@ -163,11 +170,14 @@ def test_the_loop_looks_at_its_ports_eight_times_within_the_shortest_time_out_wh
         world.looks.clear()
         run(loop, world, world.now + 2 * SECOND)
         longest = max(b - a for a, b in zip(world.looks, world.looks[1:], strict=False))
-        assert longest <= -(-min(timeout, 250 * MS) // 8 // MS) * MS  # a wait is rounded up to a millisecond
+        # a wait is rounded up to a millisecond
+        assert longest <= -(-min(timeout, 250 * MS) // 8 // MS) * MS
     loop.close()
 
 
-def test_a_port_that_never_drains_is_as_old_as_the_wire_allows_and_no_older(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_that_never_drains_is_as_old_as_the_wire_allows_and_no_older(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A pseudo terminal whose writer is faster than any wire; and more than one read in a port that waited."""
     world = World()
     (wire,) = world.wires
@@ -184,7 +194,9 @@ def test_a_port_that_never_drains_is_as_old_as_the_wire_allows_and_no_older(monk
     loop.close()
 
 
-def test_what_waited_beyond_one_read_is_dated_by_its_place_in_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_waited_beyond_one_read_is_dated_by_its_place_in_the_stream(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     world = World()
     (wire,) = world.wires
     start = world.now
@@ -218,7 +230,9 @@ class Signs:
     status = ready
 
 
-@pytest.mark.parametrize("blind", [set(), {1000}, {CAN_FD}, {1000, CAN_FD}], ids=["none", "port", "CAN", "everything"])
+@pytest.mark.parametrize(
+    "blind", [set(), {1000}, {CAN_FD}, {1000, CAN_FD}], ids=["none", "port", "CAN", "everything"]
+)
 def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
     monkeypatch: pytest.MonkeyPatch, blind: set[int]
 ) -> None:
@@ -240,7 +254,9 @@ def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
     assert len(fed) == 0 if blind else len(fed) > 8
 
 
-def test_bytes_that_came_while_the_interface_opened_are_as_old_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bytes_that_came_while_the_interface_opened_are_as_old_as_that(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     world = World()
     (wire,) = world.wires
     world.opening_ns = 3 * SECOND
@@ -255,7 +271,9 @@ def test_bytes_that_came_while_the_interface_opened_are_as_old_as_that(monkeypat
     loop.close()
 
 
-def test_bytes_that_came_while_an_interface_was_tried_again_are_as_old_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bytes_that_came_while_an_interface_was_tried_again_are_as_old_as_that(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     world = World()
     (wire,) = world.wires
     start = world.now

@@ -67,7 +67,9 @@ class Manager:
     def _watch(self) -> None:
         while not self._ending:
             try:
-                message = dict(line.split("=", 1) for line in self._socket.recv(4096).decode().splitlines())
+                message = dict(
+                    line.split("=", 1) for line in self._socket.recv(4096).decode().splitlines()
+                )
                 self.messages.append(message)
             except TimeoutError:
                 pass
@@ -84,7 +86,9 @@ class Manager:
     def wait(self, condition: Callable[[], bool], what: str) -> None:
         end = time.monotonic() + LIMIT_S
         while not condition():
-            assert time.monotonic() < end and self.process.poll() is None, f"{what}: never\n" + "\n".join(self.lines)
+            assert time.monotonic() < end and self.process.poll() is None, (
+                f"{what}: never\n" + "\n".join(self.lines)
+            )
             time.sleep(0.01)
 
     def logged(self, text: str) -> None:
@@ -122,7 +126,9 @@ def manager(tmp_path: Path, esc: PtyEsc) -> Iterator[Manager]:
         made.close()
 
 
-def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(manager: Manager, esc: PtyEsc) -> None:
+def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(
+    manager: Manager, esc: PtyEsc
+) -> None:
     manager.wait(lambda: len(manager.said("WATCHDOG")) > 4, "signs of life")
     assert "esc1: telemetry never-seen" in manager.said("STATUS")[0]
     stop = threading.Event()
@@ -134,7 +140,9 @@ def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(manage
     thread = threading.Thread(target=talk)
     thread.start()
     try:
-        manager.wait(lambda: "esc1: telemetry ok" in manager.said("STATUS")[-1], "telemetry in the status")
+        manager.wait(
+            lambda: "esc1: telemetry ok" in manager.said("STATUS")[-1], "telemetry in the status"
+        )
         document = json.loads((manager.path.parent / "status.json").read_text())
         assert document["escs"][0]["name"] == "esc1"
     finally:
@@ -148,12 +156,16 @@ def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(manage
 
 def test_a_hang_up_of_a_service_is_answered_with_what_to_do(manager: Manager, esc: PtyEsc) -> None:
     manager.process.send_signal(signal.SIGHUP)
-    manager.logged("SIGHUP is ignored: the configuration is read at the start only. Restart for another one.")
+    manager.logged(
+        "SIGHUP is ignored: the configuration is read at the start only. Restart for another one."
+    )
     esc.write(LIVE)
     manager.logged("esc1: telemetry ok")
 
 
-def test_a_gateway_that_was_killed_leaves_nothing_in_the_way_of_the_next(tmp_path: Path, esc: PtyEsc) -> None:
+def test_a_gateway_that_was_killed_leaves_nothing_in_the_way_of_the_next(
+    tmp_path: Path, esc: PtyEsc
+) -> None:
     """Neither port, nor node-ID, nor store."""
     config = tmp_path / "gateway.toml"
     more = f'[canopen]\nenabled = true\nstore = "{tmp_path}"'

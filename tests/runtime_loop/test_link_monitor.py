@@ -18,17 +18,26 @@ def attribute(kind: int, value: bytes) -> bytes:
     return struct.pack("=HH", 4 + len(value), kind) + value + bytes(-len(value) % 4)
 
 
-def link_message(kind: int = 16, name: str = "can0", flags: int = 0x10041, can: bytes | None = b"") -> bytes:
+def link_message(
+    kind: int = 16, name: str = "can0", flags: int = 0x10041, can: bytes | None = b""
+) -> bytes:
     info = b"" if can is None else attribute(18, attribute(1, b"can\0") + attribute(2, can))
     body = struct.pack("=BxHiII", 0, 280, 3, flags, 0) + attribute(3, name.encode() + b"\0") + info
     return struct.pack("=IHHII", 16 + len(body), kind, 0, 0, 0) + body
 
 
 def can_data(
-    state: int = 0, bitrate: int = 250_000, restart_ms: int = 100, counters: tuple[int, int] = (0, 0)
+    state: int = 0,
+    bitrate: int = 250_000,
+    restart_ms: int = 100,
+    counters: tuple[int, int] = (0, 0),
 ) -> bytes:
     timing = struct.pack("=8I", bitrate, 875, *range(6))
-    parts = attribute(1, timing) + attribute(4, struct.pack("=I", state)) + attribute(6, struct.pack("=I", restart_ms))
+    parts = (
+        attribute(1, timing)
+        + attribute(4, struct.pack("=I", state))
+        + attribute(6, struct.pack("=I", restart_ms))
+    )
     return parts + attribute(8, struct.pack("=HH", *counters))
 
 
@@ -74,9 +83,13 @@ def heard(*datagrams: bytes | int, name: str = "can0") -> list[LinkFacts]:
         (77, None),
     ],
 )
-def test_state_bit_rate_restart_time_and_error_counters_of_a_controller(number: int, state: CanState | None) -> None:
+def test_state_bit_rate_restart_time_and_error_counters_of_a_controller(
+    number: int, state: CanState | None
+) -> None:
     data = can_data(state=number, bitrate=125_000, restart_ms=0, counters=(130, 7))
-    assert heard(link_message(can=data)) == [LinkFacts(True, True, "can", state, 125_000, 0, (130, 7))]
+    assert heard(link_message(can=data)) == [
+        LinkFacts(True, True, "can", state, 125_000, 0, (130, 7))
+    ]
 
 
 def test_a_virtual_interface_has_no_controller() -> None:
@@ -90,7 +103,12 @@ def test_a_controller_in_bus_off_is_up_and_does_not_run(flags: int) -> None:
 
 
 def test_other_interfaces_are_none_of_ours_and_a_removed_one_is_gone() -> None:
-    datagram = link_message(name="can1") + link_message() + link_message(kind=17, name="eth0") + link_message(kind=17)
+    datagram = (
+        link_message(name="can1")
+        + link_message()
+        + link_message(kind=17, name="eth0")
+        + link_message(kind=17)
+    )
     assert [facts.exists for facts in heard(datagram)] == [True, False]
 
 
@@ -105,7 +123,12 @@ def test_after_an_overrun_the_kernel_is_asked_anew() -> None:
     assert len(fake.sent) == 1
 
 
-@given(st.lists(st.one_of(st.binary(max_size=200), st.just(link_message(can=can_data())).map(bytes)), max_size=5))
+@given(
+    st.lists(
+        st.one_of(st.binary(max_size=200), st.just(link_message(can=can_data())).map(bytes)),
+        max_size=5,
+    )
+)
 def test_rubbish_raises_nothing(datagrams: list[bytes]) -> None:
     heard(*(datagram for datagram in datagrams if datagram))
 
@@ -125,7 +148,9 @@ def test_the_real_kernel_tells_of_the_loopback_interface() -> None:
         monitor.ask()
         assert select.select([monitor.fileno()], [], [], 2)[0]
         facts = monitor.take()[-1]
-        shown = subprocess.run(["ip", "-o", "link", "show", "lo"], capture_output=True, text=True, check=True).stdout
+        shown = subprocess.run(
+            ["ip", "-o", "link", "show", "lo"], capture_output=True, text=True, check=True
+        ).stdout
         assert (facts.exists, facts.up, facts.state) == (True, ",UP" in shown, None)
     finally:
         monitor.close()

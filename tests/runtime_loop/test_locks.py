@@ -99,7 +99,9 @@ def test_a_lock_ends_with_the_process_whatever_ends_it() -> None:
     mine.close()
 
 
-@pytest.mark.parametrize("name", [NODE, node_lock("/dev/serial/by-id/usb-A%2F_1@115200", 127), f"{'x' * 300}/node/1"])
+@pytest.mark.parametrize(
+    "name", [NODE, node_lock("/dev/serial/by-id/usb-A%2F_1@115200", 127), f"{'x' * 300}/node/1"]
+)
 def test_a_file_name_stands_for_one_lock_in_one_network_namespace(name: str) -> None:
     file = file_name(name, 4026531840)
     assert "/" not in file
@@ -111,7 +113,9 @@ def test_a_file_name_stands_for_one_lock_in_one_network_namespace(name: str) -> 
 
 
 @pytest.mark.parametrize("dbc", [True, False])
-def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_opens_the_bus(dbc: bool) -> None:
+def test_a_second_gateway_with_the_same_node_or_messages_is_refused_before_it_opens_the_bus(
+    dbc: bool,
+) -> None:
     tables = {
         "can": {"channel": CHANNEL},
         "dbc": {"enabled": dbc},
@@ -156,7 +160,9 @@ def test_what_is_no_plain_file_is_reported_and_not_obeyed(kind: str, tmp_path: P
         os.link(path, target)
     else:
         path.unlink()
-        {"fifo": os.mkfifo, "folder": os.mkdir, "link": lambda name: os.symlink(target, name)}[kind](path)
+        {"fifo": os.mkfifo, "folder": os.mkdir, "link": lambda name: os.symlink(target, name)}[
+            kind
+        ](path)
     said: list[str] = []
     mine = Locks(report=said.append)
     with target.open() as other:
@@ -171,9 +177,17 @@ def test_what_is_no_plain_file_is_reported_and_not_obeyed(kind: str, tmp_path: P
 @needs_root
 @pytest.mark.parametrize(
     ("folders_owner", "files_owner", "obeyed"),
-    [(0, 0, True), (SERVICE, SERVICE, True), (SERVICE, 0, True), (0, STRANGER, False), (SERVICE, STRANGER, False)],
+    [
+        (0, 0, True),
+        (SERVICE, SERVICE, True),
+        (SERVICE, 0, True),
+        (0, STRANGER, False),
+        (SERVICE, STRANGER, False),
+    ],
 )
-def test_only_what_is_roots_or_the_services_is_obeyed(folders_owner: int, files_owner: int, obeyed: bool) -> None:
+def test_only_what_is_roots_or_the_services_is_obeyed(
+    folders_owner: int, files_owner: int, obeyed: bool
+) -> None:
     path = make(NODE, files_owner)
     os.chown(path.parent, folders_owner, folders_owner)
     path.parent.chmod(0o1777)
@@ -208,7 +222,9 @@ def test_a_users_gateway_reports_the_services_lock_and_obeys_roots(
             fcntl.flock(file, fcntl.LOCK_EX)
         assert mine.hold([NODE, roots, node_lock(CHANNEL, 7)]) == [roots]
         mine.close()
-    assert said == [f"{NODE}: a gateway of user {SERVICE} has this too; this one goes on. End one of them."]
+    assert said == [
+        f"{NODE}: a gateway of user {SERVICE} has this too; this one goes on. End one of them."
+    ]
 
 
 def test_a_file_that_its_holder_removes_is_not_mistaken_for_the_lock(
@@ -249,7 +265,12 @@ def test_a_file_that_its_holder_removes_is_not_mistaken_for_the_lock(
     ],
 )
 def test_the_folder_is_the_services_or_the_users_own(
-    uid: int, writable: set[str], runtime: str | None, expected: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+    uid: int,
+    writable: set[str],
+    runtime: str | None,
+    expected: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder.mkdir(parents=True)
     allowed = {str(folder) if name == "SYSTEM" else name for name in writable}
@@ -276,8 +297,12 @@ def broken(kind: str, path: Path) -> None:
         os.chown(path, STRANGER, STRANGER)
 
 
-@pytest.mark.parametrize("kind", ["link", "file", "open to all", pytest.param("a stranger's", marks=needs_root)])
-def test_a_users_folder_that_others_can_change_is_reported_once_and_done_without(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "kind", ["link", "file", "open to all", pytest.param("a stranger's", marks=needs_root)]
+)
+def test_a_users_folder_that_others_can_change_is_reported_once_and_done_without(
+    kind: str, tmp_path: Path
+) -> None:
     broken(kind, tmp_path / "mine")
     said: list[str] = []
     mine = Locks(tmp_path / "mine", said.append)
@@ -287,7 +312,9 @@ def test_a_users_folder_that_others_can_change_is_reported_once_and_done_without
     assert "Nothing keeps a second gateway" in said[0]
 
 
-def test_where_nothing_can_be_written_the_gateway_goes_on_and_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nothing_can_be_written_the_gateway_goes_on_and_says_so_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 

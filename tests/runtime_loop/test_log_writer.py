@@ -63,7 +63,9 @@ def test_a_stream_that_stands_still_holds_nobody_up_and_losses_are_told() -> Non
     assert lines[CAPACITY:] == ["500 log lines were lost: they could not be written in time"]
 
 
-@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), ValueError("I/O operation on closed file")])
+@pytest.mark.parametrize(
+    "error", [OSError(5, "Input/output error"), ValueError("I/O operation on closed file")]
+)
 def test_a_stream_that_fails_is_no_trouble(error: Exception) -> None:
     class Broken(io.StringIO):
         def write(self, text: str) -> int:

@@ -59,14 +59,18 @@ def sleeper() -> Iterator[threading.Thread]:
     thread.join()
 
 
-def test_the_loop_goes_before_the_threads_beside_it(kernel: Scheduler, sleeper: threading.Thread) -> None:
+def test_the_loop_goes_before_the_threads_beside_it(
+    kernel: Scheduler, sleeper: threading.Thread
+) -> None:
     sleeper.start()
     realtime.begin(30)
     assert kernel.of[threading.get_native_id()] == (os.SCHED_FIFO, 30)
     assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 29)
 
 
-def test_a_thread_that_is_started_later_follows(kernel: Scheduler, sleeper: threading.Thread) -> None:
+def test_a_thread_that_is_started_later_follows(
+    kernel: Scheduler, sleeper: threading.Thread
+) -> None:
     realtime.begin(1)
     assert start_beside_the_loop(sleeper)
     assert kernel.of[sleeper.native_id or 0] == (os.SCHED_FIFO, 1)
@@ -77,7 +81,9 @@ def test_without_it_nothing_is_changed(kernel: Scheduler, sleeper: threading.Thr
     assert kernel.of == {}
 
 
-@pytest.mark.parametrize(("service", "remedy"), [(False, "prlimit --rtprio=20"), (True, "LimitRTPRIO=20")])
+@pytest.mark.parametrize(
+    ("service", "remedy"), [(False, "prlimit --rtprio=20"), (True, "LimitRTPRIO=20")]
+)
 def test_what_is_not_permitted_is_said_with_the_remedy(
     kernel: Scheduler, monkeypatch: pytest.MonkeyPatch, service: bool, remedy: str
 ) -> None:
@@ -118,7 +124,10 @@ def test_a_real_process_has_what_it_is_permitted_to(tmp_path: Path) -> None:
                 begun = time.monotonic()
                 while "is open" not in errors.read_text() and time.monotonic() - begun < 120:
                     time.sleep(0.01)
-                policy, priority = os.sched_getscheduler(process.pid), os.sched_getparam(process.pid).sched_priority
+                policy, priority = (
+                    os.sched_getscheduler(process.pid),
+                    os.sched_getparam(process.pid).sched_priority,
+                )
             finally:
                 process.terminate()
     said = errors.read_text()

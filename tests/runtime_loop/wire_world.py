@@ -58,13 +58,17 @@ _MESSAGE = """BO_ {can_id} M{number}: 8 Gw
 def layout_of(escs: Sequence[EscSettings]) -> Layout:
     """For each ESC a message 100h, 101h ... with speed and age, sent with each frame and every 20 ms."""
     prefix = [f"{esc.name}" if len(escs) > 1 else "" for esc in escs]
-    messages = "".join(_MESSAGE.format(can_id=256 + n, number=n, esc=name) for n, name in enumerate(prefix))
+    messages = "".join(
+        _MESSAGE.format(can_id=256 + n, number=n, esc=name) for n, name in enumerate(prefix)
+    )
     text = _DBC.format(messages=messages).encode()
     return prepare(parse_database(text, "w.dbc"), "w.dbc", escs, DbcSettings(), fd_allowed=False)[1]
 
 
 def live(speed: int) -> bytes:
-    return encode(LiveData(electrical_speed=speed, battery_voltage=2400, battery_current=100), WireLayout.V4)
+    return encode(
+        LiveData(electrical_speed=speed, battery_voltage=2400, battery_current=100), WireLayout.V4
+    )
 
 
 class Wire:
@@ -86,7 +90,9 @@ class Wire:
     def send(self, at: int, bundled: bool = False) -> None:
         """The next frame begins ``at``. Bundled: an adapter hands its bytes over all at once."""
         data = live(len(self.frames) + 1)
-        self.put(data, [at + (len(data) if bundled else n + 1) * NS_PER_BYTE for n in range(len(data))])
+        self.put(
+            data, [at + (len(data) if bundled else n + 1) * NS_PER_BYTE for n in range(len(data))]
+        )
         self.frames.append(self.arrivals[-1])
 
     def put(self, data: bytes, times: Iterable[int]) -> None:
@@ -193,7 +199,9 @@ class Bus:
             self.on_send(frame)
         return self.answer
 
-    def send_all(self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int) -> tuple[int, Sent]:
+    def send_all(
+        self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+    ) -> tuple[int, Sent]:
         return one_by_one(self.send, frames, clock, latest)
 
     def close(self) -> None:
@@ -241,7 +249,9 @@ class World:
         ready = [(wire.fileno(), wire.waits_to_be_read) for wire in self.wires]
         ready.append((CAN_FD, self.bus.waits_to_be_read))
         return [
-            (self.handlers[fd], 1) for fd, is_ready in ready if is_ready and fd in self.handlers.keys() - self.blind
+            (self.handlers[fd], 1)
+            for fd, is_ready in ready
+            if is_ready and fd in self.handlers.keys() - self.blind
         ]
 
     def _arrivals(self) -> list[int]:

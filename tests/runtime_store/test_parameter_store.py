@@ -70,18 +70,24 @@ def mode(path: Path) -> int:
 # --- there and back
 
 
-def test_nothing_is_stored_at_first_and_nothing_is_made_by_reading(tmp_path: Path, store: ParameterStore) -> None:
+def test_nothing_is_stored_at_first_and_nothing_is_made_by_reading(
+    tmp_path: Path, store: ParameterStore
+) -> None:
     assert store.load("esc1") == (Stored(), None)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_was_saved_is_loaded_by_the_next_process(tmp_path: Path, store: ParameterStore) -> None:
+def test_what_was_saved_is_loaded_by_the_next_process(
+    tmp_path: Path, store: ParameterStore
+) -> None:
     names = ("a", "Z9_", "a" * 12)
     for name in names:
         assert put(store, name, OLD) is None
     assert put(store, names[0], NEW) is None
     again = ParameterStore(tmp_path / "params")
-    assert [again.load(name) for name in names] == [(decode(data), None) for data in (NEW, OLD, OLD)]
+    assert [again.load(name) for name in names] == [
+        (decode(data), None) for data in (NEW, OLD, OLD)
+    ]
     assert again.close(0)
 
 
@@ -112,13 +118,17 @@ def test_files_are_the_owners_alone_and_a_folder_that_is_made_too(
         st.dictionaries(st.integers(0x200000, 0x9FFFFF), st.binary(max_size=8), max_size=5),
     )
 )
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_any_content_comes_back(store: ParameterStore, stored: Stored) -> None:
     assert put(store, "esc1", encode(stored)) is None
     assert store.load("esc1") == (stored, None)
 
 
-@pytest.mark.parametrize("name", ["", "1esc", "_esc", "esc-1", "esc.1", "../esc", "a/b", "esc\n", "ä", "a" * 13])
+@pytest.mark.parametrize(
+    "name", ["", "1esc", "_esc", "esc-1", "esc.1", "../esc", "a/b", "esc\n", "ä", "a" * 13]
+)
 def test_a_name_that_is_none_is_refused(store: ParameterStore, name: str) -> None:
     with pytest.raises(ValueError, match="name"):
         store.save(name, OLD)
@@ -150,13 +160,17 @@ def test_a_slow_disk_holds_up_nobody_and_the_queue_is_bounded(
     disk = SlowDisk(monkeypatch)
     assert store.save("esc0", OLD)
     assert disk.reached.wait(PATIENCE)  # the worker hangs in the first saving
-    accepted = [store.save(f"esc{number % 3}", numbered(number)) for number in range(1, CAPACITY + 10)]
+    accepted = [
+        store.save(f"esc{number % 3}", numbered(number)) for number in range(1, CAPACITY + 10)
+    ]
     assert accepted == [True] * CAPACITY + [False] * 9
     assert store.results() == []
     assert select.select([store.fileno()], [], [], 0)[0] == []
     disk.go.set()
     results = wait_for(store, CAPACITY + 1)
-    assert results == [("esc0", None)] + [(f"esc{number % 3}", None) for number in range(1, CAPACITY + 1)]
+    assert results == [("esc0", None)] + [
+        (f"esc{number % 3}", None) for number in range(1, CAPACITY + 1)
+    ]
     for name in range(3):
         newest = max(number for number in range(1, CAPACITY + 1) if number % 3 == name)
         assert number_of(store.load(f"esc{name}")[0]) == newest
@@ -219,7 +233,13 @@ def place(tmp_path: Path, data: bytes) -> Path:
     return folder
 
 
-DAMAGED_FILES = [OLD[:-5], b"", b"\0" * 200, OLD + b"\n", OLD.replace(b'"version":1', b'"version":9')]
+DAMAGED_FILES = [
+    OLD[:-5],
+    b"",
+    b"\0" * 200,
+    OLD + b"\n",
+    OLD.replace(b'"version":1', b'"version":9'),
+]
 
 
 @pytest.mark.parametrize("data", DAMAGED_FILES)
@@ -276,7 +296,9 @@ def test_a_file_that_cannot_be_read_is_left_alone_until_something_is_saved(
     assert store.load("esc1") == (decode(NEW), None)
 
 
-def test_a_left_over_temporary_file_is_never_read_and_hinders_no_saving(tmp_path: Path, store: ParameterStore) -> None:
+def test_a_left_over_temporary_file_is_never_read_and_hinders_no_saving(
+    tmp_path: Path, store: ParameterStore
+) -> None:
     folder = place(tmp_path, OLD)
     for left_over in (NEW, bytes(10_000)):
         (folder / "esc1.params.tmp").write_bytes(left_over)
@@ -300,7 +322,9 @@ def test_a_file_in_place_of_the_folder_is_told(tmp_path: Path, store: ParameterS
     assert (tmp_path / "params").read_bytes() == b""
 
 
-def python(code: str, *arguments: str, prefix: tuple[str, ...] = ()) -> subprocess.CompletedProcess[str]:
+def python(
+    code: str, *arguments: str, prefix: tuple[str, ...] = ()
+) -> subprocess.CompletedProcess[str]:
     command = [*prefix, sys.executable, "-c", HELPERS + code, str(ROOT), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
@@ -326,9 +350,13 @@ def put(store, data):
 def test_a_full_and_a_read_only_file_system_leave_the_old_file_whole(tmp_path: Path) -> None:
     """A real file system of 64 KiB, in a mount namespace of the test's own."""
     unshare = ("unshare", "--user", "--map-root-user", "--mount")
-    made = subprocess.run([*unshare, "mount", "-t", "tmpfs", "none", tmp_path], capture_output=True, check=False)
+    made = subprocess.run(
+        [*unshare, "mount", "-t", "tmpfs", "none", tmp_path], capture_output=True, check=False
+    )
     if made.returncode:
-        pytest.skip("no file system can be mounted here; the failures of each step are tested without one")
+        pytest.skip(
+            "no file system can be mounted here; the failures of each step are tested without one"
+        )
     code = """
 disk = Path(sys.argv[2])
 subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "none", disk], check=True)
@@ -385,7 +413,8 @@ def test_after_kill_9_at_any_instant_the_file_is_one_that_was_asked_for_and_none
     for _ in range(12):
         child = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0)
         assert child.stdout is not None
-        said = b"".join(child.stdout.readline() for _ in range(rng.randrange(1, 12)))  # so far it goes on by itself
+        # so far it goes on by itself
+        said = b"".join(child.stdout.readline() for _ in range(rng.randrange(1, 12)))
         for _ in range(rng.randrange(20_000)):
             pass  # some instant of the next saving
         child.kill()
@@ -421,7 +450,11 @@ class Recorder:
     """Writes down, in their order, the calls that change or secure what is on disk. The one that is ``failing`` raises ``error``."""
 
     def __init__(
-        self, monkeypatch: pytest.MonkeyPatch, folder: Path, failing: Step = (), error: OSError | None = None
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        folder: Path,
+        failing: Step = (),
+        error: OSError | None = None,
     ) -> None:
         self.steps: list[Step] = []
         self._folder, self._failing, self._error = folder, failing, error
@@ -527,13 +560,20 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
             for name, inode in names.items():
                 whole, safe = contents[inode], secured[inode]
                 if inode in torn:
-                    whole = (safe, whole[: (len(safe) + len(whole)) // 2], "\0" * len(whole), whole)[damage]
+                    whole = (
+                        safe,
+                        whole[: (len(safe) + len(whole)) // 2],
+                        "\0" * len(whole),
+                        whole,
+                    )[damage]
                 state[name] = whole
             found.append(state)
     return found
 
 
-def recorded(monkeypatch: pytest.MonkeyPatch, folder: Path, *contents: bytes, load: bool = False) -> list[Step]:
+def recorded(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, *contents: bytes, load: bool = False
+) -> list[Step]:
     """What the store does on disk for one load, or for savings one after the other; each confirmation is a step too."""
     store = ParameterStore(folder)
     with monkeypatch.context() as patched:
@@ -547,7 +587,11 @@ def recorded(monkeypatch: pytest.MonkeyPatch, folder: Path, *contents: bytes, lo
     return recorder.steps
 
 
-FILE, TEMPORARY, DAMAGED = "params/esc1.params", "params/esc1.params.tmp", "params/esc1.params.damaged"
+FILE, TEMPORARY, DAMAGED = (
+    "params/esc1.params",
+    "params/esc1.params.tmp",
+    "params/esc1.params.damaged",
+)
 
 
 def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
@@ -558,11 +602,17 @@ def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
         done = steps[:length]
         confirmed = sum(step[0] == "confirmed" for step in done)
         allowed = asked[confirmed : confirmed + 2]
-        wrong += [state.get(FILE, "") for state in after_power_loss(files, done) if state.get(FILE, "") not in allowed]
+        wrong += [
+            state.get(FILE, "")
+            for state in after_power_loss(files, done)
+            if state.get(FILE, "") not in allowed
+        ]
     return wrong
 
 
-def test_a_new_folder_is_secured_before_anything_is_confirmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_folder_is_secured_before_anything_is_confirmed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     steps = recorded(monkeypatch, tmp_path / "params", NEW)
     assert steps[:2] == [("mkdir", "params"), ("fsync", ".")]
 
@@ -624,7 +674,13 @@ def test_the_simulated_loss_of_power_finds_what_a_careless_writer_does(missing: 
     elif missing == "order":
         steps[2], steps[3] = ("rename", TEMPORARY, FILE), ("fsync", FILE)
     else:
-        steps = [("unlink", FILE), ("create", FILE), ("write", FILE, new), ("fsync", FILE), *steps[4:]]
+        steps = [
+            ("unlink", FILE),
+            ("create", FILE),
+            ("write", FILE, new),
+            ("fsync", FILE),
+            *steps[4:],
+        ]
     assert faults(files, steps) != []
 
 

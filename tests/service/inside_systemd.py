@@ -75,7 +75,10 @@ def write_configuration(file: Path, channel: str, port: str) -> None:
 
 
 def entries() -> list[dict[str, Any]]:
-    return [json.loads(line) for line in run("journalctl", "-u", UNIT, "-o", "json", "--no-pager")["out"].splitlines()]
+    return [
+        json.loads(line)
+        for line in run("journalctl", "-u", UNIT, "-o", "json", "--no-pager")["out"].splitlines()
+    ]
 
 
 def main(folder: Path) -> None:
@@ -154,7 +157,9 @@ def trial(facts: Facts) -> None:
     facts["running in the end"] = shown()
     facts["locks"] = sorted(path.name.partition(".")[2] for path in Path(LOCKS).iterdir())
     run("systemctl", "stop", UNIT)
-    facts["locks after a stop"] = [path.name for path in Path(LOCKS).iterdir()] if Path(LOCKS).is_dir() else None
+    facts["locks after a stop"] = (
+        [path.name for path in Path(LOCKS).iterdir()] if Path(LOCKS).is_dir() else None
+    )
     facts["purge"] = service("uninstall", "--purge")
     facts["after purge"] = [shown(), left_over(), run("id", "kontronik-can-gw")["code"]]
     facts["status in the end"] = service("status")
@@ -162,7 +167,11 @@ def trial(facts: Facts) -> None:
 
 
 def left_over() -> list[str]:
-    found = [*Path("/etc").rglob("*kontronik*"), *Path("/var/lib").glob("kontronik*"), *Path("/run").glob("kontronik*")]
+    found = [
+        *Path("/etc").rglob("*kontronik*"),
+        *Path("/var/lib").glob("kontronik*"),
+        *Path("/run").glob("kontronik*"),
+    ]
     return sorted(str(path) for path in found)
 
 

@@ -35,7 +35,9 @@ class Manager:
 
 @pytest.fixture(params=["path", "abstract"])
 def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]:
-    found = Manager(str(tmp_path / "notify") if request.param == "path" else f"@kcg-test-{secrets.token_hex(8)}")
+    found = Manager(
+        str(tmp_path / "notify") if request.param == "path" else f"@kcg-test-{secrets.token_hex(8)}"
+    )
     with found.socket:
         yield found
 
@@ -75,7 +77,12 @@ def test_a_long_status_fits_what_systemd_reads(manager: Manager) -> None:
 
 
 def test_without_a_manager_nothing_happens() -> None:
-    for address in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}, {"NOTIFY_SOCKET": "@"}):
+    for address in (
+        {},
+        {"NOTIFY_SOCKET": ""},
+        {"NOTIFY_SOCKET": "vsock:2:1"},
+        {"NOTIFY_SOCKET": "@"},
+    ):
         notifier = Notifier(address | {"WATCHDOG_USEC": "1000"})
         notifier.ready("x")
         notifier.watchdog()

@@ -37,7 +37,11 @@ def install(root: Path, *words: object) -> Done:
 
 
 def tree(root: Path) -> list[str]:
-    return sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_symlink() or path.is_file())
+    return sorted(
+        str(path.relative_to(root))
+        for path in root.rglob("*")
+        if path.is_symlink() or path.is_file()
+    )
 
 
 def edit(root: Path, name: str = CONFIGURATION) -> None:
@@ -66,7 +70,10 @@ def test_a_staged_install_writes_files_that_all_may_read(root: Path) -> None:
     assert done.code == 0
     assert added(root) == sorted(FILES)
     assert {(root / name).stat().st_mode & 0o777 for name in FILES} == {0o644}
-    assert f"ExecStart={EXECUTABLE} run --wait" in (root / UNITS / "kontronik-can-gw.service").read_text()
+    assert (
+        f"ExecStart={EXECUTABLE} run --wait"
+        in (root / UNITS / "kontronik-can-gw.service").read_text()
+    )
     assert "is the example. Set ports, bit rate and motors first." in done.err
     assert done.err.endswith("kontronik-can-gw.service was not enabled.\n")
 
@@ -114,7 +121,10 @@ def test_an_instance_has_its_own_configuration_and_goes_alone(root: Path) -> Non
         "kontronik-can-gw@left.service",
         "kontronik-can-gw@right.service",
     ]
-    assert str((wants / "kontronik-can-gw@left.service").readlink()) == f"/{UNITS}/kontronik-can-gw@.service"
+    assert (
+        str((wants / "kontronik-can-gw@left.service").readlink())
+        == f"/{UNITS}/kontronik-can-gw@.service"
+    )
     assert not (root / CONFIGURATION).exists()
     run("service", "uninstall", "--root", root, "--instance", "left")
     assert [link.name for link in wants.iterdir()] == ["kontronik-can-gw@right.service"]
@@ -137,7 +147,10 @@ def test_an_older_file_of_ours_is_replaced_without_a_word_of_force(root: Path) -
     install(root, "--network", 250_000)
     network = root / "etc/systemd/network/50-kontronik-can-gw-can0.network"
     assert "BitRate=250000" in network.read_text()
-    assert "was written by another version or with other options" in install(root, "--network", 500_000).err
+    assert (
+        "was written by another version or with other options"
+        in install(root, "--network", 500_000).err
+    )
     assert "BitRate=500000" in network.read_text()
     assert not list(network.parent.glob("*.bak"))
 
@@ -147,7 +160,9 @@ def test_what_was_changed_by_hand_is_refused_then_kept_aside(root: Path) -> None
     unit = root / UNITS / "kontronik-can-gw.service"
     unit.write_text(unit.read_text().replace("Nice=-10", "Nice=0"))
     mine = unit.read_text()
-    assert "kontronik-can-gw.service: was changed by hand. --force replaces it" in the_line(install(root), 2)
+    assert "kontronik-can-gw.service: was changed by hand. --force replaces it" in the_line(
+        install(root), 2
+    )
     assert unit.read_text() == mine
     assert install(root, "--force").code == 0
     assert unit.with_name("kontronik-can-gw.service.bak").read_text() == mine
@@ -177,7 +192,9 @@ def test_the_group_of_serial_ports_comes_from_the_image(root: Path) -> None:
     (root / "etc/group").write_text("root:x:0:\nuucp:x:986:\n")
     install(root)
     assert "\nSupplementaryGroups=uucp\n" in (root / UNITS / "kontronik-can-gw.service").read_text()
-    assert "m kontronik-can-gw uucp\n" in (root / "etc/sysusers.d/kontronik-can-gw.conf").read_text()
+    assert (
+        "m kontronik-can-gw uucp\n" in (root / "etc/sysusers.d/kontronik-can-gw.conf").read_text()
+    )
 
 
 def test_a_program_in_a_home_folder_is_made_visible(root: Path) -> None:
@@ -188,10 +205,15 @@ def test_a_program_in_a_home_folder_is_made_visible(root: Path) -> None:
 def test_uninstall_keeps_what_was_changed_by_hand_aside(root: Path) -> None:
     install(root)
     rules = root / "etc/udev/rules.d/70-kontronik-can-gw.rules"
-    rules.write_text(rules.read_text() + 'SUBSYSTEM=="tty", ENV{ID_SERIAL_SHORT}=="A1", SYMLINK+="esc_left"\n')
+    rules.write_text(
+        rules.read_text() + 'SUBSYSTEM=="tty", ENV{ID_SERIAL_SHORT}=="A1", SYMLINK+="esc_left"\n'
+    )
     mine = rules.read_text()
     done = run("service", "uninstall", "--root", root)
-    assert "70-kontronik-can-gw.rules: was changed by hand, kept as 70-kontronik-can-gw.rules.bak" in done.err
+    assert (
+        "70-kontronik-can-gw.rules: was changed by hand, kept as 70-kontronik-can-gw.rules.bak"
+        in done.err
+    )
     assert rules.with_name("70-kontronik-can-gw.rules.bak").read_text() == mine
     assert not rules.exists()
 
@@ -245,7 +267,9 @@ def test_a_wrong_use_is_told_in_the_last_line(words: list[str], said: str) -> No
     assert said in done.err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("executable", ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExecStartPre=/x"])
+@pytest.mark.parametrize(
+    "executable", ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExecStartPre=/x"]
+)
 def test_a_program_that_a_unit_cannot_hold_is_refused(root: Path, executable: str) -> None:
     done = run("service", "install", "--root", root, "--executable", executable)
     assert (done.code, added(root)) == (2, [])
@@ -253,13 +277,17 @@ def test_a_program_that_a_unit_cannot_hold_is_refused(root: Path, executable: st
 
 
 @pytest.mark.parametrize("action", ["install", "status", "uninstall"])
-def test_without_systemd_it_is_refused(action: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_systemd_it_is_refused(
+    action: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(service_machine, "_BOOTED", tmp_path / "none")
     assert "this system does not run systemd." in the_line(run("service", action), 1)
 
 
 @pytest.mark.parametrize("action", ["install", "uninstall"])
-def test_without_root_it_is_refused(action: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_root_it_is_refused(
+    action: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(service_machine, "_BOOTED", tmp_path)
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     said = the_line(run("service", action), 1)
@@ -338,7 +366,9 @@ FAILED = RUNNING | {
 }
 
 
-def status(folder: Path, monkeypatch: pytest.MonkeyPatch, units: object, log: object, *words: object) -> Done:
+def status(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, units: object, log: object, *words: object
+) -> Done:
     file = folder / "said.json"
     file.write_text(json.dumps({"units": units, "log": log}))
     for name, text in (("systemctl", SYSTEMCTL), ("journalctl", JOURNALCTL)):
@@ -350,11 +380,21 @@ def status(folder: Path, monkeypatch: pytest.MonkeyPatch, units: object, log: ob
     return run("service", "status", *words)
 
 
-def test_status_shows_state_configuration_and_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_shows_state_configuration_and_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = [
-        {"__REALTIME_TIMESTAMP": "1795276360000000", "PRIORITY": "4", "MESSAGE": "esc1: lost\u001b[31m"},
+        {
+            "__REALTIME_TIMESTAMP": "1795276360000000",
+            "PRIORITY": "4",
+            "MESSAGE": "esc1: lost\u001b[31m",
+        },
         "no JSON",
-        {"__REALTIME_TIMESTAMP": "1795276361000000", "PRIORITY": "6", "MESSAGE": [101, 115, 99, 255]},
+        {
+            "__REALTIME_TIMESTAMP": "1795276361000000",
+            "PRIORITY": "6",
+            "MESSAGE": [101, 115, 99, 255],
+        },
         {"MESSAGE": "without time"},
     ]
     done = status(tmp_path, monkeypatch, {"kontronik-can-gw.service": RUNNING}, log)
@@ -366,10 +406,15 @@ def test_status_shows_state_configuration_and_log(tmp_path: Path, monkeypatch: p
         "  process        pid 107, restarted 0 times, 27 MB",
     ]
     assert lines[3].startswith("  configuration  /etc/kontronik-can-gw/gateway.toml")
-    assert [line[17:].split("  ", 1)[1] for line in lines[-2:]] == ["warning: esc1: lost?[31m", "esc\ufffd"]
+    assert [line[17:].split("  ", 1)[1] for line in lines[-2:]] == [
+        "warning: esc1: lost?[31m",
+        "esc\ufffd",
+    ]
 
 
-def test_status_of_a_service_that_cannot_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_of_a_service_that_cannot_start_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     done = status(tmp_path, monkeypatch, {"kontronik-can-gw.service": FAILED}, [], "-n", 0)
     assert done.code == 3
     lines = done.out.splitlines()

@@ -40,7 +40,9 @@ def obstacle() -> str | None:
 def hidden_folders() -> list[str]:
     """What the unprivileged user of the service needs and cannot reach."""
     found: list[str] = []
-    for folder in dict.fromkeys(str(Path(name).resolve()) for name in (sys.base_prefix, sys.prefix, str(PROJECT))):
+    for folder in dict.fromkeys(
+        str(Path(name).resolve()) for name in (sys.base_prefix, sys.prefix, str(PROJECT))
+    ):
         closed = [part for part in Path(folder).parents if not part.stat().st_mode & stat.S_IXOTH]
         if closed and not any(folder.startswith(f"{other}/") for other in found):
             found.append(folder)
@@ -54,9 +56,22 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> Facts:
     folder = tmp_path_factory.mktemp("systemd")
     folder.chmod(0o755)
     words = ["--backend", "uml", "--timeout", str(TIMEOUT_S), "--rw", str(folder), "--"]
-    inside = ["sh", str(HERE / "boot_systemd.sh"), sys.executable, str(HERE / "inside_systemd.py"), str(folder)]
+    inside = [
+        "sh",
+        str(HERE / "boot_systemd.sh"),
+        sys.executable,
+        str(HERE / "inside_systemd.py"),
+        str(folder),
+    ]
     done = subprocess.run(
-        [sys.executable, "-B", str(PROJECT / "tests" / "vm" / "vm_run.py"), *words, *inside, *hidden_folders()],
+        [
+            sys.executable,
+            "-B",
+            str(PROJECT / "tests" / "vm" / "vm_run.py"),
+            *words,
+            *inside,
+            *hidden_folders(),
+        ],
         capture_output=True,
         text=True,
         check=False,
@@ -78,13 +93,17 @@ def talk(facts: Facts, name: str, code: int = 0) -> str:
 
 
 def test_an_example_that_nobody_edited_is_not_started(facts: Facts) -> None:
-    assert "gateway.toml: is the example. Set ports, bit rate and motors first." in talk(facts, "install")
+    assert "gateway.toml: is the example. Set ports, bit rate and motors first." in talk(
+        facts, "install"
+    )
     assert facts["after install"]["ActiveState"] == "inactive"
     assert facts["after install"]["UnitFileState"] == "disabled"
 
 
 def test_it_runs_as_its_own_user_without_any_right(facts: Facts) -> None:
-    assert talk(facts, "install now").endswith("is enabled and runs. See: kontronik-can-gw service status\n")
+    assert talk(facts, "install now").endswith(
+        "is enabled and runs. See: kontronik-can-gw service status\n"
+    )
     assert facts["running"]["ActiveState"] == "active"
     assert facts["running"]["UnitFileState"] == "enabled"
     process = dict(line.split(":\t", 1) for line in facts["process"].splitlines() if ":\t" in line)
@@ -151,7 +170,15 @@ def test_several_gateways_run_side_by_side(facts: Facts) -> None:
 
 def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> None:
     needed = [
-        *("CAN socket", "netlink", "abstract socket", "state folder", "runtime folder", "lock folder", "terminal"),
+        *(
+            "CAN socket",
+            "netlink",
+            "abstract socket",
+            "state folder",
+            "runtime folder",
+            "lock folder",
+            "terminal",
+        ),
         *("ctypes", "other processes", "machine-id"),
     ]
     refused = {
@@ -181,8 +208,13 @@ def test_networkd_understands_the_network_file(facts: Facts) -> None:
     done, said = facts["network"]
     assert done["code"] == 0
     if said == "missing":
-        pytest.skip("systemd-networkd is missing: sudo apt-get install systemd (or systemd-networkd)")
-    assert "60-wrong.network:4: Unknown key name 'Bitrat'" in said or "60-wrong.network:4: Unknown key 'Bitrat'" in said
+        pytest.skip(
+            "systemd-networkd is missing: sudo apt-get install systemd (or systemd-networkd)"
+        )
+    assert (
+        "60-wrong.network:4: Unknown key name 'Bitrat'" in said
+        or "60-wrong.network:4: Unknown key 'Bitrat'" in said
+    )
     assert "50-kontronik-can-gw-vcan1.network:" not in said
 
 

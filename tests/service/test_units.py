@@ -23,7 +23,9 @@ def files(root: Path, **more: Any) -> dict[str, PlannedFile]:
     usual: dict[str, Any] = {"executable": "/bin/true", "home_visible": False, "group": "dialout"}
     made = {Path(file.path).name: file for file in planned(Choices(**(usual | more)), root)}
     return made | {
-        Path(file.path).parent.name: file for file in planned(Choices(**(usual | more)), root) if ".d/" in file.path
+        Path(file.path).parent.name: file
+        for file in planned(Choices(**(usual | more)), root)
+        if ".d/" in file.path
     }
 
 
@@ -31,7 +33,9 @@ def units(folder: Path, prometheus: bool = False) -> list[Path]:
     """The units with their drop-ins in a folder, the template as an instance."""
     for file in planned(Choices("/bin/true", False, "dialout", prometheus=prometheus), folder):
         if "/system/" in file.path:
-            path = folder / file.path.partition("/system/")[2].replace("gw@.service", "gw@left.service")
+            path = folder / file.path.partition("/system/")[2].replace(
+                "gw@.service", "gw@left.service"
+            )
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(file.text)
     return [folder / name.replace("@", "@left") for name in NAMES]
@@ -51,7 +55,12 @@ def analyze(*words: str) -> "subprocess.CompletedProcess[str]":
         pytest.skip(ENABLE)
     environment = os.environ | {"SYSTEMD_COLORS": "0", "LC_ALL": "C.UTF-8"}
     return subprocess.run(
-        ["systemd-analyze", *words], capture_output=True, text=True, check=False, timeout=60, env=environment
+        ["systemd-analyze", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env=environment,
     )
 
 
@@ -63,7 +72,9 @@ def test_systemd_finds_nothing_to_complain_about(tmp_path: Path, prometheus: boo
     for unit in units(tmp_path, prometheus):
         done = analyze("verify", "--man=no", str(unit))
         ours = [
-            line for line in (done.stdout + done.stderr).splitlines() if "kontronik" in line or str(tmp_path) in line
+            line
+            for line in (done.stdout + done.stderr).splitlines()
+            if "kontronik" in line or str(tmp_path) in line
         ]
         assert (done.returncode, ours) == (0, []), done.stderr
 
@@ -113,7 +124,9 @@ SETTINGS = {
 }
 
 
-def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet(tmp_path: Path) -> None:
+def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet(
+    tmp_path: Path,
+) -> None:
     made = files(tmp_path)
     unit = settings(made[NAMES[0]].text)
     assert {name: unit[name] for name in SETTINGS} == SETTINGS
@@ -121,17 +134,24 @@ def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet
     assert not [name for name in unit if name.startswith(never)]
     assert "prometheus.conf" not in made
     loopback = settings(files(tmp_path, prometheus=True)["prometheus.conf"].text)
-    assert loopback == {"RestrictAddressFamilies": ["AF_INET AF_INET6"], "IPAddressAllow": ["localhost"]}
+    assert loopback == {
+        "RestrictAddressFamilies": ["AF_INET AF_INET6"],
+        "IPAddressAllow": ["localhost"],
+    }
 
 
 def test_it_may_open_serial_ports_and_nothing_else(tmp_path: Path) -> None:
     unit = settings(files(tmp_path)[NAMES[0]].text)
     assert unit["DevicePolicy"] == ["closed"]
-    assert {"char-ttyUSB rw", "char-ttyACM rw", "char-ttyS rw", "char-ttyAMA rw"} <= set(unit["DeviceAllow"])
+    assert {"char-ttyUSB rw", "char-ttyACM rw", "char-ttyS rw", "char-ttyAMA rw"} <= set(
+        unit["DeviceAllow"]
+    )
     assert all(re.fullmatch(r"char-tty[A-Za-z]+ rw", line) for line in unit["DeviceAllow"])
     # an adapter may be plugged in when the service runs already: its driver has to be loaded before
     for module in ("usbserial", "cdc_acm"):
-        assert all(f"modprobe@{module}.service" in unit[name][0].split() for name in ("Wants", "After"))
+        assert all(
+            f"modprobe@{module}.service" in unit[name][0].split() for name in ("Wants", "After")
+        )
     assert "PrivateDevices" not in unit
 
 
@@ -175,23 +195,34 @@ RULE = re.compile(
 def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
     """By the grammar of the keys in use, and by udev itself where it can (udevadm verify, systemd 254)."""
     text = files(tmp_path)["70-kontronik-can-gw.rules"].text
-    lines = [line.removeprefix("#") for line in text.splitlines() if re.match("#?[A-Z]+(==|=)", line)]
+    lines = [
+        line.removeprefix("#") for line in text.splitlines() if re.match("#?[A-Z]+(==|=)", line)
+    ]
     assert len(lines) == 6
     for line in lines:
         for part in line.split(", "):
             assert RULE.fullmatch(part), part
-    assert text.count('GOTO="kontronik_can_gw_end"') == text.count('LABEL="kontronik_can_gw_end"') == 1
+    assert (
+        text.count('GOTO="kontronik_can_gw_end"') == text.count('LABEL="kontronik_can_gw_end"') == 1
+    )
     udevadm = shutil.which("udevadm", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/bin")
-    if udevadm and "verify" in subprocess.run([udevadm, "--help"], capture_output=True, text=True, check=False).stdout:
+    if (
+        udevadm
+        and "verify"
+        in subprocess.run([udevadm, "--help"], capture_output=True, text=True, check=False).stdout
+    ):
         rules = tmp_path / "70-kontronik-can-gw.rules"
         rules.write_text(text)
-        done = subprocess.run([udevadm, "verify", str(rules)], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [udevadm, "verify", str(rules)], capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stderr + done.stdout
 
 
 def test_udev_rules_keep_modem_manager_away(tmp_path: Path) -> None:
     text = files(tmp_path)["70-kontronik-can-gw.rules"].text
-    assert "latency_timer" not in text  # the gateway asks for it once echo is off, and nothing before that
+    # the gateway asks for it once echo is off, and nothing before that
+    assert "latency_timer" not in text
     ignored = [line for line in text.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
     assert [line.split(",")[0] for line in ignored] == ['SUBSYSTEM=="usb"', 'SUBSYSTEM=="tty"']
     assert all("0403" in line for line in ignored)

@@ -78,22 +78,30 @@ any_options = st.builds(
 
 @given(options=any_options, seed=st.integers())
 @settings(max_examples=60, deadline=None)
-def test_whatever_the_profile_every_frame_decodes_to_what_was_meant(options: EscOptions, seed: int) -> None:
+def test_whatever_the_profile_every_frame_decodes_to_what_was_meant(
+    options: EscOptions, seed: int
+) -> None:
     esc = SimulatedEsc(options, seed=seed)
     frames = esc.frames_until(100 * options.period_ns)
     assert all(sent.intact and sent.wire == sent.frame for sent in frames)
     assert [frame.data for frame in received(frames)] == [sent.data for sent in frames]
-    assert {frame.layout for frame in received(frames)} == {options.layout or usual_layout(options.device)}
+    assert {frame.layout for frame in received(frames)} == {
+        options.layout or usual_layout(options.device)
+    }
 
 
 @given(cuts=st.lists(st.integers(0, 20 * S), max_size=20), seed=st.integers(0, 5))
 @settings(max_examples=8, deadline=None)
-def test_the_same_seed_gives_the_same_bytes_however_the_calls_are_spaced(cuts: list[int], seed: int) -> None:
+def test_the_same_seed_gives_the_same_bytes_however_the_calls_are_spaced(
+    cuts: list[int], seed: int
+) -> None:
     faults = Faults(noise=2, lost_bytes=0.01, flipped_bits=0.001, dropout=Dropout(S, 3 * S))
     options = EscOptions(faults=faults)
     esc = SimulatedEsc(options, seed=seed)
     pieces = [esc.frames_until(cut) for cut in [*sorted(cuts), 20 * S]]
-    assert list(itertools.chain.from_iterable(pieces)) == SimulatedEsc(options, seed=seed).frames_until(20 * S)
+    assert list(itertools.chain.from_iterable(pieces)) == SimulatedEsc(
+        options, seed=seed
+    ).frames_until(20 * S)
 
 
 def test_live_frames_leave_each_period_and_the_info_frame_follows_the_hundredth() -> None:
@@ -101,7 +109,8 @@ def test_live_frames_leave_each_period_and_the_info_frame_follows_the_hundredth(
     live_times = [sent.time_ns for sent in frames if isinstance(sent.data, LiveData)]
     assert live_times == list(range(0, 2 * S, 10_000_000))
     assert [at for at, sent in enumerate(frames) if isinstance(sent.data, InfoData)] == [100, 201]
-    assert frames[100].time_ns - frames[99].time_ns == pytest.approx(3_820_000, rel=0.01)  # wire time of 40 bytes
+    # wire time of 40 bytes
+    assert frames[100].time_ns - frames[99].time_ns == pytest.approx(3_820_000, rel=0.01)
 
 
 @pytest.mark.parametrize("device", Device)
@@ -113,7 +122,9 @@ def test_the_flight_is_physically_plausible(device: Device) -> None:
     assert all(-100 <= live.throttle <= 100 and 0 <= live.output_opening <= 100 for live in flight)
     assert all(900 < live.pwm_input < 2000 for live in flight)
     assert all(15 <= live.power_stage_temperature < 90 for live in flight)
-    assert {OperatingState(live.operating_state) for live in flight} >= {phase.state for phase in FLIGHT}
+    assert {OperatingState(live.operating_state) for live in flight} >= {
+        phase.state for phase in FLIGHT
+    }
     for before, live in itertools.pairwise(flight):
         assert 0 <= live.consumed_charge - before.consumed_charge <= 1
         assert live.peak_current >= before.peak_current
@@ -127,7 +138,9 @@ def test_the_flight_is_physically_plausible(device: Device) -> None:
     assert climb.battery_voltage < idle - 50
     assert climb.battery_current > 500
     assert climb.motor_current >= climb.battery_current
-    held = max(live.battery_current if device is Device.JIVEPRO else live.motor_current for live in flight)
+    held = max(
+        live.battery_current if device is Device.JIVEPRO else live.motor_current for live in flight
+    )
     assert held <= flight[-1].peak_current <= held * 1.2
     assert flight[-1].electrical_speed == 0  # the peak is held though the motor stands
     hottest = max(live.power_stage_temperature for live in flight)
@@ -160,7 +173,9 @@ def test_the_log_in_info_frames_agrees_with_the_live_frames_before(device: Devic
 
 @pytest.mark.parametrize("layout", Layout)
 @pytest.mark.parametrize("seed", range(3))
-def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(layout: Layout, seed: int) -> None:
+def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(
+    layout: Layout, seed: int
+) -> None:
     faults = Faults(noise=3, lost_bytes=0.002, flipped_bits=0.0002)
     frames = sends(20, EscOptions(layout=layout, faults=faults), seed)
     intact = [sent.data for sent in frames if sent.intact]
@@ -169,7 +184,9 @@ def test_a_receiver_finds_exactly_the_intact_frames_among_the_spoiled(layout: La
     unprotected = [  # legacy: flips behind the CRC's reach are accepted by any receiver
         sent
         for sent in frames
-        if not sent.intact and layout is Layout.LEGACY and sent.wire[-len(sent.frame) :][:32] == sent.frame[:32]
+        if not sent.intact
+        and layout is Layout.LEGACY
+        and sent.wire[-len(sent.frame) :][:32] == sent.frame[:32]
     ]
     assert len(intact) <= len(found) <= len(intact) + len(unprotected)
     rest = iter(found)
@@ -209,7 +226,9 @@ def test_another_device_may_be_plugged_in_and_powers_up_in_its_own_layout() -> N
         at = sent.time_ns / S
         assert frame.layout is (Layout.V4 if at < 20 else Layout.LEGACY)
         if isinstance(sent.data, InfoData):
-            assert sent.data.device == (Device.KOSMIK if at < 20 else Device.JIVEPRO if at < 30 else Device.UHV)
+            assert sent.data.device == (
+                Device.KOSMIK if at < 20 else Device.JIVEPRO if at < 30 else Device.UHV
+            )
     fresh = next(sent.data for sent in frames if sent.time_ns >= 20 * S)
     assert isinstance(fresh, LiveData)
     assert (fresh.peak_current, fresh.consumed_charge) == (0, 0)

@@ -21,7 +21,9 @@ from kontronik_can_gw.runtime.snapshot import (
 from kontronik_can_gw.signals.plan import Layout
 
 START = 1000 * SECOND
-PROGRAM = ProgramFacts("/etc/kontronik-can-gw/gateway.toml", "1.2.3", 4711, 99, "pid:[1]", "2026-01-02T03:04:05Z")
+PROGRAM = ProgramFacts(
+    "/etc/kontronik-can-gw/gateway.toml", "1.2.3", 4711, 99, "pid:[1]", "2026-01-02T03:04:05Z"
+)
 
 
 @dataclass
@@ -38,7 +40,9 @@ class Bench:
         made = [EscSettings(name, self.settings.pole_pairs, self.settings.gear) for name in names]
         self.gateway = Gateway(made, Layout("", "", ()), START)
         self.gateway.start(START)
-        self.simulated = [SimulatedEsc(self.options, seed=n, start_ns=START) for n in range(self.escs)]
+        self.simulated = [
+            SimulatedEsc(self.options, seed=n, start_ns=START) for n in range(self.escs)
+        ]
         self.sent: list[list[LiveData | InfoData]] = [[] for _ in names]
         self.silent: set[int] = set()
 
@@ -87,6 +91,7 @@ class Bench:
 def with_nodes(document: Mapping[str, Any], count: int = 2, sent: int = 0) -> dict[str, Any]:
     """The document of a gateway with CANopen nodes."""
     nodes = [
-        {"esc": f"esc{n + 1}", "node_id": n + 1, "state": "operational", "pdos_sent": sent + n} for n in range(count)
+        {"esc": f"esc{n + 1}", "node_id": n + 1, "state": "operational", "pdos_sent": sent + n}
+        for n in range(count)
     ]
     return {**document, "nodes": nodes}

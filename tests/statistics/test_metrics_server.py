@@ -17,7 +17,12 @@ from statistics_bench import Bench
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime.prometheus import CONNECTIONS, REQUEST_LIMIT, TIME_LIMIT_NS, MetricsServer
+from kontronik_can_gw.runtime.prometheus import (
+    CONNECTIONS,
+    REQUEST_LIMIT,
+    TIME_LIMIT_NS,
+    MetricsServer,
+)
 from kontronik_can_gw.runtime.snapshot import STALE_NS
 from kontronik_can_gw.runtime.statistics import Statistics
 
@@ -136,7 +141,10 @@ def test_metrics_are_fetched_as_prometheus_does(tmp_path: Path, example: dict[st
     end = time.monotonic() + PATIENCE
     text = ""
     while "battery" not in text and time.monotonic() < end:
-        with contextlib.suppress(OSError), urlopen(f"http://{host}:{port}/metrics", timeout=PATIENCE) as answer:
+        with (
+            contextlib.suppress(OSError),
+            urlopen(f"http://{host}:{port}/metrics", timeout=PATIENCE) as answer,
+        ):
             assert answer.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
             text = answer.read().decode()
     found = {family.name: family for family in text_string_to_metric_families(text)}
@@ -152,10 +160,22 @@ def test_metrics_are_fetched_as_prometheus_does(tmp_path: Path, example: dict[st
     ("status", "hosts"),
     [
         (200, ["localhost", "LOCALHOST:1", "127.0.0.1:9123", "127.9.9.9", "[::1]:5"]),
-        (403, ["example.com", "localhost.example.com", "127.0.0.1.example.com", "192.168.0.1", "", "[::2]"]),
+        (
+            403,
+            [
+                "example.com",
+                "localhost.example.com",
+                "127.0.0.1.example.com",
+                "192.168.0.1",
+                "",
+                "[::2]",
+            ],
+        ),
     ],
 )
-def test_a_page_that_has_its_own_name_lead_here_is_refused(served: Served, status: int, hosts: list[str]) -> None:
+def test_a_page_that_has_its_own_name_lead_here_is_refused(
+    served: Served, status: int, hosts: list[str]
+) -> None:
     assert [status_of(served.get(host=host)) for host in hosts] == [status] * len(hosts)
 
 
@@ -206,14 +226,19 @@ def test_an_address_that_cannot_be_had_is_one_line_with_the_remedy(
     with pytest.raises(RunError, match=taken) as caught:
         Statistics(None, served.server.address)
     assert caught.value.exit_code == 1
-    with pytest.raises(RunError, match=r"statistics.prometheus 192.0.2.1:9123: cannot be listened to: Cannot assign"):
+    with pytest.raises(
+        RunError,
+        match=r"statistics.prometheus 192.0.2.1:9123: cannot be listened to: Cannot assign",
+    ):
         MetricsServer(("192.0.2.1", 9123))
 
     def refused(*_: object) -> None:
         raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
 
     monkeypatch.setattr(socket, "socket", refused)
-    with pytest.raises(RunError, match=r"Address family not supported by protocol.*RestrictAddressFamilies="):
+    with pytest.raises(
+        RunError, match=r"Address family not supported by protocol.*RestrictAddressFamilies="
+    ):
         MetricsServer(("127.0.0.1", 0))
 
 
@@ -231,7 +256,9 @@ def test_an_address_is_free_again_at_once_also_after_it_was_used(served: Served)
 
 
 @pytest.mark.parametrize("trickles", [False, True])
-def test_who_does_not_come_to_an_end_is_ended_after_two_seconds(served: Served, trickles: bool) -> None:
+def test_who_does_not_come_to_an_end_is_ended_after_two_seconds(
+    served: Served, trickles: bool
+) -> None:
     (client,) = served.accept(1)
     client.send(b"GET /metr")
     for _ in range(19):
@@ -247,7 +274,8 @@ def test_who_does_not_come_to_an_end_is_ended_after_two_seconds(served: Served, 
 
 
 def test_who_does_not_read_is_ended_and_the_others_are_answered(served: Served) -> None:
-    served.server._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # those that it accepts have it, too
+    # those that it accepts have it, too
+    served.server._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
     lazy = socket.socket()
     lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
     lazy.connect(served.server.address)
@@ -280,7 +308,9 @@ def test_a_flood_of_connections_is_held_to_fifty_in_a_second(served: Served) -> 
     assert status_of(late.answer) == 200
 
 
-def test_without_descriptors_it_waits_a_second_and_goes_on(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_descriptors_it_waits_a_second_and_goes_on(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def none_left(_listener: socket.socket) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 

@@ -50,7 +50,10 @@ def value(document: dict[str, Any], name: str, **labels: str) -> float | None:
 def document() -> dict[str, Any]:
     bench = Bench(2)
     bench.run(6)
-    ports = [PortFacts(f"esc{n}", f"/dev/{n}", True, line_errors={"parity": n, "framing": 0}) for n in (1, 2)]
+    ports = [
+        PortFacts(f"esc{n}", f"/dev/{n}", True, line_errors={"parity": n, "framing": 0})
+        for n in (1, 2)
+    ]
     can = CanFacts("socketcan", "can0", 500_000, True, error_counters=(8, 0))
     return with_nodes(bench.document(ports=ports, can=can, store=StoreFacts(1, "disk full")))
 
@@ -66,9 +69,13 @@ def test_names_have_the_prefix_counters_end_in_total_and_a_unit_stands_behind_th
         for unit in UNITS:
             units[unit] += name.removesuffix("_total").endswith(f"_{unit}")
         # promtool check metrics: base units, suffixes and types that belong to other kinds of metric
-        assert not re.search(r"_(bits|minutes|hours|days|kelvins|gauge|counter|histogram|summary)(_|$)", name), name
+        assert not re.search(
+            r"_(bits|minutes|hours|days|kelvins|gauge|counter|histogram|summary)(_|$)", name
+        ), name
         assert not name.endswith(("_count", "_sum", "_bucket")), name
-        assert not re.search(r"_(v|a|w|wh|mah|ms|us|percent|rpm|millis|degrees|kbit)(_|$)", name), name
+        assert not re.search(r"_(v|a|w|wh|mah|ms|us|percent|rpm|millis|degrees|kbit)(_|$)", name), (
+            name
+        )
     assert all(units.values()), units
 
 
@@ -94,7 +101,9 @@ def test_values_are_in_base_units(document: dict[str, Any]) -> None:
         "esc_received_bytes_total": document["escs"][0]["counters"]["bytes"],
     }
     for name, number in expected.items():
-        assert value(document, f"kontronik_{name}", esc="esc1") == pytest.approx(number, rel=1e-12), name
+        assert value(document, f"kontronik_{name}", esc="esc1") == pytest.approx(
+            number, rel=1e-12
+        ), name
     assert value(document, "kontronik_can_bitrate") == 500_000
     assert value(document, "kontronik_can_transmit_errors") == 8
     assert value(document, "kontronik_uptime_seconds") == 6
@@ -105,7 +114,9 @@ def test_values_are_in_base_units(document: dict[str, Any]) -> None:
 def test_every_value_of_the_document_has_its_metric_for_each_esc(document: dict[str, Any]) -> None:
     found = families(document)
     for name in ({"cell_count": "cells"}.get(name, name) for name in document["units"]):
-        (family,) = [f for full, f in found.items() if re.match(rf"kontronik_{name}(_(?!error)|$)", full)]
+        (family,) = [
+            f for full, f in found.items() if re.match(rf"kontronik_{name}(_(?!error)|$)", full)
+        ]
         assert [sample.labels for sample in family.samples] == [{"esc": "esc1"}, {"esc": "esc2"}]
     for name in document["can"]["counters"]:
         assert f"kontronik_can_{name.removesuffix('_count')}_total" in found
@@ -117,7 +128,11 @@ def test_what_is_not_available_is_left_out() -> None:
     bench.silent.add(0)
     bench.run(1)
     document = bench.document()
-    values = [v for k, v in document["escs"][0]["values"].items() if k not in ("energy_used", "motor_run_time")]
+    values = [
+        v
+        for k, v in document["escs"][0]["values"].items()
+        if k not in ("energy_used", "motor_run_time")
+    ]
     assert set(values) == {None}
     text = metrics(document)
     assert value(document, "kontronik_battery_voltage_volts", esc="esc1") is None
@@ -131,7 +146,9 @@ def test_what_is_not_available_is_left_out() -> None:
     assert "kontronik_store" not in text
 
 
-def test_each_error_bit_is_a_flag_with_its_severity_and_an_unknown_one_shows_when_it_is_set() -> None:
+def test_each_error_bit_is_a_flag_with_its_severity_and_an_unknown_one_shows_when_it_is_set() -> (
+    None
+):
     bench = Bench(1)
     bench.run(3)
     esc = bench.gateway.escs[0]
@@ -145,7 +162,9 @@ def test_each_error_bit_is_a_flag_with_its_severity_and_an_unknown_one_shows_whe
     assert len(families(bench.document())["kontronik_selftest_error"].samples) == len(SelfTestError)
 
 
-def test_texts_with_quotes_backslashes_and_line_ends_are_read_back(document: dict[str, Any]) -> None:
+def test_texts_with_quotes_backslashes_and_line_ends_are_read_back(
+    document: dict[str, Any],
+) -> None:
     channel = 'a"b\\c\nd\\n µ'
     made = document | {"can": document["can"] | {"channel": channel}, "version": "\udcff"}
     (sample,) = families(made)["kontronik_can_info"].samples

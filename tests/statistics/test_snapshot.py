@@ -40,8 +40,12 @@ def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
         assert esc["operating_state"] == state_text(live.operating_state)
         assert (esc["device"], esc["firmware"]) == ("KOSMIK", info.firmware)
         assert esc["values"]["motor_speed"] == pytest.approx(live.electrical_speed / 7, abs=1e-6)
-        assert esc["values"]["output_speed"] == pytest.approx(live.electrical_speed / 7 / 9.8, abs=1e-6)
-        assert esc["values"]["battery_power"] == pytest.approx(live.battery_voltage * live.battery_current / 1000)
+        assert esc["values"]["output_speed"] == pytest.approx(
+            live.electrical_speed / 7 / 9.8, abs=1e-6
+        )
+        assert esc["values"]["battery_power"] == pytest.approx(
+            live.battery_voltage * live.battery_current / 1000
+        )
         assert set(esc["values"]) == set(document["units"])
         assert (esc["link"], esc["fresh"], esc["layout"]) == ("ok", True, "V4")
 
@@ -57,7 +61,9 @@ def test_pole_pairs_that_come_over_the_bus_hold_from_the_next_document_on() -> N
     assert after["output_speed"] == after["motor_speed"] > 0
 
 
-def test_values_are_null_as_soon_as_they_are_older_than_the_time_out_whatever_the_gateway_was_told() -> None:
+def test_values_are_null_as_soon_as_they_are_older_than_the_time_out_whatever_the_gateway_was_told() -> (
+    None
+):
     bench = Bench(1)
     bench.run(1)
     heard = bench.gateway.escs[0].live_ns
@@ -79,9 +85,11 @@ def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> No
     counters = document["escs"][0]["counters"]
     assert {f.name for f in fields(Counters)} <= set(counters)
     assert counters["dropped_bytes"] > 0
-    assert counters == {**bench.gateway.escs[0].counters.as_dict(), "suspect_frames": 0, "late_frames": 0} | {
-        "line_errors": 0
-    }
+    assert counters == {
+        **bench.gateway.escs[0].counters.as_dict(),
+        "suspect_frames": 0,
+        "late_frames": 0,
+    } | {"line_errors": 0}
     others = {"state", "can_state", "esc_count", "escs_ok", "started_ns"}
     assert set(document["can"]["counters"]) == {f.name for f in fields(GatewayStatus)} - others
 
@@ -91,7 +99,11 @@ def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_er
     bench.run(1)
     esc = bench.gateway.escs[0]
     assert esc.live is not None
-    word = 1 << OperatingError.UNDERVOLTAGE | 1 << OperatingError.POWER_STAGE_OVERTEMP_WARNING | 1 << 31
+    word = (
+        1 << OperatingError.UNDERVOLTAGE
+        | 1 << OperatingError.POWER_STAGE_OVERTEMP_WARNING
+        | 1 << 31
+    )
     esc.live = esc.live._replace(operating_errors=word | 1 << OperatingError.PROGRAMMING_ALLOWED)
     (shown,) = bench.document()["escs"]
     assert shown["errors"] == ["undervoltage", "bit31"]
@@ -105,10 +117,15 @@ def test_a_port_that_is_lost_tells_since_when_and_why_and_the_log_is_the_newest(
     bench.gateway.port_lost(0, bench.now)
     lines = [f"line {n}" for n in range(30)]
     document = bench.document(
-        ports=[PortFacts("esc1", "/dev/b", False, "gone", lost_since_ns=bench.now - 5 * SECOND)], log_lines=lines
+        ports=[PortFacts("esc1", "/dev/b", False, "gone", lost_since_ns=bench.now - 5 * SECOND)],
+        log_lines=lines,
     )
     (esc,) = document["escs"]
-    assert (esc["port"]["open"], esc["port"]["complaint"], esc["port"]["lost_for_s"]) == (False, "gone", 5.0)
+    assert (esc["port"]["open"], esc["port"]["complaint"], esc["port"]["lost_for_s"]) == (
+        False,
+        "gone",
+        5.0,
+    )
     assert (esc["link"], esc["diagnosis"]) == ("port-error", None)
     assert document["log"] == lines[-LOG_LINES:]
 
@@ -122,7 +139,9 @@ def test_the_figures_of_the_process_are_those_of_proc(tmp_path: Path) -> None:
     assert after.open_fds == before.open_fds + 5
     assert after.threads == len(list(Path("/proc/self/task").iterdir()))
     status = Path("/proc/self/status").read_text(encoding="ascii")
-    resident = next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmRSS"))
+    resident = next(
+        int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmRSS")
+    )
     assert abs(after.rss_bytes - resident) < 0.2 * resident
 
 
@@ -138,7 +157,9 @@ def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> Non
     assert start_ticks(child) == 0
 
 
-def test_the_default_file_is_in_the_services_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_file_is_in_the_services_runtime_folder(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     assert default_file() is None
     monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/kontronik-can-gw:/run/other")

@@ -27,7 +27,12 @@ PATIENCE = 60.0
 def numbered(number: int, size: int = 0) -> dict[str, Any]:
     """A document as far as the thread looks into it."""
     counters = {"sent_frames": number, "received_frames": 0}
-    return {"monotonic_ns": number * SECOND, "can": {"counters": counters}, "nodes": [], "pad": [number] * size}
+    return {
+        "monotonic_ns": number * SECOND,
+        "can": {"counters": counters},
+        "nodes": [],
+        "pad": [number] * size,
+    }
 
 
 def until(condition: Callable[[], bool]) -> None:
@@ -96,7 +101,9 @@ def statistics(file: Path) -> Iterator[Statistics]:
     made.close()
 
 
-def test_a_document_is_wanted_at_once_and_then_once_a_second(file: Path, statistics: Statistics) -> None:
+def test_a_document_is_wanted_at_once_and_then_once_a_second(
+    file: Path, statistics: Statistics
+) -> None:
     assert statistics.wanted(0)
     statistics.publish(numbered(5))
     assert not statistics.wanted(5 * SECOND + PERIOD_NS - 1)
@@ -115,7 +122,9 @@ def test_the_file_is_readable_for_all_whole_and_alone(file: Path) -> None:
     statistics.close()
 
 
-def test_who_reads_while_it_is_written_always_reads_a_whole_document(file: Path, statistics: Statistics) -> None:
+def test_who_reads_while_it_is_written_always_reads_a_whole_document(
+    file: Path, statistics: Statistics
+) -> None:
     put(statistics, file, 1)
     ended = threading.Event()
     torn: list[bytes] = []
@@ -195,11 +204,15 @@ def test_a_file_that_another_gateway_writes_is_refused(file: Path) -> None:
     Statistics(file, None).close()
 
 
-def test_a_file_that_became_another_gateways_is_left_alone(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Locks, "hold", lambda _self, _names: [])  # as of gateways in different network namespaces
+def test_a_file_that_became_another_gateways_is_left_alone(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # as of gateways in different network namespaces
+    monkeypatch.setattr(Locks, "hold", lambda _self, _names: [])
     first = Statistics(file, None)
     put(first, file, 1)
-    second = Statistics(file, None)  # whose thread removes what others left half: first must not be writing then
+    # whose thread removes what others left half: first must not be writing then
+    second = Statistics(file, None)
     put(second, file, 2)
     first.close()
     assert number_in(file) == 2
@@ -264,7 +277,9 @@ def test_all_signals_are_blocked_in_the_thread_and_in_no_other(file: Path) -> No
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
     thread = next(thread for thread in threading.enumerate() if thread.name == "statistics")
     status = Path(f"/proc/self/task/{thread.native_id}/status").read_text(encoding="ascii")
-    blocked = int(next(line.split()[1] for line in status.splitlines() if line.startswith("SigBlk")), 16)
+    blocked = int(
+        next(line.split()[1] for line in status.splitlines() if line.startswith("SigBlk")), 16
+    )
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
         assert blocked >> number - 1 & 1
     statistics.close()

@@ -22,7 +22,16 @@ from hypothesis import strategies as st
 from statistics_bench import Bench, with_nodes
 
 from kontronik_can_gw.cli import status
-from kontronik_can_gw.cli.status import HEALTHY, NOT_RUNNING, TROUBLE, Node, Seen, judge, look_at, screen
+from kontronik_can_gw.cli.status import (
+    HEALTHY,
+    NOT_RUNNING,
+    TROUBLE,
+    Node,
+    Seen,
+    judge,
+    look_at,
+    screen,
+)
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.runtime.snapshot import (
@@ -37,7 +46,9 @@ from kontronik_can_gw.runtime.snapshot import (
 Document = dict[str, Any]
 
 
-def heard(escs: int = 2, seconds: float = 2, change: Callable[[Bench], None] | None = None) -> Bench:
+def heard(
+    escs: int = 2, seconds: float = 2, change: Callable[[Bench], None] | None = None
+) -> Bench:
     """A healthy gateway that runs."""
     bench = Bench(escs)
     bench.run(seconds)
@@ -70,7 +81,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kontronik_can_gw.cli.status.time.monotonic_ns", lambda: NOW)
 
 
-def written(file: Path, bench: Bench, program: ProgramFacts | None = None, **changes: Any) -> Document:
+def written(
+    file: Path, bench: Bench, program: ProgramFacts | None = None, **changes: Any
+) -> Document:
     """A file of this process and this instant."""
     document = bench.document(program=program or program_facts("gateway.toml"))
     document |= {"monotonic_ns": NOW} | changes
@@ -102,11 +115,20 @@ def test_a_port_that_is_lost_is_told_with_its_complaint_and_for_how_long() -> No
     bench = heard()
     bench.gateway.port_lost(0, bench.now)
     ports = [
-        PortFacts("esc1", "/dev/a", False, "esc1: /dev/a: lost (hung up).", lost_since_ns=bench.now - 70 * SECOND),
+        PortFacts(
+            "esc1",
+            "/dev/a",
+            False,
+            "esc1: /dev/a: lost (hung up).",
+            lost_since_ns=bench.now - 70 * SECOND,
+        ),
         PortFacts("esc2", "/dev/b", True),
     ]
     seen = judged(bench.document(ports=ports))
-    assert (seen.code, seen.troubles) == (TROUBLE, ("esc1: port not open for 70 s: /dev/a: lost (hung up).",))
+    assert (seen.code, seen.troubles) == (
+        TROUBLE,
+        ("esc1: port not open for 70 s: /dev/a: lost (hung up).",),
+    )
 
 
 OPEN = CanFacts("socketcan", "can0", None, True)
@@ -120,11 +142,17 @@ OPEN = CanFacts("socketcan", "can0", None, True)
         (CanState.UNKNOWN, CanFacts("slcan", "x", None, True), []),
         (CanState.BUS_OFF, OPEN, ["CAN can0 is bus-off"]),
         (CanState.DOWN, OPEN, ["CAN can0 is down"]),
-        (CanState.UNKNOWN, CanFacts("socketcan", "can0", None, False, "can0: gone"), ["can0: gone"]),
+        (
+            CanState.UNKNOWN,
+            CanFacts("socketcan", "can0", None, False, "can0: gone"),
+            ["can0: gone"],
+        ),
         (CanState.ERROR_ACTIVE, replace(OPEN, stalled=True), ["CAN can0: no frame can be sent"]),
     ],
 )
-def test_a_bus_that_takes_nothing_is_a_fault(state: CanState, facts: CanFacts, said: list[str]) -> None:
+def test_a_bus_that_takes_nothing_is_a_fault(
+    state: CanState, facts: CanFacts, said: list[str]
+) -> None:
     bench = heard()
     bench.gateway.set_can_state(state, bench.now)
     seen = judged(bench.document(can=facts))
@@ -149,7 +177,9 @@ def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> Non
     assert "25." not in shown and "esc1" not in shown
 
 
-def test_a_document_of_a_dead_process_or_from_before_the_last_start_of_the_machine_is_of_none_that_runs() -> None:
+def test_a_document_of_a_dead_process_or_from_before_the_last_start_of_the_machine_is_of_none_that_runs() -> (
+    None
+):
     document = heard().document()
     for seen in (judged(document, alive=False), judged(document, -STALE_NS - 1)):
         assert (seen.code, seen.sentence) == (NOT_RUNNING, "not running")
@@ -158,7 +188,9 @@ def test_a_document_of_a_dead_process_or_from_before_the_last_start_of_the_machi
 # --- files
 
 
-def test_a_living_writer_is_told_from_a_dead_one_and_from_another_with_its_pid(tmp_path: Path) -> None:
+def test_a_living_writer_is_told_from_a_dead_one_and_from_another_with_its_pid(
+    tmp_path: Path,
+) -> None:
     file, bench, own = tmp_path / "status.json", heard(), program_facts("x")
     written(file, bench)
     assert look_at(file, NOW).code == HEALTHY
@@ -180,7 +212,18 @@ def test_a_living_writer_is_told_from_a_dead_one_and_from_another_with_its_pid(t
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"7", b"{}", b"\xff\xfe", b'{"format": 1}', b'{"format": 2}', b"[" * 100_000, b"1" * 5000]
+    "content",
+    [
+        b"",
+        b"{",
+        b"7",
+        b"{}",
+        b"\xff\xfe",
+        b'{"format": 1}',
+        b'{"format": 2}',
+        b"[" * 100_000,
+        b"1" * 5000,
+    ],
 )
 def test_what_is_no_statistics_file_is_told_in_one_line(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "status.json"
@@ -200,25 +243,37 @@ def test_a_missing_file_a_folder_and_a_pipe_are_told_in_one_line(tmp_path: Path)
 
 def test_the_configuration_says_where_the_file_is(tmp_path: Path) -> None:
     configuration = tmp_path / "gateway.toml"
-    configuration.write_text('[statistics]\nfile = "s/status.json"\n[[esc]]\nport = "x"\n', encoding="utf-8")
+    configuration.write_text(
+        '[statistics]\nfile = "s/status.json"\n[[esc]]\nport = "x"\n', encoding="utf-8"
+    )
     written(tmp_path / "s" / "status.json", heard())
     code, out, _ = shell("-c", configuration)
     assert code == HEALTHY and out.startswith("kontronik-can-gw")
 
 
-def test_a_configuration_that_says_nothing_is_looked_for_among_the_services(tmp_path: Path, run_folder: Path) -> None:
+def test_a_configuration_that_says_nothing_is_looked_for_among_the_services(
+    tmp_path: Path, run_folder: Path
+) -> None:
     configuration = tmp_path / "front.toml"
     configuration.write_text('[[esc]]\nport = "x"\n', encoding="utf-8")
     code, _, talk = shell("-c", configuration)
     assert code == NOT_RUNNING and "no gateway with this configuration runs as a service" in talk
-    written(run_folder / "kontronik-can-gw-rear" / "status.json", heard(), program_facts(tmp_path / "rear.toml"))
-    written(run_folder / "kontronik-can-gw-front" / "status.json", heard(), program_facts(configuration))
+    written(
+        run_folder / "kontronik-can-gw-rear" / "status.json",
+        heard(),
+        program_facts(tmp_path / "rear.toml"),
+    )
+    written(
+        run_folder / "kontronik-can-gw-front" / "status.json", heard(), program_facts(configuration)
+    )
     code, out, _ = shell("-c", configuration)
     assert code == HEALTHY
     assert str(configuration) in out and "rear.toml" not in out
 
 
-def test_without_words_all_services_are_shown_and_the_worst_is_the_exit_code(run_folder: Path) -> None:
+def test_without_words_all_services_are_shown_and_the_worst_is_the_exit_code(
+    run_folder: Path,
+) -> None:
     code, out, talk = shell()
     assert (code, out) == (NOT_RUNNING, "")
     assert "sudo systemctl start kontronik-can-gw" in talk and talk.count("\n") == 1
@@ -237,7 +292,12 @@ def test_without_words_all_services_are_shown_and_the_worst_is_the_exit_code(run
 def test_a_faulty_configuration_and_two_sources_are_wrong_usage(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text("[xyz]\n", encoding="utf-8")
     assert shell("-c", tmp_path / "a.toml")[0] == 2
-    for wrong in (("-c", "a", "--file", "b"), ("--interval", "0"), ("--interval", "nan"), ("--interval", "x")):
+    for wrong in (
+        ("-c", "a", "--file", "b"),
+        ("--interval", "0"),
+        ("--interval", "nan"),
+        ("--interval", "x"),
+    ):
         assert shell(*wrong)[0] == 2
 
 
@@ -259,7 +319,13 @@ def test_nothing_that_a_terminal_might_obey_comes_from_a_file(tmp_path: Path) ->
     document = heard().document(log_lines=[evil])
     document |= {"configuration": evil, "version": evil}
     document["can"] |= {"channel": evil, "state": evil, "complaint": evil}
-    document["escs"][0] |= {"name": evil, "link": evil, "errors": [evil], "fresh": False, "diagnosis": evil}
+    document["escs"][0] |= {
+        "name": evil,
+        "link": evil,
+        "errors": [evil],
+        "fresh": False,
+        "diagnosis": evil,
+    }
     shown = words(judged(document))
     assert all(char.isprintable() or char == "\n" for char in shown)
     document["process"]["pid_namespace"] = ""
@@ -274,7 +340,13 @@ WHOLE = with_nodes(heard(3).document(log_lines=["14:03:01 esc1: telemetry lost"]
 def places(value: object, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The paths of everything in a document."""
     found = [path]
-    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    children = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, child in children:
         found += places(child, (*path, key))
     return found
@@ -285,14 +357,18 @@ _ODD = st.one_of(
     st.none(),
     st.booleans(),
     st.integers(-(10**30), 10**30),
-    st.sampled_from([float("nan"), float("inf"), 1e308, -1e308, 10**400, [], {}, [[]], [None, {}], {"a": {}}]),
+    st.sampled_from(
+        [float("nan"), float("inf"), 1e308, -1e308, 10**400, [], {}, [[]], [None, {}], {"a": {}}]
+    ),
     st.text(max_size=20),
 )
 
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(PLACES), _ODD), min_size=1, max_size=5), st.booleans())
-def test_no_document_makes_anything_but_lines(changes: list[tuple[tuple[Any, ...], Any]], alive: bool) -> None:
+def test_no_document_makes_anything_but_lines(
+    changes: list[tuple[tuple[Any, ...], Any]], alive: bool
+) -> None:
     document: Any = json.loads(json.dumps(WHOLE))
     for place, value in changes:
         at = document
@@ -309,11 +385,22 @@ def test_no_document_makes_anything_but_lines(changes: list[tuple[tuple[Any, ...
 # --- the process
 
 
-def test_on_a_terminal_it_is_live_and_ends_by_a_signal_with_0_and_the_cursor_shown(tmp_path: Path) -> None:
+def test_on_a_terminal_it_is_live_and_ends_by_a_signal_with_0_and_the_cursor_shown(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "status.json"
     document = written(file, heard(), monotonic_ns=time.clock_gettime_ns(time.CLOCK_MONOTONIC))
     master, slave = pty.openpty()
-    command = [sys.executable, "-m", "kontronik_can_gw", "status", "--file", str(file), "--interval", "0.1"]
+    command = [
+        sys.executable,
+        "-m",
+        "kontronik_can_gw",
+        "status",
+        "--file",
+        str(file),
+        "--interval",
+        "0.1",
+    ]
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"}
     process = subprocess.Popen(
         command, stdin=slave, stdout=slave, stderr=slave, env=environment, start_new_session=True

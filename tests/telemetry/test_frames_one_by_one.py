@@ -8,10 +8,17 @@ from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings,
 
 STEP = 10 * MS
 FLIGHT = [
-    LiveData(electrical_speed=20_000, battery_voltage=2400, battery_current=100, operating_state=21),
-    LiveData(electrical_speed=20_000, battery_voltage=2300, battery_current=-50),  # regeneration: drawn is nothing
-    LiveData(electrical_speed=0, battery_voltage=2410, battery_current=7, bec_current=1200, throttle=-100),
-    LiveData(electrical_speed=1, battery_voltage=2390, battery_current=300, operating_errors=1 << 31),
+    LiveData(
+        electrical_speed=20_000, battery_voltage=2400, battery_current=100, operating_state=21
+    ),
+    # regeneration: drawn is nothing
+    LiveData(electrical_speed=20_000, battery_voltage=2300, battery_current=-50),
+    LiveData(
+        electrical_speed=0, battery_voltage=2410, battery_current=7, bec_current=1200, throttle=-100
+    ),
+    LiveData(
+        electrical_speed=1, battery_voltage=2390, battery_current=300, operating_errors=1 << 31
+    ),
     LiveData(),
 ]
 
@@ -55,7 +62,11 @@ def test_no_energy_while_time_stands_still_or_goes_back() -> None:
     energy, run_time = telemetry.energy, telemetry.run_time
     assert read(telemetry, frame, now + STEP) == [Event.LIVE]
     assert read(telemetry, frame, now) == [Event.LIVE]
-    assert (telemetry.energy, telemetry.run_time, telemetry.live_ns) == (energy, run_time, now + STEP)
+    assert (telemetry.energy, telemetry.run_time, telemetry.live_ns) == (
+        energy,
+        run_time,
+        now + STEP,
+    )
 
 
 def test_frames_between_damage_are_at_their_places() -> None:

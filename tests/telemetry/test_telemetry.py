@@ -28,7 +28,9 @@ from kontronik_can_gw.esc.telemetry import (
 from kontronik_can_gw.esc.values import Source, sources
 
 TIMEOUT = 250 * MS
-LIVE = LiveData(electrical_speed=21_000, battery_voltage=2400, battery_current=100, operating_state=21)
+LIVE = LiveData(
+    electrical_speed=21_000, battery_voltage=2400, battery_current=100, operating_state=21
+)
 BAD = bytearray(encode(LIVE, Layout.V4))
 BAD[10] ^= 1
 BROKEN = bytes(BAD)
@@ -40,8 +42,12 @@ def live(speed: int = 21_000, layout: Layout = Layout.V4) -> bytes:
     return encode(LIVE._replace(electrical_speed=speed), layout)
 
 
-def info(device: int = Device.KOSMIK, layout: Layout = Layout.V4, cells: int = 6, variant: int = 120) -> bytes:
-    return encode(InfoData(device_and_variant=device_and_variant(device, variant), cell_count=cells), layout)
+def info(
+    device: int = Device.KOSMIK, layout: Layout = Layout.V4, cells: int = 6, variant: int = 120
+) -> bytes:
+    return encode(
+        InfoData(device_and_variant=device_and_variant(device, variant), cell_count=cells), layout
+    )
 
 
 def esc(**known: int) -> EscTelemetry:
@@ -70,7 +76,12 @@ def info_of(telemetry: EscTelemetry) -> InfoData | None:
 
 
 def stream(
-    telemetry: EscTelemetry, begin: int, seconds: float, period: int = 10 * MS, extra: bytes = b"", frame: bytes = b""
+    telemetry: EscTelemetry,
+    begin: int,
+    seconds: float,
+    period: int = 10 * MS,
+    extra: bytes = b"",
+    frame: bytes = b"",
 ) -> int:
     """Frames each ``period``, with what the runtime does beside: ``advance`` at each deadline. Returns the last time."""
     now = begin
@@ -94,7 +105,12 @@ def value(source: Source, telemetry: EscTelemetry, now: int = 0) -> float:
 def test_before_the_first_byte_nothing_was_ever_seen_and_nothing_is_available() -> None:
     telemetry = esc()
     assert (telemetry.link, telemetry.live, telemetry.info) == (LinkState.NEVER_SEEN, None, None)
-    assert (telemetry.layout, telemetry.cells, telemetry.losses, telemetry.age_ms(5 * SECOND)) == (0, 0, 0, None)
+    assert (telemetry.layout, telemetry.cells, telemetry.losses, telemetry.age_ms(5 * SECOND)) == (
+        0,
+        0,
+        0,
+        None,
+    )
     telemetry.advance(100 * SECOND)
     assert link_of(telemetry) is LinkState.NEVER_SEEN
     assert telemetry.frame_rate == 0
@@ -146,7 +162,8 @@ def test_five_crc_errors_in_a_second_degrade_the_link_and_a_clean_second_mends_i
 @pytest.mark.parametrize(("noise", "state"), [(4, LinkState.OK), (5, LinkState.DEGRADED)])
 def test_more_than_a_tenth_of_dropped_bytes_degrades_the_link(noise: int, state: LinkState) -> None:
     telemetry = alive(SECOND)
-    stream(telemetry, SECOND + 10 * MS, 1.1, extra=b"\x55" * noise)  # 4 of 44 bytes are 9 %, 5 of 45 are 11 %
+    # 4 of 44 bytes are 9 %, 5 of 45 are 11 %
+    stream(telemetry, SECOND + 10 * MS, 1.1, extra=b"\x55" * noise)
     assert link_of(telemetry) is state
 
 
@@ -226,7 +243,9 @@ def test_the_age_is_told_in_milliseconds_also_after_the_loss() -> None:
 
 
 @pytest.mark.parametrize(("gap", "taken"), [(TIMEOUT, True), (TIMEOUT + 1, False)])
-def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(gap: int, taken: bool) -> None:
+def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(
+    gap: int, taken: bool
+) -> None:
     telemetry = esc()
     frame = live()
     read(telemetry, NOISE + frame[:1], SECOND)
@@ -239,7 +258,8 @@ def test_a_frame_whose_first_byte_is_older_than_the_time_out_is_given_up(gap: in
 
 def test_frames_found_when_old_bytes_are_given_up_are_counted_as_late_and_not_shown() -> None:
     telemetry = esc(timeout_ns=100 * MS)
-    hidden = b"KODI" + live(5, Layout.LEGACY)  # whole, but the header in front could still be a frame of 44 bytes
+    # whole, but the header in front could still be a frame of 44 bytes
+    hidden = b"KODI" + live(5, Layout.LEGACY)
     read(telemetry, hidden, SECOND)
     assert telemetry.live is None
     read(telemetry, b"", SECOND + 100 * MS + 1)
@@ -335,7 +355,9 @@ def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight()
     for before, after in pairwise(sent):
         assert isinstance(before.data, LiveData)
         seconds = (after.time_ns - before.time_ns) / 1e9
-        watt_seconds += max(0.0, before.data.battery_voltage / 100 * before.data.battery_current / 10) * seconds
+        watt_seconds += (
+            max(0.0, before.data.battery_voltage / 100 * before.data.battery_current / 10) * seconds
+        )
         run_seconds += seconds if before.data.electrical_speed else 0
     for each in sent:
         read(telemetry, each.wire, SECOND + each.time_ns)
@@ -359,7 +381,9 @@ def test_energy_is_not_counted_over_a_gap_and_is_kept_over_a_loss() -> None:
     assert (telemetry.energy, telemetry.run_time) == (kept, 100 * MS)
 
 
-@pytest.mark.parametrize(("override", "told", "cells"), [(0, 6, 6), (12, 6, 12), (12, 0, 12), (0, 0, 0)])
+@pytest.mark.parametrize(
+    ("override", "told", "cells"), [(0, 6, 6), (12, 6, 12), (12, 0, 12), (0, 0, 0)]
+)
 def test_the_mean_cell_voltage_is_that_of_the_configured_cells_else_of_the_cells_told(
     override: int, told: int, cells: int
 ) -> None:
@@ -424,11 +448,17 @@ def test_bec_current_is_supplied_by_all_but_a_jivepro_and_at_0_only_by_a_known_d
 
 @pytest.mark.parametrize(("old", "new"), [(Layout.V4, Layout.LEGACY), (Layout.LEGACY, Layout.V4)])
 @pytest.mark.parametrize("kind", ["live", "info"])
-def test_another_layout_is_another_device_of_which_nothing_is_known(old: Layout, new: Layout, kind: str) -> None:
+def test_another_layout_is_another_device_of_which_nothing_is_known(
+    old: Layout, new: Layout, kind: str
+) -> None:
     telemetry = esc()
     read(telemetry, live(1, old) + info(Device.KOSMIK, old), SECOND)
     assert telemetry.info is not None
-    events = read(telemetry, live(2, new) if kind == "live" else info(Device.JIVEPRO, new, 3), SECOND + 10 * MS)
+    events = read(
+        telemetry,
+        live(2, new) if kind == "live" else info(Device.JIVEPRO, new, 3),
+        SECOND + 10 * MS,
+    )
     assert events & Event.LINK
     assert events & Event.INFO
     assert telemetry.layout == {Layout.V4: 1, Layout.LEGACY: 2}[new]
@@ -446,10 +476,19 @@ def test_another_device_in_the_same_layout_is_told_as_a_change_and_the_same_devi
     telemetry = alive()
     read(telemetry, info(Device.KOSMIK), SECOND + 10 * MS)
     assert read(telemetry, info(Device.KOSMIK, cells=7), SECOND + 20 * MS) == Event.INFO
-    assert read(telemetry, info(Device.KOLIBRI, cells=12), SECOND + 30 * MS) == Event.INFO | Event.LINK
-    assert read(telemetry, info(Device.KOLIBRI, variant=80), SECOND + 40 * MS) == Event.INFO | Event.LINK
+    assert (
+        read(telemetry, info(Device.KOLIBRI, cells=12), SECOND + 30 * MS) == Event.INFO | Event.LINK
+    )
+    assert (
+        read(telemetry, info(Device.KOLIBRI, variant=80), SECOND + 40 * MS)
+        == Event.INFO | Event.LINK
+    )
     assert telemetry.info is not None
-    assert (telemetry.info.device, telemetry.info.variant, telemetry.cells) == (Device.KOLIBRI, 80, 6)
+    assert (telemetry.info.device, telemetry.info.variant, telemetry.cells) == (
+        Device.KOLIBRI,
+        80,
+        6,
+    )
 
 
 def test_info_is_forgotten_with_the_loss_of_telemetry() -> None:
@@ -522,7 +561,9 @@ def chunks_of(seed: int, most: int = 40) -> list[tuple[bytes, int]]:
     out = bytearray()
     for number in range(source.randrange(1, 20)):
         layout = source.choice(list(Layout))
-        frame = bytearray(source.choice([live(number + 1, layout), live(number + 1, layout), info(3, layout)]))
+        frame = bytearray(
+            source.choice([live(number + 1, layout), live(number + 1, layout), info(3, layout)])
+        )
         kind = source.randrange(10)
         if kind == 0:
             frame[source.randrange(len(frame))] ^= 1 << source.randrange(8)
@@ -539,7 +580,9 @@ def chunks_of(seed: int, most: int = 40) -> list[tuple[bytes, int]]:
     pieces = [bytes(out[a:b]) for a, b in pairwise([0, *cuts, len(out)])]
     now, timed = source.randrange(SECOND), []
     for piece in pieces:
-        now += source.choice([0, 1, MS, 10 * MS, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, source.randrange(3 * SECOND)])
+        now += source.choice(
+            [0, 1, MS, 10 * MS, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, source.randrange(3 * SECOND)]
+        )
         timed.append((piece, now))
     return timed
 
@@ -553,7 +596,11 @@ def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[LiveData]:
     for at in range(len(whole)):
         row = next((row for row in SHORTEST_FIRST if fits(whole, at, row)), None)
         if row is not None:
-            form = next(form for form in FORMS if (form.kind.value, form.layout.value) == (row.kind, row.layout))
+            form = next(
+                form
+                for form in FORMS
+                if (form.kind.value, form.layout.value) == (row.kind, row.layout)
+            )
             first = timed[bisect_right(ends, at)][1]
             last = timed[bisect_right(ends, at + form.length - 1)][1]
             data = form.decode(whole, at)
@@ -564,7 +611,9 @@ def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[LiveData]:
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32), st.booleans())
-def test_what_is_shown_was_received_within_the_time_out_whatever_comes(seed: int, advance: bool) -> None:
+def test_what_is_shown_was_received_within_the_time_out_whatever_comes(
+    seed: int, advance: bool
+) -> None:
     telemetry = esc()
     timed = chunks_of(seed)
     for n, (piece, now) in enumerate(timed):
@@ -585,7 +634,9 @@ def test_what_is_shown_was_received_within_the_time_out_whatever_comes(seed: int
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32))
-def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_deadlines(seed: int) -> None:
+def test_the_next_deadline_is_never_in_the_past_and_nothing_expires_between_deadlines(
+    seed: int,
+) -> None:
     """An EscTelemetry that is advanced at its deadlines only shows, at any time, what one advanced all the time shows."""
     seldom, often = esc(), esc()
     source = random.Random(seed)

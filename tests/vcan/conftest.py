@@ -27,7 +27,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @contextmanager
 def fresh_vcan() -> Iterator[str]:
     name = f"kcg{os.getpid() % 10000}n{next(_numbers)}"
-    made = subprocess.run(["ip", "link", "add", name, "type", "vcan"], capture_output=True, text=True, check=False)
+    made = subprocess.run(
+        ["ip", "link", "add", name, "type", "vcan"], capture_output=True, text=True, check=False
+    )
     if made.returncode:
         said = made.stderr.strip() or "ip link add failed"
         reason = f"no vcan can be made here ({said}): run `make test`, or `tests/vm/run -- pytest tests/vcan`"

@@ -29,7 +29,11 @@ def need(there: bool, what: str) -> None:
 def zencan(interface: str, command: str, seconds: float = 120) -> str:
     """What zencan-cli prints for one command. It exits with 0 even when it reports an error."""
     run = subprocess.run(
-        [str(ZENCAN), interface, "-c", command], capture_output=True, text=True, check=True, timeout=seconds
+        [str(ZENCAN), interface, "-c", command],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=seconds,
     )
     return run.stdout.strip()
 
@@ -50,7 +54,9 @@ class NodeMaster:
         self.events: list[dict[str, Any]] = []
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._ready = threading.Event()
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+        )
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
         assert self._ready.wait(60), "node_master.js did not start"
@@ -144,7 +150,11 @@ def tshark(log: Path) -> list[SimpleNamespace]:
         command += ["-e", name]
     # it writes its settings to HOME, which may be read-only
     run = subprocess.run(
-        command, capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(log.parent)}
+        command,
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "HOME": str(log.parent)},
     )
     lines = run.stdout.splitlines()
     return [SimpleNamespace(**dict(zip(FIELDS, line.split("\t"), strict=True))) for line in lines]

@@ -65,7 +65,9 @@ class Peer:
 
 
 @contextmanager
-def port_on(interface: str, ids: Sequence[int], fd: bool = False, own: bool = False) -> Iterator[CanPort]:
+def port_on(
+    interface: str, ids: Sequence[int], fd: bool = False, own: bool = False
+) -> Iterator[CanPort]:
     port = CanPort(CanConfig("socketcan", interface, fd=fd, options={"receive_own_messages": own}))
     try:
         port.set_receive_ids(frozenset(ids))
@@ -94,7 +96,9 @@ def all_of(port: CanPort) -> list[CanFrame]:
 # --- the port
 
 
-def test_exactly_the_wanted_frames_come_and_nothing_else_makes_the_socket_readable(vcan: str) -> None:
+def test_exactly_the_wanted_frames_come_and_nothing_else_makes_the_socket_readable(
+    vcan: str,
+) -> None:
     wanted = (0x000, 0x080, 0x601, 0x7E5)
     with port_on(vcan, wanted) as port, Peer(vcan) as peer:
         for can_id in range(0x800):
@@ -142,7 +146,11 @@ def test_on_a_bus_with_can_fd_frames_are_told_apart(vcan: str) -> None:
 
 
 def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vcan: str) -> None:
-    with port_on(vcan, [0x581], own=True) as port, port_on(vcan, [0x581]) as second, Peer(vcan) as peer:
+    with (
+        port_on(vcan, [0x581], own=True) as port,
+        port_on(vcan, [0x581]) as second,
+        Peer(vcan) as peer,
+    ):
         assert port.send(CanFrame(0x581, b"own")) is Sent.OK
         peer.send(0x581, b"other")
         assert all_of(port) == [CanFrame(0x581, b"other")]
@@ -151,7 +159,9 @@ def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vca
         assert [peer.receive() for _ in range(2)] == [(0x581, b"own"), (0x702 | REMOTE, b"")]
 
 
-def test_a_block_of_several_clients_fits_into_the_socket_and_an_overrun_is_noticed(vcan: str) -> None:
+def test_a_block_of_several_clients_fits_into_the_socket_and_an_overrun_is_noticed(
+    vcan: str,
+) -> None:
     with port_on(vcan, [0x601]) as port, Peer(vcan) as peer:
         for n in range(508):  # four blocks of 127 segments, more than a socket's usual 278 frames
             peer.send(0x601, n.to_bytes(2, "little"))
@@ -177,7 +187,9 @@ class Node(Gateway):
     """A gateway that answers a frame with an even id by one frame, one with an odd id by a block of 127 and 40 fast PDOs."""
 
     def __init__(self, *ids: int) -> None:
-        super().__init__([EscSettings("esc1", timeout_ns=60 * 10**9)], Layout("x", "Gw", ()), time.monotonic_ns())
+        super().__init__(
+            [EscSettings("esc1", timeout_ns=60 * 10**9)], Layout("x", "Gw", ()), time.monotonic_ns()
+        )
         self.ids = frozenset(ids)
         self.waiting: list[CanFrame] = []
 
@@ -222,7 +234,9 @@ def run_node(vcan: str, esc: PtyEsc) -> Iterator[Callable[[Node], Loop]]:
         assert not thread.is_alive()
 
 
-def test_4000_foreign_frames_do_not_reach_a_process_that_receives(vcan: str, run_node: Callable[[Node], Loop]) -> None:
+def test_4000_foreign_frames_do_not_reach_a_process_that_receives(
+    vcan: str, run_node: Callable[[Node], Loop]
+) -> None:
     node = Node(0x000, 0x080, 0x602)
     run_node(node)
     with Peer(vcan) as peer:
@@ -233,9 +247,25 @@ def test_4000_foreign_frames_do_not_reach_a_process_that_receives(vcan: str, run
         assert node.status.received_frames == 1
 
 
-def test_a_block_of_127_and_pdos_share_a_bus_that_is_full(vcan: str, run_node: Callable[[Node], Loop]) -> None:
+def test_a_block_of_127_and_pdos_share_a_bus_that_is_full(
+    vcan: str, run_node: Callable[[Node], Loop]
+) -> None:
     """Some 1000 frames/s, with room for ten: the kernel says ENOBUFS again and again."""
-    shaper = ["tc", "qdisc", "add", "dev", vcan, "root", "tbf", "rate", "125kbit", "burst", "160", "limit", "160"]
+    shaper = [
+        "tc",
+        "qdisc",
+        "add",
+        "dev",
+        vcan,
+        "root",
+        "tbf",
+        "rate",
+        "125kbit",
+        "burst",
+        "160",
+        "limit",
+        "160",
+    ]
     subprocess.run(shaper, check=True)
     node = Node(0x601)
     run_node(node)
@@ -255,7 +285,9 @@ def test_a_block_of_127_and_pdos_share_a_bus_that_is_full(vcan: str, run_node: C
     assert status.send_failures > 0, "the queue was full"
 
 
-def test_a_node_hears_again_when_its_interface_was_down_or_removed(vcan: str, run_node: Callable[[Node], Loop]) -> None:
+def test_a_node_hears_again_when_its_interface_was_down_or_removed(
+    vcan: str, run_node: Callable[[Node], Loop]
+) -> None:
     node = Node(0x602)
     loop = run_node(node)
     up = ("set", vcan, "up")
@@ -289,8 +321,13 @@ def test_a_flood_of_wanted_frames_does_not_starve_the_uart(
         for n in range(100):
             before, flooded = counters.live, node.status.received_frames
             esc.write(encode(LiveData(electrical_speed=n), UartLayout.V4))
-            wait_for(lambda before=before: counters.live > before or flood.poll() is not None, f"live frame {n}")  # type: ignore[misc]
-            wait_for(lambda flooded=flooded: node.status.received_frames > flooded, "the flood goes on")  # type: ignore[misc]
+            wait_for(
+                lambda before=before: counters.live > before or flood.poll() is not None,
+                f"live frame {n}",
+            )  # type: ignore[misc]
+            wait_for(
+                lambda flooded=flooded: node.status.received_frames > flooded, "the flood goes on"
+            )  # type: ignore[misc]
         assert flood.poll() is None, "to the end"
         assert counters.live == 100
     finally:

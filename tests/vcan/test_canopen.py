@@ -56,7 +56,9 @@ class Nodes:
         """Command a state and wait for the heartbeat that tells it."""
         begin = len(self.states(node))
         self.master.node(node).nmt.state = COMMANDS[state]
-        wait_for(lambda: self.states(node)[begin:][-1:] == [state], f"node {node} {COMMANDS[state]}")
+        wait_for(
+            lambda: self.states(node)[begin:][-1:] == [state], f"node {node} {COMMANDS[state]}"
+        )
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +123,10 @@ def test_every_object_of_the_eds_is_what_the_esc_sent(nodes: Nodes) -> None:
     run.feed(1, times=12)  # an info frame among them
     fed = run.escs[1]
     sent, extremes = fed.live(len(fed.sent) - 1), fed.info(len(fed.info_sent) - 1)
-    wait_for(lambda: answered(lambda: master.upload(2, 0x2020, 0x0B)), "the frame rate, known after a second")
+    wait_for(
+        lambda: answered(lambda: master.upload(2, 0x2020, 0x0B)),
+        "the frame rate, known after a second",
+    )
     sizes = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
     read = {}
     for entry in load_eds(EDS.read_bytes(), str(EDS)).entries:
@@ -192,9 +197,21 @@ def test_all_pdos_of_a_moment_show_one_frame(nodes: Nodes, at_sync: bool) -> Non
         fed = nodes.run.escs[0]
         sent = fed.live(len(fed.sent) - 1)
         one, two, three, *_ = (frame.data for frame in came())
-        assert struct.unpack("<IHh", one) == (sent.electrical_speed, sent.battery_voltage, sent.battery_current)
-        assert struct.unpack("<hhH", two[:6]) == (sent.motor_current, sent.peak_current, sent.consumed_charge)
-        assert struct.unpack("<HHH", three[:6]) == (sent.bec_voltage, sent.pwm_input, sent.bec_current)
+        assert struct.unpack("<IHh", one) == (
+            sent.electrical_speed,
+            sent.battery_voltage,
+            sent.battery_current,
+        )
+        assert struct.unpack("<hhH", two[:6]) == (
+            sent.motor_current,
+            sent.peak_current,
+            sent.consumed_charge,
+        )
+        assert struct.unpack("<HHH", three[:6]) == (
+            sent.bec_voltage,
+            sent.pwm_input,
+            sent.bec_current,
+        )
         shown.append((sent.electrical_speed, sent.battery_voltage, sent.battery_current))
     wait_for(lambda: heard[-20:] == shown, "the library hears them too")
 
@@ -202,9 +219,15 @@ def test_all_pdos_of_a_moment_show_one_frame(nodes: Nodes, at_sync: bool) -> Non
 def test_emergencies_rise_and_fall_with_the_escs_error_bits(nodes: Nodes) -> None:
     master, fed = nodes.master, nodes.run.escs[0]
     nodes.go(1, OPERATIONAL)
-    undervoltage, watchdog = 1 << OperatingError.UNDERVOLTAGE, 1 << OperatingError.WATCHDOG_ERROR_TRIPPED
+    undervoltage, watchdog = (
+        1 << OperatingError.UNDERVOLTAGE,
+        1 << OperatingError.WATCHDOG_ERROR_TRIPPED,
+    )
     # a summary bit that another one explains
-    hot = 1 << OperatingError.POWER_STAGE_OVERTEMP_WARNING | 1 << OperatingError.OPERATING_WARNING_FOUND
+    hot = (
+        1 << OperatingError.POWER_STAGE_OVERTEMP_WARNING
+        | 1 << OperatingError.OPERATING_WARNING_FOUND
+    )
     no_alarm = 1 << OperatingError.PROGRAMMING_ALLOWED
     for errors in (undervoltage, undervoltage | watchdog, watchdog, 0, hot, 0, no_alarm, 0):
         fed.become(fed.identity._replace(errors=errors))
@@ -222,7 +245,9 @@ def test_emergencies_rise_and_fall_with_the_escs_error_bits(nodes: Nodes) -> Non
     ]
     assert [struct.unpack("<HBBI", frame.data) for frame in nodes.of(0x81)] == wanted
     wait_for(lambda: len(master.node(1).emcy.log) >= 5, "the library hears them too")
-    assert [(each.code, each.register) for each in master.node(1).emcy.log[-5:]] == [each[:2] for each in wanted]
+    assert [(each.code, each.register) for each in master.node(1).emcy.log[-5:]] == [
+        each[:2] for each in wanted
+    ]
     master.write(1, 0x1003, 0, 0, 1)
     assert (master.number(1, 0x1003), master.number(1, 0x1001)) == (0, 0)
     assert master.refusal(lambda: master.upload(1, 0x1003, 1)) == NO_DATA
@@ -249,8 +274,13 @@ def test_telemetry_loss_and_return(nodes: Nodes) -> None:
                 frames = nodes.watch.recorded
                 return frames[frames.index(nodes.of(0x81)[-1]) :]
 
-            wait_for(lambda: sum(f.can_id == TPDO4 + 1 for f in after()) >= 3, "TPDO 4 by its event timer")
-            assert not {f.can_id for f in after()} & {pdo + 1 for pdo in PDOS[:3]}, "an old value that looks new"
+            wait_for(
+                lambda: sum(f.can_id == TPDO4 + 1 for f in after()) >= 3,
+                "TPDO 4 by its event timer",
+            )
+            assert not {f.can_id for f in after()} & {pdo + 1 for pdo in PDOS[:3]}, (
+                "an old value that looks new"
+            )
             said = [f.data for f in after() if f.can_id == TPDO4 + 1]
             assert all(data[:6] == b"\xff" * 6 and data[6] & 0x0F == STATUS_LOST for data in said)
         else:
@@ -262,7 +292,11 @@ def test_telemetry_loss_and_return(nodes: Nodes) -> None:
         assert master.number(1, 0x2020, 0x0A) == losses + 1
         ages = [master.number(1, 0x2020, 3) for _ in range(2)]
         assert 250 <= ages[0] <= ages[1], "the age counts on"
-        for setting, value in ((1, sent.battery_voltage), (2, 0xFFFF)):  # by setting: the last value, not available
+        for setting, value in (
+            (1, sent.battery_voltage),
+            (2, 0xFFFF),
+        ):
+            # by setting: the last value, not available
             master.write(1, 0x2100, 5, setting, 1)
             assert master.number(1, 0x2000, 2) == value
         master.write(1, 0x2100, 5, 0, 1)
@@ -323,4 +357,7 @@ def test_a_pdo_is_mapped_anew_through_the_library(nodes: Nodes) -> None:
     wait_for(lambda: nodes.of(0x1F1)[-1].data == voltage.to_bytes(2, "little"), "the shorter PDO")
     master.write(1, 0x1804, 1, INVALID | RTR_OFF | 0x1F1, 4)
     for can_id in (0x688, 0x281):  # the DBC's, TPDO 2's
-        assert master.refusal(lambda can_id=can_id: master.write(1, 0x1804, 1, RTR_OFF | can_id, 4)) == IN_USE  # type: ignore[misc]
+        assert (
+            master.refusal(lambda can_id=can_id: master.write(1, 0x1804, 1, RTR_OFF | can_id, 4))
+            == IN_USE
+        )  # type: ignore[misc]

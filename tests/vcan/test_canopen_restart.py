@@ -8,7 +8,16 @@ from pathlib import Path
 import pytest
 from canopen.lss import LssError
 from encoding import Identity
-from vcan_tools import LIMIT_S, SERIAL, Chain, GatewayProcess, Master, canopen_table, chain, wait_for
+from vcan_tools import (
+    LIMIT_S,
+    SERIAL,
+    Chain,
+    GatewayProcess,
+    Master,
+    canopen_table,
+    chain,
+    wait_for,
+)
 
 SAVE, LOAD = (int.from_bytes(word, "little") for word in (b"save", b"load"))
 PRODUCT, REVISION = 0x4B4F4E01, 0x00010000
@@ -26,8 +35,13 @@ def started(run: Chain) -> Iterator[GatewayProcess]:
         yield gateway
 
 
-def test_what_is_saved_is_there_after_a_restart_and_gone_when_restored(vcan: str, tmp_path: Path) -> None:
-    with chain(vcan, tmp_path, Identity(1), toml=canopen_table(tmp_path / "store")) as run, Master(vcan) as master:
+def test_what_is_saved_is_there_after_a_restart_and_gone_when_restored(
+    vcan: str, tmp_path: Path
+) -> None:
+    with (
+        chain(vcan, tmp_path, Identity(1), toml=canopen_table(tmp_path / "store")) as run,
+        Master(vcan) as master,
+    ):
 
         def kept() -> list[int]:
             return [master.number(1, *where) for where in KEPT]
@@ -65,7 +79,9 @@ def test_what_is_saved_is_there_after_a_restart_and_gone_when_restored(vcan: str
             assert kept() == DEFAULTS
 
 
-def test_lss_names_nodes_and_what_it_stored_holds_after_a_restart(vcan: str, tmp_path: Path) -> None:
+def test_lss_names_nodes_and_what_it_stored_holds_after_a_restart(
+    vcan: str, tmp_path: Path
+) -> None:
     """By selection, whose answers are waited for. What is not there shows by no answer: fastscan is tried by masters of others."""
     toml = canopen_table(tmp_path / "store", 255)
     with chain(vcan, tmp_path, Identity(1), Identity(2), toml=toml) as run, Master(vcan) as master:
@@ -75,7 +91,11 @@ def test_lss_names_nodes_and_what_it_stored_holds_after_a_restart(vcan: str, tmp
         with run.running() as gateway:
             wait_for(lambda: gateway.log.count("waits for LSS") == 2, "the log lines")
             # NMT start of all, SYNC, SDO: none of a node without an ID
-            for can_id, data in ((0, b"\x01\x00"), (0x80, b""), (0x67F, b"\x40\x00\x10\x00\0\0\0\0")):
+            for can_id, data in (
+                (0, b"\x01\x00"),
+                (0x80, b""),
+                (0x67F, b"\x40\x00\x10\x00\0\0\0\0"),
+            ):
                 master.network.send_message(can_id, data)
             for number, node in ((1, 0x21), (0, 0x05)):
                 assert lss.send_switch_state_selective(0, PRODUCT, REVISION, SERIAL + number)  # type: ignore[no-untyped-call]
@@ -88,7 +108,9 @@ def test_lss_names_nodes_and_what_it_stored_holds_after_a_restart(vcan: str, tmp
                     "it holds when the configuration state is left"
                 )
                 lss.send_switch_state_global(lss.WAITING_STATE)  # type: ignore[no-untyped-call]
-                wait_for(lambda node=node: node in {each for _, each in run.watch.boot_ups}, "a boot-up")  # type: ignore[misc]
+                wait_for(
+                    lambda node=node: node in {each for _, each in run.watch.boot_ups}, "a boot-up"
+                )  # type: ignore[misc]
                 assert master.number(node, 0x1018, 4) == SERIAL + number
             sent = {frame.can_id for frame in run.watch.recorded} - run.watch.table.keys()
             said = {0, 0x80, 0x67F, 0x7E4, 0x7E5, 0x605, 0x585, 0x621, 0x5A1, 0x705, 0x721}

@@ -37,7 +37,8 @@ def adapter() -> Iterator[Adapter]:
 def doctor(file: Path) -> tuple[dict[str, dict[str, Any]], int]:
     """Findings of the CAN and port groups by check, and the exit code."""
     printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):  # in this process: a new one takes long on a slow machine
+    with contextlib.redirect_stdout(printed):
+        # in this process: a new one takes long on a slow machine
         code = main(["doctor", "-c", str(file), "--json"])
     findings = json.loads(printed.getvalue())["findings"]
     return {f["check"]: f for f in findings if f["check"].startswith(("can.", "port."))}, code
@@ -49,7 +50,9 @@ def configured(folder: Path, interface: str, port: str) -> Path:
     return file
 
 
-def test_a_vcan_that_is_up_has_no_errors_and_nothing_is_sent_to_it(vcan: str, tmp_path: Path, esc: PtyEsc) -> None:
+def test_a_vcan_that_is_up_has_no_errors_and_nothing_is_sent_to_it(
+    vcan: str, tmp_path: Path, esc: PtyEsc
+) -> None:
     with Candump(vcan) as dump:
         found, code = doctor(configured(tmp_path, vcan, esc.path))
     assert dump.frames == []
@@ -73,22 +76,30 @@ def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it(
         assert doctor(file)[1] == 0
 
 
-def test_a_running_gateway_is_noted_with_its_node_and_goes_on(vcan: str, tmp_path: Path, start_gateway: Start) -> None:
+def test_a_running_gateway_is_noted_with_its_node_and_goes_on(
+    vcan: str, tmp_path: Path, start_gateway: Start
+) -> None:
     with bench(EscOptions()) as run:
-        gateway = start_gateway(configuration(vcan, [run.ports[0].path], canopen_table(tmp_path / "store", 42)))
+        gateway = start_gateway(
+            configuration(vcan, [run.ports[0].path], canopen_table(tmp_path / "store", 42))
+        )
         gateway.wait_for_line("esc1: /dev/pts")
         file = tmp_path / "gateway0.toml"
         found, code = doctor(file)
         assert code == 0
         assert found["port.users"]["severity"] == "note"
-        assert found["port.users"]["text"] == f"in use by kontronik-can-gw (pid {gateway.process.pid})"
+        assert (
+            found["port.users"]["text"] == f"in use by kontronik-can-gw (pid {gateway.process.pid})"
+        )
         assert found["can.gateway"]["severity"] == "note"
         assert "CANopen node 42" in found["can.gateway"]["text"]
         assert gateway.process.poll() is None
         assert gateway.end() == 0
 
 
-def test_bit_rate_and_state_of_a_real_driver_are_seen(adapter: Adapter, tmp_path: Path, esc: PtyEsc) -> None:
+def test_bit_rate_and_state_of_a_real_driver_are_seen(
+    adapter: Adapter, tmp_path: Path, esc: PtyEsc
+) -> None:
     file = configured(tmp_path, adapter.name, esc.path)
     found, code = doctor(file)
     assert code == 1
@@ -121,4 +132,6 @@ def test_bit_rate_and_state_of_a_real_driver_are_seen(adapter: Adapter, tmp_path
 
 
 def shown(name: str) -> str:
-    return subprocess.run(["ip", "-d", "link", "show", name], capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        ["ip", "-d", "link", "show", name], capture_output=True, text=True, check=True
+    ).stdout

@@ -16,7 +16,9 @@ from kontronik_can_gw.esc.kontronik.states import Device
 
 LINK_THERE, LINK_LOST, STOPPING = (2, 3), 4, 2
 """A link is Degraded rather than Ok when its ESC waits for the bus to show each frame."""
-EIGHT = [Identity(i + 1, (Layout.V4, Layout.LEGACY)[i % 2], cells=6 + i, alarms=i > 5) for i in range(8)]
+EIGHT = [
+    Identity(i + 1, (Layout.V4, Layout.LEGACY)[i % 2], cells=6 + i, alarms=i > 5) for i in range(8)
+]
 
 
 @pytest.mark.parametrize(
@@ -34,11 +36,16 @@ def test_every_frame_is_on_the_bus_as_it_was_sent_and_the_last_word_is_that_it_e
     with chain(vcan, tmp_path, *identities) as run, run.running() as gateway:
         run.feed(times=times)
         every = {can_id for can_id, message in run.watch.table.items()}
-        wait_for(lambda: {frame.can_id for frame in run.watch.recorded} == every, "all messages of the DBC")
+        wait_for(
+            lambda: {frame.can_id for frame in run.watch.recorded} == every,
+            "all messages of the DBC",
+        )
         for index, identity in enumerate(identities):
             link = f"Esc{index + 1}Link"
             wait_for(lambda i=index, d=identity.device: run.watch.info_device(i) == d, "the device")  # type: ignore[misc]
-            wait_for(lambda name=link: run.signal(name, "link_state") in LINK_THERE, "the link is there")  # type: ignore[misc]
+            wait_for(
+                lambda name=link: run.signal(name, "link_state") in LINK_THERE, "the link is there"
+            )  # type: ignore[misc]
         newest = [len(fed.sent) - 1 for fed in run.escs]
         assert run.watch.values > 2 * times * len(identities)
         assert all(fresh[-1].n == n for fresh, n in zip(run.watch.fresh, newest, strict=True))
@@ -65,20 +72,36 @@ def test_loss_and_return_of_telemetry_are_on_the_bus(vcan: str, tmp_path: Path) 
         for loss in (1, 2):
             begin = go_silent(run)
             count = len(run.watch.of(0x680))
-            wait_for(lambda count=count: len(run.watch.of(0x680)) >= count + 3, "cyclic messages go on")  # type: ignore[misc]
-            assert all(frame.data[3] == 0xFF for frame in run.watch.of(0x680)[-3:]), "with NotAvailable"
-            after = [frame.data[:7].hex() for frame in run.watch.recorded[begin:] if frame.can_id == 0x688]
+            wait_for(
+                lambda count=count: len(run.watch.of(0x680)) >= count + 3, "cyclic messages go on"
+            )  # type: ignore[misc]
+            assert all(frame.data[3] == 0xFF for frame in run.watch.of(0x680)[-3:]), (
+                "with NotAvailable"
+            )
+            after = [
+                frame.data[:7].hex()
+                for frame in run.watch.recorded[begin:]
+                if frame.can_id == 0x688
+            ]
             assert after == ["ffffffffff80ff"], "event messages say so once"
             assert gateway.log.count("telemetry lost") >= loss
         run.feed()
-        wait_for(lambda: run.signal("Esc1Link", "link_state") in LINK_THERE, "the link is there again")
+        wait_for(
+            lambda: run.signal("Esc1Link", "link_state") in LINK_THERE, "the link is there again"
+        )
 
 
 def test_silent_on_loss_stops_values_but_not_the_link_status(vcan: str, tmp_path: Path) -> None:
-    with chain(vcan, tmp_path, Identity(1), esc="", toml='[dbc]\non_loss = "silent"') as run, run.running():
+    with (
+        chain(vcan, tmp_path, Identity(1), esc="", toml='[dbc]\non_loss = "silent"') as run,
+        run.running(),
+    ):
         go_silent(run)
         begin = len(run.watch.recorded)
-        wait_for(lambda: sum(f.can_id == 0x6D9 for f in run.watch.recorded[begin:]) >= 2, "the gateway's messages")
+        wait_for(
+            lambda: sum(f.can_id == 0x6D9 for f in run.watch.recorded[begin:]) >= 2,
+            "the gateway's messages",
+        )
         late = {frame.can_id for frame in run.watch.recorded[begin:]}
         assert late == {0x680, 0x6B0, 0x6D8, 0x6D9}, "both messages with link status go on"
 
@@ -130,7 +153,10 @@ def test_a_users_dbc_is_followed(vcan: str, tmp_path: Path) -> None:
     dbc = 'fd = true\n[dbc]\nfile = "car.dbc"\nnode = "Gw"\n[dbc.bind]\n"BigEndian.Temp" = "power_stage_temperature"\n'
     port = PtyPort(tmp_path / "esc1", Identity(1))
     toml = configuration(vcan, [port.path], dbc)
-    with can.Bus(interface="socketcan", channel=vcan, fd=True) as bus, gateway_process(tmp_path / "c.toml", toml):
+    with (
+        can.Bus(interface="socketcan", channel=vcan, fd=True) as bus,
+        gateway_process(tmp_path / "c.toml", toml),
+    ):
         for n in range(30):
             while len(port.fed.sent) == n:
                 port.fed.send_one()
@@ -160,7 +186,8 @@ def test_a_users_dbc_is_followed(vcan: str, tmp_path: Path) -> None:
                     values = known.decode_simple(bytes(message.data))
                     shown.update({(known.name, name): value for name, value in values.items()})
                 return all(
-                    key in shown and abs(shown[key] - value) <= half + 1e-6 for key, (value, half) in wanted.items()
+                    key in shown and abs(shown[key] - value) <= half + 1e-6
+                    for key, (value, half) in wanted.items()
                 )
 
             wait_for(all_shown, f"frame {n}: {wanted}")

@@ -37,7 +37,10 @@ Start = Callable[..., GatewayProcess]
 EDS = shipped("eds/kontronik_esc.eds")
 PRODUCT, REVISION, SERIAL = 0x4B4F4E01, 0x00010000, 0x00100200
 # something changes all the time
-LIVELY = (Phase("up", 0.5, 80, OperatingState.Forward, 0.5), Phase("down", 0.5, 20, OperatingState.Forward, 0.5))
+LIVELY = (
+    Phase("up", 0.5, 80, OperatingState.Forward, 0.5),
+    Phase("down", 0.5, 20, OperatingState.Forward, 0.5),
+)
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 # CiA 301 data types: bytes of a number; strings and domains have any length
 SIZES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
@@ -49,9 +52,16 @@ TOO_LONG, NO_DATA, DEVICE_STATE = 0x06070012, 0x08000024, 0x08000022
 
 def canopen_only(interface: str, run: Bench, folder: Path, node_id: int) -> str:
     """A configuration with nodes and no DBC."""
-    parts = [f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 500000\n[dbc]\nenabled = false\n']
-    parts += [f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{folder}"\n']
-    parts += [f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ntelemetry_timeout_ms = 2000\n' for port in run.ports]
+    parts = [
+        f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 500000\n[dbc]\nenabled = false\n'
+    ]
+    parts += [
+        f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{folder}"\n'
+    ]
+    parts += [
+        f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ntelemetry_timeout_ms = 2000\n'
+        for port in run.ports
+    ]
     return "\n".join(parts)
 
 
@@ -80,7 +90,9 @@ def zencan_there() -> None:
 
 
 @pytest.mark.usefixtures("zencan_there")
-def test_zencan_scans_reads_writes_and_stores(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+def test_zencan_scans_reads_writes_and_stores(
+    vcan: str, start_gateway: Start, tmp_path: Path
+) -> None:
     with bench(EscOptions(), EscOptions()) as run, Candump(vcan) as dump:
         start_nodes(vcan, start_gateway, run, tmp_path, 5)
         wait_for(lambda: len(dump.of(0x705)) >= 2 and len(dump.of(0x706)) >= 2, "heartbeats")
@@ -88,7 +100,9 @@ def test_zencan_scans_reads_writes_and_stores(vcan: str, start_gateway: Start, t
         found = zencan(vcan, "scan")
         assert re.findall(r"^Node (\d+):", found, re.MULTILINE) == ["5", "6"], found
         for serial in (SERIAL, SERIAL + 1):
-            identity = f"vendor: 0, product: {PRODUCT:X}, revision: {REVISION:X}, serial: {serial:X}"
+            identity = (
+                f"vendor: 0, product: {PRODUCT:X}, revision: {REVISION:X}, serial: {serial:X}"
+            )
             assert identity in found, found
         assert found.count("Device Name: 'KONTRONIK ESC gateway'") == 2, found
         assert "Unknown" not in re.sub("Unknown State", "", found), found
@@ -100,7 +114,9 @@ def test_zencan_scans_reads_writes_and_stores(vcan: str, start_gateway: Start, t
         assert read(0x2101, 1, "u8") == "5"
         assert read(0x2101, 1, "u8", node=6) == "6"
         assert int(read(0x2000, 2, "u16")) in {data.battery_voltage for _, data in run.live(0)}
-        assert int(read(0x2000, 12, "i8")) in {data.power_stage_temperature for _, data in run.live(0)}
+        assert int(read(0x2000, 12, "i8")) in {
+            data.power_stage_temperature for _, data in run.live(0)
+        }
 
         def refusal(command: str) -> str:
             said = zencan(vcan, command)
@@ -124,13 +140,17 @@ def test_zencan_scans_reads_writes_and_stores(vcan: str, start_gateway: Start, t
         assert zencan(vcan, f"write 5 0x1010 1 u32 {SAVE}") == "Wrote 4 bytes"
         assert list(tmp_path.rglob("*")), "nothing was stored"
         zencan(vcan, "nmt reset-app 5")
-        wait_for(lambda: len([f for f in dump.of(0x705) if f.data == b"\0"]) == 2, "a second boot-up")
+        wait_for(
+            lambda: len([f for f in dump.of(0x705) if f.data == b"\0"]) == 2, "a second boot-up"
+        )
         assert read(0x2100, 1, "u8") == "14"
         assert len([f for f in dump.of(0x706) if f.data == b"\0"]) == 1  # the other was not reset
 
 
 @pytest.mark.usefixtures("zencan_there")
-def test_zencan_switches_states_and_remaps_a_pdo(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+def test_zencan_switches_states_and_remaps_a_pdo(
+    vcan: str, start_gateway: Start, tmp_path: Path
+) -> None:
     new = tmp_path / "remap.toml"
     new.write_text("""
         [tpdo.4]
@@ -161,13 +181,17 @@ def test_zencan_switches_states_and_remaps_a_pdo(vcan: str, start_gateway: Start
         blocks = re.split(r"TPDO\d:", seen)[1:]
         assert len(blocks) == 6, seen
         assert "valid=true, COB=Std(0x189), transmission_type=254" in blocks[0], seen
-        assert "valid=true, COB=Std(0x2F0), transmission_type=254".lower() in blocks[4].lower(), seen
+        assert "valid=true, COB=Std(0x2F0), transmission_type=254".lower() in blocks[4].lower(), (
+            seen
+        )
         mapped = re.findall(r"index=(0x\w+), sub=(\d+), size=(\d+)", blocks[4])
         assert mapped == [("0x2000", "2", "16"), ("0x2000", "1", "32")], seen
         assert "valid=false" in blocks[5], seen
 
         pdo_ids = {0x189, 0x289, 0x389, 0x489, 0x2F0}
-        assert not [frame for frame in list(dump.frames) if frame.can_id in pdo_ids], "a PDO while PRE-OPERATIONAL"
+        assert not [frame for frame in list(dump.frames) if frame.can_id in pdo_ids], (
+            "a PDO while PRE-OPERATIONAL"
+        )
         zencan(vcan, "nmt start 9")
         wait_for(lambda: last_state() == OPERATIONAL, "OPERATIONAL")
         wait_for(lambda: len(dump.of(0x2F0)) >= 20 and len(dump.of(0x189)) >= 20, "PDOs")
@@ -181,7 +205,9 @@ def test_zencan_switches_states_and_remaps_a_pdo(vcan: str, start_gateway: Start
 
         wanted = sent_speeds(run)
         assert {struct.unpack("<IHh", frame.data) for frame in dump.of(0x189)} <= wanted
-        assert {struct.unpack("<HI", frame.data)[::-1] for frame in dump.of(0x2F0)} <= {s[:2] for s in wanted}
+        assert {struct.unpack("<HI", frame.data)[::-1] for frame in dump.of(0x2F0)} <= {
+            s[:2] for s in wanted
+        }
 
         zencan(vcan, "nmt reset-comms 9")
         wait_for(lambda: last_state() == PRE_OPERATIONAL, "PRE-OPERATIONAL")
@@ -261,7 +287,12 @@ def test_node_canopen_downloads_in_every_way(
         for value, block in ((11, False), (12, True)):
             node_master.download(5, 0x2100, 2, u32(value), block)
             assert node_master.upload(5, 0x2100, 2) == u32(value)
-        for data, code in ((b"\0", TOO_LOW), (b"\x65", TOO_HIGH), (b"\1\2", TOO_LONG), (b"\1\2\3\4\5\6", TOO_LONG)):
+        for data, code in (
+            (b"\0", TOO_LOW),
+            (b"\x65", TOO_HIGH),
+            (b"\1\2", TOO_LONG),
+            (b"\1\2\3\4\5\6", TOO_LONG),
+        ):
             for block in (False, True):
                 with pytest.raises(Refused) as refused:
                     node_master.download(5, 0x2100, 1, data, block)
@@ -275,7 +306,9 @@ def test_node_canopen_downloads_in_every_way(
         assert node_master.upload(5, 0x2100, 2) == u32(12)
         node_master.download(5, 0x1011, 1, b"load")
         node_master("nmt", command="resetNode", node=5)
-        wait_for(lambda: node_master.states(5)[-2:] == [BOOT_UP, PRE_OPERATIONAL], "another boot-up")
+        wait_for(
+            lambda: node_master.states(5)[-2:] == [BOOT_UP, PRE_OPERATIONAL], "another boot-up"
+        )
         wait_for(lambda: node_master.upload(5, 0x2100, 2) == u32(1), "the default")
 
 
@@ -286,14 +319,21 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
     with bench(EscOptions(profile=LIVELY, faults=Faults(errors=(hot,)))) as run:
         node_master("add", node=7, heartbeat=3000)
         start_nodes(vcan, start_gateway, run, tmp_path, 7)
-        wait_for(lambda: node_master.states(7) == [BOOT_UP, PRE_OPERATIONAL], "boot-up and heartbeat")
-        ids = [node_master("receivePdo", node=7, file=str(EDS), number=number) for number in (1, 2, 3, 4)]
+        wait_for(
+            lambda: node_master.states(7) == [BOOT_UP, PRE_OPERATIONAL], "boot-up and heartbeat"
+        )
+        ids = [
+            node_master("receivePdo", node=7, file=str(EDS), number=number)
+            for number in (1, 2, 3, 4)
+        ]
         assert ids == [0x187, 0x287, 0x387, 0x487]
         assert not node_master.of("pdo")
         node_master("nmt", command="startNode", node=7)
 
         def pdos(cob_id: int) -> list[dict[str, float]]:
-            return [dict(told["values"]) for told in node_master.of("pdo") if told["cob_id"] == cob_id]
+            return [
+                dict(told["values"]) for told in node_master.of("pdo") if told["cob_id"] == cob_id
+            ]
 
         wait_for(lambda: all(len(pdos(cob_id)) >= 3 for cob_id in ids), "changes in all four PDOs")
         wait_for(lambda: bool(node_master.of("emergency")), "an emergency")
@@ -320,7 +360,10 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
         wanted = {(d.electrical_speed, d.battery_voltage, d.battery_current) for d in sent}
         values = [tuple(pdo.values()) for pdo in pdos(0x187)[: counts[0x187]]]
         assert set(values) <= wanted
-        wanted_2 = {(d.motor_current, d.peak_current, d.consumed_charge, d.throttle, d.output_opening) for d in sent}
+        wanted_2 = {
+            (d.motor_current, d.peak_current, d.consumed_charge, d.throttle, d.output_opening)
+            for d in sent
+        }
         assert {tuple(pdo.values()) for pdo in pdos(0x287)[: counts[0x287]]} <= wanted_2
 
         for command, state in (
@@ -361,7 +404,9 @@ def test_node_canopen_names_nodes_by_lss(
             node_master("waiting")
             wait_for(lambda n=node_id: dump.of(0x700 + n) != [], "a boot-up")  # type: ignore[misc]
         assert [i["serialNumber"] for i in sorted(found, key=str)] == [SERIAL, SERIAL + 1]
-        assert {(i["vendorId"], i["productCode"], i["revisionNumber"]) for i in found} == {(0, PRODUCT, REVISION)}
+        assert {(i["vendorId"], i["productCode"], i["revisionNumber"]) for i in found} == {
+            (0, PRODUCT, REVISION)
+        }
         assert node_master("fastscan", timeout=500) is None
 
         # a configured node is found by its whole identity, and gets another node-ID that holds from the next reset on
@@ -382,7 +427,9 @@ def is_abort(frame: SimpleNamespace) -> bool:
     return frame.sdo_abort != "" and int(frame.sdo_command, 0) == 0x80
 
 
-def test_tshark_reads_what_was_said(vcan: str, node_master: NodeMaster, start_gateway: Start, tmp_path: Path) -> None:
+def test_tshark_reads_what_was_said(
+    vcan: str, node_master: NodeMaster, start_gateway: Start, tmp_path: Path
+) -> None:
     need(has_tshark(), "tshark")
     with bench(EscOptions(profile=LIVELY)) as run:
         with recording(vcan, tmp_path / "bus.log") as log:
@@ -392,7 +439,10 @@ def test_tshark_reads_what_was_said(vcan: str, node_master: NodeMaster, start_ga
             node_master("add", node=0x55, heartbeat=3000)
             node_master("lss", command="configureNodeId", args=[0x55, 500])
             node_master("waiting")
-            wait_for(lambda: node_master.states(0x55) == [BOOT_UP, PRE_OPERATIONAL], "boot-up and heartbeat")
+            wait_for(
+                lambda: node_master.states(0x55) == [BOOT_UP, PRE_OPERATIONAL],
+                "boot-up and heartbeat",
+            )
             name = node_master.upload(0x55, 0x1008)
             assert node_master.upload(0x55, 0x1008, block=True) == name
             for index, sub in ((0x2222, 0), (0x2000, 0x22), (0x2102, 1)):
@@ -421,9 +471,18 @@ def test_tshark_reads_what_was_said(vcan: str, node_master: NodeMaster, start_ga
         return [f for f in frames if int(f.can_id, 0) == cob_id]
 
     states = [int(f.state, 0) for f in of(0x755)]
-    assert [state for state, _ in itertools.groupby(states)] == [BOOT_UP, PRE_OPERATIONAL, OPERATIONAL, STOPPED]
+    assert [state for state, _ in itertools.groupby(states)] == [
+        BOOT_UP,
+        PRE_OPERATIONAL,
+        OPERATIONAL,
+        STOPPED,
+    ]
     assert [int(f.nmt_command, 0) for f in of(0)] == [1, 2]
-    aborts = [(int(f.sdo_index, 0), int(f.sdo_sub, 0), int(f.sdo_abort, 0)) for f in of(0x5D5) if is_abort(f)]
+    aborts = [
+        (int(f.sdo_index, 0), int(f.sdo_sub, 0), int(f.sdo_abort, 0))
+        for f in of(0x5D5)
+        if is_abort(f)
+    ]
     assert aborts == [(0x2222, 0, NO_OBJECT), (0x2000, 0x22, NO_SUB), (0x2102, 1, WRITE_ONLY)]
     echoed = [f.sdo_abort for f in of(0x655) if is_abort(f)]
     assert len(echoed) == len(aborts), "the master returns an abort; one more would be its own"

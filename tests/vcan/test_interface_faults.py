@@ -35,21 +35,31 @@ def test_a_missing_interface_and_one_without_can_fd_are_one_line_with_the_remedy
         assert name == vcan or len(gateway.lines) == 1
 
 
-def test_an_interface_that_goes_down_and_up_or_away_and_back_is_used_again(vcan: str, tmp_path: Path) -> None:
+def test_an_interface_that_goes_down_and_up_or_away_and_back_is_used_again(
+    vcan: str, tmp_path: Path
+) -> None:
     with chain(vcan, tmp_path, Identity(1)) as run, run.running() as gateway:
         run.feed(times=3)
         for n in (1, 2):
             ip("link", "set", vcan, "down")
-            wait_for(lambda n=n: gateway.log.count("is down. Start it") == n, "the log says that it is down")  # type: ignore[misc]
+            wait_for(
+                lambda n=n: gateway.log.count("is down. Start it") == n,
+                "the log says that it is down",
+            )  # type: ignore[misc]
             run.escs[0].send_one()  # which nobody sees
             ip("link", "set", vcan, "up")
-            wait_for(lambda n=n: gateway.log.count("frames are sent again") == n, "the log says that it is up")  # type: ignore[misc]
+            wait_for(
+                lambda n=n: gateway.log.count("frames are sent again") == n,
+                "the log says that it is up",
+            )  # type: ignore[misc]
             run.feed(times=3)
         ip("link", "del", vcan)
         wait_for(lambda: f"{vcan}: " in gateway.lines[-1], "the log says that it is gone")
         ip("link", "add", vcan, "type", "vcan")
         ip("link", "set", vcan, "up")
-        wait_for(lambda: gateway.log.count("frames are sent again") == 3, "the log says that it is back")
+        wait_for(
+            lambda: gateway.log.count("frames are sent again") == 3, "the log says that it is back"
+        )
         run.feed(times=3)
         assert gateway.end() == 0, gateway.log
 
@@ -69,7 +79,11 @@ def test_commands_to_a_stopped_process_are_obeyed_when_it_goes_on(
         time.sleep(0.4)  # longer than 250 ms: a hold-up
         gateway.process.send_signal(signal.SIGCONT)
         wait_for(lambda: len(dump.of(0x581)) == 2, "both answers")
-        order = [frame.can_id for frame in dump.frames if frame.can_id in (0x581, 0x701) and frame.data[0] != 0x7F]
+        order = [
+            frame.can_id
+            for frame in dump.frames
+            if frame.can_id in (0x581, 0x701) and frame.data[0] != 0x7F
+        ]
         assert order == [0x701, 0x581, 0x701, 0x581]
         gateway.wait_for_line("suspended")
         assert gateway.end() == 0
@@ -80,4 +94,7 @@ def test_the_controllers_state_is_followed_from_error_frames(vcan: str, tmp_path
         wait_for(lambda: run.signal("GatewayStatus", "can_state") == 1, "ErrorActive")
         for frame, state in ERROR_FRAMES.items():
             subprocess.run(["cansend", vcan, frame], check=True)
-            wait_for(lambda state=state: run.signal("GatewayStatus", "can_state") == state, f"CanState {state}")  # type: ignore[misc]
+            wait_for(
+                lambda state=state: run.signal("GatewayStatus", "can_state") == state,
+                f"CanState {state}",
+            )  # type: ignore[misc]

@@ -33,14 +33,19 @@ def once(*words: object) -> subprocess.CompletedProcess[str]:
 def lines_of(*words: object) -> Iterator[tuple[subprocess.Popen[str], list[str], list[str]]]:
     """``monitor`` as its own process, and the lines of its standard output and standard error so far."""
     pipe = subprocess.PIPE
-    with subprocess.Popen([*COMMAND, *map(str, words)], stdout=pipe, stderr=pipe, text=True) as process:
+    with subprocess.Popen(
+        [*COMMAND, *map(str, words)], stdout=pipe, stderr=pipe, text=True
+    ) as process:
 
         def read(stream: Any, lines: list[str]) -> None:
             lines.extend(line.rstrip() for line in stream)
 
         out: list[str] = []
         err: list[str] = []
-        threads = [threading.Thread(target=read, args=pair) for pair in ((process.stdout, out), (process.stderr, err))]
+        threads = [
+            threading.Thread(target=read, args=pair)
+            for pair in ((process.stdout, out), (process.stderr, err))
+        ]
         for thread in threads:
             thread.start()
         try:
@@ -56,7 +61,9 @@ def sent_on(interface: str) -> int:
     return int(Path("/sys/class/net", interface, "statistics/tx_packets").read_text())
 
 
-def test_once_tells_of_all_escs_of_the_configuration(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+def test_once_tells_of_all_escs_of_the_configuration(
+    vcan: str, start_gateway: Start, tmp_path: Path
+) -> None:
     with bench(FAULTY, EscOptions(cell_count=12)) as run, Candump(vcan) as dump:
         gateway = start_gateway(configuration(vcan, [port.path for port in run.ports]))
         gateway.wait_for_line("esc2: /dev/pts")
@@ -90,7 +97,9 @@ def test_once_on_a_silent_bus_is_one_line_and_nothing_is_sent(vcan: str) -> None
     assert sent_on(vcan) == 0
 
 
-def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(vcan: str, start_gateway: Start) -> None:
+def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
+    vcan: str, start_gateway: Start
+) -> None:
     with bench(EscOptions()) as run:
         gateway = start_gateway(configuration(vcan, [run.ports[0].path]))
         gateway.wait_for_line("esc1: /dev/pts")
@@ -103,7 +112,11 @@ def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(vcan: str, st
             wait_for(is_shown, "values")
             for act, undo, what in (
                 (("set", vcan, "down"), [("set", vcan, "up")], "is down. Start it"),
-                (("del", vcan), [("add", vcan, "type", "vcan"), ("set", vcan, "up")], "there is none."),
+                (
+                    ("del", vcan),
+                    [("add", vcan, "type", "vcan"), ("set", vcan, "up")],
+                    "there is none.",
+                ),
             ):
                 told, lines = len(err), len(out)
                 ip("link", *act)
@@ -126,14 +139,23 @@ def test_the_listener_takes_only_what_was_asked_for_and_sends_nothing(vcan: str)
     assert sent_on(vcan) == 0
     with can.Bus(interface="socketcan", channel=vcan) as bus:
         for number in range(50):
-            for can_id, extended in ((0x123, False), (0x124, False), (0x123, True), (0x1ABCDE, True)):
+            for can_id, extended in (
+                (0x123, False),
+                (0x124, False),
+                (0x123, True),
+                (0x1ABCDE, True),
+            ):
                 bus.send(can.Message(arbitration_id=can_id, data=[number], is_extended_id=extended))
-            bus.send(can.Message(arbitration_id=0x123, is_remote_frame=True, dlc=1, is_extended_id=False))
+            bus.send(
+                can.Message(arbitration_id=0x123, is_remote_frame=True, dlc=1, is_extended_id=False)
+            )
             time.sleep(0.001)
         frames: list[CanFrame] = []
         while len(frames) < 100 and (more := listener.receive(LIMIT_S)):
             frames += more
-    expected = [CanFrame(each, bytes([n]), each != 0x123) for n in range(50) for each in (0x123, 0x1ABCDE)]
+    expected = [
+        CanFrame(each, bytes([n]), each != 0x123) for n in range(50) for each in (0x123, 0x1ABCDE)
+    ]
     assert frames == expected
     assert sent_on(vcan) == 250
     listener.close()

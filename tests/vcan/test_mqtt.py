@@ -25,7 +25,13 @@ FLIES = EscOptions(
         Phase("down", 2, 20, OperatingState.Forward, 2),
     )
 )
-FIELDS = ("electrical_speed", "battery_voltage", "battery_current", "throttle", "power_stage_temperature")
+FIELDS = (
+    "electrical_speed",
+    "battery_voltage",
+    "battery_current",
+    "throttle",
+    "power_stage_temperature",
+)
 
 
 def as_published(data: LiveData) -> dict[str, float]:
@@ -40,11 +46,15 @@ def test_what_escs_send_arrives_at_a_subscriber(
     broker = Mosquitto(tmp_path)
     try:
         with bench(FLIES, FLIES) as run, Subscriber(broker.port, "kontronik/chain/#") as heard:
-            toml = configuration(vcan, [port.path for port in run.ports], esc="telemetry_timeout_ms = 5000")
+            toml = configuration(
+                vcan, [port.path for port in run.ports], esc="telemetry_timeout_ms = 5000"
+            )
             gateway = start_gateway(toml)
             gateway.wait_for_line("esc2: /dev/pts")
             file = tmp_path / "mqtt.toml"
-            file.write_text(f'[mqtt]\nbroker = "{broker.address}"\ngateway = "chain"\nrate = 5\n{toml}')
+            file.write_text(
+                f'[mqtt]\nbroker = "{broker.address}"\ngateway = "chain"\nrate = 5\n{toml}'
+            )
             with Process("-c", file, "--discovery") as program:
                 program.wait_for_line("connected as kontronik-can-gw-chain")
                 run.start()
@@ -60,11 +70,16 @@ def test_what_escs_send_arrives_at_a_subscriber(
                         shortly = [values for at, values in sent if at < when]
                         # each value is one that this ESC has sent: they come in several CAN frames
                         for name in FIELDS:
-                            assert any(abs(values[name] - found[name]) < 1e-6 for values in shortly), (esc, name, found)
+                            assert any(
+                                abs(values[name] - found[name]) < 1e-6 for values in shortly
+                            ), (esc, name, found)
                         assert found["available"] is True
                 run.stop()
                 heard.wait("kontronik/chain/esc1/available", b"offline")
-                wait_for(lambda: heard.of("kontronik/chain/esc1/state")[-1].json["link_state"] == "Lost", "a lost link")
+                wait_for(
+                    lambda: heard.of("kontronik/chain/esc1/state")[-1].json["link_state"] == "Lost",
+                    "a lost link",
+                )
                 assert heard.of("kontronik/chain/available")[-1].payload == b"online"
                 gateway.end()
                 heard.wait("kontronik/chain/available", b"offline")

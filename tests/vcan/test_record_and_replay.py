@@ -11,7 +11,17 @@ from typing import Any
 import can
 import cantools.database
 import pytest
-from vcan_tools import LIMIT_S, Bench, Candump, GatewayProcess, bench, canopen_table, configuration, ip, wait_for
+from vcan_tools import (
+    LIMIT_S,
+    Bench,
+    Candump,
+    GatewayProcess,
+    bench,
+    canopen_table,
+    configuration,
+    ip,
+    wait_for,
+)
 
 from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.config.keys import shipped
@@ -21,14 +31,18 @@ from kontronik_can_gw.esc.simulator import Dropout, EscOptions, Faults
 Start = Callable[..., GatewayProcess]
 pytestmark = pytest.mark.extended
 
-NOISY = EscOptions(faults=Faults(noise=0.5, lost_bytes=0.002, dropout=Dropout(700_000_000, 3_000_000_000)))
+NOISY = EscOptions(
+    faults=Faults(noise=0.5, lost_bytes=0.002, dropout=Dropout(700_000_000, 3_000_000_000))
+)
 
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 
 
 def program(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(
+        [*PROGRAM, *map(str, words)], capture_output=True, text=True, timeout=60, check=False
+    )
 
 
 def frames_of(dump: Candump) -> list[tuple[int, bytes]]:
@@ -43,7 +57,9 @@ def by_id(frames: Sequence[tuple[Any, ...]]) -> dict[int, list[bytes]]:
     return found
 
 
-def recorded_run(run: Bench, start: Start, toml: str, folder: Path, seconds: float) -> GatewayProcess:
+def recorded_run(
+    run: Bench, start: Start, toml: str, folder: Path, seconds: float
+) -> GatewayProcess:
     gateway = start(toml, "--record", str(folder))
     gateway.wait_for_line(f"esc{len(run.ports)}: /dev/pts")
     run.start()
@@ -83,7 +99,17 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
         for source, marked in ((folder, False), (log, False), (folder, True)):
             with Candump(second_vcan) as replayed:
                 words = [] if marked else ["--unmarked"]
-                done = program("replay", source, "--to", "can", "--channel", second_vcan, "--speed", "3", *words)
+                done = program(
+                    "replay",
+                    source,
+                    "--to",
+                    "can",
+                    "--channel",
+                    second_vcan,
+                    "--speed",
+                    "3",
+                    *words,
+                )
                 assert done.returncode == 0, done.stderr
                 assert f"{len(on_bus)} frames to {second_vcan}" in done.stderr
                 wait_for(lambda r=replayed: len(r.frames) >= len(on_bus), "all frames")  # type: ignore[misc]
@@ -98,7 +124,12 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
             shown, were = by_id(frames_of(replayed)), by_id(on_bus)
             assert shown.keys() == were.keys()
             differing = {can_id for can_id in were if shown[can_id] != were[can_id]}
-            assert differing == {state.frame_id, 0x481, 0x482}  # TPDO 4 has the link status, in which bit 6 says replay
+            # TPDO 4 has the link status, in which bit 6 says replay
+            assert differing == {
+                state.frame_id,
+                0x481,
+                0x482,
+            }
             states = [
                 str(state.decode_simple(data)["GatewayState"])
                 for can_id, data in frames_of(replayed)
@@ -109,9 +140,13 @@ def test_a_replay_is_what_was_on_the_bus_frame_by_frame(
         ip("link", "del", second_vcan)
 
 
-def test_a_replay_keeps_away_from_a_bus_with_a_gateway(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+def test_a_replay_keeps_away_from_a_bus_with_a_gateway(
+    vcan: str, start_gateway: Start, tmp_path: Path
+) -> None:
     with bench(EscOptions()) as run:
-        gateway = recorded_run(run, start_gateway, configuration(vcan, [run.ports[0].path]), tmp_path / "c", 1.5)
+        gateway = recorded_run(
+            run, start_gateway, configuration(vcan, [run.ports[0].path]), tmp_path / "c", 1.5
+        )
         [file] = (tmp_path / "c").glob("*.kcap")
         done = program("replay", file, "--to", "can", "--channel", vcan)
         assert (done.returncode, done.stdout) == (1, "")
@@ -120,12 +155,19 @@ def test_a_replay_keeps_away_from_a_bus_with_a_gateway(vcan: str, start_gateway:
         assert gateway.end() == 0
 
 
-def test_what_a_killed_gateway_had_recorded_was_on_the_disk(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+def test_what_a_killed_gateway_had_recorded_was_on_the_disk(
+    vcan: str, start_gateway: Start, tmp_path: Path
+) -> None:
     folder = tmp_path / "captures"
     with bench(EscOptions()) as run:
-        gateway = recorded_run(run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4)
+        gateway = recorded_run(
+            run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4
+        )
         sure = time.monotonic_ns()
-        wait_for(lambda: (found := bytes_of(folder)) and found[-1] > sure, "what came by now is on the disk")
+        wait_for(
+            lambda: (found := bytes_of(folder)) and found[-1] > sure,
+            "what came by now is on the disk",
+        )
         gateway.end(signal.SIGKILL)
     with open_input(folder) as found:
         times = bytes_of(folder)
@@ -136,7 +178,9 @@ def test_what_a_killed_gateway_had_recorded_was_on_the_disk(vcan: str, start_gat
         assert [line for line in found.damage if "was not closed" in line]
 
 
-def test_a_full_disk_stops_recording_and_nothing_else(vcan: str, start_gateway: Start, tmp_path: Path) -> None:
+def test_a_full_disk_stops_recording_and_nothing_else(
+    vcan: str, start_gateway: Start, tmp_path: Path
+) -> None:
     folder = tmp_path / "small"
     folder.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", str(folder)], check=True)
@@ -174,7 +218,9 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
 ) -> None:
     folder = tmp_path / "captures"
     with bench(EscOptions()) as run:
-        gateway = recorded_run(run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4)
+        gateway = recorded_run(
+            run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4
+        )
         assert gateway.end() == 0
         sent = {live.battery_voltage for _, live in run.live(0)}
     link = tmp_path / "played"
@@ -192,7 +238,9 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
     database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
     assert isinstance(database, cantools.database.can.Database)
     speed = database.get_message_by_name("EscSpeed")
-    values = [speed.decode_simple(frame.data)["BatteryVoltage"] for frame in live.of(speed.frame_id)]
+    values = [
+        speed.decode_simple(frame.data)["BatteryVoltage"] for frame in live.of(speed.frame_id)
+    ]
     numbers = [round(float(value) * 100) for value in values if isinstance(value, (int, float))]
     assert len(numbers) > 20
     assert set(numbers) <= sent

@@ -57,7 +57,9 @@ class GatewayProcess:
 
     def __init__(self, config: Path, *options: str) -> None:
         command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), *options]
-        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -77,7 +79,9 @@ class GatewayProcess:
         def seen() -> bool:
             if self.process.poll() is not None:
                 self._reader.join(LIMIT_S)
-                assert text in self.log, f"the gateway ended with {self.process.returncode}:\n{self.log}"
+                assert text in self.log, (
+                    f"the gateway ended with {self.process.returncode}:\n{self.log}"
+                )
             return text in self.log
 
         wait_for(seen, lambda: f"log line {text!r} in:\n{self.log}")
@@ -128,7 +132,9 @@ class Candump:
         self._interface = interface
         self._marks = 0
         self._mark = 0
-        self._process = subprocess.Popen(["stdbuf", "-oL", *command], stdout=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen(
+            ["stdbuf", "-oL", *command], stdout=subprocess.PIPE, text=True
+        )
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
@@ -169,7 +175,9 @@ class Candump:
             self._process.stdout.close()
 
 
-def configuration(interface: str, ports: Sequence[str], dbc: str = "", esc: str = NEVER_STALE) -> str:
+def configuration(
+    interface: str, ports: Sequence[str], dbc: str = "", esc: str = NEVER_STALE
+) -> str:
     """A configuration text for these ports."""
     parts = [f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 1000000\n{dbc}\n']
     parts += [f'[[esc]]\nport = "{port}"\npole_pairs = 7\ngear = 9.8\n{esc}\n' for port in ports]
@@ -209,10 +217,17 @@ class Chain:
     """ESCs that say what is expected of them, the gateway, and a judge of each value on the bus."""
 
     def __init__(
-        self, interface: str, folder: Path, identities: Sequence[Identity], toml: str = "", esc: str = NEVER_STALE
+        self,
+        interface: str,
+        folder: Path,
+        identities: Sequence[Identity],
+        toml: str = "",
+        esc: str = NEVER_STALE,
     ) -> None:
         self.interface = interface
-        self.ports = [PtyPort(folder / f"port{i + 1}", identity) for i, identity in enumerate(identities)]
+        self.ports = [
+            PtyPort(folder / f"port{i + 1}", identity) for i, identity in enumerate(identities)
+        ]
         self.escs = [port.fed for port in self.ports]
         for fed in self.escs:
             fed.info_every = 10
@@ -243,7 +258,9 @@ class Chain:
 
             def shown(numbers: Sequence[int] = numbers, held_up: int = held_up) -> bool:
                 assert self.gateway is not None
-                seen = all(fed.seen[n] == SPEED | CURRENT for fed, n in zip(chosen, numbers, strict=True))
+                seen = all(
+                    fed.seen[n] == SPEED | CURRENT for fed, n in zip(chosen, numbers, strict=True)
+                )
                 return (
                     seen or self.gateway.log.count("suspended") > held_up
                 )  # then it may throw frames away, and says so
@@ -265,7 +282,9 @@ class Chain:
         self.catch_up()
         self.watch.settle(lambda _begin, _end: 0)
         assert not self.watch.wrong, self.watch.wrong
-        assert [port.received() for port in self.ports] == [0] * len(self.ports), "something was sent to an ESC"
+        assert [port.received() for port in self.ports] == [0] * len(self.ports), (
+            "something was sent to an ESC"
+        )
 
     def close(self) -> None:
         self.watch.close()
@@ -302,7 +321,9 @@ class Bench:
 
     def start(self) -> None:
         self._stop.clear()
-        simulated = [SimulatedEsc(options, seed=self._seed + i) for i, options in enumerate(self._options)]
+        simulated = [
+            SimulatedEsc(options, seed=self._seed + i) for i, options in enumerate(self._options)
+        ]
         pairs = list(zip(simulated, self.ports, strict=True))
 
         def note(index: int, sent: Sent, taken: bool) -> None:
@@ -320,10 +341,14 @@ class Bench:
             self._thread.join(LIMIT_S)
 
     def live(self, index: int) -> list[tuple[float, LiveData]]:
-        return [(when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, LiveData)]
+        return [
+            (when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, LiveData)
+        ]
 
     def info(self, index: int) -> list[tuple[float, InfoData]]:
-        return [(when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, InfoData)]
+        return [
+            (when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, InfoData)
+        ]
 
     def close(self) -> None:
         self.stop()
@@ -340,7 +365,9 @@ def bench(*escs: EscOptions) -> Iterator[Bench]:
         yield made
     finally:
         made.close()
-    assert [port.received for port in made.ports] == [0] * len(escs), "something was transmitted to an ESC"
+    assert [port.received for port in made.ports] == [0] * len(escs), (
+        "something was transmitted to an ESC"
+    )
 
 
 # --- CANopen

@@ -49,7 +49,9 @@ PROJECT = os.path.dirname(os.path.dirname(HERE))
 TIMED_OUT = 124
 VM_FAILED = 125
 
-PASSED_ON = re.compile(r"(PATH|HOME|LANG|LC_ALL|CI|VIRTUAL_ENV)$|KCG_|PYTHON|PYTEST_|HYPOTHESIS_|COVERAGE_")
+PASSED_ON = re.compile(
+    r"(PATH|HOME|LANG|LC_ALL|CI|VIRTUAL_ENV)$|KCG_|PYTHON|PYTEST_|HYPOTHESIS_|COVERAGE_"
+)
 TMPFS = ("/tmp", "/var/tmp", "/run", "/dev/shm")  # guest-init.sh mounts an empty one on each
 
 UML_MEMORY_MIB = 512
@@ -70,7 +72,9 @@ def passed_on(environment: Mapping[str, str]) -> dict[str, str]:
 
 def with_sbin(path: str) -> str:
     folders = path.split(os.pathsep) if path else []
-    return os.pathsep.join(folders + [d for d in ("/usr/sbin", "/usr/bin", "/sbin", "/bin") if d not in folders])
+    return os.pathsep.join(
+        folders + [d for d in ("/usr/sbin", "/usr/bin", "/sbin", "/bin") if d not in folders]
+    )
 
 
 # --- this kernel
@@ -79,20 +83,36 @@ def with_sbin(path: str) -> str:
 def native_prefix() -> list[str] | None:
     """What to put before a command so that it can make vcan interfaces here ([] if nothing); None if it cannot."""
     try:
-        socket.socket(29, socket.SOCK_RAW, 1).close()  # AF_CAN, CAN_RAW, also where Python was built without them
+        # AF_CAN, CAN_RAW, also where Python was built without them
+        socket.socket(29, socket.SOCK_RAW, 1).close()
     except OSError:
         return None
     here: list[str] = []
     with_lo = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
     namespace = ["unshare", "--user", "--map-root-user", "--net", *with_lo]
-    as_root = ["sudo", "-n", "unshare", "--net", "setpriv", f"--reuid={os.getuid()}", f"--regid={os.getgid()}"]
-    as_root += ["--init-groups", "--inh-caps=+net_admin,+net_raw", "--ambient-caps=+net_admin,+net_raw", "env"]
+    as_root = [
+        "sudo",
+        "-n",
+        "unshare",
+        "--net",
+        "setpriv",
+        f"--reuid={os.getuid()}",
+        f"--regid={os.getgid()}",
+    ]
+    as_root += [
+        "--init-groups",
+        "--inh-caps=+net_admin,+net_raw",
+        "--ambient-caps=+net_admin,+net_raw",
+        "env",
+    ]
     as_root += [f"{name}={value}" for name, value in passed_on(os.environ).items()] + with_lo
     interface = f"vm{os.getpid()}"
     probe = ["sh", "-c", f"ip link add dev {interface} type vcan && ip link del {interface}"]
     for prefix in (here, namespace, as_root):
         with contextlib.suppress(OSError):
-            done = subprocess.run(prefix + probe, check=False, stdin=subprocess.DEVNULL, capture_output=True)
+            done = subprocess.run(
+                prefix + probe, check=False, stdin=subprocess.DEVNULL, capture_output=True
+            )
             if done.returncode == 0:
                 return prefix
     return None
@@ -102,21 +122,30 @@ def native_prefix() -> list[str] | None:
 
 
 def uml_command(job: str, out: int, err: int) -> list[str]:
-    command = (
-        f"linux.uml mem={UML_MEMORY_MIB}M root=/dev/root rootfstype=hostfs rootflags=/ ro init={job}/guest-init.sh"
+    command = f"linux.uml mem={UML_MEMORY_MIB}M root=/dev/root rootfstype=hostfs rootflags=/ ro init={job}/guest-init.sh"
+    command += (
+        f" VM_JOB={job} VM_BACKEND=uml GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512} con=null ssl=null"
     )
-    command += f" VM_JOB={job} VM_BACKEND=uml GLIBC_TUNABLES={GLIBC_WITHOUT_AVX512} con=null ssl=null"
-    command += f" ssl0=null,fd:{out} ssl1=null,fd:{err} uml_dir={job} umid=uml noreboot quiet loglevel=3"
+    command += (
+        f" ssl0=null,fd:{out} ssl1=null,fd:{err} uml_dir={job} umid=uml noreboot quiet loglevel=3"
+    )
     return command.split()
 
 
 def uml_guest_environment() -> dict[str, str]:
-    environment = {"GLIBC_TUNABLES": GLIBC_WITHOUT_AVX512, "OPENSSL_ia32cap": OPENSSL_WITHOUT_AVX512}
+    environment = {
+        "GLIBC_TUNABLES": GLIBC_WITHOUT_AVX512,
+        "OPENSSL_ia32cap": OPENSSL_WITHOUT_AVX512,
+    }
     with contextlib.suppress(OSError, importlib.metadata.PackageNotFoundError, ValueError):
         with open("/proc/cpuinfo") as cpuinfo:
             has_avx512 = "avx512f" in cpuinfo.read()
         major, minor = importlib.metadata.version("numpy").split(".")[:2]
-        if has_avx512 and (int(major), int(minor)) >= (2, 4):  # numpy warns of a name that it does not know
+        if has_avx512 and (int(major), int(minor)) >= (
+            2,
+            4,
+        ):
+            # numpy warns of a name that it does not know
             environment["NPY_DISABLE_CPU_FEATURES"] = "X86_V4 AVX512_ICL AVX512_SPR"
         elif has_avx512:
             names = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
@@ -136,7 +165,9 @@ def uml_memory_folder(job: str) -> str:
 
 def qemu_kernel() -> str | None:
     """The newest kernel that setup.sh has unpacked."""
-    kernels = glob.glob(os.path.join(os.environ.get("VM_CACHE") or os.path.join(HERE, ".cache"), "*", "vmlinux"))
+    kernels = glob.glob(
+        os.path.join(os.environ.get("VM_CACHE") or os.path.join(HERE, ".cache"), "*", "vmlinux")
+    )
     return max(kernels, key=os.path.getmtime, default=None)
 
 
@@ -146,16 +177,48 @@ def qemu_command(job: str, out: int, err: int) -> list[str]:
         raise OSError("no kernel unpacked: run tests/vm/setup.sh qemu")
     append = "console=ttyS0 panic=-1 quiet loglevel=3 tsc=reliable no_timer_check mitigations=off nokaslr"
     append += f" random.trust_cpu=on VM_BACKEND=qemu GUEST_INIT={job}/guest-init.sh"
-    command = ["qemu-system-x86_64", "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot"]
-    command += ["-machine", "q35", "-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max", "-m", str(QEMU_MEMORY_MIB)]
-    command += ["-kernel", kernel, "-initrd", os.path.join(os.path.dirname(kernel), "initrd.cpio"), "-append", append]
+    command = [
+        "qemu-system-x86_64",
+        "-nodefaults",
+        "-no-user-config",
+        "-display",
+        "none",
+        "-no-reboot",
+    ]
+    command += [
+        "-machine",
+        "q35",
+        "-accel",
+        "tcg,thread=multi,tb-size=512",
+        "-cpu",
+        "max",
+        "-m",
+        str(QEMU_MEMORY_MIB),
+    ]
+    command += [
+        "-kernel",
+        kernel,
+        "-initrd",
+        os.path.join(os.path.dirname(kernel), "initrd.cpio"),
+        "-append",
+        append,
+    ]
     command += ["-serial", f"file:{job}/klog", "-device", "virtio-serial-pci"]
 
     def port(name: str, chardev: str) -> list[str]:
-        return ["-chardev", f"{chardev},id={name}", "-device", f"virtserialport,chardev={name},name={name}"]
+        return [
+            "-chardev",
+            f"{chardev},id={name}",
+            "-device",
+            f"virtserialport,chardev={name},name={name}",
+        ]
 
     for name, fd in (("stdout", out), ("stderr", err)):
-        command += ["-add-fd", f"fd={fd},set={fd}", *port(name, f"file,path=/dev/fdset/{fd},append=on")]
+        command += [
+            "-add-fd",
+            f"fd={fd},set={fd}",
+            *port(name, f"file,path=/dev/fdset/{fd},append=on"),
+        ]
     for tag, path, options in (("root", "/", ",readonly=on,multidevs=remap"), ("host", "/", ",multidevs=remap"),
                                ("job", job, "")):  # fmt: skip
         command += ["-fsdev", f"local,id={tag},path={path},security_model=none{options}"]
@@ -190,14 +253,28 @@ def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence
     with open(os.path.join(without, "asammdf.py"), "w") as file:
         file.write('raise ImportError("kept out of virtual machines by tests/vm/vm_run.py")\n')
     path = os.pathsep.join(filter(None, ("/run/job/without", os.environ.get("PYTHONPATH"))))
-    environment = passed_on(os.environ) | {"VM_BACKEND": backend, "TMPDIR": "/tmp", "NO_COLOR": "1", "PYTHONPATH": path}
+    environment = passed_on(os.environ) | {
+        "VM_BACKEND": backend,
+        "TMPDIR": "/tmp",
+        "NO_COLOR": "1",
+        "PYTHONPATH": path,
+    }
     environment["PYTHONDONTWRITEBYTECODE"] = "1"
     if backend == "uml":
         environment |= uml_guest_environment()
     lines = [f"export {name}={shlex.quote(value)}" for name, value in environment.items()]
-    lines += ["echo >/run/job/started", f"cd {shlex.quote(os.getcwd())} && exec {shlex.join(command)}"]
+    lines += [
+        "echo >/run/job/started",
+        f"cd {shlex.quote(os.getcwd())} && exec {shlex.join(command)}",
+    ]
     # Where the project or Python is in a folder that the guest hides under a tmpfs, it is mounted there again.
-    needed = {os.getcwd(), PROJECT, sys.prefix, sys.base_prefix, os.path.dirname(os.path.abspath(command[0]))}
+    needed = {
+        os.getcwd(),
+        PROJECT,
+        sys.prefix,
+        sys.base_prefix,
+        os.path.dirname(os.path.abspath(command[0])),
+    }
     hidden = sorted(folder for folder in needed if under_tmpfs(folder) and folder not in TMPFS)
     for name, content in (("job.sh", lines), ("ro", hidden), ("rw", writable)):
         with open(os.path.join(job, name), "w") as file:
@@ -254,7 +331,9 @@ def leave(number: int, _frame: FrameType | None) -> NoReturn:
     sys.exit(128 + number)
 
 
-def run_in_vm(backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float) -> tuple[int, bool]:
+def run_in_vm(
+    backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
+) -> tuple[int, bool]:
     """Returns the exit code, and whether the command was started at all."""
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
     try:
@@ -269,7 +348,9 @@ def run_in_vm(backend: str, command: Sequence[str], writable: Sequence[str], tim
         with contextlib.ExitStack() as ends:
             for fd in (out_write, err_write):
                 ends.callback(os.close, fd)
-            vm_command = (uml_command if backend == "uml" else qemu_command)(job, out_write, err_write)
+            vm_command = (uml_command if backend == "uml" else qemu_command)(
+                job, out_write, err_write
+            )
             log = ends.enter_context(open(os.path.join(job, "log"), "wb"))
             process = subprocess.Popen(
                 vm_command,
@@ -278,7 +359,11 @@ def run_in_vm(backend: str, command: Sequence[str], writable: Sequence[str], tim
                 stderr=log,
                 pass_fds=(out_write, err_write),
                 start_new_session=True,
-                env={**os.environ, "TMPDIR": uml_memory_folder(job), "PATH": with_sbin(os.environ.get("PATH", ""))},
+                env={
+                    **os.environ,
+                    "TMPDIR": uml_memory_folder(job),
+                    "PATH": with_sbin(os.environ.get("PATH", "")),
+                },
             )
         guard_fd = guard(process.pid, job)
         try:
@@ -311,9 +396,15 @@ def run_in_vm(backend: str, command: Sequence[str], writable: Sequence[str], tim
             with open(os.path.join(job, "rc")) as file:
                 return int(file.read()), True
         except (OSError, ValueError):
-            print(f"vm/run: {backend}: the VM ended without a result; its last words:", file=sys.stderr)
+            print(
+                f"vm/run: {backend}: the VM ended without a result; its last words:",
+                file=sys.stderr,
+            )
             for name in ("log", "klog"):
-                with contextlib.suppress(OSError), open(os.path.join(job, name), errors="replace") as file:
+                with (
+                    contextlib.suppress(OSError),
+                    open(os.path.join(job, name), errors="replace") as file,
+                ):
                     sys.stderr.write(file.read()[-4000:])
             return VM_FAILED, started
     except OSError as error:
@@ -332,13 +423,17 @@ def installed() -> list[str]:
     if not os.path.exists("/usr/bin/busybox"):
         return []
     vms = ["uml"] if shutil.which("linux.uml", path=path) else []
-    return vms + (["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64", path=path) else [])
+    return vms + (
+        ["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64", path=path) else []
+    )
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(usage=__doc__, add_help=True)
     kinds = ("auto", "native", "uml", "qemu")
-    parser.add_argument("--backend", choices=kinds, default=os.environ.get("KCG_VM_BACKEND") or "auto")
+    parser.add_argument(
+        "--backend", choices=kinds, default=os.environ.get("KCG_VM_BACKEND") or "auto"
+    )
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--rw", action="append", default=[])
     parser.add_argument("--which", action="store_true")
@@ -376,7 +471,10 @@ def main() -> int:
         if code != VM_FAILED or started:
             return code
     if not vms:
-        print("vm/run: this kernel has no vcan and there is no VM: run tests/vm/setup.sh uml", file=sys.stderr)
+        print(
+            "vm/run: this kernel has no vcan and there is no VM: run tests/vm/setup.sh uml",
+            file=sys.stderr,
+        )
     return VM_FAILED
 
 

@@ -67,8 +67,14 @@ def document(facts: Description) -> Document:
     sections: list[Section] = []
     anchors: set[str] = set()
     for title, level, blocks in titled:
-        sections.append(Section(title, level, _anchor(title, anchors), tuple(block for block in blocks if block)))
-    return Document("What the gateway sends and what it means", tuple(_lead(facts)), tuple(sections))
+        sections.append(
+            Section(
+                title, level, _anchor(title, anchors), tuple(block for block in blocks if block)
+            )
+        )
+    return Document(
+        "What the gateway sends and what it means", tuple(_lead(facts)), tuple(sections)
+    )
 
 
 _SOURCES = (
@@ -80,8 +86,16 @@ _SOURCES = (
 def _lead(facts: Description) -> Iterator[str]:
     yield f"Made by {facts.program} from the files in use, by: kontronik-can-gw describe."
     yield f"ESCs: {', '.join(facts.escs)}."
-    yield f"DBC: {facts.dbc.file}, messages of {facts.dbc.node}." if facts.dbc else "DBC: none, dbc.enabled is false."
-    yield f"EDS: {facts.canopen.file}." if facts.canopen else "CANopen: none, canopen.enabled is false."
+    yield (
+        f"DBC: {facts.dbc.file}, messages of {facts.dbc.node}."
+        if facts.dbc
+        else "DBC: none, dbc.enabled is false."
+    )
+    yield (
+        f"EDS: {facts.canopen.file}."
+        if facts.canopen
+        else "CANopen: none, canopen.enabled is false."
+    )
 
 
 def _anchor(title: str, taken: set[str]) -> str:
@@ -101,11 +115,27 @@ def _anchor(title: str, taken: set[str]) -> str:
 def _messages(dbc: DbcFacts, several: bool) -> Iterator[tuple[str, int, list[str | Table]]]:
     rows = []
     for message in dbc.messages:
-        rows.append((Code(message.name), _id(message), str(message.length), _timing(message), message.comment))
-    yield "Messages", 2, [dbc.comment, Table(("message", "id", "bytes", "sent", "meaning"), tuple(rows))]
+        rows.append(
+            (
+                Code(message.name),
+                _id(message),
+                str(message.length),
+                _timing(message),
+                message.comment,
+            )
+        )
+    yield (
+        "Messages",
+        2,
+        [dbc.comment, Table(("message", "id", "bytes", "sent", "meaning"), tuple(rows))],
+    )
     for message in dbc.messages:
         text = f"{_id(message)}, {message.length} bytes{', CAN FD' if message.fd else ''}. Sent {_timing(message)}."
-        yield f"{message.name} {_id(message)}", 3, [text, message.comment, _signals(message, several)]
+        yield (
+            f"{message.name} {_id(message)}",
+            3,
+            [text, message.comment, _signals(message, several)],
+        )
 
 
 def _id(message: MessageFacts) -> str:
@@ -123,7 +153,16 @@ def _timing(message: MessageFacts) -> str:
 
 
 def _signals(message: MessageFacts, several: bool) -> Table:
-    head = ("signal", "bits", "unit", "resolution", "range", "not available, error", "shows", "meaning")
+    head = (
+        "signal",
+        "bits",
+        "unit",
+        "resolution",
+        "range",
+        "not available, error",
+        "shows",
+        "meaning",
+    )
     return Table(head, tuple(_signal(signal, several) for signal in message.signals))
 
 
@@ -136,7 +175,9 @@ def _signal(signal: SignalFacts, several: bool) -> tuple[str, ...]:
         bits = str(signal.start_bit)
     if signal.page is not None:
         bits += f", page {signal.page}"
-    steps = f"{_number(signal.factor)}" + (f", offset {_number(signal.offset)}" if signal.offset else "")
+    steps = f"{_number(signal.factor)}" + (
+        f", offset {_number(signal.offset)}" if signal.offset else ""
+    )
     span = f"{_number(signal.minimum)} … {_number(signal.maximum)}"
     if is_flag and (signal.factor, signal.minimum, signal.maximum) == (1, 0, 1):
         steps, span = "", "0, 1"
@@ -148,8 +189,12 @@ def _signal(signal: SignalFacts, several: bool) -> tuple[str, ...]:
     shows = signal.role if signal.source is None else signal.source
     if signal.source is not None and signal.esc is not None and several:
         shows = f"{signal.esc}.{signal.source}"
-    named = [value for value in signal.values if value.value not in (signal.not_available, signal.error)]
-    meaning = " ".join(filter(None, (signal.comment, _named(named), *(f"{note}." for note in signal.notes))))
+    named = [
+        value for value in signal.values if value.value not in (signal.not_available, signal.error)
+    ]
+    meaning = " ".join(
+        filter(None, (signal.comment, _named(named), *(f"{note}." for note in signal.notes)))
+    )
     shown = shows if signal.source is None else Code(shows)
     return Code(signal.name), bits, signal.unit, steps, span, codes, shown, meaning
 
@@ -174,13 +219,25 @@ def _faults(facts: Description) -> Iterator[tuple[str, int, list[str | Table]]]:
         whose = "unknown" if device.peak_current is None else f"of the {device.peak_current}"
         missing = ", ".join(device.not_supplied) or "nothing"
         rows.append((str(device.value), Code(device.name), whose, missing))
-    yield "Devices", 2, [Table(("number", "device", "peak current", "does not supply"), tuple(rows))]
-    yield "Link states", 2, ["The telemetry line between an ESC and the gateway.", _states(facts.link_states)]
+    yield (
+        "Devices",
+        2,
+        [Table(("number", "device", "peak current", "does not supply"), tuple(rows))],
+    )
+    yield (
+        "Link states",
+        2,
+        ["The telemetry line between an ESC and the gateway.", _states(facts.link_states)],
+    )
     yield "CAN states", 2, ["The gateway's CAN controller.", _states(facts.can_states)]
     yield "Gateway states", 2, [_states(facts.gateway_states)]
     found = tuple((Code(f.name), f.meaning, f.remedy) for f in facts.gateway_faults)
     told = "Told as emergencies on CANopen nodes, in the log and by kontronik-can-gw status."
-    yield "Faults that the gateway finds", 2, [told, Table(("fault", "meaning", "what to do"), found)]
+    yield (
+        "Faults that the gateway finds",
+        2,
+        [told, Table(("fault", "meaning", "what to do"), found)],
+    )
 
 
 def _errors(errors: Iterable[ErrorFacts]) -> Table:
@@ -199,12 +256,18 @@ def _states(states: Iterable[StateFacts]) -> Table:
 def _canopen(facts: CanopenFacts) -> Iterator[tuple[str, int, list[str | Table]]]:
     yield "CANopen nodes", 2, ["One node for each ESC, all with the objects below."]
     for node in facts.nodes:
-        title = f"Node {node.node_id} ({node.esc})" if node.node_id is not None else f"Node of {node.esc}"
+        title = (
+            f"Node {node.node_id} ({node.esc})"
+            if node.node_id is not None
+            else f"Node of {node.esc}"
+        )
         yield title, 3, list(_node(node))
     head = ("code", "byte 3", "byte 4", "name", "class", "meaning", "what to do")
     text = "Emergency messages: bytes 0 and 1 are the code, byte 2 is 1001h, byte 3 the bit of the ESC's error word, or FFh."
     yield "Emergencies", 2, [text, Table(head, tuple(map(_emergency, facts.emergencies)))]
-    writes = "Nothing can be written over the bus: canopen.read_only is true." if facts.read_only else ""
+    writes = (
+        "Nothing can be written over the bus: canopen.read_only is true." if facts.read_only else ""
+    )
     yield "CANopen objects", 2, [*facts.notes, writes]
     for item in facts.objects:
         yield f"{item.index:04X}h {item.name}", 3, [*item.notes, _object(item)]
@@ -241,7 +304,8 @@ def _object(item: ObjectFacts) -> Table:
 
 
 def _entry(e: EntryFacts) -> tuple[str, ...]:
-    default = "" if e.default is None or e.source is not None else _hex(e.default)  # a live value has none of its own
+    # a live value has none of its own
+    default = "" if e.default is None or e.source is not None else _hex(e.default)
     if e.plus_node_id:
         default = f"$NODEID + {default}"
     limits = "" if e.low is e.high is None else f"{_number(e.low)} … {_number(e.high)}"

@@ -318,7 +318,9 @@ class Description:
         return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
 
-def describe(bus: BusLayout | None, canopen: CanopenSetup | None, escs: Sequence[EscSettings]) -> Description:
+def describe(
+    bus: BusLayout | None, canopen: CanopenSetup | None, escs: Sequence[EscSettings]
+) -> Description:
     """What a gateway with this DBC, these CANopen nodes and these ESCs sends. None: without that output."""
     names = tuple(esc.name for esc in escs)
     dbc = None if bus is None else _dbc(bus, names)
@@ -331,12 +333,16 @@ def describe(bus: BusLayout | None, canopen: CanopenSetup | None, escs: Sequence
         sources=tuple(_sources(dbc, None if canopen is None else canopen.eds, meanings)),
         operating_errors=_errors(OperatingError),
         selftest_errors=_errors(SelfTestError),
-        operating_states=tuple(StateFacts(int(s), s.text, s.meaning, s.remedy) for s in OperatingState),
+        operating_states=tuple(
+            StateFacts(int(s), s.text, s.meaning, s.remedy) for s in OperatingState
+        ),
         devices=tuple(_devices()),
         link_states=_states(LINK_STATES),
         can_states=_states(CAN_STATES),
         gateway_states=_states(GATEWAY_STATES),
-        gateway_faults=tuple(FaultFacts(e.name.lower(), e.meaning, e.remedy, e.value[0]) for e in GatewayError),
+        gateway_faults=tuple(
+            FaultFacts(e.name.lower(), e.meaning, e.remedy, e.value[0]) for e in GatewayError
+        ),
     )
 
 
@@ -356,15 +362,21 @@ def _dbc(bus: BusLayout, escs: Sequence[str]) -> DbcFacts:
                 extended=plan.extended,
                 fd=plan.fd,
                 length=plan.length,
-                send_type=tuple(text for flag, text in _SEND_TYPES.items() if flag in plan.send_type),
+                send_type=tuple(
+                    text for flag, text in _SEND_TYPES.items() if flag in plan.send_type
+                ),
                 cycle_ms=_number(Fraction(plan.cycle_ns, MS)),
                 delay_ms=_number(Fraction(plan.delay_ns, MS)),
                 comment=_line(message.comment),
-                signals=tuple(_signal(signal, signals[signal.name], escs) for signal in plan.signals),
+                signals=tuple(
+                    _signal(signal, signals[signal.name], escs) for signal in plan.signals
+                ),
             )
         )
     comment = next((bus.comment for bus in bus.database.buses if bus.comment), "")
-    return DbcFacts(PurePath(bus.layout.file).name, bus.layout.node, _line(comment), tuple(messages))
+    return DbcFacts(
+        PurePath(bus.layout.file).name, bus.layout.node, _line(comment), tuple(messages)
+    )
 
 
 class _Stated(Protocol):
@@ -385,7 +397,13 @@ class _Stated(Protocol):
 
 
 def _signal(plan: SignalPlan, signal: _Stated, escs: Sequence[str]) -> SignalFacts:
-    is_flag = plan.length == 1 and not plan.signed and plan.numbers is None and plan.factor == 1 and plan.offset == 0
+    is_flag = (
+        plan.length == 1
+        and not plan.signed
+        and plan.numbers is None
+        and plan.factor == 1
+        and plan.offset == 0
+    )
     has_codes = plan.role is Role.SOURCE and not is_flag
     ends = sorted(float(raw * plan.factor + plan.offset) for raw in (plan.low, plan.high))
     if plan.is_float:
@@ -421,17 +439,23 @@ def _signal(plan: SignalPlan, signal: _Stated, escs: Sequence[str]) -> SignalFac
 def _meanings() -> dict[str, str]:
     """Source to what it means: of a flag the bit's meaning, else the comment of the shipped signal that shows it."""
     shown = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-    comments = {(m.name, s.name): _line(s.comment) for m in shown.database.messages for s in m.signals}
+    comments = {
+        (m.name, s.name): _line(s.comment) for m in shown.database.messages for s in m.signals
+    }
     found = {
         plan.source.name: comments[message.name, plan.name]
         for message in shown.layout.messages
         for plan in message.signals
         if plan.source is not None
     }
-    return found | {bit.text: bit.meaning for names in (OperatingError, SelfTestError) for bit in names}
+    return found | {
+        bit.text: bit.meaning for names in (OperatingError, SelfTestError) for bit in names
+    }
 
 
-def _sources(dbc: DbcFacts | None, eds: Eds | None, meanings: Mapping[str, str]) -> Iterator[SourceFacts]:
+def _sources(
+    dbc: DbcFacts | None, eds: Eds | None, meanings: Mapping[str, str]
+) -> Iterator[SourceFacts]:
     signals: dict[str, list[str]] = {}
     for message in dbc.messages if dbc else ():
         for signal in message.signals:
@@ -455,14 +479,24 @@ def _sources(dbc: DbcFacts | None, eds: Eds | None, meanings: Mapping[str, str])
         available = _AVAILABLE[source.group] + (", where supplied" if source.supplied else "")
         texts = _values({int(number): text for number, text in source.names.items()})
         yield SourceFacts(
-            name, source.unit, available, meaning, source.rolls, name in bindable, texts, in_signals, in_objects
+            name,
+            source.unit,
+            available,
+            meaning,
+            source.rolls,
+            name in bindable,
+            texts,
+            in_signals,
+            in_objects,
         )
 
 
 # --- CANopen
 
 
-def _canopen(setup: CanopenSetup, escs: Sequence[EscSettings], meanings: Mapping[str, str]) -> CanopenFacts:
+def _canopen(
+    setup: CanopenSetup, escs: Sequence[EscSettings], meanings: Mapping[str, str]
+) -> CanopenFacts:
     eds = setup.eds
     comments = _comments(eds)
     indices = {entry.index for entry in eds.entries}
@@ -471,12 +505,18 @@ def _canopen(setup: CanopenSetup, escs: Sequence[EscSettings], meanings: Mapping
         entries = [entry for entry in eds.entries if entry.index == index]
         notes = tuple(line for line in comments if index in _named(line))
         facts = tuple(_entry(entry, meanings) for entry in entries)
-        objects.append(ObjectFacts(index, eds.object_names[index], _KINDS[entries[0].object_type], notes, facts))
+        objects.append(
+            ObjectFacts(
+                index, eds.object_names[index], _KINDS[entries[0].object_type], notes, facts
+            )
+        )
     return CanopenFacts(
         file=PurePath(eds.name).name,
         read_only=any(settings.read_only for settings in setup.settings),
         notes=tuple(line for line in comments if not _named(line) & indices),
-        nodes=tuple(_node(node, esc) for node, esc in zip(setup.nodes(escs).nodes, escs, strict=True)),
+        nodes=tuple(
+            _node(node, esc) for node, esc in zip(setup.nodes(escs).nodes, escs, strict=True)
+        ),
         objects=tuple(objects),
         emergencies=tuple(_emergencies(eds)),
     )
@@ -490,7 +530,11 @@ def _entry(entry: Entry, meanings: Mapping[str, str]) -> EntryFacts:
         sub=entry.sub,
         name=entry.name,
         type=DATA_TYPES[entry.data_type],
-        bits=None if number is None else 1 if DATA_TYPES[entry.data_type] == "BOOLEAN" else 8 * number.size,
+        bits=None
+        if number is None
+        else 1
+        if DATA_TYPES[entry.data_type] == "BOOLEAN"
+        else 8 * number.size,
         access=entry.access,
         readable=entry.access != "wo",
         writable="w" in entry.access,
@@ -534,12 +578,17 @@ def _node(node: Node, esc: EscSettings) -> NodeFacts:
             transmission_type=tpdo.type,
             inhibit_ms=_number(Fraction(tpdo.inhibit_ns, MS)),
             event_ms=_number(Fraction(tpdo.event_ns, MS)),
-            mapped=tuple(f"{e.index:04X}h:{e.sub:02X} {e.name}" for e in (m.variable.entry for m in tpdo.mapped)),
+            mapped=tuple(
+                f"{e.index:04X}h:{e.sub:02X} {e.name}"
+                for e in (m.variable.entry for m in tpdo.mapped)
+            ),
         )
         for tpdo in node.tpdos
         if tpdo.valid and node.node_id != UNCONFIGURED
     )
-    return NodeFacts(esc.name, None if node.node_id == UNCONFIGURED else node.node_id, cob_ids, pdos)
+    return NodeFacts(
+        esc.name, None if node.node_id == UNCONFIGURED else node.node_id, cob_ids, pdos
+    )
 
 
 def _emergencies(eds: Eds) -> Iterator[EmergencyFacts]:
@@ -553,18 +602,28 @@ def _emergencies(eds: Eds) -> Iterator[EmergencyFacts]:
         named = bits.get(bit)
         if named is None:
             text = ErrorFacts(
-                bit, f"bit{bit}", Severity.ERROR.value, "a bit that has no name yet", "Ask the maker of the ESC."
+                bit,
+                f"bit{bit}",
+                Severity.ERROR.value,
+                "a bit that has no name yet",
+                "Ask the maker of the ESC.",
             )
         else:
             text = _error(named)
-        yield EmergencyFacts(code, bit, None, register_of(code), text.name, text.severity, text.meaning, text.remedy)
+        yield EmergencyFacts(
+            code, bit, None, register_of(code), text.name, text.severity, text.meaning, text.remedy
+        )
     for error in GatewayError:
         code, detail = error.value
         byte4 = None if error is GatewayError.HEARTBEAT_LOST else detail
         name, severity = error.name.lower(), Severity.ERROR.value
-        yield EmergencyFacts(code, BY_GATEWAY, byte4, register_of(code), name, severity, error.meaning, error.remedy)
+        yield EmergencyFacts(
+            code, BY_GATEWAY, byte4, register_of(code), name, severity, error.meaning, error.remedy
+        )
     status = Severity.STATUS.value
-    yield EmergencyFacts(0, BY_GATEWAY, 0, 0, "no_error", status, "no error any more", "Nothing to do.")
+    yield EmergencyFacts(
+        0, BY_GATEWAY, 0, 0, "no_error", status, "no error any more", "Nothing to do."
+    )
 
 
 # --- errors, states, devices
@@ -580,7 +639,9 @@ def _error(bit: ErrorBit) -> ErrorFacts:
 
 def _states(texts: Mapping[Any, Text]) -> tuple[StateFacts, ...]:
     states: list[IntEnum] = list(texts)
-    return tuple(StateFacts(int(s), pascal_case(s.name), texts[s].meaning, texts[s].remedy) for s in states)
+    return tuple(
+        StateFacts(int(s), pascal_case(s.name), texts[s].meaning, texts[s].remedy) for s in states
+    )
 
 
 def _devices() -> Iterator[DeviceFacts]:
@@ -604,7 +665,11 @@ def _finite(value: float) -> float | None:
 
 def _text(data: bytes) -> str:
     """A text as it is, other bytes in hexadecimal."""
-    return data.decode("ascii") if data.isascii() and data.decode("ascii").isprintable() else data.hex(" ")
+    return (
+        data.decode("ascii")
+        if data.isascii() and data.decode("ascii").isprintable()
+        else data.hex(" ")
+    )
 
 
 def _line(text: object) -> str:

@@ -32,7 +32,9 @@ LINK_STATES: Mapping[LinkState, Text] = {
         GatewayError.CRC_RATE.remedy,
     ),
     LinkState.LOST: Text("good frames came, and come no more", GatewayError.TELEMETRY_LOST.remedy),
-    LinkState.PORT_ERROR: Text("the serial port cannot be opened or read", GatewayError.PORT_GONE.remedy),
+    LinkState.PORT_ERROR: Text(
+        "the serial port cannot be opened or read", GatewayError.PORT_GONE.remedy
+    ),
 }
 CAN_STATES: Mapping[CanState, Text] = {
     CanState.UNKNOWN: Text("the CAN interface does not tell"),
@@ -41,7 +43,9 @@ CAN_STATES: Mapping[CanState, Text] = {
         "works, but there are errors on the bus",
         GatewayError.CAN_PASSIVE.remedy,
     ),
-    CanState.ERROR_PASSIVE: Text("works, with many errors on the bus", GatewayError.CAN_PASSIVE.remedy),
+    CanState.ERROR_PASSIVE: Text(
+        "works, with many errors on the bus", GatewayError.CAN_PASSIVE.remedy
+    ),
     CanState.BUS_OFF: Text(
         "switched off by errors on the bus: no frame can leave",
         f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0 somebody has to restart the interface.",

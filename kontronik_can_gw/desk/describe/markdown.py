@@ -49,6 +49,8 @@ def text(content: str) -> str:
     plain = " ".join(content.split())
     masked = re.sub(r"([\\`*\[\]<>|~&$])", r"\\\1", plain)
     masked = re.sub(r"(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])", r"\\_", masked)
-    masked = re.sub(r"(https?|ftp)(://)|(www)(\.)", r"\1\3<!-- -->\2\4", masked)  # no link that nobody meant
-    masked = re.sub(r"^([#+=-])|(?<= )(#+)$", r"\\\1\2", masked)  # a heading, a list; the end of a heading
+    # no link that nobody meant
+    masked = re.sub(r"(https?|ftp)(://)|(www)(\.)", r"\1\3<!-- -->\2\4", masked)
+    # a heading, a list; the end of a heading
+    masked = re.sub(r"^([#+=-])|(?<= )(#+)$", r"\\\1\2", masked)
     return re.sub(r"^(\d+)([.)])(?= |$)", r"\1\\\2", masked)

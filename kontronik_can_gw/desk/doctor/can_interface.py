@@ -32,7 +32,11 @@ def check_can(system: System, can: CanConfig) -> list[Finding]:
         _missing(system, findings, can)
     elif not link.is_can:
         there = ", ".join(can_interfaces(system)) or "none"
-        findings.error("can.exists", f"{can.channel} is no CAN interface", f"Set can.channel; CAN interfaces: {there}")
+        findings.error(
+            "can.exists",
+            f"{can.channel} is no CAN interface",
+            f"Set can.channel; CAN interfaces: {there}",
+        )
     else:
         _link(findings, link, can)
     _other_gateways(system, findings, can.channel)
@@ -49,14 +53,22 @@ def _driver(findings: Findings, can: CanConfig) -> None:
     try:
         import_module(module)
     except Exception as error:  # a driver without its vendor's library fails in its own way
-        findings.error("can.driver", f"{can.interface}: its driver cannot be loaded: {error}", "Install what it names")
+        findings.error(
+            "can.driver",
+            f"{can.interface}: its driver cannot be loaded: {error}",
+            "Install what it names",
+        )
         return
-    findings.ok("can.driver", f"python-can's driver {can.interface} can be loaded; it is not opened here")
+    findings.ok(
+        "can.driver", f"python-can's driver {can.interface} can be loaded; it is not opened here"
+    )
 
 
 def _kernel(system: System, findings: Findings) -> bool:
     lines = (system.text("/proc/net/protocols") or "").splitlines()
-    if any(line.split()[:1] == ["CAN_RAW"] for line in lines) or system.exists("/sys/module/can_raw"):
+    if any(line.split()[:1] == ["CAN_RAW"] for line in lines) or system.exists(
+        "/sys/module/can_raw"
+    ):
         findings.ok("can.kernel", "the kernel has SocketCAN")
         return True
     release = platform.release()
@@ -85,18 +97,30 @@ def _again_command(can: CanConfig, what: str) -> str:
 def _missing(system: System, findings: Findings, can: CanConfig) -> None:
     there = can_interfaces(system)
     if there:
-        findings.error("can.exists", f"there is no interface {can.channel}", f"Set can.channel: {', '.join(there)}")
+        findings.error(
+            "can.exists",
+            f"there is no interface {can.channel}",
+            f"Set can.channel: {', '.join(there)}",
+        )
         return
     remedy = "Plug in the adapter and load its driver; for a virtual one (tests only):"
     command = f"sudo ip link add {can.channel} type vcan && sudo ip link set {can.channel} up"
-    findings.error("can.exists", f"there is no interface {can.channel}, nor any other CAN interface", remedy, command)
+    findings.error(
+        "can.exists",
+        f"there is no interface {can.channel}, nor any other CAN interface",
+        remedy,
+        command,
+    )
 
 
 def _link(findings: Findings, link: Link, can: CanConfig) -> None:
     kind = {None: "CAN", "can": "CAN controller"}.get(link.kind, str(link.kind))
     virtual = link.kind in _VIRTUAL
     if virtual:
-        findings.note("can.exists", f"{kind}: a virtual interface without a controller; frames stay on this machine")
+        findings.note(
+            "can.exists",
+            f"{kind}: a virtual interface without a controller; frames stay on this machine",
+        )
     else:
         findings.ok("can.exists", kind)
     if not link.up:
@@ -113,7 +137,10 @@ def _link(findings: Findings, link: Link, can: CanConfig) -> None:
         findings.ok("can.fd", "CAN FD is on")
     if not link.complete:
         findings.note(
-            "can.details", "without `ip` bit rate and controller cannot be looked at", "", "sudo apt install iproute2"
+            "can.details",
+            "without `ip` bit rate and controller cannot be looked at",
+            "",
+            "sudo apt install iproute2",
         )
     elif not virtual:
         if link.up or link.bitrate:  # else the command that starts it sets both
@@ -166,21 +193,32 @@ def _restart(findings: Findings, link: Link, can: CanConfig) -> None:
             f"sudo ip link set {can.channel} down; sudo ip link set {can.channel} up",
         )
         return
-    remedy = f"Once by hand, and for good by RestartSec={_RESTART_MS}ms in [CAN] of systemd-networkd:"
+    remedy = (
+        f"Once by hand, and for good by RestartSec={_RESTART_MS}ms in [CAN] of systemd-networkd:"
+    )
     command = _again_command(can, f"restart-ms {_RESTART_MS}")
     if not link.restart_ms:
         findings.error(
-            "can.restart", "restart-ms 0: after a bus-off the controller stays off for ever", remedy, command
+            "can.restart",
+            "restart-ms 0: after a bus-off the controller stays off for ever",
+            remedy,
+            command,
         )
     elif link.restart_ms > _LONG_RESTART_MS:
-        findings.warning("can.restart", f"restart-ms {link.restart_ms}: bus-off lasts that long", remedy, command)
+        findings.warning(
+            "can.restart", f"restart-ms {link.restart_ms}: bus-off lasts that long", remedy, command
+        )
     else:
         findings.ok("can.restart", f"leaves bus-off after {link.restart_ms} ms")
 
 
 def _controller(findings: Findings, link: Link, can: CanConfig) -> None:
     counters = link.error_counters
-    told = "" if counters is None else f", error counters: transmit {counters[0]}, receive {counters[1]}"
+    told = (
+        ""
+        if counters is None
+        else f", error counters: transmit {counters[0]}, receive {counters[1]}"
+    )
     bus = "Check the wires, both 120 ohm terminators, the bit rate, and that another node is on and acknowledges"
     match link.state:
         case "ERROR-ACTIVE":
@@ -201,15 +239,20 @@ def _controller(findings: Findings, link: Link, can: CanConfig) -> None:
     off = {"LISTEN-ONLY": "listen-only", "LOOPBACK": "loopback"}
     for mode, option in off.items():
         if mode in link.modes:
-            what = "nothing can be sent" if mode == "LISTEN-ONLY" else "frames may not reach the bus"
+            what = (
+                "nothing can be sent" if mode == "LISTEN-ONLY" else "frames may not reach the bus"
+            )
             command = _again_command(can, f"{option} off")
             findings.error("can.mode", f"the controller is in {option} mode: {what}", "", command)
     if "ONE-SHOT" in link.modes:
         command = _again_command(can, "one-shot off")
-        findings.warning("can.mode", "one-shot mode: a frame that loses arbitration is lost", "", command)
+        findings.warning(
+            "can.mode", "one-shot mode: a frame that loses arbitration is lost", "", command
+        )
     if link.termination is not None:
         findings.note(
-            "can.termination", f"built-in termination: {link.termination or 'off'}{' ohm' * bool(link.termination)}"
+            "can.termination",
+            f"built-in termination: {link.termination or 'off'}{' ohm' * bool(link.termination)}",
         )
 
 
@@ -232,12 +275,20 @@ def _queue(findings: Findings, link: Link, can: CanConfig, virtual: bool) -> Non
 def _statistics(findings: Findings, link: Link) -> None:
     if times := link.events.get("bus_off"):
         remedy = "A short, a wrong bit rate or a bad cable: check the bus"
-        findings.warning("can.bus_off", f"bus-off {times} times since the interface was made", remedy)
+        findings.warning(
+            "can.bus_off", f"bus-off {times} times since the interface was made", remedy
+        )
     names = {"error_passive": "error passive", "bus_error": "bus errors", "restarts": "restarts"}
     seen = [f"{link.events[key]} {name}" for key, name in names.items() if link.events.get(key)]
-    seen += [f"{number} {name.replace('_', ' ')}" for name, number in sorted(link.statistics.items()) if number]
+    seen += [
+        f"{number} {name.replace('_', ' ')}"
+        for name, number in sorted(link.statistics.items())
+        if number
+    ]
     if seen:
-        findings.note("can.statistics", f"counted so far: {', '.join(seen)}", "If they grow, check the bus")
+        findings.note(
+            "can.statistics", f"counted so far: {', '.join(seen)}", "If they grow, check the bus"
+        )
     elif link.statistics:
         findings.ok("can.statistics", "no errors and no lost frames counted")
 
@@ -251,13 +302,32 @@ def _other_gateways(system: System, findings: Findings, channel: str) -> None:
         for file in system.names(str(path)):
             status = system.status(str(path / file))
             name = lock_name(file, 0 if namespace is None else namespace.st_ino)
-            if name is not None and name.startswith(f"{channel}/") and status is not None and is_held(status, held):
+            if (
+                name is not None
+                and name.startswith(f"{channel}/")
+                and status is not None
+                and is_held(status, held)
+            ):
                 found.append(name.removeprefix(f"{channel}/"))
     if not found:
         return
-    nodes = sorted({number for what, _, number in (name.partition("/") for name in found) if what == "node"})
-    messages = sorted({number for what, _, number in (name.partition("/") for name in found) if what == "messages"})
-    what = [f"CANopen node {', '.join(sorted(nodes, key=int))}"] if nodes and all(n.isdigit() for n in nodes) else []
+    nodes = sorted(
+        {number for what, _, number in (name.partition("/") for name in found) if what == "node"}
+    )
+    messages = sorted(
+        {
+            number
+            for what, _, number in (name.partition("/") for name in found)
+            if what == "messages"
+        }
+    )
+    what = (
+        [f"CANopen node {', '.join(sorted(nodes, key=int))}"]
+        if nodes and all(n.isdigit() for n in nodes)
+        else []
+    )
     what += [f"the messages from {', '.join(messages)}h on"] if messages else []
     running = ", ".join(str(process) for process in system.processes if process.is_gateway)
-    findings.note("can.gateway", f"{running or 'a gateway'} already sends {' and '.join(what) or 'here'}")
+    findings.note(
+        "can.gateway", f"{running or 'a gateway'} already sends {' and '.join(what) or 'here'}"
+    )

@@ -44,7 +44,9 @@ class Link:
 def can_interfaces(system: System) -> list[str]:
     """Names of all CAN interfaces."""
     return [
-        name for name in system.names("/sys/class/net") if system.number(f"/sys/class/net/{name}/type") == _CAN_TYPE
+        name
+        for name in system.names("/sys/class/net")
+        if system.number(f"/sys/class/net/{name}/type") == _CAN_TYPE
     ]
 
 
@@ -82,7 +84,9 @@ def _from_ip(found: Mapping[str, Any], slcan: bool) -> Link:
         queue_length=found.get("txqlen"),
         # a driver that knows fixed rates only, as slcan, has no further timing
         bitrate=timing.get("bitrate", data.get("bittiming_bitrate", 0 if kind == "can" else None)),
-        data_bitrate=data.get("data_bittiming", {}).get("bitrate", data.get("data_bittiming_bitrate")),
+        data_bitrate=data.get("data_bittiming", {}).get(
+            "bitrate", data.get("data_bittiming_bitrate")
+        ),
         sample_point=float(sample_point) if sample_point else None,
         restart_ms=data.get("restart_ms", 0 if kind == "can" else None),
         can_restart=not (slcan and kind == "can"),

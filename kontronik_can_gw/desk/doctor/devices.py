@@ -24,7 +24,9 @@ class Adapter:
     def __str__(self) -> str:
         words = [self.product, f"driver {self.driver}" if self.driver else ""]
         if self.usb:
-            words.append(f"serial number {self.serial}" if self.serial else "without a serial number")
+            words.append(
+                f"serial number {self.serial}" if self.serial else "without a serial number"
+            )
         return ", ".join(word for word in words if word)
 
 
@@ -39,7 +41,9 @@ def adapter_of(system: System, tty: str) -> Adapter:
         mini_uart = mini_uart or MINI_UART in compatible.split("\0") or driver == "bcm2835-aux-uart"
         if (vendor_id := system.text(f"{folder}/idVendor")) is not None:
             product = system.text(f"{folder}/product") or ""
-            return Adapter(driver, folder, product, system.text(f"{folder}/serial") or "", vendor_id, mini_uart)
+            return Adapter(
+                driver, folder, product, system.text(f"{folder}/serial") or "", vendor_id, mini_uart
+            )
     return Adapter(driver, mini_uart=mini_uart)
 
 
@@ -61,7 +65,11 @@ def stable_names(system: System, port: str) -> list[str]:
     found = []
     for kind in kinds:
         folder = f"/dev/serial/{kind}"
-        found += [f"{folder}/{name}" for name in system.names(folder) if system.real(f"{folder}/{name}") == real]
+        found += [
+            f"{folder}/{name}"
+            for name in system.names(folder)
+            if system.real(f"{folder}/{name}") == real
+        ]
     return found
 
 

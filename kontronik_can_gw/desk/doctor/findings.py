@@ -50,7 +50,9 @@ class Findings:
     def error(self, check: str, text: str, remedy: str = "", command: str = "") -> None:
         self.add(Severity.ERROR, check, text, remedy, command)
 
-    def add(self, severity: Severity, check: str, text: str, remedy: str = "", command: str = "") -> None:
+    def add(
+        self, severity: Severity, check: str, text: str, remedy: str = "", command: str = ""
+    ) -> None:
         self.found.append(Finding(self.group, check, severity, text, remedy, command))
 
 
@@ -58,7 +60,9 @@ def count(findings: Iterable[Finding], severity: Severity) -> int:
     return sum(finding.severity is severity for finding in findings)
 
 
-def document(findings: Sequence[Finding], version: str, config: str, exit_code: int) -> dict[str, Any]:
+def document(
+    findings: Sequence[Finding], version: str, config: str, exit_code: int
+) -> dict[str, Any]:
     """The report as one JSON document."""
     return {
         "format": FORMAT,

@@ -14,12 +14,16 @@ _LOW_BYTES = 16 * 1024 * 1024
 _HOMES = ("/home", "~root", "/run/user")
 
 
-def check_readable(system: System, findings: Findings, check: str, file: str, unit: Unit | None) -> None:
+def check_readable(
+    system: System, findings: Findings, check: str, file: str, unit: Unit | None
+) -> None:
     """The service can read a file. Nothing is said where there is no service."""
     if unit is None or unit.user is None:
         return
     who = unit.user
-    if unit.hides_homes and any(PurePath(file).is_relative_to(Path(home).expanduser()) for home in _HOMES):
+    if unit.hides_homes and any(
+        PurePath(file).is_relative_to(Path(home).expanduser()) for home in _HOMES
+    ):
         text = f"{file}: {unit.name} sees no home folders (ProtectHome)"
         findings.error(check, text, "Move it:", f"sudo mv {file} /etc/kontronik-can-gw/")
         return
@@ -29,15 +33,29 @@ def check_readable(system: System, findings: Findings, check: str, file: str, un
         if at is not None and not who.may(at, 1):
             text = f"{file}: the service's user {who.name} may not enter {folder}"
             findings.error(
-                check, text, "Keep the configuration in /etc/kontronik-can-gw, or:", f"sudo chmod o+x {folder}"
+                check,
+                text,
+                "Keep the configuration in /etc/kontronik-can-gw, or:",
+                f"sudo chmod o+x {folder}",
             )
             return
     if status is not None and not who.may(status, 4):
-        findings.error(check, f"{file}: the service's user {who.name} may not read it", "", f"sudo chmod o+r {file}")
+        findings.error(
+            check,
+            f"{file}: the service's user {who.name} may not read it",
+            "",
+            f"sudo chmod o+r {file}",
+        )
 
 
 def check_folder(
-    system: System, findings: Findings, check: str, what: str, folder: str, unit: Unit | None, least: int = 0
+    system: System,
+    findings: Findings,
+    check: str,
+    what: str,
+    folder: str,
+    unit: Unit | None,
+    least: int = 0,
 ) -> None:
     """Files can be made in a folder, or it can be made, and there is room.
 
@@ -50,13 +68,18 @@ def check_folder(
     status = system.status(there)
     if status is not None and not S_ISDIR(status.st_mode):
         findings.error(
-            check, f"{what}: {folder}: {there} is a file, not a folder", "Choose another folder:", f"ls -l {there}"
+            check,
+            f"{what}: {folder}: {there} is a file, not a folder",
+            "Choose another folder:",
+            f"ls -l {there}",
         )
         return
     left = system.file_system(there)
     if left is not None and left.read_only:
         text = f"{what}: {folder}: the file system is read-only"
-        findings.error(check, text, "Make it writable, or choose another folder:", f"findmnt --target {there}")
+        findings.error(
+            check, text, "Make it writable, or choose another folder:", f"findmnt --target {there}"
+        )
         return
     if left is not None and (left.free_bytes < _MIN_BYTES or left.free_files == 0):
         text = f"{what}: {folder}: the file system is full"
@@ -67,7 +90,9 @@ def check_folder(
     if kept_by_systemd or (system.exists(folder) and status is None):
         findings.ok(check, f"{what}: {folder}, made by systemd for the service")
     elif unit is not None and owner is not None:
-        allowed = not unit.strict or any(PurePath(folder).is_relative_to(path) for path in unit.writable)
+        allowed = not unit.strict or any(
+            PurePath(folder).is_relative_to(path) for path in unit.writable
+        )
         if status is None or not owner.may(status, 3):
             findings.error(
                 check,
@@ -87,7 +112,8 @@ def check_folder(
         findings.ok(check, f"{what}: {folder}{made}")
     elif not system.may_fill(there) and any(process.is_gateway for process in system.processes):
         findings.note(
-            check, f"{what}: {folder}: {system.user.name} may not write there; perhaps the gateway that runs may"
+            check,
+            f"{what}: {folder}: {system.user.name} may not write there; perhaps the gateway that runs may",
         )
     elif not system.may_fill(there):
         findings.error(

@@ -37,7 +37,10 @@ def _clock(system: System, findings: Findings, year: int) -> None:
         findings.ok("machine.clock", f"the clock says {year}")
     source = system.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     if source in _SLOW_CLOCKS:
-        findings.note("machine.clock_source", f"clock source {source}: reading the time is slow on this machine")
+        findings.note(
+            "machine.clock_source",
+            f"clock source {source}: reading the time is slow on this machine",
+        )
     elif source:
         findings.ok("machine.clock_source", f"clock source {source}")
 
@@ -48,26 +51,38 @@ def _processor(system: System, findings: Findings) -> None:
     if load:
         text = f"load {load[0]} with {processors} processor{'s' * (processors > 1)}"
         if float(load[0]) > 2 * processors:
-            findings.warning("machine.load", f"{text}: values may be late", "See what else runs:", "top")
+            findings.warning(
+                "machine.load", f"{text}: values may be late", "See what else runs:", "top"
+            )
         else:
             findings.ok("machine.load", text)
     governor = system.text("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
-    if governor == "powersave" and system.text("/sys/devices/system/cpu/cpu0/cpufreq/scaling_driver") != "intel_pstate":
+    if (
+        governor == "powersave"
+        and system.text("/sys/devices/system/cpu/cpu0/cpufreq/scaling_driver") != "intel_pstate"
+    ):
         command = "echo schedutil | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
-        findings.note("machine.governor", "the processor is kept at its lowest speed (powersave)", "", command)
+        findings.note(
+            "machine.governor", "the processor is kept at its lowest speed (powersave)", "", command
+        )
     elif governor:
         findings.ok("machine.governor", f"processor governor {governor}")
 
 
 def _memory(system: System, findings: Findings) -> None:
     lines = [line.split() for line in (system.text("/proc/meminfo") or "").splitlines()]
-    kilobytes = {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdigit()}
+    kilobytes = {
+        words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdigit()
+    }
     free = kilobytes.get("MemAvailable:")
     if free is None:
         return
     if free < _MIN_MEMORY_KB:
         findings.warning(
-            "machine.memory", f"{free // 1024} MB of memory are free; a gateway needs about 40", "", "free -h"
+            "machine.memory",
+            f"{free // 1024} MB of memory are free; a gateway needs about 40",
+            "",
+            "free -h",
         )
     else:
         findings.ok("machine.memory", f"{free // 1024} MB of memory are free")
@@ -81,7 +96,9 @@ def _power(system: System, findings: Findings) -> None:
             continue
         if system.number(f"{folder}/in0_lcrit_alarm"):
             findings.note(
-                "machine.power", "undervoltage since the start: USB adapters may drop out", "Use a stronger supply"
+                "machine.power",
+                "undervoltage since the start: USB adapters may drop out",
+                "Use a stronger supply",
             )
         else:
             findings.ok("machine.power", "no undervoltage since the start")

@@ -30,7 +30,8 @@ def check_port(system: System, esc: str, port: str, unit: Unit | None, look: Loo
     real = system.real(port)
     if real.startswith("/dev/pts/"):
         findings.ok("port.exists", f"{port} is a pseudo terminal: a simulated ESC")
-        holders = [process for process in system.openers(status)[0] if process.is_gateway]  # the simulator has it too
+        # the simulator has it too
+        holders = [process for process in system.openers(status)[0] if process.is_gateway]
         if not holders and not system.may_open(port):
             findings.error(
                 "port.permission",
@@ -45,7 +46,10 @@ def check_port(system: System, esc: str, port: str, unit: Unit | None, look: Loo
         return findings.found
     adapter = adapter_of(system, tty)
     what = str(adapter)
-    findings.ok("port.exists", f"{port}{f' is {tty}' if tty not in port else ''}{f': {what}' if what else ''}")
+    findings.ok(
+        "port.exists",
+        f"{port}{f' is {tty}' if tty not in port else ''}{f': {what}' if what else ''}",
+    )
     _name(system, findings, port, tty)
     holders, complete = system.openers(status)
     gateway = any(process.is_gateway for process in holders)
@@ -64,7 +68,9 @@ def check_port(system: System, esc: str, port: str, unit: Unit | None, look: Loo
             "echo dtoverlay=disable-bt | sudo tee -a /boot/firmware/config.txt",
         )
     elif holders or console or prompt:
-        findings.note("port.parity", "even parity was not tried: the port is in use", *_ask_gateway(gateway))
+        findings.note(
+            "port.parity", "even parity was not tried: the port is in use", *_ask_gateway(gateway)
+        )
     elif not system.may_open(port):
         findings.note(
             "port.parity",
@@ -80,15 +86,27 @@ def _missing(system: System, findings: Findings, port: str) -> None:
     there = ports_there(system)
     text = f"{port}: no such port" + (f"; there are {', '.join(there)}" if there else "")
     if port.startswith("/dev/ttyAMA"):
-        findings.error("port.exists", text, "On a Raspberry Pi: enable_uart=1 and dtoverlay=disable-bt in config.txt")
+        findings.error(
+            "port.exists",
+            text,
+            "On a Raspberry Pi: enable_uart=1 and dtoverlay=disable-bt in config.txt",
+        )
         return
-    remedy = "Plug in the adapter, or name another port" if not there else "Plug in the adapter, or name one of these"
+    remedy = (
+        "Plug in the adapter, or name another port"
+        if not there
+        else "Plug in the adapter, or name one of these"
+    )
     findings.error("port.exists", text, remedy, "ls -l /dev/serial/by-id")
 
 
 def _choose(system: System) -> str:
     there = ports_there(system)
-    return f"Name one of these as esc.port: {', '.join(there)}" if there else "Name the adapter's port as esc.port"
+    return (
+        f"Name one of these as esc.port: {', '.join(there)}"
+        if there
+        else "Name the adapter's port as esc.port"
+    )
 
 
 def _name(system: System, findings: Findings, port: str, tty: str) -> None:
@@ -109,17 +127,30 @@ def _name(system: System, findings: Findings, port: str, tty: str) -> None:
 
 
 def _permission(
-    system: System, findings: Findings, port: str, status: os.stat_result, service: User | None, gateway: bool
+    system: System,
+    findings: Findings,
+    port: str,
+    status: os.stat_result,
+    service: User | None,
+    gateway: bool,
 ) -> None:
     """Whoever runs the gateway may open the port. Where that is neither the service nor known, it is us."""
     group, me = system.group_name(status.st_gid), system.user.name
     shared = status.st_mode & 0o060 == 0o060 and status.st_gid != 0
     open_to_group = f"sudo chgrp dialout {port} && sudo chmod g+rw {port}"
     if service is not None and service.may(status, 6):
-        findings.ok("port.permission", f"the service's user {service.name} may open it (group {group})")
+        findings.ok(
+            "port.permission", f"the service's user {service.name} may open it (group {group})"
+        )
     elif service is not None:
-        command = f"sudo usermod -aG {group} {service.name}" if shared and service.uid > 0 else open_to_group
-        findings.error("port.permission", f"the service's user {service.name} may not open it", "", command)
+        command = (
+            f"sudo usermod -aG {group} {service.name}"
+            if shared and service.uid > 0
+            else open_to_group
+        )
+        findings.error(
+            "port.permission", f"the service's user {service.name} may not open it", "", command
+        )
     if system.may_open(port):
         if service is None:
             findings.ok("port.permission", f"{me} may open it (group {group})")
@@ -128,26 +159,46 @@ def _permission(
     if shared:
         remedy, command = "Join its group, then log in again:", f"sudo usermod -aG {group} {me}"
     if service is None and not gateway:
-        findings.error("port.permission", f"{me} may not open it: permission denied", remedy, command)
+        findings.error(
+            "port.permission", f"{me} may not open it: permission denied", remedy, command
+        )
     else:
-        findings.note("port.permission", f"{me} may not open it, only the gateway can", remedy, command)
+        findings.note(
+            "port.permission", f"{me} may not open it, only the gateway can", remedy, command
+        )
 
 
-def _device_kind(system: System, findings: Findings, status: os.stat_result, unit: Unit | None) -> None:
+def _device_kind(
+    system: System, findings: Findings, status: os.stat_result, unit: Unit | None
+) -> None:
     """The unit allows only some kinds of devices, by the names in /proc/devices."""
     if unit is None or unit.devices is None:
         return
-    lines = (line.split() for line in (system.text("/proc/devices") or "").partition("Block")[0].splitlines())
-    kinds = [f"char-{words[1]}" for words in lines if len(words) == 2 and words[0] == str(os.major(status.st_rdev))]
+    lines = (
+        line.split()
+        for line in (system.text("/proc/devices") or "").partition("Block")[0].splitlines()
+    )
+    kinds = [
+        f"char-{words[1]}"
+        for words in lines
+        if len(words) == 2 and words[0] == str(os.major(status.st_rdev))
+    ]
     if kinds and not set(kinds) & set(unit.devices):
         text = f"{unit.name} may not use this kind of device ({kinds[0]})"
-        findings.error("port.device_kind", text, f"Add DeviceAllow={kinds[0]} rw:", f"sudo systemctl edit {unit.name}")
+        findings.error(
+            "port.device_kind",
+            text,
+            f"Add DeviceAllow={kinds[0]} rw:",
+            f"sudo systemctl edit {unit.name}",
+        )
 
 
 def _console(system: System, findings: Findings, tty: str) -> bool:
     """The kernel writes its messages to a console: they would reach the ESC."""
     words = (system.text("/proc/cmdline") or "").split()
-    named = [word for word in words if word.startswith("console=") and word[8:].partition(",")[0] == tty]
+    named = [
+        word for word in words if word.startswith("console=") and word[8:].partition(",")[0] == tty
+    ]
     active = tty in (system.text("/sys/class/tty/console/active") or "").split()
     if named or active:
         word = named[0] if named else f"console={tty}"
@@ -164,9 +215,16 @@ def _console(system: System, findings: Findings, tty: str) -> bool:
 
 def _getty(system: System, findings: Findings, tty: str) -> tuple[bool, list[Process]]:
     """Is a login prompt on this port, and by which programs."""
-    found = [p for p in system.processes if "getty" in p.name and any(w.rpartition("/")[2] == tty for w in p.words[1:])]
+    found = [
+        p
+        for p in system.processes
+        if "getty" in p.name and any(w.rpartition("/")[2] == tty for w in p.words[1:])
+    ]
     unit = f"serial-getty@{tty}"
-    active = bool(system.has_systemd and (system.run("systemctl", "is-active", unit) or "").strip() == "active")
+    active = bool(
+        system.has_systemd
+        and (system.run("systemctl", "is-active", unit) or "").strip() == "active"
+    )
     if found or active:
         who = ", ".join(map(str, found)) or unit
         findings.error(
@@ -198,7 +256,10 @@ def _meddlers(system: System, findings: Findings, tty: str, adapter: Adapter) ->
             )
     if "brltty" in names and adapter.vendor_id in _GRABBED_BY_BRLTTY:
         findings.warning(
-            "port.brltty", "brltty runs, and takes such adapters for Braille displays", "", "sudo apt remove brltty"
+            "port.brltty",
+            "brltty runs, and takes such adapters for Braille displays",
+            "",
+            "sudo apt remove brltty",
         )
 
 
@@ -207,7 +268,9 @@ def _users(findings: Findings, holders: list[Process], complete: bool) -> None:
     if others:
         who = ", ".join(map(str, others))
         command = f"kill {' '.join(str(process.pid) for process in others)}"
-        findings.error("port.users", f"in use by {who}", "End it, and what starts it again:", command)
+        findings.error(
+            "port.users", f"in use by {who}", "End it, and what starts it again:", command
+        )
     for process in holders:
         if process.is_gateway:
             findings.note("port.users", f"in use by {process}")
@@ -215,32 +278,49 @@ def _users(findings: Findings, holders: list[Process], complete: bool) -> None:
         if complete:
             findings.ok("port.users", "nobody else has it open")
         else:
-            findings.note("port.users", "nobody seems to have it open; only root can see all", "Run doctor with sudo")
+            findings.note(
+                "port.users",
+                "nobody seems to have it open; only root can see all",
+                "Run doctor with sudo",
+            )
 
 
 def _ask_gateway(gateway: bool) -> tuple[str, str]:
-    return ("The gateway has set it, or has said why it cannot:", "kontronik-can-gw status") if gateway else ("", "")
+    return (
+        ("The gateway has set it, or has said why it cannot:", "kontronik-can-gw status")
+        if gateway
+        else ("", "")
+    )
 
 
-def _power_and_latency(system: System, findings: Findings, tty: str, adapter: Adapter, gateway: bool) -> None:
+def _power_and_latency(
+    system: System, findings: Findings, tty: str, adapter: Adapter, gateway: bool
+) -> None:
     latency = system.number(f"/sys/class/tty/{tty}/device/latency_timer")
     if latency is not None and latency > 1 and gateway:  # which has asked for less, in vain
         text = f"latency timer {latency} ms: the adapter holds bytes back that long"
-        findings.warning("port.latency", text, "", f"echo 1 | sudo tee /sys/class/tty/{tty}/device/latency_timer")
+        findings.warning(
+            "port.latency", text, "", f"echo 1 | sudo tee /sys/class/tty/{tty}/device/latency_timer"
+        )
     elif latency is not None:
         asks = "; the gateway asks for 1 ms when it opens the port" if latency > 1 else ""
         findings.ok("port.latency", f"latency timer {latency} ms{asks}")
     control = f"{adapter.usb}/power/control"
     if adapter.usb and system.text(control) == "auto":
         findings.note(
-            "port.autosuspend", "the USB adapter may be suspended to save power", "", f"echo on | sudo tee {control}"
+            "port.autosuspend",
+            "the USB adapter may be suspended to save power",
+            "",
+            f"echo on | sudo tee {control}",
         )
 
 
 def _line(findings: Findings, line: Line, tty: str) -> None:
     if line.busy:
         findings.note(
-            "port.parity", "even parity was not tried: somebody has the port for himself", "Run doctor with sudo"
+            "port.parity",
+            "even parity was not tried: somebody has the port for himself",
+            "Run doctor with sudo",
         )
         return
     if line.trouble is not None:

@@ -50,7 +50,8 @@ def unit_of(system: System, config: str) -> Unit | None:
     lines = (system.run("systemctl", "show", name, f"--property={_SHOWN}") or "").splitlines()
     shown: dict[str, str] = {}
     for key, _, value in (line.partition("=") for line in lines):
-        shown[key] = f"{shown[key]} {value}" if key in shown else value  # DeviceAllow has a line for each
+        # DeviceAllow has a line for each
+        shown[key] = f"{shown[key]} {value}" if key in shown else value
     if shown.get("LoadState") != "loaded":
         return None
     groups, user = tuple(shown.get("SupplementaryGroups", "").split()), shown.get("User", "")
@@ -68,21 +69,33 @@ def unit_of(system: System, config: str) -> Unit | None:
         shown.get("ProtectSystem") == "strict",
         tuple(path.lstrip("-+") for path in shown.get("ReadWritePaths", "").split()),
         shown.get("ProtectHome") in ("yes", "tmpfs"),
-        tuple(shown.get("DeviceAllow", "").split()[::2]) if shown.get("DevicePolicy") in ("closed", "strict") else None,
+        tuple(shown.get("DeviceAllow", "").split()[::2])
+        if shown.get("DevicePolicy") in ("closed", "strict")
+        else None,
     )
 
 
 def check_service(system: System, findings: Findings, unit: Unit | None) -> None:
     """Installed, enabled, running, and how often it was restarted."""
     if not system.has_systemd:
-        findings.note("machine.service", "systemd does not run here; the gateway must be started by other means")
+        findings.note(
+            "machine.service",
+            "systemd does not run here; the gateway must be started by other means",
+        )
         return
     if unit is None:
-        findings.note("machine.service", "not installed as a service", "", "sudo kontronik-can-gw service install")
+        findings.note(
+            "machine.service",
+            "not installed as a service",
+            "",
+            "sudo kontronik-can-gw service install",
+        )
         return
     log = f"journalctl -u {unit.name} -n 50"
     if unit.state == "failed":
-        findings.error("machine.service", f"{unit.name} has failed ({unit.detail})", "Its log says why:", log)
+        findings.error(
+            "machine.service", f"{unit.name} has failed ({unit.detail})", "Its log says why:", log
+        )
     elif unit.state not in ("active", "reloading"):
         state = f"{unit.name} is {unit.state} ({unit.detail})"
         findings.note("machine.service", state, "", f"sudo systemctl start {unit.name}")
@@ -94,7 +107,9 @@ def check_service(system: System, findings: Findings, unit: Unit | None) -> None
     folder = system.status(str(SYSTEM_FOLDER))
     if folder is None or (unit.user is not None and not unit.user.may(folder, 7)):
         text = f"{SYSTEM_FOLDER}, where gateways lock node-IDs, is not there or not the service's"
-        findings.warning("machine.locks", text, "", f"sudo systemd-tmpfiles --create /etc/tmpfiles.d/{NAME}.conf")
+        findings.warning(
+            "machine.locks", text, "", f"sudo systemd-tmpfiles --create /etc/tmpfiles.d/{NAME}.conf"
+        )
     if not unit.enabled:
         text = f"{unit.name} does not start when the machine does"
         findings.note("machine.service_enabled", text, "", f"sudo systemctl enable {unit.name}")

@@ -31,7 +31,9 @@ class Process(NamedTuple):
     def is_gateway(self) -> bool:
         """True for a gateway of ours: `kontronik-can-gw run`, or `python -m kontronik_can_gw run`."""
         names = [word.rpartition("/")[2] for word in self.words[:4]]
-        return "run" in self.words[1:] and bool({"kontronik-can-gw", "kontronik_can_gw"} & set(names))
+        return "run" in self.words[1:] and bool(
+            {"kontronik-can-gw", "kontronik_can_gw"} & set(names)
+        )
 
     def __str__(self) -> str:
         return f"{'kontronik-can-gw' if self.is_gateway else self.name} (pid {self.pid})"
@@ -167,7 +169,11 @@ class System:
         for line in (self.text("/etc/passwd") or "").splitlines():
             words = line.split(":")
             if words[0] == name and len(words) > 3 and words[2].isdigit() and words[3].isdigit():
-                return User(name, int(words[2]), frozenset({int(words[3]), *self._groups(name, more_groups)}))
+                return User(
+                    name,
+                    int(words[2]),
+                    frozenset({int(words[3]), *self._groups(name, more_groups)}),
+                )
         return None
 
     def dynamic_user(self, name: str, groups: tuple[str, ...]) -> User:
@@ -178,7 +184,11 @@ class System:
         found = []
         for line in (self.text("/etc/group") or "").splitlines():
             words = line.split(":")
-            if len(words) > 3 and words[2].isdigit() and (words[0] in more or user in words[3].split(",")):
+            if (
+                len(words) > 3
+                and words[2].isdigit()
+                and (words[0] in more or user in words[3].split(","))
+            ):
                 found.append(int(words[2]))
         return found
 
@@ -229,4 +239,8 @@ class System:
         """Who has locked a file, which everybody may see."""
         where = f"{os.major(file.st_dev):02x}:{os.minor(file.st_dev):02x}:{file.st_ino}"
         lines = [line.split() for line in (self.text("/proc/locks") or "").splitlines()]
-        return {int(words[4]) for words in lines if len(words) > 5 and words[5] == where and words[4].isdigit()}
+        return {
+            int(words[4])
+            for words in lines
+            if len(words) > 5 and words[5] == where and words[4].isdigit()
+        }

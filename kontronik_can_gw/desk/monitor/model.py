@@ -101,7 +101,10 @@ QUANTITIES = (
     Quantity("output_opening", "opening", "%", 0, 5, PERCENT),
 )
 QUANTITY = {quantity.source: quantity for quantity in QUANTITIES}
-_SUMMARIES = {OperatingError.OPERATING_ERROR_FOUND.text, OperatingError.OPERATING_WARNING_FOUND.text}
+_SUMMARIES = {
+    OperatingError.OPERATING_ERROR_FOUND.text,
+    OperatingError.OPERATING_WARNING_FOUND.text,
+}
 _NO_ALARM = {OperatingError.PROGRAMMING_ALLOWED.text}
 
 
@@ -132,7 +135,9 @@ class Active(NamedTuple):
 def words(text: str) -> str:
     """A name as people write it: ``SpoolUpFromStill`` -> ``spool up from still``, ``RpmControl`` -> ``RPM control``."""
     parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]", text)
-    return " ".join(part if len(part) > 1 and part.isupper() else part.lower() for part in parts).replace("rpm", "RPM")
+    return " ".join(
+        part if len(part) > 1 and part.isupper() else part.lower() for part in parts
+    ).replace("rpm", "RPM")
 
 
 class EscMonitor:
@@ -153,7 +158,9 @@ class EscMonitor:
         flags = {bit.text for kind in (OperatingError, SelfTestError) for bit in kind}
         self._plain = {
             group: [
-                column for name, column in self._columns.items() if known[name].group is group and name not in flags
+                column
+                for name, column in self._columns.items()
+                if known[name].group is group and name not in flags
             ]
             for group in (Group.LIVE, Group.INFO)
         }
@@ -164,7 +171,9 @@ class EscMonitor:
         }
         """Unit of each source that the DBC has, in the order of the sources; without flags and words of flags."""
         link = self._columns.get("link_state", -1)
-        self._link_part = next((p.first for p in view.reader.parts if p.first <= link < p.first + p.count), None)
+        self._link_part = next(
+            (p.first for p in view.reader.parts if p.first <= link < p.first + p.count), None
+        )
         self._told = 0
         """How often the link's state came behind the first values after a gap."""
 
@@ -217,7 +226,12 @@ class EscMonitor:
         value = self.value("link_state")
         if isinstance(value, (int, float)):
             value = _enumerated(LinkState, value)
-        if value is None or normalize(value) in _WORKING or self._told >= _BELIEVED or not self.is_fresh:
+        if (
+            value is None
+            or normalize(value) in _WORKING
+            or self._told >= _BELIEVED
+            or not self.is_fresh
+        ):
             return value
         return _enumerated(LinkState, LinkState.OK)
 
@@ -238,8 +252,12 @@ class EscMonitor:
             value = device_text(int(value)) or f"device {int(value)}"
         if value is None:
             return ""
-        value = next((device.text for device in Device if normalize(device.text) == normalize(value)), value)
-        variant, main, sub = (self.number(name) for name in ("variant", "firmware_main", "firmware_sub"))
+        value = next(
+            (device.text for device in Device if normalize(device.text) == normalize(value)), value
+        )
+        variant, main, sub = (
+            self.number(name) for name in ("variant", "firmware_main", "firmware_sub")
+        )
         text = value if variant is None else f"{value} {variant:.0f}"
         return text if main is None or sub is None else f"{text}, firmware {main:.0f}.{sub:.0f}"
 
@@ -257,7 +275,11 @@ class EscMonitor:
         """What of it is to be told to people: without what is no alarm, and without a summary of what is told anyway."""
         told = [active for active in self.active if active.name not in _NO_ALARM]
         plain = {active.severity for active in told if active.name not in _SUMMARIES}
-        return [active for active in told if active.name not in _SUMMARIES or active.severity not in plain]
+        return [
+            active
+            for active in told
+            if active.name not in _SUMMARIES or active.severity not in plain
+        ]
 
     def _active(self, kind: type[ErrorBit], word_source: str, group: Group) -> Iterable[Active]:
         plain = self._plain[group]
@@ -271,7 +293,11 @@ class EscMonitor:
         named = {int(bit) for bit in kind}
         for number in range(32):
             if word >> number & 1 and number not in named:
-                yield Active(f"bit{number}", Severity.WARNING, f"bit {number} of {word_source}, which has no name")
+                yield Active(
+                    f"bit{number}",
+                    Severity.WARNING,
+                    f"bit {number} of {word_source}, which has no name",
+                )
 
 
 class Monitor:
@@ -280,7 +306,9 @@ class Monitor:
     def __init__(self, bus: BusLayout) -> None:
         self.bus = bus
         self.view = View(SignalReader(bus.layout))
-        self.escs = tuple(EscMonitor(settings, index, self.view) for index, settings in enumerate(bus.escs))
+        self.escs = tuple(
+            EscMonitor(settings, index, self.view) for index, settings in enumerate(bus.escs)
+        )
         self.start_ns: int | None = None
         """When watching began, or the extremes were reset."""
         self._now = 0
@@ -397,9 +425,15 @@ class Monitor:
                     "link": esc.link,
                     "state": esc.state,
                     "device": esc.device or None,
-                    "errors": [active.name for active in esc.active if active.severity is Severity.ERROR],
-                    "warnings": [active.name for active in esc.active if active.severity is Severity.WARNING],
-                    "status": [active.name for active in esc.active if active.severity is Severity.STATUS],
+                    "errors": [
+                        active.name for active in esc.active if active.severity is Severity.ERROR
+                    ],
+                    "warnings": [
+                        active.name for active in esc.active if active.severity is Severity.WARNING
+                    ],
+                    "status": [
+                        active.name for active in esc.active if active.severity is Severity.STATUS
+                    ],
                     "values": {name: esc.value(name) for name in esc.units},
                 }
                 for esc in self.escs
@@ -410,7 +444,9 @@ class Monitor:
         value = self.view.value(source)
         return _enumerated(kind, value) if isinstance(value, (int, float)) else value
 
-    def _tracked_of(self, first: int, count: int) -> list[tuple[int, Spread, tuple[float, float] | None]]:
+    def _tracked_of(
+        self, first: int, count: int
+    ) -> list[tuple[int, Spread, tuple[float, float] | None]]:
         """Which of a part's values have extremes, and where those are kept."""
         found = []
         for offset in range(count):
@@ -419,7 +455,9 @@ class Monitor:
                 continue
             if self.view.reader.column_of(column.source, column.esc) == first + offset:
                 esc = self.escs[column.esc]
-                factor = _to_source(column.unit, sources(self.bus.escs[column.esc])[column.source].unit)
+                factor = _to_source(
+                    column.unit, sources(self.bus.escs[column.esc])[column.source].unit
+                )
                 found.append((offset, esc.spreads[column.source], factor))
         return found
 
@@ -438,5 +476,7 @@ def _converted(value: float, factor: tuple[float, float] | None) -> float:
 
 
 def _enumerated(kind: type[LinkState] | type[GatewayState] | type[CanState], number: float) -> str:
-    names: Mapping[int, str] = {int(member): member.name.title().replace("_", "") for member in kind}
+    names: Mapping[int, str] = {
+        int(member): member.name.title().replace("_", "") for member in kind
+    }
     return names.get(int(number), str(int(number)))

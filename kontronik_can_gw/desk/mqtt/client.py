@@ -108,7 +108,9 @@ def check(broker: Broker) -> list[str]:
     except _Refused as error:
         raise RunError(str(error)) from None
     if broker.password_file is not None and not broker.tls and not _is_loopback(broker.host):
-        warnings.append(f"{broker}: without TLS the password can be read by all on the way. Use --tls.")
+        warnings.append(
+            f"{broker}: without TLS the password can be read by all on the way. Use --tls."
+        )
     return warnings
 
 
@@ -128,11 +130,17 @@ def password(file: Path) -> str:
 
 def tls_context(broker: Broker) -> ssl.SSLContext:
     """TLS 1.2 or newer, with the broker's certificate and name checked."""
-    for what, file in (("ca_file", broker.ca_file), ("cert_file", broker.cert_file), ("key_file", broker.key_file)):
+    for what, file in (
+        ("ca_file", broker.ca_file),
+        ("cert_file", broker.cert_file),
+        ("key_file", broker.key_file),
+    ):
         if file is not None and not os.access(file, os.R_OK):
             raise _Refused(f"{file}: mqtt.{what} cannot be read")
     try:
-        context = ssl.create_default_context(cafile=None if broker.ca_file is None else str(broker.ca_file))
+        context = ssl.create_default_context(
+            cafile=None if broker.ca_file is None else str(broker.ca_file)
+        )
     except (ssl.SSLError, OSError):
         raise _Refused(f"{broker.ca_file}: is not a certificate in PEM form") from None
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -142,7 +150,9 @@ def tls_context(broker: Broker) -> ssl.SSLContext:
             context.load_cert_chain(broker.cert_file, broker.key_file, password=lambda: b"")
         except (ssl.SSLError, OSError):
             both = f"{broker.cert_file}{'' if broker.key_file is None else f', {broker.key_file}'}"
-            raise _Refused(f"{both}: not a certificate in PEM form with its key (without passphrase)") from None
+            raise _Refused(
+                f"{both}: not a certificate in PEM form with its key (without passphrase)"
+            ) from None
     return context
 
 
@@ -166,13 +176,20 @@ class _Link:
         self._answer: Any = None
         protocol = MQTTProtocolVersion.MQTTv5 if version == 5 else MQTTProtocolVersion.MQTTv311
         self._client = client = paho.Client(
-            CallbackAPIVersion.VERSION2, broker.client_id, protocol=protocol, reconnect_on_failure=False
+            CallbackAPIVersion.VERSION2,
+            broker.client_id,
+            protocol=protocol,
+            reconnect_on_failure=False,
         )
         client.connect_timeout = CONNECT_S
         client.on_connect = self._connected
         client.on_disconnect = self._disconnected
-        client.on_publish = lambda _client, _data, mid, _reason, _properties: self.unacknowledged.discard(mid)
-        client.on_subscribe = lambda _client, _data, mid, _reasons, _properties: self.unacknowledged.discard(mid)
+        client.on_publish = lambda _client, _data, mid, _reason, _properties: (
+            self.unacknowledged.discard(mid)
+        )
+        client.on_subscribe = lambda _client, _data, mid, _reasons, _properties: (
+            self.unacknowledged.discard(mid)
+        )
         client.on_message = self._message
         client.on_socket_open = lambda _client, _data, sock: _limit_buffer(sock)
         if will_topic is not None:
@@ -183,7 +200,8 @@ class _Link:
         broker, client = self._broker, self._client
         if broker.username is not None:
             client.username_pw_set(
-                broker.username, None if broker.password_file is None else password(broker.password_file)
+                broker.username,
+                None if broker.password_file is None else password(broker.password_file),
             )
         if broker.tls:
             client.tls_set_context(tls_context(broker))
@@ -244,7 +262,8 @@ class _Link:
     def publish(self, offer: Offer) -> None:
         """Hand a message to the connection."""
         info = self._client.publish(offer.topic, offer.payload, offer.qos, offer.retain)
-        if offer.qos:  # it is no use to ask ``info``: it raises where the connection was lost meanwhile
+        if offer.qos:
+            # it is no use to ask ``info``: it raises where the connection was lost meanwhile
             self.unacknowledged.add(info.mid)
 
     def subscribe(self, topic: str) -> None:
@@ -265,10 +284,14 @@ class _Link:
             with contextlib.suppress(OSError):
                 sock.close()
 
-    def _connected(self, _client: object, _data: object, _flags: object, reason: Any, _properties: object) -> None:
+    def _connected(
+        self, _client: object, _data: object, _flags: object, reason: Any, _properties: object
+    ) -> None:
         self._answer = reason
 
-    def _disconnected(self, _client: object, _data: object, _flags: object, reason: Any, _properties: object) -> None:
+    def _disconnected(
+        self, _client: object, _data: object, _flags: object, reason: Any, _properties: object
+    ) -> None:
         self.end = reason
 
     def _message(self, _client: object, _data: object, message: Any) -> None:
@@ -284,7 +307,9 @@ class _Link:
             what = "user name and password" if broker.username else "--username, --password-file"
             return _Refused(f"refuses {who}: {text}. Check {what}.")
         if number == _BAD_CLIENT_ID:
-            return _Refused(f"refuses the client id {broker.client_id!r}. Choose another name with --gateway.")
+            return _Refused(
+                f"refuses the client id {broker.client_id!r}. Choose another name with --gateway."
+            )
         return _Refused(f"refuses the connection: {text}")
 
 
@@ -318,7 +343,9 @@ class MqttClient:
         """Begin to connect."""
         self._thread.start()
 
-    def offer(self, topic: str, payload: bytes, *, lasting: bool = False, retain: bool = False) -> None:
+    def offer(
+        self, topic: str, payload: bytes, *, lasting: bool = False, retain: bool = False
+    ) -> None:
         """Let a message be published; one of the same topic that still waits is replaced. ``lasting``: again after each connection."""
         offer = Offer(topic, payload, 1 if lasting else 0, retain)
         with self._lock:
@@ -373,7 +400,8 @@ class MqttClient:
 
     def _connection(self) -> None:
         """One connection, from the attempt to its end."""
-        link = _Link(self.broker, self._version, self._online_topic)  # a new one: nothing of an old one is sent again
+        # a new one: nothing of an old one is sent again
+        link = _Link(self.broker, self._version, self._online_topic)
         try:
             if not link.open(self._stopping, self._wake_out):
                 return
@@ -404,7 +432,9 @@ class MqttClient:
             self._conditions.end("broker", f"{self.broker}: connected", now)
         else:
             self._conditions.forget("broker")
-            self._conditions.say(logging.INFO, f"{self.broker}: connected as {self.broker.client_id}")
+            self._conditions.say(
+                logging.INFO, f"{self.broker}: connected as {self.broker.client_id}"
+            )
         self._greeted = True
         with self._lock:
             first = OrderedDict({self._online_topic: Offer(self._online_topic, b"online", 1, True)})
@@ -465,17 +495,22 @@ class MqttClient:
 
     def _taken_over(self, what: str) -> None:
         self._failed(f"{what}. Give each gateway a name of its own (--gateway).")
-        self._retry.due = time.monotonic_ns() + random.randrange(TAKEN_OVER_PAUSE_NS // 2, TAKEN_OVER_PAUSE_NS)
+        self._retry.due = time.monotonic_ns() + random.randrange(
+            TAKEN_OVER_PAUSE_NS // 2, TAKEN_OVER_PAUSE_NS
+        )
 
     def _failed(self, reason: str) -> None:
         now = time.monotonic_ns()
         pause = self._retry.failed(now) - now
-        self._retry.due = now + random.randrange(pause * 3 // 4, pause * 5 // 4)  # a fleet does not come all at once
+        # a fleet does not come all at once
+        self._retry.due = now + random.randrange(pause * 3 // 4, pause * 5 // 4)
         if not self._stopping.is_set():
             self._conditions.begin("broker", f"{self.broker}: {reason}", now)
 
 
-def remove(broker: Broker, filters: Iterable[str], wanted: Callable[[str, bytes], bool]) -> list[str]:
+def remove(
+    broker: Broker, filters: Iterable[str], wanted: Callable[[str, bytes], bool]
+) -> list[str]:
     """Clear what the broker keeps in topics that match ``filters`` and are ``wanted``; returns them. RunError where that fails."""
     link = _Link(broker, 5, None)
     try:
@@ -487,7 +522,9 @@ def remove(broker: Broker, filters: Iterable[str], wanted: Callable[[str, bytes]
         for topic in filters:
             link.subscribe(topic)
         _settle(link)
-        found = sorted(topic for topic, payload in set(link.received) if payload and wanted(topic, payload))
+        found = sorted(
+            topic for topic, payload in set(link.received) if payload and wanted(topic, payload)
+        )
         for topic in found:
             while not link.has_room and link.turn(0.05):
                 pass

@@ -59,7 +59,11 @@ _KINDS = {
         OperatingState.Programming,
         OperatingState.Sync_StandBy,
     ),
-    "start": (OperatingState.SpoolUpFromStill, OperatingState.SpoolUpFromTurn, OperatingState.SpoolUpQuick),
+    "start": (
+        OperatingState.SpoolUpFromStill,
+        OperatingState.SpoolUpFromTurn,
+        OperatingState.SpoolUpQuick,
+    ),
     "run": (
         OperatingState.Forward,
         OperatingState.Backward,
@@ -67,13 +71,19 @@ _KINDS = {
         OperatingState.Sync_Backward,
         OperatingState.RPMControl,
     ),
-    "brake": (OperatingState.Brake, OperatingState.BrakeTargetBackward, OperatingState.BrakeTargetForward),
+    "brake": (
+        OperatingState.Brake,
+        OperatingState.BrakeTargetBackward,
+        OperatingState.BrakeTargetForward,
+    ),
     "fault": (OperatingState.Error_Selftest, OperatingState.CutOffDuringOperation),
 }
 KIND_OF_STATE = {state: kind for kind, states in _KINDS.items() for state in states}
 """What the motor does, in five words."""
 
-_FLAGS: dict[str, ErrorBit] = {bit.text: bit for bits in (OperatingError, SelfTestError) for bit in bits}
+_FLAGS: dict[str, ErrorBit] = {
+    bit.text: bit for bits in (OperatingError, SelfTestError) for bit in bits
+}
 _SELFTEST = {bit.text for bit in SelfTestError}
 _WORDS: tuple[tuple[str, type[ErrorBit]], ...] = (
     ("operating_errors", OperatingError),
@@ -140,7 +150,9 @@ class _Member:
             if word in self.columns:
                 at = self.columns[word]
                 self.flags += [(bit.text, at, int(bit)) for bit in bits if bit.text not in own]
-        self.live = [at for source, at in self.columns.items() if _SOURCES[source].group is Group.LIVE]
+        self.live = [
+            at for source, at in self.columns.items() if _SOURCES[source].group is Group.LIVE
+        ]
         self.kinds = _kinds(view, self.columns)
         self.changed = True
         """It may have: worth a look."""
@@ -184,7 +196,9 @@ class Publisher:
         self.view = View(SignalReader(bus.layout))
         self._period = round(SECOND / rate)
         self._retain, self._discovery, self._replay = retain, discovery, replay
-        indices = sorted({column.esc for column in self.view.reader.columns if column.esc is not None})
+        indices = sorted(
+            {column.esc for column in self.view.reader.columns if column.esc is not None}
+        )
         self._members = [_Member(self.view, None, None)]
         self._members += [_Member(self.view, index, bus.escs[index].name) for index in indices]
         self._of_esc = {member.esc: member for member in self._members}
@@ -278,7 +292,10 @@ class Publisher:
     def _notable(self, member: _Member, now: int) -> tuple[object, ...]:
         if member.esc is None:
             at = member.columns.get("can_state"), member.columns.get("gateway_state")
-            return (self._is_available(member, now), *(None if i is None else self.view.values[i] for i in at))
+            return (
+                self._is_available(member, now),
+                *(None if i is None else self.view.values[i] for i in at),
+            )
         set_flags = None if not self._has_state(member) else self._set_flags(member, False)
         selftest = None if not self._has_info(member) else self._set_flags(member, True)
         link = member.columns.get("link_state")
@@ -294,7 +311,9 @@ class Publisher:
         """Whether a change may go now: the first ones of a row, and with a pause behind what went before."""
         if member.published_ns is not None and now - member.published_ns < MIN_PAUSE_NS:
             return False
-        member.budget = min(MAX_CHANGES, member.budget + (now - member.budget_ns) / _CHANGE_EVERY_NS)
+        member.budget = min(
+            MAX_CHANGES, member.budget + (now - member.budget_ns) / _CHANGE_EVERY_NS
+        )
         member.budget_ns = now
         if member.budget < 1:
             return False
@@ -304,7 +323,11 @@ class Publisher:
     def _gateway_is_silent(self, now: int) -> bool:
         """True while the silence is not told yet."""
         member = self._members[0]
-        return member.shown is not None and member.shown[0] is True and not self._is_available(member, now)
+        return (
+            member.shown is not None
+            and member.shown[0] is True
+            and not self._is_available(member, now)
+        )
 
     def _is_available(self, member: _Member, now: int) -> bool:
         if member.esc is None:
@@ -316,7 +339,11 @@ class Publisher:
 
     def _has_state(self, member: _Member) -> bool:
         """Flags cannot say 'not available': they count only while the operating state is there."""
-        known = [member.columns[s] for s in ("operating_state", "operating_state_raw") if s in member.columns]
+        known = [
+            member.columns[s]
+            for s in ("operating_state", "operating_state_raw")
+            if s in member.columns
+        ]
         return any(self.view.values[at] is not None for at in known or member.live)
 
     def _has_info(self, member: _Member) -> bool:
@@ -357,21 +384,38 @@ class Publisher:
     def _lasting(self, member: _Member, now: int) -> list[Message]:
         wanted: dict[str, bytes] = {}
         known = self._known_identity(member)
-        if self._discovery is not None and self._told.get(member.esc) != known and self._may_be_told_of(member, now):
+        if (
+            self._discovery is not None
+            and self._told.get(member.esc) != known
+            and self._may_be_told_of(member, now)
+        ):
             self._told[member.esc] = known
             topic = self.topics.discovery(self._discovery, member.name)
             wanted[topic] = json.dumps(self._device(member, *known), ensure_ascii=False).encode()
-        wanted[self.topics.available(member.name)] = ONLINE if self._is_available(member, now) else OFFLINE
-        news = {topic: payload for topic, payload in wanted.items() if self._said.get(topic) != payload}
+        wanted[self.topics.available(member.name)] = (
+            ONLINE if self._is_available(member, now) else OFFLINE
+        )
+        news = {
+            topic: payload for topic, payload in wanted.items() if self._said.get(topic) != payload
+        }
         self._said |= news
-        return [Message(topic, payload, lasting=True, retain=True) for topic, payload in news.items()]
+        return [
+            Message(topic, payload, lasting=True, retain=True) for topic, payload in news.items()
+        ]
 
     def _device(self, member: _Member, device: str | None, firmware: str | None) -> dict[str, Any]:
         topics, columns = self.topics, self.view.reader.columns
         if member.esc is None:
-            about: dict[str, Any] = {"name": f"KONTRONIK gateway {topics.gateway}", "model": PROGRAM}
+            about: dict[str, Any] = {
+                "name": f"KONTRONIK gateway {topics.gateway}",
+                "model": PROGRAM,
+            }
         else:
-            about = {"name": f"{topics.gateway} {member.name}", "manufacturer": MAKER, "model": device or "ESC"}
+            about = {
+                "name": f"{topics.gateway} {member.name}",
+                "manufacturer": MAKER,
+                "model": device or "ESC",
+            }
             about["via_device"] = topics.identifier(None)
             if firmware is not None:
                 about["sw_version"] = firmware
@@ -420,7 +464,11 @@ class Publisher:
         return device, firmware
 
     def _firmware(self, member: _Member) -> str | None:
-        parts = [self.view.values[member.columns[s]] for s in ("firmware_main", "firmware_sub") if s in member.columns]
+        parts = [
+            self.view.values[member.columns[s]]
+            for s in ("firmware_main", "firmware_sub")
+            if s in member.columns
+        ]
         if len(parts) == 2 and all(isinstance(part, int) for part in parts):
             return f"{parts[0]}.{parts[1]}"
         return None
@@ -433,7 +481,10 @@ def _next(due: int, period: int, now: int) -> int:
 
 def iso(wall_ns: int) -> str:
     """ISO 8601 in UTC, with milliseconds."""
-    return datetime.fromtimestamp(wall_ns // MS / 1000, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+    return (
+        datetime.fromtimestamp(wall_ns // MS / 1000, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3]
+        + "Z"
+    )
 
 
 def _error(flag: str) -> dict[str, str]:
@@ -443,7 +494,11 @@ def _error(flag: str) -> dict[str, str]:
 
 def _problem(errors: Sequence[Mapping[str, str]] | None) -> bool | None:
     """True where one of them is an error, not only a warning or a status."""
-    return None if errors is None else any(error["severity"] == Severity.ERROR.value for error in errors)
+    return (
+        None
+        if errors is None
+        else any(error["severity"] == Severity.ERROR.value for error in errors)
+    )
 
 
 # --- Home Assistant: which units go with which device class
@@ -461,7 +516,11 @@ _MEASURED: dict[str, tuple[str, str | None]] = {
     "us": ("µs", None),
 }
 """Our unit: theirs, and the device class. Revolutions and charge have none; of the throttle's % nothing is humidity or battery."""
-_TOTALS: dict[str, tuple[str, str | None]] = {"Wh": ("Wh", "energy"), "mAh": ("mAh", None), "s": ("s", "duration")}
+_TOTALS: dict[str, tuple[str, str | None]] = {
+    "Wh": ("Wh", "energy"),
+    "mAh": ("mAh", None),
+    "s": ("s", "duration"),
+}
 """What only grows, until the ESC or the gateway starts anew."""
 _DIAGNOSTIC = {Group.LINK, Group.INFO, Group.GATEWAY}
 _OF_USE = {"energy_used", "motor_run_time", "link_state"}
@@ -530,7 +589,10 @@ def entity(source: str, column: Column) -> dict[str, Any] | None:
     if about.group in _DIAGNOSTIC and source not in _OF_USE:
         made["entity_category"] = "diagnostic"
     if column.texts:
-        return made | {"device_class": "enum", "options": list(dict.fromkeys(text for _, text in column.texts))}
+        return made | {
+            "device_class": "enum",
+            "options": list(dict.fromkeys(text for _, text in column.texts)),
+        }
     if about.names:  # sent as a bare number
         return made
     unit = column.unit or about.unit
@@ -556,6 +618,8 @@ def is_ours(payload: bytes, topics: Topics) -> bool:
     """True for the discovery of this gateway or one of its ESCs, whatever version published it."""
     try:
         told = json.loads(payload)
-        return told["origin"]["name"] == PROGRAM and {"topic": topics.online} in told["availability"]
+        return (
+            told["origin"]["name"] == PROGRAM and {"topic": topics.online} in told["availability"]
+        )
     except (ValueError, KeyError, TypeError):
         return False

@@ -66,7 +66,9 @@ class Output:
 class Conversion(Protocol):
     """One kind of conversion."""
 
-    def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None: ...
+    def __call__(
+        self, recording: "Input", out: Output, reached: Callable[[int], None]
+    ) -> str | None: ...
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,9 @@ class TableConversion:
     by_frame: bool = False
     units_line: bool = False
 
-    def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
+    def __call__(
+        self, recording: "Input", out: Output, reached: Callable[[int], None]
+    ) -> str | None:
         from kontronik_can_gw.desk.recordings.tables import Rows, open_table
 
         rows = Rows(recording, self.choice, self.by_frame)
@@ -108,7 +112,9 @@ class LogConversion:
     start_ns: int | None = None
     end_ns: int | None = None
 
-    def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
+    def __call__(
+        self, recording: "Input", out: Output, reached: Callable[[int], None]
+    ) -> str | None:
         from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
         from kontronik_can_gw.desk.recordings.inputs import CaptureInput
         from kontronik_can_gw.desk.recordings.tables import first_of
@@ -123,7 +129,9 @@ class LogConversion:
             return None
         begins = last.time_ns - origin_ns
         channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
-        writer = CanLogWriter(out.open(), self.format, wall_ns, begins, channel, out.name, recording.provenance)
+        writer = CanLogWriter(
+            out.open(), self.format, wall_ns, begins, channel, out.name, recording.provenance
+        )
         count = 0
         try:
             for last in frames:
@@ -143,7 +151,9 @@ class LogConversion:
             told += f"; {number} {what} left out, which {self.format} does not know"
         moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - lasted
         if abs(moved) > _CLOCK_SET_NS:
-            told += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
+            told += (
+                f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
+            )
         return told
 
     def _cut(self, frames: "Iterator[TimedFrame]", origin_ns: int) -> "Iterator[TimedFrame]":
@@ -167,7 +177,9 @@ class BytesConversion:
 
     esc: int
 
-    def __call__(self, recording: "Input", out: Output, reached: Callable[[int], None]) -> str | None:
+    def __call__(
+        self, recording: "Input", out: Output, reached: Callable[[int], None]
+    ) -> str | None:
         file = out.open()
         assert not isinstance(file, Path)
         count = 0

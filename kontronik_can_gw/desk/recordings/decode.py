@@ -97,13 +97,18 @@ class Decoder:
         return [self._record(frame) for frame in self._deframer.flush()]
 
     def _record(self, frame: Frame) -> Record:
-        if frame.layout is not self._layout:  # another device was plugged in: which, its info frame will tell
+        if frame.layout is not self._layout:
+            # another device was plugged in: which, its info frame will tell
             self._layout = frame.layout
             self._device = None
         data = frame.data
         if isinstance(data, InfoData):
             self._device = data.device
-        record: Record = {"kind": frame.kind.value, "layout": frame.layout.value, "offset": frame.offset}
+        record: Record = {
+            "kind": frame.kind.value,
+            "layout": frame.layout.value,
+            "offset": frame.offset,
+        }
         record |= physical_fields(data, self._device)
         if frame.kind is Kind.LIVE:
             record["suspect"] = frame.suspect

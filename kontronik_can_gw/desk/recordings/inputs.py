@@ -156,7 +156,9 @@ def open_input(
     if b"KOD" in head:
         return DumpInput(path, layout, live_rate)
     if (called := SUFFIXES.get(path.suffix.lower())) is not None:
-        raise UserError(f"{path}: is no {NAMES[called]}, whatever its name says, and no other recording")
+        raise UserError(
+            f"{path}: is no {NAMES[called]}, whatever its name says, and no other recording"
+        )
     raise UserError(
         f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_LOOK // 1024} kB"
     )
@@ -175,7 +177,11 @@ def _parts(path: Path) -> list[Path] | None:
         if not found:
             raise UserError(f"{path}: has no captures (*{SUFFIX})")
     elif not path.exists():
-        found = sorted(p for p in path.parent.glob(f"*{SUFFIX}") if p.name.startswith(path.name)) if path.name else []
+        found = (
+            sorted(p for p in path.parent.glob(f"*{SUFFIX}") if p.name.startswith(path.name))
+            if path.name
+            else []
+        )
         if not found:
             raise RunError(f"{path}: there is no such file.")
     else:
@@ -207,7 +213,9 @@ class CaptureInput(_Base):
             found = self.setup.database()
             self.setup.gateway(Layout("", "", ()) if found is None else found[1], 0)
         except UserError as error:
-            raise UserError(*(f"{self._paths[0]}: {problem[:400]}" for problem in error.problems)) from None
+            raise UserError(
+                *(f"{self._paths[0]}: {problem[:400]}" for problem in error.problems)
+            ) from None
         except Exception as error:  # a header may hold anything
             raise UserError(f"{self._paths[0]}: {str(error)[:400]}") from None
         name = str(self._paths[0])
@@ -248,9 +256,13 @@ class CaptureInput(_Base):
                 yield entry.data
 
     def wall_ns(self, time_ns: int) -> int | None:
-        offset = next((offset for since, offset in reversed(self._offsets) if since <= time_ns), None)
+        offset = next(
+            (offset for since, offset in reversed(self._offsets) if since <= time_ns), None
+        )
         if offset is None:
-            offset = int(self.header.get("wall_ns") or 0) - int(self.header.get("monotonic_ns") or 0)
+            offset = int(self.header.get("wall_ns") or 0) - int(
+                self.header.get("monotonic_ns") or 0
+            )
         return time_ns + offset
 
     @property
@@ -270,12 +282,16 @@ class CaptureInput(_Base):
         last, impossible = 0, 0
         for number, path in enumerate(self._paths):
             for entry in self._entries_of(path, number):
-                if entry.time_ns > _LATEST_NS or (entry.kind == Kind.CLOCK and len(entry.data) != 8):
+                if entry.time_ns > _LATEST_NS or (
+                    entry.kind == Kind.CLOCK and len(entry.data) != 8
+                ):
                     impossible += 1
                     continue
                 if entry.kind == Kind.CLOCK:
                     # it stands behind what was written by the clock before
-                    self._offsets.append((entry.time_ns + 1, read_number(entry.data) - entry.time_ns))
+                    self._offsets.append(
+                        (entry.time_ns + 1, read_number(entry.data) - entry.time_ns)
+                    )
                 if entry.time_ns < last:
                     entry = entry._replace(time_ns=last)
                 last = entry.time_ns
@@ -304,7 +320,9 @@ class CaptureInput(_Base):
                     break
             self.close()
             if len(self._paths) == 1:
-                raise UserError(f"{path}: has no header that could be read, so nothing is known of what was recorded")
+                raise UserError(
+                    f"{path}: has no header that could be read, so nothing is known of what was recorded"
+                )
             self._headerless.append(f"{path.name}: has no header that could be read")
             del self._paths[0]
 
@@ -323,7 +341,9 @@ class CaptureInput(_Base):
         expected, ended = 0, False
         for found in self._blocks(path):
             if isinstance(found, Damage):
-                self._tell_damage(f"{path.name}: {found.length} bytes at {found.offset} are damaged")
+                self._tell_damage(
+                    f"{path.name}: {found.length} bytes at {found.offset} are damaged"
+                )
                 continue
             if found.number > expected:
                 self._tell_damage(
@@ -341,7 +361,9 @@ class CaptureInput(_Base):
             except ValueError as error:
                 self._tell_damage(f"{path.name}: the block at {found.offset} {error}")
         if not ended:
-            self._tell_damage(f"{path.name}: was not closed: up to the last second before its end may be missing")
+            self._tell_damage(
+                f"{path.name}: was not closed: up to the last second before its end may be missing"
+            )
 
     def _tell_damage(self, text: str) -> None:
         if len(self.damage) < _MAX_DAMAGE:
@@ -351,24 +373,37 @@ class CaptureInput(_Base):
 
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
         if header.get("run") != self.header.get("run"):
-            raise UserError(f"{path}: is of another run than {self._paths[0]}. Convert each run by itself.")
+            raise UserError(
+                f"{path}: is of another run than {self._paths[0]}. Convert each run by itself."
+            )
         now, wall = header.get("monotonic_ns"), header.get("wall_ns")
-        if isinstance(now, int) and isinstance(wall, int) and 0 <= now <= _LATEST_NS and 0 <= wall <= _LATEST_NS:
+        if (
+            isinstance(now, int)
+            and isinstance(wall, int)
+            and 0 <= now <= _LATEST_NS
+            and 0 <= wall <= _LATEST_NS
+        ):
             self._offsets.append((now, wall - now))
         missing = int(header.get("part", part)) - int(self.header.get("part", 0)) - part
         if missing > 0:
-            self.damage.append(f"{path.name}: {missing} parts of the run in front of it are not given")
+            self.damage.append(
+                f"{path.name}: {missing} parts of the run in front of it are not given"
+            )
 
     def _tell(self, replay: Replay) -> None:
         if replay.lost:
-            self.damage.append(f"{replay.lost} entries could not be recorded: the disk was too slow or full")
+            self.damage.append(
+                f"{replay.lost} entries could not be recorded: the disk was too slow or full"
+            )
         if replay.passed_over:
             self.damage.append(f"{replay.passed_over} entries make no sense to this version")
 
     def _describe(self) -> None:
         header, words = self.header, self.provenance
         program = header.get("program", {})
-        words["program"] = f"kontronik-can-gw {program.get('version', '?')}, Python {program.get('python', '?')}"
+        words["program"] = (
+            f"kontronik-can-gw {program.get('version', '?')}, Python {program.get('python', '?')}"
+        )
         words["machine"] = str(program.get("machine", ""))
         words["run"] = f"{header.get('run', '')}, part {int(header.get('part', 0)) + 1}"
         words["configuration"] = self.setup.file
@@ -384,19 +419,27 @@ class CaptureInput(_Base):
 class DumpInput(_Base):
     """The bytes of one ESC, without times."""
 
-    def __init__(self, path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE) -> None:
+    def __init__(
+        self, path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE
+    ) -> None:
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         if len(layout.escs) != 1:
-            raise UserError(f"{path}: holds the bytes of one ESC, {layout.layout.file} describes {len(layout.escs)}")
+            raise UserError(
+                f"{path}: holds the bytes of one ESC, {layout.layout.file} describes {len(layout.escs)}"
+            )
         super().__init__(str(path), layout, path.stat().st_size)
         self.times_assumed = True
         self._path = path
         self._period_ns = max(1, round(SECOND / live_rate))
-        esc = replace(layout.escs[0], timeout_ns=max(layout.escs[0].timeout_ns, 3 * self._period_ns))
+        esc = replace(
+            layout.escs[0], timeout_ns=max(layout.escs[0].timeout_ns, 3 * self._period_ns)
+        )
         self.setup = CaptureSetup((esc,), (str(path),), None, DbcSettings(), False, False, None)
         self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
         if layout.config is None:
-            self.provenance["motor"] = "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
+            self.provenance["motor"] = (
+                "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
+            )
 
     def frames(self) -> Iterator[TimedFrame]:
         yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self.chunks())
@@ -435,7 +478,8 @@ class DumpInput(_Base):
         for data in chain(self._read(), (None,)):
             if data is not None:
                 waiting += data
-            if len(waiting) > _MAX_WAITING:  # no frame for long: what can belong to none any more goes
+            if len(waiting) > _MAX_WAITING:
+                # no frame for long: what can belong to none any more goes
                 keep = len(data or b"") + _LONGEST_FRAME
                 if (gone := len(waiting) - keep) > 0:
                     yield now, bytes(waiting[:gone])
@@ -455,7 +499,9 @@ class DumpInput(_Base):
             yield now, bytes(waiting)
         counters = deframer.counters
         if counters.dropped_bytes:
-            self.damage.append(f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors")
+            self.damage.append(
+                f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
+            )
         if not lives:
             self.damage.append(counters.diagnosis() or "no live frame")
 

@@ -46,7 +46,9 @@ def shown_by(layout: BusLayout, known: Sequence[EscSettings]) -> BusLayout:
     if layout.config is None:
         return _made(layout.database, layout.layout.node, layout.layout.file, known)
     if len(layout.escs) != len(known):
-        raise UserError(f"{layout.config.file}: has {len(layout.escs)} ESCs, the recording {len(known)}")
+        raise UserError(
+            f"{layout.config.file}: has {len(layout.escs)} ESCs, the recording {len(known)}"
+        )
     return layout
 
 
@@ -66,9 +68,15 @@ def _made(database: "Database", node: str, file: str, known: Sequence[EscSetting
 def esc_names(database: "Database", node: str) -> list[str]:
     """What stands in front of sources' names in the signals of ours, in the order of the messages; empty for a DBC of one ESC."""
     known = {
-        normalize(name): source for name, source in sources(EscSettings()).items() if source.group is not Group.GATEWAY
+        normalize(name): source
+        for name, source in sources(EscSettings()).items()
+        if source.group is not Group.GATEWAY
     }
-    of_gateway = {normalize(name) for name, source in sources(EscSettings()).items() if source.group is Group.GATEWAY}
+    of_gateway = {
+        normalize(name)
+        for name, source in sources(EscSettings()).items()
+        if source.group is Group.GATEWAY
+    }
     counts: dict[str, int] = {}
     for message in database.messages:
         if node not in message.senders:
@@ -78,7 +86,9 @@ def esc_names(database: "Database", node: str) -> list[str]:
             if key in known or key in of_gateway:
                 continue
             ending = max((name for name in known if key.endswith(name)), key=len, default="")
-            prefix = signal.name[: len(signal.name.removesuffix("Percent")) - len(ending)].rstrip("_")
+            prefix = signal.name[: len(signal.name.removesuffix("Percent")) - len(ending)].rstrip(
+                "_"
+            )
             if ending and prefix:
                 counts[prefix] = counts.get(prefix, 0) + 1
     return [name for name, count in counts.items() if count > 1]

@@ -26,7 +26,9 @@ def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
             by_esc = _ids(bus, count)
         here = [ids & (others.keys() | ours) for ids in by_esc]
         # half of the messages: some come rarely, or are switched off
-        if not by_esc or any(2 * len(came) < len(ids) for came, ids in zip(here, by_esc, strict=True)):
+        if not by_esc or any(
+            2 * len(came) < len(ids) for came, ids in zip(here, by_esc, strict=True)
+        ):
             break
         found = count
         frames = sum(others.get(key, 0) for key in set().union(*here))

@@ -26,7 +26,9 @@ class PartFile:
         try:
             self.file = self.path.open("wb")
         except OSError as error:
-            raise RunError(f"{self.target}: cannot be written: {error.strerror}. Give another file.") from None
+            raise RunError(
+                f"{self.target}: cannot be written: {error.strerror}. Give another file."
+            ) from None
         return self.file
 
     def finish(self) -> None:

@@ -61,7 +61,12 @@ class SampledGateway(Gateway):
     """
 
     def __init__(
-        self, setup: CaptureSetup, layout: Layout, reader: SignalReader, now: int, frames_count: bool = True
+        self,
+        setup: CaptureSetup,
+        layout: Layout,
+        reader: SignalReader,
+        now: int,
+        frames_count: bool = True,
     ) -> None:
         self.rows: list[Sample] = []
         self._values: list[Value] = [None] * len(reader.columns)
@@ -73,12 +78,20 @@ class SampledGateway(Gateway):
 
         def taken(parts: Iterable[Part]) -> list[_Taken]:
             return [
-                (indices[p.plan.name], p.page, slice(p.first, p.first + p.count), reader.unpack_of(p)) for p in parts
+                (
+                    indices[p.plan.name],
+                    p.page,
+                    slice(p.first, p.first + p.count),
+                    reader.unpack_of(p),
+                )
+                for p in parts
             ]
 
         by_esc = [[p for p in reader.parts if esc in p.plan.escs] for esc in range(len(setup.escs))]
         self._by_esc = [taken(parts) for parts in by_esc]
-        self._with_live = [taken(p for p in parts if {Group.LIVE, Group.LINK} & p.plan.paces) for parts in by_esc]
+        self._with_live = [
+            taken(p for p in parts if {Group.LIVE, Group.LINK} & p.plan.paces) for parts in by_esc
+        ]
         self._of_gateway = taken(p for p in reader.parts if not p.plan.escs)
         super().__init__(setup.escs, layout, now, setup.silent_on_loss, setup.canopen)
         if not frames_count or not any(column.source == "sent_frames" for column in reader.columns):

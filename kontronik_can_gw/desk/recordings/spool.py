@@ -70,9 +70,13 @@ def spooled(path: Path, reached: Callable[[int], None] | None = None) -> Path:
 def _opened(path: Path, shown: str) -> int:
     """A file descriptor. A device is not opened: it might be the port of an ESC."""
     about = os.fstat(0) if str(path) == STREAM else path.stat()
-    is_pipe = stat.S_ISFIFO(about.st_mode) or stat.S_ISREG(about.st_mode) or stat.S_ISSOCK(about.st_mode)
+    is_pipe = (
+        stat.S_ISFIFO(about.st_mode) or stat.S_ISREG(about.st_mode) or stat.S_ISSOCK(about.st_mode)
+    )
     if not is_pipe and about.st_rdev != Path(os.devnull).stat().st_rdev:
-        raise UserError(f"{shown}: is a terminal or another device. Give a file, or a pipe that brings a recording.")
+        raise UserError(
+            f"{shown}: is a terminal or another device. Give a file, or a pipe that brings a recording."
+        )
     return 0 if str(path) == STREAM else os.open(path, os.O_RDONLY | os.O_CLOEXEC)
 
 

@@ -51,7 +51,10 @@ class Analysis:
     """Takes the rows of a recording. ``window``: seconds after the first row, (from, to); None: no bound."""
 
     def __init__(
-        self, bus: BusLayout, points: int = 20_000, window: tuple[float | None, float | None] = (None, None)
+        self,
+        bus: BusLayout,
+        points: int = 20_000,
+        window: tuple[float | None, float | None] = (None, None),
     ) -> None:
         self._reader = SignalReader(bus.layout)
         self._names = [settings.name for settings in bus.escs]
@@ -70,7 +73,8 @@ class Analysis:
         self._replayed = False
         self._events = _Events()
         self._escs = [
-            _Esc(index, settings, self._reader, self._pick, self._events) for index, settings in enumerate(bus.escs)
+            _Esc(index, settings, self._reader, self._pick, self._events)
+            for index, settings in enumerate(bus.escs)
         ]
         if self._gateway_state is not None:
             self._gateway_at: int | None = self._pick(self._gateway_state)
@@ -152,7 +156,10 @@ class Analysis:
         self._times.clear()
         self._pending.clear()
         if self._gateway_at is not None and not self._replayed:
-            self._replayed = any(_named(v, GatewayState) is GatewayState.REPLAY for v in set(columns[self._gateway_at]))
+            self._replayed = any(
+                _named(v, GatewayState) is GatewayState.REPLAY
+                for v in set(columns[self._gateway_at])
+            )
         numbers: list[Sequence[Number]] = []
         for esc in self._escs:
             numbers += esc.take(times, columns)
@@ -167,7 +174,10 @@ class Analysis:
             ("motor_speed", "electrical_speed"),
             ("output_speed", "electrical_speed"),
         ):
-            pairs = [(e.get(f"max {slow}"), e.get(f"max {fast}")) for e in (esc.summary.extremes for esc in self._escs)]
+            pairs = [
+                (e.get(f"max {slow}"), e.get(f"max {fast}"))
+                for e in (esc.summary.extremes for esc in self._escs)
+            ]
             tops = [(a.value, b.value) for a, b in pairs if a is not None and b is not None]
             # from a log the two come in different messages, so their tops may differ a little
             if tops and all(abs(a - b) <= _SAME_SPEED * b for a, b in tops):
@@ -182,7 +192,8 @@ class Analysis:
         found = []
         same = self._same_speeds()
         by_key = {
-            (esc.index, source): column for (esc, source), column in zip(self._drawn, points.columns, strict=False)
+            (esc.index, source): column
+            for (esc, source), column in zip(self._drawn, points.columns, strict=False)
         }
         for number, plot in enumerate(PLOTS):
             lines: list[Line] = []
@@ -220,7 +231,10 @@ class _Events:
         return event
 
     def in_order(self) -> list[Event]:
-        return sorted((event for kept in self._kept.values() for event in kept), key=lambda e: (e.begin_ns, e.esc))
+        return sorted(
+            (event for kept in self._kept.values() for event in kept),
+            key=lambda e: (e.begin_ns, e.esc),
+        )
 
 
 class _Input(NamedTuple):
@@ -240,7 +254,15 @@ class _Input(NamedTuple):
 
 
 _NUMBERS = ("consumed_charge", "energy_used", "losses", "crc_errors", "dropped_bytes", "cell_count")
-_FACTS = ("device", "device_raw", "variant", "firmware_main", "firmware_sub", "layout", "link_state")
+_FACTS = (
+    "device",
+    "device_raw",
+    "variant",
+    "firmware_main",
+    "firmware_sub",
+    "layout",
+    "link_state",
+)
 _LIVE = (
     "battery_voltage",
     "electrical_speed",
@@ -265,7 +287,12 @@ class _Esc:
     """One ESC of an analysis."""
 
     def __init__(
-        self, index: int, settings: EscSettings, reader: SignalReader, pick: Callable[[int], int], events: _Events
+        self,
+        index: int,
+        settings: EscSettings,
+        reader: SignalReader,
+        pick: Callable[[int], int],
+        events: _Events,
     ) -> None:
         self.index = index
         self.summary = Summary()
@@ -289,7 +316,9 @@ class _Esc:
             self._inputs[source] = _Input(at, float(factors[0]), float(factors[1]), column)
         self._facts_at = {source: at for source in _FACTS if (at := bind(source)) is not None}
         states = [
-            (at, source) for source in ("operating_state", "operating_state_raw") if (at := bind(source)) is not None
+            (at, source)
+            for source in ("operating_state", "operating_state_raw")
+            if (at := bind(source)) is not None
         ]
         self._state_at = states[0][0] if states else None
         self._state_numbers: dict[Value, int] = {}
@@ -297,22 +326,33 @@ class _Esc:
             found = reader.column_of("operating_state", index)
             assert found is not None
             named = {normalize(state.text): int(state) for state in OperatingState}
-            self._state_numbers = {text: named.get(normalize(text), -1) for _, text in reader.columns[found].texts}
+            self._state_numbers = {
+                text: named.get(normalize(text), -1) for _, text in reader.columns[found].texts
+            }
         self._live_at = next((at for source in _LIVE if (at := bind(source)) is not None), None)
         self._flags: list[tuple[int, ErrorBit, Value, Event | None]] = []
         self._words: list[tuple[int, type[ErrorBit], Value, dict[int, Event]]] = []
-        for names, word in ((OperatingError, "operating_errors"), (SelfTestError, "selftest_errors")):
+        for names, word in (
+            (OperatingError, "operating_errors"),
+            (SelfTestError, "selftest_errors"),
+        ):
             word_at = bind(word)
             if word_at is not None:
                 self._words.append((word_at, names, None, {}))
                 continue
             for bit in names:
-                if bit is not OperatingError.PROGRAMMING_ALLOWED and (at := bind(bit.text)) is not None:
+                if (
+                    bit is not OperatingError.PROGRAMMING_ALLOWED
+                    and (at := bind(bit.text)) is not None
+                ):
                     self._flags.append((at, bit, None, None))
         self._derive_power = (
-            "battery_power" not in self._inputs and {"battery_voltage", "battery_current"} <= self._inputs.keys()
+            "battery_power" not in self._inputs
+            and {"battery_voltage", "battery_current"} <= self._inputs.keys()
         )
-        self._derive_cell = "mean_cell_voltage" not in self._inputs and "battery_voltage" in self._inputs
+        self._derive_cell = (
+            "mean_cell_voltage" not in self._inputs and "battery_voltage" in self._inputs
+        )
         self.drawn = [
             quantity.source
             for plot in PLOTS
@@ -323,7 +363,9 @@ class _Esc:
         ]
         self._cells: Number = settings.cell_count or None
         self.missing += [
-            plot.title for plot in PLOTS if not any(quantity.source in self.drawn for quantity in plot.lines)
+            plot.title
+            for plot in PLOTS
+            if not any(quantity.source in self.drawn for quantity in plot.lines)
         ]
         if self._state_at is None:
             self.missing.append("Operating states")
@@ -331,7 +373,9 @@ class _Esc:
             self.missing.append("Errors")
         self._ledger = Ledger(self.summary)
         self._counters = {
-            source: Counter(self._inputs[source].column) for source in _NUMBERS[:5] if source in self._inputs
+            source: Counter(self._inputs[source].column)
+            for source in _NUMBERS[:5]
+            if source in self._inputs
         }
         self.segments: list[Segment] = []
         self._shortest_ns = 0
@@ -345,7 +389,9 @@ class _Esc:
 
     # --- rows
 
-    def take(self, times: tuple[int, ...], columns: Sequence[tuple[Value, ...]]) -> list[Sequence[Number]]:
+    def take(
+        self, times: tuple[int, ...], columns: Sequence[tuple[Value, ...]]
+    ) -> list[Sequence[Number]]:
         """A chunk of rows; the columns that are drawn."""
         numbers = {source: found.read(columns) for source, found in self._inputs.items()}
         if "cell_count" in numbers:
@@ -359,9 +405,12 @@ class _Esc:
         if self._derive_cell:
             cells = self._cells
             numbers["mean_cell_voltage"] = [
-                None if v is None or not cells else round(v / cells, 3) for v in numbers["battery_voltage"]
+                None if v is None or not cells else round(v / cells, 3)
+                for v in numbers["battery_voltage"]
             ]
-        present: Sequence[Value] = (None,) * len(times) if self._live_at is None else columns[self._live_at]
+        present: Sequence[Value] = (
+            (None,) * len(times) if self._live_at is None else columns[self._live_at]
+        )
         self._follow_link(times, present, columns)
         self._follow_facts(times, columns)
         self._follow_states(times, columns)
@@ -389,7 +438,9 @@ class _Esc:
             self._count_gap(end_ns - self._gap.begin_ns)
         summary, counters = self.summary, self._counters
         self._ledger.finish(
-            end_ns, has_power="battery_power" in self.drawn, has_speed=any(s in self._inputs for s in _SPEEDS)
+            end_ns,
+            has_power="battery_power" in self.drawn,
+            has_speed=any(s in self._inputs for s in _SPEEDS),
         )
         if (energy := counters.get("energy_used")) is not None and energy.seen:
             summary.energy_counter = energy.total
@@ -420,7 +471,15 @@ class _Esc:
                     self._seen_up = True
                 elif self._seen_up:
                     self._gap = self._events.add(
-                        Event("link", self.index, time_ns, None, "telemetry_lost", "No telemetry", "warning")
+                        Event(
+                            "link",
+                            self.index,
+                            time_ns,
+                            None,
+                            "telemetry_lost",
+                            "No telemetry",
+                            "warning",
+                        )
                     )
                 self._up = up
         at = self._facts_at.get("link_state")
@@ -436,9 +495,23 @@ class _Esc:
                     if now is LinkState.DEGRADED
                     else "The port of the ESC cannot be used"
                 )
-                self._events.add(Event("link", self.index, time_ns, None, str(now), text, "warning", momentary=True))
+                self._events.add(
+                    Event(
+                        "link", self.index, time_ns, None, str(now), text, "warning", momentary=True
+                    )
+                )
             elif before is LinkState.DEGRADED and now is LinkState.OK:
-                self._events.add(Event("link", self.index, time_ns, None, "OK", "Link in order again", momentary=True))
+                self._events.add(
+                    Event(
+                        "link",
+                        self.index,
+                        time_ns,
+                        None,
+                        "OK",
+                        "Link in order again",
+                        momentary=True,
+                    )
+                )
             self._link = value
 
     def _count_gap(self, length_ns: int) -> None:
@@ -471,12 +544,16 @@ class _Esc:
             before = _device_words(self.facts)
             self.facts.device = str(device)
             self.facts.variant = variant if isinstance(variant, int) else None
-            self.facts.firmware = f"{main}.{sub}" if isinstance(main, int) and isinstance(sub, int) else None
+            self.facts.firmware = (
+                f"{main}.{sub}" if isinstance(main, int) and isinstance(sub, int) else None
+            )
             self.facts.devices.append((time_ns, _device_words(self.facts)))
             del self.facts.devices[MAX_EVENTS:]
             if was is not None:
                 text = f"Device changed from {before} to {_device_words(self.facts)}"
-                self._events.add(Event("device", self.index, time_ns, None, "device", text, momentary=True))
+                self._events.add(
+                    Event("device", self.index, time_ns, None, "device", text, momentary=True)
+                )
 
     # --- states
 
@@ -514,7 +591,9 @@ class _Esc:
             event.end_ns = time_ns
         severity = "error" if group.key == "fault" else "status"
         text = f"{group.label}: {state_name(number)}"
-        self._class_event = self._events.add(Event("state", self.index, time_ns, None, group.key, text, severity))
+        self._class_event = self._events.add(
+            Event("state", self.index, time_ns, None, group.key, text, severity)
+        )
 
     def _add_segment(self, segment: Segment) -> None:
         if segment.end_ns - segment.begin_ns < self._shortest_ns:
@@ -567,12 +646,16 @@ class _Esc:
 
     def _begin(self, bit: ErrorBit | None, name: str, time_ns: int) -> Event:
         if bit is None:
-            return self._events.add(Event("error", self.index, time_ns, None, name, "unknown to this program", "error"))
+            return self._events.add(
+                Event("error", self.index, time_ns, None, name, "unknown to this program", "error")
+            )
         text = bit.meaning
         if isinstance(bit, SelfTestError):
             text = f"self-test: {text}"
         remedy = str(getattr(bit, "remedy", "") or "")
-        return self._events.add(Event("error", self.index, time_ns, None, bit.text, text, bit.severity.value, remedy))
+        return self._events.add(
+            Event("error", self.index, time_ns, None, bit.text, text, bit.severity.value, remedy)
+        )
 
     # --- extremes
 
@@ -584,7 +667,9 @@ class _Esc:
                 values = numbers.get(source)
                 if values is None:
                     continue
-                known = [value for value in values if value is not None] if None in values else values
+                known = (
+                    [value for value in values if value is not None] if None in values else values
+                )
                 if not known:
                     continue
                 value = pick(known)  # type: ignore[arg-type]  # no None here

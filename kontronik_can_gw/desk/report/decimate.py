@@ -42,7 +42,8 @@ class Decimator:
         self._begin = array("q")
         self._end = array("q")
         self._count = array("q")  # rows in it
-        self._gaps: list[int] = []  # a bit for each column that has no value in the bucket, or _MIXED
+        # a bit for each column that has no value in the bucket, or _MIXED
+        self._gaps: list[int] = []
         self._first: list[list[Number]] = [[] for _ in range(width)]
         self._second: list[list[Number]] = [[] for _ in range(width)]
         self._mixed = [bytearray() for _ in range(width)]
@@ -72,7 +73,9 @@ class Decimator:
     def finish(self) -> Points:
         """The points of all rows so far."""
         times: list[int] = []
-        for begin, end, count, gaps in zip(self._begin, self._end, self._count, self._gaps, strict=True):
+        for begin, end, count, gaps in zip(
+            self._begin, self._end, self._count, self._gaps, strict=True
+        ):
             if gaps == _MIXED:
                 times += (begin, begin, begin, end, end)
             elif count == 1:
@@ -98,9 +101,18 @@ class Decimator:
         """Rows of the same kind that can be taken before buckets must be merged."""
         most = (self._points if self._rows == 1 else self._points // 2) + self._runs - 1
         is_open = self._gaps and self._gaps[-1] == gaps
-        return (most - len(self._begin)) * self._rows + (max(0, self._rows - self._count[-1]) if is_open else 0)
+        return (most - len(self._begin)) * self._rows + (
+            max(0, self._rows - self._count[-1]) if is_open else 0
+        )
 
-    def _take(self, times: Sequence[int], columns: Sequence[Sequence[Number]], at: int, stop: int, gaps: int) -> None:
+    def _take(
+        self,
+        times: Sequence[int],
+        columns: Sequence[Sequence[Number]],
+        at: int,
+        stop: int,
+        gaps: int,
+    ) -> None:
         """Rows that all have the same gaps, as many as there is room for."""
         rows = self._rows
         if rows == 1:
@@ -108,7 +120,9 @@ class Decimator:
             self._end.extend(times[at:stop])
             self._count.extend([1] * (stop - at))
             self._gaps += [gaps] * (stop - at)
-            for first, second, mixed, values in zip(self._first, self._second, self._mixed, columns, strict=True):
+            for first, second, mixed, values in zip(
+                self._first, self._second, self._mixed, columns, strict=True
+            ):
                 part = values[at:stop]
                 first += part
                 second += part
@@ -120,7 +134,9 @@ class Decimator:
             self._count[-1] += end - at
             for first, second, values in zip(self._first, self._second, columns, strict=True):
                 if first[-1] is not None:
-                    first[-1], second[-1], _ = _join(first[-1], second[-1], 0, *_reduce(values[at:end]), 0)
+                    first[-1], second[-1], _ = _join(
+                        first[-1], second[-1], 0, *_reduce(values[at:end]), 0
+                    )
             at = end
         if at == stop:
             return
@@ -129,7 +145,9 @@ class Decimator:
         self._end.extend([times[min(start + rows, stop) - 1] for start in starts])
         self._count.extend([min(start + rows, stop) - start for start in starts])
         self._gaps += [gaps] * len(starts)
-        for first, second, mixed, values in zip(self._first, self._second, self._mixed, columns, strict=True):
+        for first, second, mixed, values in zip(
+            self._first, self._second, self._mixed, columns, strict=True
+        ):
             mixed += bytes(len(starts))
             part = values[at:stop]
             if part.count(part[0]) == len(part):  # nothing moves: most columns, most of the time
@@ -148,7 +166,12 @@ class Decimator:
         rows = 0
         for index, count in enumerate(self._count):
             gaps = self._gaps[index]
-            if groups and gaps != _MIXED and gaps == self._gaps[index - 1] and rows + count <= self._rows:
+            if (
+                groups
+                and gaps != _MIXED
+                and gaps == self._gaps[index - 1]
+                and rows + count <= self._rows
+            ):
                 groups[-1].append(index)
                 rows += count
             else:
@@ -167,7 +190,8 @@ class Decimator:
                     groups.append([index])
             self._regroup(groups)
             self._rows = max(self._rows, 2)
-            self._runs = 2 + sum(a != b or b == _MIXED for a, b in pairwise(self._gaps))  # with the one that comes
+            # with the one that comes
+            self._runs = 2 + sum(a != b or b == _MIXED for a, b in pairwise(self._gaps))
             if self._runs <= self._most_runs // 2 or len(self._begin) == 1:
                 return
             self._blur_ns *= 2
@@ -179,9 +203,12 @@ class Decimator:
         count, gaps = self._count, self._gaps
         self._count = array("q", [sum(count[index] for index in group) for group in groups])
         self._gaps = [
-            gaps[group[0]] if all(gaps[index] == gaps[group[0]] for index in group) else _MIXED for group in groups
+            gaps[group[0]] if all(gaps[index] == gaps[group[0]] for index in group) else _MIXED
+            for group in groups
         ]
-        for column, (first, second, mixed) in enumerate(zip(self._first, self._second, self._mixed, strict=True)):
+        for column, (first, second, mixed) in enumerate(
+            zip(self._first, self._second, self._mixed, strict=True)
+        ):
             joined = []
             for group in groups:
                 index = group[0]
@@ -228,7 +255,9 @@ def _reduce(part: Sequence[Number]) -> tuple[Number, Number]:
     return high, low
 
 
-def _join(a1: Number, a2: Number, a_mixed: int, b1: Number, b2: Number, b_mixed: int) -> tuple[Number, Number, int]:
+def _join(
+    a1: Number, a2: Number, a_mixed: int, b1: Number, b2: Number, b_mixed: int
+) -> tuple[Number, Number, int]:
     """The same for two buckets that follow each other, and whether the column has values and gaps in them."""
     if a1 is None or a2 is None:
         return b1, b2, b_mixed or int(b1 is not None)

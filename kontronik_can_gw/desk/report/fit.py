@@ -55,7 +55,9 @@ class ResistanceFit:
         middle = _quantile(slopes, 0.5)
         if middle <= 0:
             return None
-        return Resistance(middle, (_quantile(slopes, 0.75) - _quantile(slopes, 0.25)) / 2, len(slopes))
+        return Resistance(
+            middle, (_quantile(slopes, 0.75) - _quantile(slopes, 0.25)) / 2, len(slopes)
+        )
 
     def _restart(self, voltage: float, current: float) -> None:
         self._x0, self._y0 = current, voltage  # sums around these lose no digits

@@ -77,7 +77,9 @@ class Ledger:
         speed: Sequence[Number],
     ) -> None:
         last, since = self._last, self._since
-        for time_ns, now in zip(times, zip(present, voltage, current, power, speed, strict=True), strict=True):
+        for time_ns, now in zip(
+            times, zip(present, voltage, current, power, speed, strict=True), strict=True
+        ):
             if now == last:
                 continue
             if last is not None:

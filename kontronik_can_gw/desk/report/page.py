@@ -38,7 +38,9 @@ def render(
         f"default-src 'none'; script-src {_hash(library)} {_hash(script)}; style-src {_hash(styles)}; "
         "base-uri 'none'; form-action 'none'"
     )
-    data = json.dumps(_data(flight, wall_ns), ensure_ascii=True, separators=(",", ":"), allow_nan=False)
+    data = json.dumps(
+        _data(flight, wall_ns), ensure_ascii=True, separators=(",", ":"), allow_nan=False
+    )
     parts = {
         "policy": escape(policy),
         "title": escape(title),
@@ -81,7 +83,8 @@ def _data(flight: Flight, wall_ns: int | None) -> Json:
         "classes": [{"label": c.label, "light": c.light, "dark": c.dark} for c in STATE_CLASSES],
         "states": {str(state): [state_name(state), class_of(state)] for state in states},
         "segments": [
-            [[seconds(s.begin_ns), seconds(s.end_ns), s.state] for s in segments] for segments in flight.segments
+            [[seconds(s.begin_ns), seconds(s.end_ns), s.state] for s in segments]
+            for segments in flight.segments
         ],
         "plots": [
             {
@@ -90,7 +93,10 @@ def _data(flight: Flight, wall_ns: int | None) -> Json:
                 "unit": PLOTS[plot.plot].unit,
                 "digits": PLOTS[plot.plot].digits,
                 "lines": list(plot.labels),
-                "series": [{"esc": line.esc, "line": line.quantity, **encode(line.values)} for line in plot.lines],
+                "series": [
+                    {"esc": line.esc, "line": line.quantity, **encode(line.values)}
+                    for line in plot.lines
+                ],
             }
             for plot in flight.plots
         ],
@@ -120,11 +126,17 @@ def encode(values: Sequence[Number]) -> dict[str, Json]:
             break
     else:
         nan = float("nan")
-        return {"type": "f64", "data": _blob(array("d", [nan if value is None else value for value in values]))}
+        return {
+            "type": "f64",
+            "data": _blob(array("d", [nan if value is None else value for value in values])),
+        }
     reach = max(map(abs, steps), default=0)
     if reach >= 1 << 31:
         nan = float("nan")
-        return {"type": "f64", "data": _blob(array("d", [nan if value is None else value for value in values]))}
+        return {
+            "type": "f64",
+            "data": _blob(array("d", [nan if value is None else value for value in values])),
+        }
     code, least = ("h", -(1 << 15)) if reach < 1 << 15 else ("i", -(1 << 31))
     packed = array(code, [least if value is None else round(value * scale) for value in values])
     return {"type": "i16" if code == "h" else "i32", "scale": scale, "data": _blob(packed)}
@@ -158,7 +170,9 @@ def duration(length_ns: int) -> str:
         return f"{length_ns / SECOND:.1f} s"
     minutes, seconds = divmod(round(length_ns / SECOND), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02} min {seconds:02} s" if hours else f"{minutes} min {seconds:02} s"
+    return (
+        f"{hours} h {minutes:02} min {seconds:02} s" if hours else f"{minutes} min {seconds:02} s"
+    )
 
 
 def number(value: float, digits: int) -> str:
@@ -177,7 +191,11 @@ def wall_clock(wall_ns: int) -> str:
 
 
 def _head(
-    flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: int | None, damage: Sequence[str]
+    flight: Flight,
+    source: str,
+    provenance: Mapping[str, str],
+    wall_ns: int | None,
+    damage: Sequence[str],
 ) -> str:
     length = flight.end_ns - flight.start_ns
     facts = [("File", source), ("Length", f"{duration(length)}, {number(flight.rows, 0)} rows")]
@@ -189,18 +207,25 @@ def _head(
     for name, fact in zip(flight.names, flight.facts, strict=True):
         words, told = fact_words(fact, flight.origin_ns), provenance.get(name, "")
         if words or told:
-            facts.append((name, ", at ".join(filter(None, (words, told.rpartition(", at ")[2]))) if words else told))
+            facts.append(
+                (
+                    name,
+                    ", at ".join(filter(None, (words, told.rpartition(", at ")[2])))
+                    if words
+                    else told,
+                )
+            )
     if flight.replayed:
         facts.append(("Replay", "These frames were replayed from a recording."))
     known = {label.lower() for label, _ in facts}
     facts += [(key, text) for key, text in provenance.items() if key.lower() not in known]
-    html = "".join(f"<div><dt>{escape(key)}</dt><dd>{escape(text)}</dd></div>" for key, text in facts if text)
+    html = "".join(
+        f"<div><dt>{escape(key)}</dt><dd>{escape(text)}</dd></div>" for key, text in facts if text
+    )
     html = f"<dl>{html}</dl>"
     if damage:
         lines = "".join(f"<li>{escape(line)}</li>" for line in damage)
-        html += (
-            f'<div class="damage"><strong>The input is damaged; what is intact is shown.</strong><ul>{lines}</ul></div>'
-        )
+        html += f'<div class="damage"><strong>The input is damaged; what is intact is shown.</strong><ul>{lines}</ul></div>'
     return html
 
 
@@ -211,7 +236,11 @@ def fact_words(facts: Facts, origin_ns: int) -> str:
         shown = facts.devices[:MAX_DEVICES]
         first, *others = (text for _, text in shown)
         since = [clock(time_ns - origin_ns) for time_ns, _ in shown[1:]]
-        words.append("; ".join([first, *(f"from {at}: {text}" for at, text in zip(since, others, strict=True))]))
+        words.append(
+            "; ".join(
+                [first, *(f"from {at}: {text}" for at, text in zip(since, others, strict=True))]
+            )
+        )
         if len(facts.devices) > len(shown):
             words[-1] += f"; and {len(facts.devices) - len(shown)} more changes"
         return words[-1]
@@ -226,25 +255,35 @@ def fact_words(facts: Facts, origin_ns: int) -> str:
 
 def _at(time_ns: int, flight: Flight) -> str:
     since = time_ns - flight.origin_ns
-    return f'<button type="button" class="at" data-at="{since / SECOND:.6f}">{clock(since)}</button>'
+    return (
+        f'<button type="button" class="at" data-at="{since / SECOND:.6f}">{clock(since)}</button>'
+    )
 
 
 def _tiles(flight: Flight) -> str:
     """The numbers that are asked for first; of several ESCs the outermost, and whose it is."""
     several = len(flight.names) > 1
-    tiles: list[tuple[str, str, str]] = [("Duration", duration(flight.end_ns - flight.start_ns), "")]
+    tiles: list[tuple[str, str, str]] = [
+        ("Duration", duration(flight.end_ns - flight.start_ns), "")
+    ]
     turning = [s.turning_ns for s in flight.summaries if s.turning_ns is not None]
     if turning:
-        tiles.append(("Motor turning", duration(max(turning)), "the longest of all" if several else ""))
+        tiles.append(
+            ("Motor turning", duration(max(turning)), "the longest of all" if several else "")
+        )
     energies = [s.energy for s in flight.summaries if s.energy is not None]
     if energies:
         charge = [s.charge for s in flight.summaries if s.charge is not None]
         aside = f"{number(sum(charge), 0)} mAh" if charge else ""
-        tiles.append(("Energy" + (", all ESCs" if several else ""), f"{number(sum(energies), 1)} Wh", aside))
+        tiles.append(
+            ("Energy" + (", all ESCs" if several else ""), f"{number(sum(energies), 1)} Wh", aside)
+        )
 
     def outermost(label: str, key: str, unit: str, digits: int) -> None:
         found = [
-            (s.extremes[key], name) for s, name in zip(flight.summaries, flight.names, strict=True) if key in s.extremes
+            (s.extremes[key], name)
+            for s, name in zip(flight.summaries, flight.names, strict=True)
+            if key in s.extremes
         ]
         if not found:
             return
@@ -291,7 +330,10 @@ def _summary(flight: Flight) -> str:
         (
             "Use",
             [
-                ("Motor turning", lambda s: None if s.turning_ns is None else f"<b>{duration(s.turning_ns)}</b>"),
+                (
+                    "Motor turning",
+                    lambda s: None if s.turning_ns is None else f"<b>{duration(s.turning_ns)}</b>",
+                ),
                 ("Energy used", _energy),
                 ("Energy returned by braking", value(lambda s: s.energy_returned, "Wh", 2)),
                 ("Charge used", _charge),
@@ -331,11 +373,15 @@ def _summary(flight: Flight) -> str:
             [
                 (
                     "With telemetry",
-                    lambda s: f"<b>{number(100 * s.telemetry_ns / whole, 2)}</b> % ({duration(s.telemetry_ns)})",
+                    lambda s: (
+                        f"<b>{number(100 * s.telemetry_ns / whole, 2)}</b> % ({duration(s.telemetry_ns)})"
+                    ),
                 ),
                 (
                     "Gaps, the longest",
-                    lambda s: f"<b>{s.gaps}</b>" + (f" ({duration(s.longest_gap_ns)})" if s.gaps else ""),
+                    lambda s: (
+                        f"<b>{s.gaps}</b>" + (f" ({duration(s.longest_gap_ns)})" if s.gaps else "")
+                    ),
                 ),
                 ("Losses of the link", value(lambda s: s.losses, "", 0)),
                 ("CRC errors", value(lambda s: s.crc_errors, "", 0)),
@@ -361,7 +407,9 @@ def _summary(flight: Flight) -> str:
         if rows:
             head = f"<thead><tr><td></td>{names}</tr></thead>" if several else ""
             caption = f"<caption>{escape(title)}</caption>"
-            html.append(f'<table class="numbers">{caption}{head}<tbody>{"".join(rows)}</tbody></table>')
+            html.append(
+                f'<table class="numbers">{caption}{head}<tbody>{"".join(rows)}</tbody></table>'
+            )
     return "".join(html)
 
 
@@ -397,7 +445,9 @@ def _per_cell(voltage: float | None, summary: Summary) -> str | None:
 
 def _under_load(summary: Summary, flight: Flight) -> str | None:
     least = summary.load_voltage
-    return None if least is None else f"{_per_cell(least.value, summary)} {_at(least.time_ns, flight)}"
+    return (
+        None if least is None else f"{_per_cell(least.value, summary)} {_at(least.time_ns, flight)}"
+    )
 
 
 def _sag(summary: Summary) -> str | None:
@@ -416,7 +466,12 @@ def _resistance(summary: Summary) -> str | None:
     return f"{text}, {found.stretches} stretches"
 
 
-_KINDS = {"error": "errors", "state": "changes of state", "link": "changes of the link", "device": "changes of device"}
+_KINDS = {
+    "error": "errors",
+    "state": "changes of state",
+    "link": "changes of the link",
+    "device": "changes of device",
+}
 
 
 def _notes(flight: Flight) -> str:

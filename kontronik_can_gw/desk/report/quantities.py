@@ -83,7 +83,9 @@ class StateClass:
 
 _S = OperatingState
 STATE_CLASSES = (
-    StateClass("off", "Motor off, standby", "#c9ced6", "#4a515c", frozenset({_S.MotorOff, _S.StandBy})),
+    StateClass(
+        "off", "Motor off, standby", "#c9ced6", "#4a515c", frozenset({_S.MotorOff, _S.StandBy})
+    ),
     StateClass(
         "waiting",
         "Waiting",
@@ -91,7 +93,13 @@ STATE_CLASSES = (
         "#31638a",
         frozenset({_S.WaitForSignal, _S.WaitForMotorOff, _S.WaitForMotorOn}),
     ),
-    StateClass("start", "Self-test, signal", "#cab8e6", "#6a4f93", frozenset({_S.Selftest, _S.AcousticSignal})),
+    StateClass(
+        "start",
+        "Self-test, signal",
+        "#cab8e6",
+        "#6a4f93",
+        frozenset({_S.Selftest, _S.AcousticSignal}),
+    ),
     StateClass(
         "spool",
         "Spooling up, synchronising",
@@ -104,15 +112,33 @@ STATE_CLASSES = (
             }
         ),
     ),
-    StateClass("running", "Running", "#6fcf9f", "#1d7a51", frozenset({_S.Forward, _S.Backward, _S.RPMControl})),
     StateClass(
-        "braking", "Braking", "#f0a56b", "#a3571a", frozenset({_S.Brake, _S.BrakeTargetBackward, _S.BrakeTargetForward})
+        "running",
+        "Running",
+        "#6fcf9f",
+        "#1d7a51",
+        frozenset({_S.Forward, _S.Backward, _S.RPMControl}),
+    ),
+    StateClass(
+        "braking",
+        "Braking",
+        "#f0a56b",
+        "#a3571a",
+        frozenset({_S.Brake, _S.BrakeTargetBackward, _S.BrakeTargetForward}),
     ),
     StateClass("programming", "Programming", "#e5b3d0", "#8a4a70", frozenset({_S.Programming})),
-    StateClass("fault", "Fault", "#e0413a", "#d64b44", frozenset({_S.Error_Selftest, _S.CutOffDuringOperation})),
+    StateClass(
+        "fault",
+        "Fault",
+        "#e0413a",
+        "#d64b44",
+        frozenset({_S.Error_Selftest, _S.CutOffDuringOperation}),
+    ),
     StateClass("unknown", "Unknown to this program", "#ffffff", "#15181d", frozenset()),
 )
-CLASS_OF = {int(state): index for index, group in enumerate(STATE_CLASSES) for state in group.states}
+CLASS_OF = {
+    int(state): index for index, group in enumerate(STATE_CLASSES) for state in group.states
+}
 UNKNOWN_CLASS = len(STATE_CLASSES) - 1
 
 

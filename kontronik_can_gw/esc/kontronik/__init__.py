@@ -3,7 +3,12 @@
 from kontronik_can_gw.esc.kontronik.codec import Form, Kind, Layout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, Row, rows
-from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+)
 
 __all__ = [
     "Counters",

@@ -13,7 +13,14 @@ import struct
 from enum import Enum
 from zlib import crc32
 
-from kontronik_can_gw.esc.kontronik.fields import Data, DataType, InfoData, LiveData, body_format, rows
+from kontronik_can_gw.esc.kontronik.fields import (
+    Data,
+    DataType,
+    InfoData,
+    LiveData,
+    body_format,
+    rows,
+)
 
 
 class Kind(Enum):
@@ -33,7 +40,18 @@ class Layout(Enum):
 class Form:
     """One of the four frame forms: its length, what its CRC covers, and how its body is packed."""
 
-    __slots__ = ("_data", "_struct", "covered", "crc_at", "data_type", "header", "kind", "layout", "length", "name")
+    __slots__ = (
+        "_data",
+        "_struct",
+        "covered",
+        "crc_at",
+        "data_type",
+        "header",
+        "kind",
+        "layout",
+        "length",
+        "name",
+    )
 
     def __init__(self, kind: Kind, layout: Layout) -> None:
         self.kind = kind
@@ -41,7 +59,11 @@ class Form:
         self.name = f"{kind.value}_{layout.value}"
         self.header = b"KODL" if kind is Kind.LIVE else b"KODI"
         self.data_type: DataType = LiveData if kind is Kind.LIVE else InfoData
-        reserved = 0 if layout is Layout.LEGACY else -(4 + struct.calcsize("<" + body_format(self.data_type))) % 4
+        reserved = (
+            0
+            if layout is Layout.LEGACY
+            else -(4 + struct.calcsize("<" + body_format(self.data_type))) % 4
+        )
         self._struct = struct.Struct(f"<4s{body_format(self.data_type)}{reserved}xI")
         self.length = self._struct.size
         self.crc_at = self.length - 4

@@ -41,7 +41,11 @@ class Frame(NamedTuple):
     def suspect(self) -> bool:
         """True where the bytes outside a legacy live frame's CRC are impossible (operating state above 26)."""
         data = self.data
-        return self.form.layout is Layout.LEGACY and isinstance(data, LiveData) and data.operating_state > LARGEST_STATE
+        return (
+            self.form.layout is Layout.LEGACY
+            and isinstance(data, LiveData)
+            and data.operating_state > LARGEST_STATE
+        )
 
 
 @dataclass(slots=True)
@@ -80,7 +84,12 @@ class Counters:
 
     @property
     def dropped_bytes(self) -> int:
-        return self.dropped_noise + self.dropped_crc + self.dropped_unknown_kind + self.dropped_incomplete
+        return (
+            self.dropped_noise
+            + self.dropped_crc
+            + self.dropped_unknown_kind
+            + self.dropped_incomplete
+        )
 
     @property
     def pending(self) -> int:
@@ -103,9 +112,7 @@ class Counters:
             return None
         received = self.bytes - old.bytes
         if not received:
-            return (
-                "no bytes: ESC off, wire open, wrong port, or a KOSMIK that waits for one throttle pulse after power-up"
-            )
+            return "no bytes: ESC off, wire open, wrong port, or a KOSMIK that waits for one throttle pulse after power-up"
         if self.crc_errors > old.crc_errors:
             return "headers but no valid CRC: noise on the line, bytes lost, or another revision of the protocol"
         if self.headers > old.headers or self.pending >= 4:
@@ -115,9 +122,7 @@ class Counters:
         noise = self.dropped_noise - old.dropped_noise
         if noise >= 64 and (self.long_run_bytes - old.long_run_bytes) * 10 >= noise * 9:
             return "bytes but never KOD, in long runs of equal bits: a slower line, as the 9600 baud of an old JIVE (not PRO)"
-        return (
-            "bytes but never KOD: wrong parity (8E1 is needed), inverted signal, or the ESC is set to another protocol"
-        )
+        return "bytes but never KOD: wrong parity (8E1 is needed), inverted signal, or the ESC is set to another protocol"
 
 
 class Deframer:

@@ -28,7 +28,9 @@ class Row(NamedTuple):
     def type_range(self) -> tuple[int, int]:
         """Smallest and largest raw value of the wire type."""
         bits = struct.calcsize("<" + self.wire) * 8
-        return (-(1 << bits - 1), (1 << bits - 1) - 1) if self.wire.islower() else (0, (1 << bits) - 1)
+        return (
+            (-(1 << bits - 1), (1 << bits - 1) - 1) if self.wire.islower() else (0, (1 << bits) - 1)
+        )
 
     @property
     def stated_range(self) -> tuple[int, int]:
@@ -48,7 +50,8 @@ class Row(NamedTuple):
 _NOT_JIVEPRO = frozenset({Device.JIVEPRO})
 
 ElectricalSpeed = Annotated[int, Row("I", "1/min")]
-Voltage = Annotated[int, Row("H", "V", 100, 0, 10_000)]  # "10.000" in the sheet is a German ten thousand
+# "10.000" in the sheet is a German ten thousand
+Voltage = Annotated[int, Row("H", "V", 100, 0, 10_000)]
 Current = Annotated[int, Row("h", "A", 10, -10_000, 10_000)]  # signed: regeneration is negative
 Charge = Annotated[int, Row("H", "mAh")]
 BecCurrent = Annotated[int, Row("H", "A", 1000, not_on=_NOT_JIVEPRO)]
@@ -131,7 +134,9 @@ DataType = type[LiveData] | type[InfoData]
 
 def _rows(data: DataType) -> dict[str, Row]:
     hints = get_type_hints(data, include_extras=True)
-    return {name: next(a for a in get_args(hints[name]) if isinstance(a, Row)) for name in data._fields}
+    return {
+        name: next(a for a in get_args(hints[name]) if isinstance(a, Row)) for name in data._fields
+    }
 
 
 _ROWS: dict[DataType, dict[str, Row]] = {LiveData: _rows(LiveData), InfoData: _rows(InfoData)}

@@ -34,7 +34,12 @@ def messages(frame: bytes, supplied: bool) -> list[tuple[str, dict[str, Any]]]:
     return [
         (
             "FiveSpeed",
-            {"ElectricalSpeed": speed, "BatteryVoltage": voltage / 100, "PwmInput": pwm, "Timing": timing},
+            {
+                "ElectricalSpeed": speed,
+                "BatteryVoltage": voltage / 100,
+                "PwmInput": pwm,
+                "Timing": timing,
+            },
         ),
         (
             "FiveCurrent",
@@ -67,13 +72,17 @@ def can_frame(message: Any, values: dict[str, Any], index: int = 0, **further: A
         if not isinstance(value, str) and not signal.minimum <= value <= signal.maximum:
             values[signal.name] = "Error"
     data = message.encode(values)
-    return can.Message(arbitration_id=message.frame_id + index, data=data, is_extended_id=False, **further)
+    return can.Message(
+        arbitration_id=message.frame_id + index, data=data, is_extended_id=False, **further
+    )
 
 
 class Esc:
     """One ESC: its port, what was received and is not decoded yet, its messages."""
 
-    def __init__(self, index: int, path: str, database: Any, bus: can.BusABC, lock: threading.Lock) -> None:
+    def __init__(
+        self, index: int, path: str, database: Any, bus: can.BusABC, lock: threading.Lock
+    ) -> None:
         self.index = index
         self.database = database
         self.bus = bus
@@ -126,7 +135,10 @@ class Esc:
                 if len(self.buffer) < length:
                     return
                 covered = (length - 4) // 4 * 4
-                if crc32(self.buffer[:covered]) == struct.unpack_from("<I", self.buffer, length - 4)[0]:
+                if (
+                    crc32(self.buffer[:covered])
+                    == struct.unpack_from("<I", self.buffer, length - 4)[0]
+                ):
                     frame, self.buffer = self.buffer[:length], self.buffer[length:]
                     self.handle(frame, layout)
                     break
@@ -162,7 +174,11 @@ class Esc:
         """Encode and send a message."""
         message = self.database.get_message_by_name(name)
         frame = can_frame(message, values, self.index)
-        with self.lock, contextlib.suppress(can.CanOperationError):  # the bus is full: the next one is newer anyway
+        with (
+            self.lock,
+            contextlib.suppress(can.CanOperationError),
+        ):
+            # the bus is full: the next one is newer anyway
             self.bus.send(frame)
 
 

@@ -10,7 +10,13 @@ from collections.abc import Generator, Iterator
 from datetime import UTC, datetime
 from typing import BinaryIO
 
-from kontronik_can_gw.desk.recordings.can_logs.record import OLDEST_WALL_S, SECOND_NS, Damage, LogFrame, is_possible
+from kontronik_can_gw.desk.recordings.can_logs.record import (
+    OLDEST_WALL_S,
+    SECOND_NS,
+    Damage,
+    LogFrame,
+    is_possible,
+)
 from kontronik_can_gw.frames import CanFrame
 
 _FILE_HEADER = struct.Struct("<4sL8xQQLL8H8H")
@@ -59,7 +65,9 @@ class BlfReader:
             if fields[0] == b"LOGG":
                 self._full = fields[2] if fields[2] <= _LARGEST_FILE else 0
                 self.wall_start_ns = system_time_ns(fields[6:14])
-                self._first = fields[1] if _FILE_HEADER.size <= fields[1] <= 1 << 16 else _FILE_HEADER_SIZE
+                self._first = (
+                    fields[1] if _FILE_HEADER.size <= fields[1] <= 1 << 16 else _FILE_HEADER_SIZE
+                )
         file.seek(0)
 
     def __iter__(self) -> Iterator[LogFrame]:
@@ -105,7 +113,9 @@ class BlfReader:
         if end - lost >= _PADDING:
             damage.stretch(lost, end)
 
-    def _container(self, head: bytes, position: int, size: int, kind: int, end: int) -> tuple[bytes, int] | None:
+    def _container(
+        self, head: bytes, position: int, size: int, kind: int, end: int
+    ) -> tuple[bytes, int] | None:
         """The content of what stands at ``position``, and where it ends; None where it cannot be read."""
         body = self._file.read(min(size, end - position) - _BASE.size)
         is_cut = position + size > end
@@ -131,9 +141,12 @@ class BlfReader:
                 return None
             if unpacker.eof:
                 is_cut = False
-                if len(unpacker.unused_data) >= _PADDING:  # its length is wrong, what follows is not lost
+                if len(unpacker.unused_data) >= _PADDING:
+                    # its length is wrong, what follows is not lost
                     after -= len(unpacker.unused_data)
-                    self._damage.notes.append(f"the length of the container at offset {position} is wrong")
+                    self._damage.notes.append(
+                        f"the length of the container at offset {position} is wrong"
+                    )
             elif not is_cut:
                 return None
         else:
@@ -157,7 +170,9 @@ class BlfReader:
             start += block
         return end
 
-    def _objects(self, data: bytes, offset: int, from_start: bool) -> Generator[LogFrame, None, int]:
+    def _objects(
+        self, data: bytes, offset: int, from_start: bool
+    ) -> Generator[LogFrame, None, int]:
         """The frames in a container's content; returns how far it came. ``from_start``: the first byte begins an object."""
         position, end = 0, len(data)
         while True:
@@ -181,7 +196,12 @@ class BlfReader:
                 following = end
             if after > end and following == end and size <= _LARGEST_OBJECT:
                 return found  # it goes on in the next container
-            if size < _BASE.size or version not in (1, 2) or kind > _LAST_KIND or not _fits(data, after, following):
+            if (
+                size < _BASE.size
+                or version not in (1, 2)
+                or kind > _LAST_KIND
+                or not _fits(data, after, following)
+            ):
                 self._damaged(offset)
                 position = following
                 continue
@@ -199,7 +219,9 @@ class BlfReader:
         if note not in self._damage.notes[-1:]:
             self._damage.notes.append(note)
 
-    def _frame(self, data: bytes, start: int, header_size: int, version: int, size: int, kind: int) -> LogFrame | None:
+    def _frame(
+        self, data: bytes, start: int, header_size: int, version: int, size: int, kind: int
+    ) -> LogFrame | None:
         flags, _, _, stamp = _OBJECT.unpack_from(data, start + _BASE.size)
         time_ns = stamp * 10_000 if flags == 1 else stamp
         at = start + _BASE.size + _OBJECT.size + (8 if version == 2 else 0)
@@ -211,7 +233,9 @@ class BlfReader:
             if 8 < length < 16:  # a raw DLC; it means 8 bytes
                 length = 8
         elif kind == _CAN_FD_MESSAGE:
-            channel, bits, _, can_id, _, _, fd_flags, length, content = _FD_MESSAGE.unpack_from(data, at)
+            channel, bits, _, can_id, _, _, fd_flags, length, content = _FD_MESSAGE.unpack_from(
+                data, at
+            )
             remote, received, fd = bits & _REMOTE, not bits & _TX, bool(fd_flags & _EDL)
         elif kind == _CAN_FD_MESSAGE_64:
             fields = _FD_MESSAGE_64.unpack_from(data, at)
@@ -237,13 +261,22 @@ class BlfReader:
         extended = bool(can_id & _EXTENDED)
         if not is_possible(can_id & ~_EXTENDED, extended, length, fd):
             raise struct.error
-        return LogFrame(time_ns, CanFrame(can_id & _ID_MASK, content[:length], extended, fd), received, str(channel))
+        return LogFrame(
+            time_ns,
+            CanFrame(can_id & _ID_MASK, content[:length], extended, fd),
+            received,
+            str(channel),
+        )
 
 
 def _fits(data: bytes, after: int, following: int) -> bool:
     """True where an object that ends at ``after`` is followed by the next one, or by the end."""
     # "LOBJ" may stand in an object's data: then it is the length that tells
-    return after <= following < after + _PADDING or data.startswith(_SIGNATURE, after) or following == len(data)
+    return (
+        after <= following < after + _PADDING
+        or data.startswith(_SIGNATURE, after)
+        or following == len(data)
+    )
 
 
 def system_time_ns(fields: tuple[int, ...]) -> int | None:

@@ -32,7 +32,13 @@ SUFFIXES = {
     ".mf4": "mf4",
     ".mdf": "mf4",
 }
-NAMES = {"candump": "CAN log (candump)", "asc": "ASC log", "blf": "BLF file", "trc": "TRC file", "mf4": "MF4 file"}
+NAMES = {
+    "candump": "CAN log (candump)",
+    "asc": "ASC log",
+    "blf": "BLF file",
+    "trc": "TRC file",
+    "mf4": "MF4 file",
+}
 """What people call the formats."""
 _HEAD = 1 << 16
 _FAR = 1 << 20
@@ -58,7 +64,10 @@ def log_format(path: Path) -> str | None:
         return "mf4"
     lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 2000)[:2000]
     for line in lines:
-        if CANDUMP_LINE.fullmatch(line) is not None or CANDUMP_SCREEN_LINE.fullmatch(line) is not None:
+        if (
+            CANDUMP_LINE.fullmatch(line) is not None
+            or CANDUMP_SCREEN_LINE.fullmatch(line) is not None
+        ):
             return "candump"
         if ASC_HEAD.match(line) is not None or ASC_LINE.match(line) is not None:
             return "asc"
@@ -191,9 +200,13 @@ class CanLog:
         for item in items:
             time_ns = item.time_ns
             if last is not None and not -_BACK_NS <= time_ns - last <= _AHEAD_NS:
-                if doubtful is not None and not -_BACK_NS <= time_ns - doubtful.time_ns <= _AHEAD_NS:
+                if (
+                    doubtful is not None
+                    and not -_BACK_NS <= time_ns - doubtful.time_ns <= _AHEAD_NS
+                ):
                     wrong += 1
-                elif doubtful is not None:  # two agree: the clock was set, or the first frame was the damaged one
+                elif doubtful is not None:
+                    # two agree: the clock was set, or the first frame was the damaged one
                     yield doubtful
                     yield item
                     doubtful, last = None, time_ns
@@ -208,7 +221,9 @@ class CanLog:
         if doubtful is not None:
             yield doubtful
         if wrong:
-            self._damage.notes.append(f"{wrong} frame{'s' if wrong > 1 else ''} with an impossible time left out")
+            self._damage.notes.append(
+                f"{wrong} frame{'s' if wrong > 1 else ''} with an impossible time left out"
+            )
 
     def close(self) -> None:
         """Close the file."""

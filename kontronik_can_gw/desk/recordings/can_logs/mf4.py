@@ -37,7 +37,8 @@ def asammdf_module() -> "ModuleType":
         raise RunError("MF4 needs asammdf: pip install 'kontronik-can-gw[mf4]'") from None
     import logging
 
-    logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)  # what it says is said again by us, in one line
+    # what it says is said again by us, in one line
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)
     module: ModuleType = asammdf
     return module
 
@@ -67,7 +68,9 @@ class Mf4Reader:
         """False where it holds values, but nothing of a bus."""
         bus = (_GROUP, f"{_GROUP}.ID", _ERRORS, _REMOTES)
         groups = [group for group in self._mdf.groups if int(group.channel_group.cycles_nr)]
-        return not groups or any(channel.name in bus for group in groups for channel in group.channels)
+        return not groups or any(
+            channel.name in bus for group in groups for channel in group.channels
+        )
 
     def __iter__(self) -> Iterator[LogFrame]:
         groups = []
@@ -79,9 +82,13 @@ class Mf4Reader:
                 groups.append(self._frames(index, cycles, names))
                 total += cycles
             elif cycles and _ERRORS in names:
-                self._damage.foreign["error frames"] = self._damage.foreign.get("error frames", 0) + cycles
+                self._damage.foreign["error frames"] = (
+                    self._damage.foreign.get("error frames", 0) + cycles
+                )
             elif cycles and _REMOTES in names:
-                self._damage.foreign["remote frames"] = self._damage.foreign.get("remote frames", 0) + cycles
+                self._damage.foreign["remote frames"] = (
+                    self._damage.foreign.get("remote frames", 0) + cycles
+                )
         if not groups:
             self._damage.notes.append("no CAN frames are logged in it (no group CAN_DataFrame)")
         for done, item in enumerate(heapq.merge(*groups, key=lambda item: item.time_ns)):
@@ -98,29 +105,50 @@ class Mf4Reader:
             columns: dict[str, Any] = {}
             with quiet():
                 try:
-                    for part in ("ID", "DataBytes", "DataLength", "IDE", "Dir", "EDL", "BusChannel"):
+                    for part in (
+                        "ID",
+                        "DataBytes",
+                        "DataLength",
+                        "IDE",
+                        "Dir",
+                        "EDL",
+                        "BusChannel",
+                    ):
                         name = f"{_GROUP}.{part}"
                         if name not in names:
                             continue
-                        signal = self._mdf.get(name, group=index, record_offset=start, record_count=count)
+                        signal = self._mdf.get(
+                            name, group=index, record_offset=start, record_count=count
+                        )
                         columns[part] = signal.samples
                         times = signal.timestamps
                     stamps = np.rint(times * 1e9).astype(np.int64).tolist()
                     ids = (columns["ID"].astype(np.int64)).tolist()
                     content = columns["DataBytes"]
-                    if content.dtype.kind in "SO":  # of varying length, without the zeros at its end
+                    if content.dtype.kind in "SO":
+                        # of varying length, without the zeros at its end
                         size = 64
                         rows = [bytes(row).ljust(size, b"\0") for row in content]
                     else:
                         size = content.shape[1]
                         rows = [bytes(row) for row in content.astype(np.uint8)]
-                    lengths = columns["DataLength"].tolist() if "DataLength" in columns else [size] * count
-                    extended = columns["IDE"].tolist() if "IDE" in columns else [i > 0x7FF for i in ids]
-                    channels = columns["BusChannel"].tolist() if "BusChannel" in columns else [1] * count
+                    lengths = (
+                        columns["DataLength"].tolist()
+                        if "DataLength" in columns
+                        else [size] * count
+                    )
+                    extended = (
+                        columns["IDE"].tolist() if "IDE" in columns else [i > 0x7FF for i in ids]
+                    )
+                    channels = (
+                        columns["BusChannel"].tolist() if "BusChannel" in columns else [1] * count
+                    )
                     received = _received(columns.get("Dir"), count)
                     fds = columns["EDL"].tolist() if "EDL" in columns else [n > 8 for n in lengths]
                 except Exception as error:  # whatever a damaged file makes of it
-                    self._damage.notes.append(f"frames {start + 1} to {start + count} are damaged: {_short(error)}")
+                    self._damage.notes.append(
+                        f"frames {start + 1} to {start + count} are damaged: {_short(error)}"
+                    )
                     continue
             bad = 0
             for stamp, can_id, data, length, is_extended, channel, is_received, fd in zip(
@@ -133,7 +161,9 @@ class Mf4Reader:
                 frame = CanFrame(pure, data[:length], bool(is_extended), bool(fd))
                 yield LogFrame(stamp, frame, is_received, str(channel))
             if bad:
-                self._damage.notes.append(f"{bad} frames of {start + 1} to {start + count} are damaged")
+                self._damage.notes.append(
+                    f"{bad} frames of {start + 1} to {start + count} are damaged"
+                )
 
     def close(self) -> None:
         """Close the file and asammdf's temporary one."""
@@ -144,15 +174,29 @@ class Mf4Reader:
 class Mf4Writer:
     """Writes CAN frames as python-can's MF4Writer does, in chunks. ``start_ns``: Unix time of time 0; None: 1970."""
 
-    def __init__(self, path: Path, start_ns: int | None, provenance: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, path: Path, start_ns: int | None, provenance: Mapping[str, str] | None = None
+    ) -> None:
         module = asammdf_module()
         import numpy as np
 
         self._path = path
         self._provenance = provenance or {}
         self._np = np
-        parts = [("BusChannel", "<u1"), ("ID", "<u4"), ("IDE", "<u1"), ("DLC", "<u1"), ("DataLength", "<u1")]
-        parts += [("DataBytes", "(64,)u1"), ("Dir", "<u1"), ("EDL", "<u1"), ("BRS", "<u1"), ("ESI", "<u1")]
+        parts = [
+            ("BusChannel", "<u1"),
+            ("ID", "<u4"),
+            ("IDE", "<u1"),
+            ("DLC", "<u1"),
+            ("DataLength", "<u1"),
+        ]
+        parts += [
+            ("DataBytes", "(64,)u1"),
+            ("Dir", "<u1"),
+            ("EDL", "<u1"),
+            ("BRS", "<u1"),
+            ("ESI", "<u1"),
+        ]
         self._dtype = np.dtype([(f"{_GROUP}.{name}", kind) for name, kind in parts])
         self._rows: list[tuple[Any, ...]] = []
         self._times: list[float] = []
@@ -160,7 +204,8 @@ class Mf4Writer:
         with quiet():
             self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
             set_start(self._mdf, start_ns or 0)
-            source = module.blocks.v4_blocks.SourceInformation(source_type=2, bus_type=2)  # a bus, CAN
+            # a bus, CAN
+            source = module.blocks.v4_blocks.SourceInformation(source_type=2, bus_type=2)
             self._mdf.append(
                 module.Signal(
                     name=_GROUP,
@@ -176,7 +221,18 @@ class Mf4Writer:
         size = len(frame.data)
         data = frame.data.ljust(64, b"\0")
         fd = int(frame.fd)
-        row = (1, frame.can_id, int(frame.extended), FD_LENGTHS.index(size), size, data, int(not received), fd, fd, 0)
+        row = (
+            1,
+            frame.can_id,
+            int(frame.extended),
+            FD_LENGTHS.index(size),
+            size,
+            data,
+            int(not received),
+            fd,
+            fd,
+            0,
+        )
         self._rows.append(row)
         self._times.append(self._last / SECOND_NS)
         if len(self._rows) >= _CHUNK:
@@ -187,7 +243,9 @@ class Mf4Writer:
         if not self._rows:
             return
         table = np.zeros(len(self._rows), dtype=self._dtype)
-        for name, column in zip(self._dtype.names or (), zip(*self._rows, strict=True), strict=True):
+        for name, column in zip(
+            self._dtype.names or (), zip(*self._rows, strict=True), strict=True
+        ):
             if name.endswith("DataBytes"):
                 table[name] = np.frombuffer(b"".join(column), dtype=np.uint8).reshape(-1, 64)
             else:
@@ -228,7 +286,9 @@ def _opened(module: "ModuleType", path: Path) -> Any:
 
 def set_start(mdf: Any, start_ns: int) -> None:
     """Unix time in ns of the recording's start, as UTC. asammdf itself goes through a float, which is not exact."""
-    mdf.header.start_time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=start_ns // 1000)
+    mdf.header.start_time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(
+        microseconds=start_ns // 1000
+    )
     mdf.header.abs_time = start_ns
 
 
@@ -239,7 +299,9 @@ def save_mf4(mdf: Any, path: Path, provenance: Mapping[str, str]) -> None:
     with quiet():
         try:
             if provenance:
-                mdf.header.comment = "\n".join(f"{key}: {value}" for key, value in provenance.items())
+                mdf.header.comment = "\n".join(
+                    f"{key}: {value}" for key, value in provenance.items()
+                )
             start = mdf.header.abs_time
             beside = path.with_name(f"{path.name}.mf4")  # asammdf insists on its suffix
             Path(mdf.save(beside, overwrite=True, compression=2)).replace(path)

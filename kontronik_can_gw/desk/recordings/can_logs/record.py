@@ -32,7 +32,9 @@ class Reader(Protocol):
 
 def is_possible(can_id: int, extended: bool, size: int, fd: bool) -> bool:
     """True where a frame with this id and so many bytes exists on a CAN bus."""
-    return can_id <= (0x1FFFFFFF if extended else 0x7FF) and (size in FD_LENGTHS if fd else size <= 8)
+    return can_id <= (0x1FFFFFFF if extended else 0x7FF) and (
+        size in FD_LENGTHS if fd else size <= 8
+    )
 
 
 class Damage:
@@ -79,7 +81,9 @@ class Damage:
             rest = self.lines - sum(b - a + 1 for a, b in self._line_ranges[:_SHOWN])
             if rest:
                 shown.append(f"and {rest} more")
-            texts.append(f"{self.lines} damaged line{'s' if self.lines > 1 else ''}: {', '.join(shown)}")
+            texts.append(
+                f"{self.lines} damaged line{'s' if self.lines > 1 else ''}: {', '.join(shown)}"
+            )
         if self.stretches == 1:
             start, end = self._stretches[0]
             texts.append(f"a damaged stretch of {end - start} bytes at offset {start}")
@@ -87,5 +91,7 @@ class Damage:
             shown = [f"{b - a} at offset {a}" for a, b in self._stretches[:_SHOWN]]
             if self.stretches > _SHOWN:
                 shown.append(f"and {self.stretches - _SHOWN} more")
-            texts.append(f"{self.stretches} damaged stretches, {self.stretch_bytes} bytes in all: {', '.join(shown)}")
+            texts.append(
+                f"{self.stretches} damaged stretches, {self.stretch_bytes} bytes in all: {', '.join(shown)}"
+            )
         return texts + self.notes

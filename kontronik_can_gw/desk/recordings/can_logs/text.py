@@ -44,24 +44,35 @@ ASC_LINE = re.compile(
     rb")",
     re.IGNORECASE,
 )
-ASC_HEAD = re.compile(rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)", re.IGNORECASE)
+ASC_HEAD = re.compile(
+    rb"\s*(?:date\s|base\s+(?:hex|dec)|begin\s+triggerblock|//\s*version)", re.IGNORECASE
+)
 _ASC_OTHER = re.compile(
     rb"\s*(?://.*|(?:date|base|begin|end|no|internal|previous)\b.*|\d+\.\d+\s+(?!\d+\s+\S+\s+(?:Rx|Tx)\b)(?!CANFD\b)[\x09\x20-\x7e\x80-\xff]+)?\s*",
     re.IGNORECASE,
 )
-_ASC_BASE = re.compile(rb"\s*base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.IGNORECASE)
+_ASC_BASE = re.compile(
+    rb"\s*base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.IGNORECASE
+)
 _ASC_DATE = re.compile(r"\s*(?:date|begin\s+triggerblock)\s+\w+\s+(.+?)\s*$", re.IGNORECASE)
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
 _RELATIVE = b"relative"
 
-TRC_HEAD = re.compile(rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE)
+TRC_HEAD = re.compile(
+    rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})", re.IGNORECASE
+)
 TRC_LINE = re.compile(
     rb"\s*\d{1,10}\)?[ \t]+\d{1,12}(?:\.\d{1,6})?[ \t]+"
     rb"(?:(?:DT|FD|FB|FE|BI|RR|ST|EC|ER|EV|Rx|Tx|\d{1,2})[ \t]+)*(?:[0-9A-Fa-f]{8}|[0-9A-Fa-f]{4})[ \t]"
 )
 """How a line of any version begins."""
-_TRC_COLUMNS = {"1.0": "N,O,I,l,D", "1.1": "N,O,d,I,l,D", "1.3": "N,O,B,d,I,R,l,D", "2.0": "N,O,T,I,d,l,D"}
+_TRC_COLUMNS = {
+    "1.0": "N,O,I,l,D",
+    "1.1": "N,O,d,I,l,D",
+    "1.3": "N,O,B,d,I,R,l,D",
+    "2.0": "N,O,T,I,d,l,D",
+}
 _TRC_NEWEST = "N,O,T,B,I,d,R,L,D"
 _TRC_FRAMES = {"DT": False, "FD": True, "FB": True, "FE": True, "BI": True}
 _TRC_EVENTS = frozenset(("ST", "EC", "ER", "EV"))
@@ -88,8 +99,12 @@ class CandumpReader:
         self._file = file
         self._damage = damage
         self.wall_start_ns: int | None = None
-        for _, line in zip(range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False):
-            if (match := CANDUMP_LINE.fullmatch(line) or CANDUMP_SCREEN_LINE.fullmatch(line)) is not None:
+        for _, line in zip(
+            range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False
+        ):
+            if (
+                match := CANDUMP_LINE.fullmatch(line) or CANDUMP_SCREEN_LINE.fullmatch(line)
+            ) is not None:
                 self.wall_start_ns = 0 if int(match[1]) >= OLDEST_WALL_S else None
                 break
         file.seek(0)
@@ -130,7 +145,9 @@ class CandumpReader:
             if channel is None:
                 channel = channels[name] = name.decode("ascii")
             time_ns = int(seconds) * SECOND_NS + int(fraction.ljust(9, b"0"))
-            yield LogFrame(time_ns, CanFrame(can_id, data, extended, fd), direction in (b"R", b"r"), channel)
+            yield LogFrame(
+                time_ns, CanFrame(can_id, data, extended, fd), direction in (b"R", b"r"), channel
+            )
 
 
 def _as_logged(
@@ -144,7 +161,9 @@ def _as_logged(
     remote: bytes | None,
 ) -> bytes:
     """The line of a log for one of the screen."""
-    content = b"R" if remote else (b"#1" if len(length) == 2 else b"") + b"".join((data or b"").split())
+    content = (
+        b"R" if remote else (b"#1" if len(length) == 2 else b"") + b"".join((data or b"").split())
+    )
     return b"(%b.%b) %b %b#%b%b" % (
         seconds,
         fraction,
@@ -164,7 +183,9 @@ class AscReader:
         self._base = 16
         self._relative = False
         self.wall_start_ns: int | None = None
-        for _, line in zip(range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False):
+        for _, line in zip(
+            range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False
+        ):
             if (match := _ASC_BASE.match(line)) is not None:
                 self._base = 10 if match[1].lower() == b"dec" else 16
                 self._relative = (match[2] or b"").lower() == _RELATIVE
@@ -199,7 +220,9 @@ class AscReader:
                 continue
             fd = match[10] is not None
             channel, direction, id_text, x = (
-                (match[10], match[11], match[12], match[13]) if fd else (match[3], match[6], match[4], match[5])
+                (match[10], match[11], match[12], match[13])
+                if fd
+                else (match[3], match[6], match[4], match[5])
             )
             try:
                 can_id = int(id_text, base)
@@ -212,7 +235,11 @@ class AscReader:
                 else:
                     size = min(8, int(match[7], base))
                     words = match[8].split()[:size]
-                data = bytes.fromhex(b"".join(words).decode("ascii")) if base == 16 else bytes(map(int, words))
+                data = (
+                    bytes.fromhex(b"".join(words).decode("ascii"))
+                    if base == 16
+                    else bytes(map(int, words))
+                )
             except ValueError:
                 damage.line(number)
                 continue
@@ -220,7 +247,9 @@ class AscReader:
                 damage.line(number)
                 continue
             received = direction.lower() == b"rx"
-            yield LogFrame(time_ns, CanFrame(can_id, data, bool(x), fd), received, channel.decode("ascii"))
+            yield LogFrame(
+                time_ns, CanFrame(can_id, data, bool(x), fd), received, channel.decode("ascii")
+            )
 
 
 def asc_time(text: str) -> int | None:
@@ -234,7 +263,8 @@ def asc_time(text: str) -> int | None:
         hour, minute, second = (int(part) for part in clock.split(":"))
         if len(words) == 5:
             hour = hour % 12 + (12 if words[3] == "pm" else 0)
-        moment = datetime(int(words[-1]), _MONTHS.index(month) + 1, int(words[1]), hour, minute, second)  # noqa: DTZ001  local
+        year, month_number, day = int(words[-1]), _MONTHS.index(month) + 1, int(words[1])
+        moment = datetime(year, month_number, day, hour, minute, second)  # noqa: DTZ001  local
         return int(moment.timestamp()) * SECOND_NS + int((fraction or "0").ljust(9, "0")[:9])
     except (ValueError, OverflowError, OSError):
         return None
@@ -248,7 +278,9 @@ class TrcReader:
         self._damage = damage
         self.wall_start_ns: int | None = None
         version, columns = "", ""
-        for _, line in zip(range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False):
+        for _, line in zip(
+            range(_HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False
+        ):
             text = line.decode("latin-1").strip()
             if text and not text.startswith(";"):
                 break
@@ -261,7 +293,9 @@ class TrcReader:
                 self.wall_start_ns = _trc_start(value)
         file.seek(0)
         if not columns:
-            columns = _TRC_COLUMNS.get(version, _TRC_NEWEST if version.startswith("2") else _TRC_COLUMNS["1.0"])
+            columns = _TRC_COLUMNS.get(
+                version, _TRC_NEWEST if version.startswith("2") else _TRC_COLUMNS["1.0"]
+            )
         self._columns = [column.strip() for column in columns.split(",")]
 
     def __iter__(self) -> Iterator[LogFrame]:
@@ -283,7 +317,9 @@ class TrcReader:
                     raise ValueError
                 kind = "DT" if t is None else words[t].decode("ascii")
                 direction = b"" if d is None else words[d]
-                if kind == "RR" or (t is None and len(words) == count and words[-1].strip().upper() == b"RTR"):
+                if kind == "RR" or (
+                    t is None and len(words) == count and words[-1].strip().upper() == b"RTR"
+                ):
                     damage.skip("remote frames")
                     continue
                 if kind in _TRC_EVENTS or (t is None and direction in _TRC_OLD_EVENTS):
@@ -312,7 +348,9 @@ class TrcReader:
             except (ValueError, IndexError):  # of numbers, texts, lengths
                 damage.line(number)
                 continue
-            yield LogFrame(time_ns, CanFrame(can_id, data, extended, fd), direction == b"Rx", channel)
+            yield LogFrame(
+                time_ns, CanFrame(can_id, data, extended, fd), direction == b"Rx", channel
+            )
 
 
 def _trc_start(text: str) -> int | None:

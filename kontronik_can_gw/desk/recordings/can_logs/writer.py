@@ -51,7 +51,9 @@ class CanLogWriter:
             start_ns = None if wall_start_ns is None else _whole_us(wall_start_ns + first_ns)
             mf4 = Mf4Writer(file, start_ns, provenance)
             shift = 0 if start_ns is None else start_ns - (wall_start_ns or 0)
-            self.write = lambda time_ns, frame, received: mf4.write(time_ns - shift, frame, received)
+            self.write = lambda time_ns, frame, received: mf4.write(
+                time_ns - shift, frame, received
+            )
             self._close, self._discard = mf4.close, mf4.discard
             return
         assert not isinstance(file, Path)
@@ -60,16 +62,22 @@ class CanLogWriter:
             self.write = _candump(file, wall_start_ns or 0, channel)
             return
         # Vector's and PEAK's headers count milliseconds
-        base_ns = 0 if wall_start_ns is None else (wall_start_ns + first_ns) // _MS * _MS - wall_start_ns
+        base_ns = (
+            0 if wall_start_ns is None else (wall_start_ns + first_ns) // _MS * _MS - wall_start_ns
+        )
         start_ns = None if wall_start_ns is None else wall_start_ns + base_ns
-        {"asc": self._asc, "blf": self._blf, "trc": self._trc}[format_](file, base_ns, start_ns, name)
+        {"asc": self._asc, "blf": self._blf, "trc": self._trc}[format_](
+            file, base_ns, start_ns, name
+        )
 
     def _asc(self, file: IO[bytes], base_ns: int, start_ns: int | None, _name: str) -> None:
         with without_asammdf():
             from can import ASCWriter
         # python-can's header tells when the file was written, and cuts zeros of the milliseconds
         # local time, as ASC has it
-        moment = datetime(1970, 1, 1) if start_ns is None else datetime.fromtimestamp(start_ns // SECOND_NS)  # noqa: DTZ001, DTZ006
+        moment = datetime(1970, 1, 1)  # noqa: DTZ001
+        if start_ns is not None:
+            moment = datetime.fromtimestamp(start_ns // SECOND_NS)  # noqa: DTZ006
         stamp = moment.strftime(f"%a %b %d %H:%M:%S.{(start_ns or 0) // _MS % 1000:03d} %Y")
         text = io.TextIOWrapper(file, encoding="ascii", newline="\n", write_through=True)
         writer = ASCWriter(io.StringIO())
@@ -133,7 +141,9 @@ class CanLogWriter:
         self.write = write
         self._close, self._discard = detach, detach
 
-    def _through(self, take: "Callable[[Message], None]", base_ns: int, more_ns: float = 0.0) -> None:
+    def _through(
+        self, take: "Callable[[Message], None]", base_ns: int, more_ns: float = 0.0
+    ) -> None:
         """Write by one of python-can's writers. Times go in seconds since ``base_ns``, for which a float is exact enough."""
         from can import Message
 
@@ -182,7 +192,9 @@ class _Named:
         self.reconfigure = file.reconfigure
 
 
-def _candump(file: IO[bytes], wall_start_ns: int, channel: str) -> Callable[[int, CanFrame, bool], None]:
+def _candump(
+    file: IO[bytes], wall_start_ns: int, channel: str
+) -> Callable[[int, CanFrame, bool], None]:
     """As python-can's CanutilsLogWriter writes it, at several times its speed."""
     write = file.write
     half = 500 + wall_start_ns

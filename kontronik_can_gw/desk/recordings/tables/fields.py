@@ -43,8 +43,20 @@ def fields_of(columns: Sequence[Column]) -> list[Field]:
     counts = Counter(column.name for column in columns)
     fields = []
     for one in columns:
-        kind = Kind.TEXT if one.texts else Kind.FLAG if one.is_flag else Kind.WHOLE if one.is_whole else Kind.FLOAT
-        name = one.name if counts[one.name] == 1 and one.name not in _OWN else f"{one.message}.{one.name}"
+        kind = (
+            Kind.TEXT
+            if one.texts
+            else Kind.FLAG
+            if one.is_flag
+            else Kind.WHOLE
+            if one.is_whole
+            else Kind.FLOAT
+        )
+        name = (
+            one.name
+            if counts[one.name] == 1 and one.name not in _OWN
+            else f"{one.message}.{one.name}"
+        )
         fields.append(Field(name, one.unit, kind, one.message, one.texts))
     return fields
 

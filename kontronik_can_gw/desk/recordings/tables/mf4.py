@@ -30,11 +30,15 @@ class Mf4Table:
             if table.by_frame:
                 messages = dict.fromkeys(one.message for one in table.fields[2:])
                 self._groups: dict[Value, _Group] = {
-                    message: _Group(self._mdf, module, table.fields, table.indices(message), message)
+                    message: _Group(
+                        self._mdf, module, table.fields, table.indices(message), message
+                    )
                     for message in messages
                 }
             else:
-                self._group = _Group(self._mdf, module, table.fields, range(len(table.fields)), "ESC values")
+                self._group = _Group(
+                    self._mdf, module, table.fields, range(len(table.fields)), "ESC values"
+                )
                 self._groups = {}
 
     def write(self, row: Row) -> None:
@@ -56,7 +60,9 @@ class Mf4Table:
 class _Group:
     """One channel group."""
 
-    def __init__(self, mdf: Any, module: Any, fields: Sequence[Field], indices: Sequence[int], name: str) -> None:
+    def __init__(
+        self, mdf: Any, module: Any, fields: Sequence[Field], indices: Sequence[int], name: str
+    ) -> None:
         import numpy as np
 
         self._np = np
@@ -74,7 +80,8 @@ class _Group:
             if one.kind is Kind.TEXT:
                 texts = {number: text for number, text in one.texts if text != NOT_AVAILABLE}
                 missing = next(
-                    (number for number, text in one.texts if text == NOT_AVAILABLE), max(texts, default=-1) + 1
+                    (number for number, text in one.texts if text == NOT_AVAILABLE),
+                    max(texts, default=-1) + 1,
                 )
                 texts[missing] = NOT_AVAILABLE
                 codes = {text: number for number, text in texts.items()} | {None: missing}

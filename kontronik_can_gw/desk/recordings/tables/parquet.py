@@ -23,7 +23,9 @@ class ParquetTable:
             import pyarrow as pa  # type: ignore[import-untyped]
             from pyarrow import parquet
         except ImportError:
-            raise RunError("Parquet needs pyarrow: pip install 'kontronik-can-gw[parquet]'") from None
+            raise RunError(
+                "Parquet needs pyarrow: pip install 'kontronik-can-gw[parquet]'"
+            ) from None
         self._pa: Any = pa
         self._table = table
         # the same text may stand for several numbers
@@ -37,7 +39,9 @@ class ParquetTable:
             heads.append(pa.field(UTC, pa.timestamp("ns", tz="UTC")))
         heads += [
             pa.field(
-                one.header, self._type(one), metadata={"signal": one.name, "unit": one.unit, "message": one.message}
+                one.header,
+                self._type(one),
+                metadata={"signal": one.name, "unit": one.unit, "message": one.message},
             )
             for one in table.fields
         ]
@@ -87,7 +91,9 @@ class ParquetTable:
         for one, codes, column in zip(self._table.fields, self._codes, columns, strict=True):
             if one.kind is Kind.TEXT:
                 indices = pa.array([codes.get(value) for value in column], pa.int32())
-                arrays.append(pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string())))
+                arrays.append(
+                    pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string()))
+                )
             else:
                 arrays.append(pa.array(column, self._type(one)))
         self._rows = []

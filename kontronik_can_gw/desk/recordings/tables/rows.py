@@ -51,15 +51,28 @@ class Choice:
     rate: float | None = None
 
     @classmethod
-    def of(cls, columns: Sequence[Column], names: Sequence[str] = (), esc: int | None = None, **times: Any) -> "Choice":
+    def of(
+        cls,
+        columns: Sequence[Column],
+        names: Sequence[str] = (),
+        esc: int | None = None,
+        **times: Any,
+    ) -> "Choice":
         """The columns whose signal has one of these names (with * and ?), of one ESC. UserError for a name that fits none."""
         chosen: list[int] = []
         problems = []
         for name in names:
-            found = [i for i, c in enumerate(columns) if fnmatch.fnmatchcase(c.name.lower(), name.lower())]
+            found = [
+                i
+                for i, c in enumerate(columns)
+                if fnmatch.fnmatchcase(c.name.lower(), name.lower())
+            ]
             if not found:
                 close = get_close_matches(name, [c.name for c in columns], 1, 0.5)
-                problems.append(f"--signals {name}: no such signal." + (f" Did you mean {close[0]}?" if close else ""))
+                problems.append(
+                    f"--signals {name}: no such signal."
+                    + (f" Did you mean {close[0]}?" if close else "")
+                )
             chosen += [i for i in found if i not in chosen]
         if problems:
             raise UserError(*problems)
@@ -130,7 +143,8 @@ class Rows:
         count = len(reader.columns)
         for time_ns, frame, _ in frames:
             head = names.get(frame.key)
-            if head is None or (chunks := reader.read(frame.key, frame.data)) is None:  # shorter than its message
+            if head is None or (chunks := reader.read(frame.key, frame.data)) is None:
+                # shorter than its message
                 continue
             values: list[Value] = [None] * count
             for first, new in chunks:
@@ -144,7 +158,10 @@ def _frame_names(reader: SignalReader, choice: Choice) -> dict[int, tuple[str, s
     for index in choice.columns:
         column = reader.columns[index]
         can_id = column.key & ~EXTENDED
-        found[column.key] = (f"{can_id:08X}" if column.key & EXTENDED else f"{can_id:03X}", column.message)
+        found[column.key] = (
+            f"{can_id:08X}" if column.key & EXTENDED else f"{can_id:03X}",
+            column.message,
+        )
     return found
 
 
@@ -159,7 +176,9 @@ def _cut(rows: Iterator[Row], start_ns: int | None, end_ns: int | None) -> Itera
         yield row
 
 
-def thinned(rows: Iterator[Row], rate: float, by: Callable[[Row], object] | None = None) -> Iterator[Row]:
+def thinned(
+    rows: Iterator[Row], rate: float, by: Callable[[Row], object] | None = None
+) -> Iterator[Row]:
     """At most ``rate`` rows a second, the newest of each period; ``by`` tells rows apart that do not stand for each other."""
     period = SECOND_NS / rate
     held: dict[object, Row] = {}

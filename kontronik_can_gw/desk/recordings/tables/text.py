@@ -53,7 +53,11 @@ class CsvTable:
         self._write = file.write
         self._utc = UtcText()
         self._line = _compiled(table.fields, "csv", table.has_utc)
-        heads = [f"{TIME} [s]", *([UTC] if table.has_utc else []), *(one.header for one in table.fields)]
+        heads = [
+            f"{TIME} [s]",
+            *([UTC] if table.has_utc else []),
+            *(one.header for one in table.fields),
+        ]
         file.write((",".join(map(csv_text, heads)) + "\n").encode())
 
     def write(self, row: Row) -> None:
@@ -99,7 +103,9 @@ class JsonTable:
         """Nothing is held."""
 
 
-def _compiled(fields: Sequence[Field], form: str, has_utc: bool, only: Sequence[int] | None = None) -> _Line:
+def _compiled(
+    fields: Sequence[Field], form: str, has_utc: bool, only: Sequence[int] | None = None
+) -> _Line:
     """A function from time, UTC and values to a line."""
     is_csv = form == "csv"
     nothing = "" if is_csv else "null"

@@ -26,7 +26,9 @@ class TableWriter(Protocol):
 
 
 @contextmanager
-def open_table(target: IO[bytes] | Path, form: str, table: Table, units_line: bool = False) -> Iterator[TableWriter]:
+def open_table(
+    target: IO[bytes] | Path, form: str, table: Table, units_line: bool = False
+) -> Iterator[TableWriter]:
     """A writer, closed at the end. ``target``: a file that is open for bytes, of Parquet and MF4 a path.
 
     RunError where a library is missing. ``units_line``: of JSON lines, a first line with the units.
