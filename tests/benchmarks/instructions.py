@@ -160,9 +160,9 @@ def instructions(context: Context) -> list[Figure]:
     """The three programs."""
     number = 20 if context.quick else 200
     found = {
-        program: for_each(lambda n, p=program: of_python(p, n), number)
+        program: for_each(lambda n, p=program: of_python(p, n), number)  # type: ignore[misc]
         for program in ("ours", "obvious")
-    }  # type: ignore[misc]
+    }
     found["c"] = for_each(lambda n: of_c(context, n), number)
     return [
         judged("ours: decode, pack, schedule", found["ours"], "instructions/frame", "<= 40000"),

@@ -18,9 +18,8 @@ PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 def program(*words: object, **options: object) -> "subprocess.CompletedProcess[str]":
     """Run it as a process of its own."""
     command = [*PROGRAM, *map(str, words)]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=60, check=False, **options
-    )  # type: ignore[call-overload, no-any-return]
+    options = {"capture_output": True, "text": True, "timeout": 60, **options}
+    return subprocess.run(command, check=False, **options)  # type: ignore[call-overload, no-any-return]
 
 
 @pytest.fixture

@@ -322,12 +322,13 @@ def test_a_flood_of_wanted_frames_does_not_starve_the_uart(
             before, flooded = counters.live, node.status.received_frames
             esc.write(encode(LiveData(electrical_speed=n), UartLayout.V4))
             wait_for(
-                lambda before=before: counters.live > before or flood.poll() is not None,
+                lambda before=before: counters.live > before or flood.poll() is not None,  # type: ignore[misc]
                 f"live frame {n}",
-            )  # type: ignore[misc]
+            )
             wait_for(
-                lambda flooded=flooded: node.status.received_frames > flooded, "the flood goes on"
-            )  # type: ignore[misc]
+                lambda flooded=flooded: node.status.received_frames > flooded,  # type: ignore[misc]
+                "the flood goes on",
+            )
         assert flood.poll() is None, "to the end"
         assert counters.live == 100
     finally:

@@ -358,6 +358,6 @@ def test_a_pdo_is_mapped_anew_through_the_library(nodes: Nodes) -> None:
     master.write(1, 0x1804, 1, INVALID | RTR_OFF | 0x1F1, 4)
     for can_id in (0x688, 0x281):  # the DBC's, TPDO 2's
         assert (
-            master.refusal(lambda can_id=can_id: master.write(1, 0x1804, 1, RTR_OFF | can_id, 4))
+            master.refusal(lambda can_id=can_id: master.write(1, 0x1804, 1, RTR_OFF | can_id, 4))  # type: ignore[misc]
             == IN_USE
-        )  # type: ignore[misc]
+        )

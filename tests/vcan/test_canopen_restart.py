@@ -109,8 +109,9 @@ def test_lss_names_nodes_and_what_it_stored_holds_after_a_restart(
                 )
                 lss.send_switch_state_global(lss.WAITING_STATE)  # type: ignore[no-untyped-call]
                 wait_for(
-                    lambda node=node: node in {each for _, each in run.watch.boot_ups}, "a boot-up"
-                )  # type: ignore[misc]
+                    lambda node=node: node in {each for _, each in run.watch.boot_ups},  # type: ignore[misc]
+                    "a boot-up",
+                )
                 assert master.number(node, 0x1018, 4) == SERIAL + number
             sent = {frame.can_id for frame in run.watch.recorded} - run.watch.table.keys()
             said = {0, 0x80, 0x67F, 0x7E4, 0x7E5, 0x605, 0x585, 0x621, 0x5A1, 0x705, 0x721}

@@ -44,8 +44,9 @@ def test_every_frame_is_on_the_bus_as_it_was_sent_and_the_last_word_is_that_it_e
             link = f"Esc{index + 1}Link"
             wait_for(lambda i=index, d=identity.device: run.watch.info_device(i) == d, "the device")  # type: ignore[misc]
             wait_for(
-                lambda name=link: run.signal(name, "link_state") in LINK_THERE, "the link is there"
-            )  # type: ignore[misc]
+                lambda name=link: run.signal(name, "link_state") in LINK_THERE,  # type: ignore[misc]
+                "the link is there",
+            )
         newest = [len(fed.sent) - 1 for fed in run.escs]
         assert run.watch.values > 2 * times * len(identities)
         assert all(fresh[-1].n == n for fresh, n in zip(run.watch.fresh, newest, strict=True))
@@ -73,8 +74,9 @@ def test_loss_and_return_of_telemetry_are_on_the_bus(vcan: str, tmp_path: Path) 
             begin = go_silent(run)
             count = len(run.watch.of(0x680))
             wait_for(
-                lambda count=count: len(run.watch.of(0x680)) >= count + 3, "cyclic messages go on"
-            )  # type: ignore[misc]
+                lambda count=count: len(run.watch.of(0x680)) >= count + 3,  # type: ignore[misc]
+                "cyclic messages go on",
+            )
             assert all(frame.data[3] == 0xFF for frame in run.watch.of(0x680)[-3:]), (
                 "with NotAvailable"
             )

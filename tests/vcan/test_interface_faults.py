@@ -43,15 +43,15 @@ def test_an_interface_that_goes_down_and_up_or_away_and_back_is_used_again(
         for n in (1, 2):
             ip("link", "set", vcan, "down")
             wait_for(
-                lambda n=n: gateway.log.count("is down. Start it") == n,
+                lambda n=n: gateway.log.count("is down. Start it") == n,  # type: ignore[misc]
                 "the log says that it is down",
-            )  # type: ignore[misc]
+            )
             run.escs[0].send_one()  # which nobody sees
             ip("link", "set", vcan, "up")
             wait_for(
-                lambda n=n: gateway.log.count("frames are sent again") == n,
+                lambda n=n: gateway.log.count("frames are sent again") == n,  # type: ignore[misc]
                 "the log says that it is up",
-            )  # type: ignore[misc]
+            )
             run.feed(times=3)
         ip("link", "del", vcan)
         wait_for(lambda: f"{vcan}: " in gateway.lines[-1], "the log says that it is gone")
@@ -95,6 +95,6 @@ def test_the_controllers_state_is_followed_from_error_frames(vcan: str, tmp_path
         for frame, state in ERROR_FRAMES.items():
             subprocess.run(["cansend", vcan, frame], check=True)
             wait_for(
-                lambda state=state: run.signal("GatewayStatus", "can_state") == state,
+                lambda state=state: run.signal("GatewayStatus", "can_state") == state,  # type: ignore[misc]
                 f"CanState {state}",
-            )  # type: ignore[misc]
+            )
