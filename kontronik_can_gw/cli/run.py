@@ -180,7 +180,7 @@ class _Run:
 def settle_memory() -> None:
     """What is there now stays: no collection of garbage ever walks through it again.
 
-    The hot path makes no objects that refer to each other in a circle (tests/runtime_loop/test_garbage.py), so only what is young is looked
+    The hot path makes no objects that refer to each other in a circle (tests/runtime/test_garbage.py), so only what is young is looked
     through now and then; the whole only here, at the start.
     """
     gc.collect()

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from dbc_rules import RULES, findings, parse
+from esc import sheet
 from packer_oracle import pascal
-from protocol import sheet
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_esc.dbc"
 DATA = SHIPPED.read_bytes()

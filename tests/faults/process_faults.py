@@ -17,7 +17,7 @@ from raw_bus import RawBus
 LIMIT_S = 1.0
 RESTART_LIMIT_S = 3.0
 """A new process needs its layout compiled too, for which User Mode Linux, on one shared processor, takes some times as long as the machine
-itself; that a gateway is back within a second there is held by tests/runtime_loop/test_life_of_the_process.py."""
+itself; that a gateway is back within a second there is held by tests/runtime/test_life_of_the_process.py."""
 STOPPING = 2
 TIMEOUT_OBJECT = 0x2100, 4
 """Telemetry time-out in ms, which a master may set and store."""

@@ -1,6 +1,6 @@
 """Is what is golden right? Each flight, dialogue and capture against a brute-force search, the sheet and cantools.
 
-UART bytes are searched by tests/protocol/reference.py, fields and scales are those of tests/protocol/sheet.py, frames are decoded by
+UART bytes are searched by tests/esc/reference.py, fields and scales are those of tests/esc/sheet.py, frames are decoded by
 cantools. Nothing of the product is used but the DBC of a configuration, as text. ``python tests/golden/judge.py`` says what was judged.
 """
 
@@ -30,7 +30,7 @@ import meaning  # noqa: E402
 import scenario  # noqa: E402
 from cantools.database.can import Database  # noqa: E402
 from cantools.database.can.signal import Signal  # noqa: E402
-from protocol import reference, sheet  # noqa: E402
+from esc import reference, sheet  # noqa: E402
 
 NOT_JUDGED = ("no_start_values.txt",)
 """Flags without a start value go to 1 on loss, which is a false alarm: a known defect (README.md)."""

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from drive import Drive, Frame, replayed, shipped_eds
-from protocol import reference, sheet
+from esc import reference, sheet
 
 SECOND = 10**9
 INPUTS = Path(__file__).parent / "inputs"

@@ -34,9 +34,9 @@ BLOCKED_S = 900  # wall time after which a mutant that waits is given up, undeci
 MEMORY = 6 << 30
 NOT_DECIDED = (70, -signal.SIGALRM)
 PACKAGES = {
-    "protocol": (("esc/kontronik",), ("tests/protocol", "tests/telemetry")),
-    "dbc_output": (("dbc", "signals"), ("tests/dbc_output", "tests/dbc")),
-    "cia301": (("canopen",), ("tests/cia301", "tests/cia305", "tests/eds")),
+    "protocol": (("esc/kontronik",), ("tests/esc",)),
+    "dbc_output": (("dbc", "signals"), ("tests/signals", "tests/dbc")),
+    "cia301": (("canopen",), ("tests/canopen",)),
 }
 Result = dict[str, Any]
 NOTE = "_note_of_mutants"

@@ -1,4 +1,4 @@
-"""LSS slaves: dialogues from dialogues/*.txt, several slaves on one bus, and a foreign master (CiA 305)."""
+"""LSS slaves: dialogues from lss_dialogues/*.txt, several slaves on one bus, and a foreign master (CiA 305)."""
 
 import random
 from pathlib import Path
@@ -14,7 +14,7 @@ from wire import Wire
 
 from kontronik_can_gw.canopen.lss import LssSlave
 
-FILES = Path(__file__).parent.glob("dialogues/*.txt")
+FILES = Path(__file__).parent.glob("lss_dialogues/*.txt")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """An independent reckoning of what a signal must hold, and a maker of random DBC layouts and random telemetry.
 
 Nothing here uses the package's tables of fields, units or positions: they are typed again from the telemetry sheet, here and in
-tests/protocol/sheet.py, and bits are counted one by one. The package is used only to make telemetry objects out of encoded frames.
+tests/esc/sheet.py, and bits are counted one by one. The package is used only to make telemetry objects out of encoded frames.
 """
 
 import math
@@ -15,7 +15,7 @@ from typing import Any
 
 import cantools.database
 from cantools.database.can import Database
-from protocol import sheet
+from esc import sheet
 
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from protocol.reference import Found, certain_at, frames_of
-from protocol.sheet import LIVE_STRUCT
-from protocol.streams import random_stream
+from esc.reference import Found, certain_at, frames_of
+from esc.sheet import LIVE_STRUCT
+from esc.streams import random_stream
 from recordings import convert, dump_bytes
 
 from kontronik_can_gw.desk.recordings import inputs

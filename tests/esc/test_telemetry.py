@@ -9,8 +9,8 @@ from operator import or_
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from protocol.reference import SHORTEST_FIRST, fits
 
+from esc.reference import SHORTEST_FIRST, fits
 from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import FORMS
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant

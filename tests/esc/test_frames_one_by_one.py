@@ -1,8 +1,8 @@
 """Live frames as a read mostly brings them: one, whole and alone."""
 
 import pytest
-from protocol.reference import ambiguous
 
+from esc.reference import ambiguous
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings, EscTelemetry, Event
 
