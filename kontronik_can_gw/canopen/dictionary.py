@@ -3,6 +3,7 @@
 Built from an EDS. A variable is either plain storage or bound: ``read`` then gives its value at each access.
 """
 
+import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -204,10 +205,9 @@ class Dictionary:
                 continue
             value = variable.decode(data)
             entry = variable.entry
-            low, high = entry.low, entry.high
-            if not isinstance(value, bytes) and not (low is None or value >= low) & (
-                high is None or value <= high
-            ):
+            low = -math.inf if entry.low is None else entry.low
+            high = math.inf if entry.high is None else entry.high
+            if not isinstance(value, bytes) and not low <= value <= high:
                 misfits.append(number)
                 continue
             variable.value = value
