@@ -327,7 +327,6 @@ class Gateway:
     def _apply(self, esc: int, settings: EscSettings) -> None:
         """Settings that came over the bus: they hold for everything that is sent, the DBC's messages too."""
         self.escs[esc].apply(settings)
-        self._output.apply(esc, settings)
         self.shortest_timeout_ns = self._shortest_timeout()
         self._next_expiry = 0
 

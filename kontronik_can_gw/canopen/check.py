@@ -17,7 +17,7 @@ from kontronik_can_gw.canopen.node import (
     range_of,
 )
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
-from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAPPING
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.errors import UserError
@@ -56,7 +56,7 @@ def check_eds(
     problems = [
         f"{eds.name}: {variable.entry.index:04X}h:{variable.entry.sub:02X} {variable.entry.name}: {what}"
         for variable, what in (
-            *_objects(dictionary, settings),
+            *_objects(dictionary),
             *_store_objects(dictionary),
             *_settings(dictionary, all_escs),
         )
@@ -70,9 +70,9 @@ def check_eds(
         raise UserError(*dict.fromkeys(problems))
 
 
-def _objects(dictionary: Dictionary, settings: EscSettings) -> Iterator[tuple[Variable, str]]:
+def _objects(dictionary: Dictionary) -> Iterator[tuple[Variable, str]]:
     """Types and access of what telemetry and services show and read."""
-    for (index, sub), binding in bindings(settings).items():
+    for (index, sub), binding in BINDINGS.items():
         variable = dictionary.get(index, sub)
         if variable is None:
             continue

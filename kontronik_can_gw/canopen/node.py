@@ -20,7 +20,7 @@ from kontronik_can_gw.canopen.emergency import Emergencies, GatewayError
 from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.lss import UNCONFIGURED, LssSlave
 from kontronik_can_gw.canopen.nmt import Command, NmtState
-from kontronik_can_gw.canopen.objects import Bound, bindings, reader_text
+from kontronik_can_gw.canopen.objects import BINDINGS, Bound
 from kontronik_can_gw.canopen.pdo import (
     COB_ID,
     COMMUNICATION,
@@ -663,9 +663,6 @@ class Node:
             self.emergencies.set_word(self.esc.live.operating_errors, now, force=True)
         if settings != self.esc.settings:
             self._around.settings_changed(self, settings)
-            self._bind_sources()
-            for tpdo in self.tpdos:
-                tpdo.configure(now)
 
     def _set_pending(self, node_id: int) -> None:
         self.pending_node_id = node_id
@@ -768,37 +765,31 @@ class Node:
         read(at.ERROR_CODE, 0, lambda _now: self.emergencies.code)
 
     def _bind_sources(self) -> None:
-        """Objects that show a source. Done again when pole pairs or gear change, which are worked into the sources."""
-        for (index, sub), bound in bindings(self.esc.settings).items():
+        """Objects that show a value of the ESC or of the gateway."""
+        for (index, sub), bound in BINDINGS.items():
             variable = self.dictionary.get(index, sub)
-            if variable is None or self._bound.get((index, sub)) == bound:
-                continue
-            self._bound[index, sub] = bound
-            variable.read = self._reader(variable, bound)
+            if variable is not None:
+                self._bound[index, sub] = bound
+                variable.read = self._reader(variable, bound)
 
     def _reader(self, variable: Variable, bound: Bound) -> Callable[[int], Value]:
         esc, gateway, dictionary = self.esc, self._gateway, self.dictionary
         low, high = range_of(variable)
-        names: dict[str, Callable[[EscTelemetry, object, GatewayStatus, int], int | None]] = {}
-        exec(reader_text(bound, high), names)  # noqa: S102  text made by us, from sources of ours
-        value_of = names["read"]
         not_available = high if low == 0 else low
         is_live = bound.source.group is Group.LIVE
 
         def read(now: int) -> Value:
             behaviour = dictionary.number(at.SETTINGS, 5)
-            live: object = None
-            if is_live:
-                live = esc.live
-                if live is None and behaviour == _CODES:
+            if is_live and esc.live is None:
+                if behaviour == _CODES:
                     return not_available
-                if live is None:
-                    live = esc.last_live
-                    if live is None:
-                        raise SdoAbort(Abort.NO_DATA)
-                    if behaviour != _LAST_VALUE:
-                        raise SdoAbort(Abort.DEVICE_STATE)
-            value = value_of(esc, live, gateway, now)
+                if esc.last_live is None:
+                    raise SdoAbort(Abort.NO_DATA)
+                if behaviour != _LAST_VALUE:
+                    raise SdoAbort(Abort.DEVICE_STATE)
+                value = bound.last(esc, high)
+            else:
+                value = bound.read(esc, gateway, now, high)
             if value is not None and low <= value <= high:
                 return value
             if behaviour == _CODES:

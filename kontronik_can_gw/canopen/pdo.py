@@ -9,13 +9,16 @@ carry the link status: those go on, with all ones (80..0h for signed types) for 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
+from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
 from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.objects import LINK, Bound
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscTelemetry, Event
-from kontronik_can_gw.esc.values import GatewayStatus, Group, Source
+from kontronik_can_gw.esc.values import GatewayStatus, Group, Kind
+from kontronik_can_gw.esc.values import Value as EscValue
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.packer import Pack, compile_pack, place
 from kontronik_can_gw.signals.plan import (
@@ -69,6 +72,20 @@ class Mapped:
     bound: Bound | None
 
 
+def _stored(variable: Variable) -> EscValue:
+    """An object that is no value of the ESC: storage, or of a service; not available where that has none (1003h)."""
+
+    def read(_esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> Any:
+        if variable.read is None:
+            return variable.value
+        try:
+            return variable.read(now)
+        except SdoAbort:
+            return None
+
+    return EscValue(variable.entry.name, "", Group.GATEWAY, Kind.GATEWAY, read=read)
+
+
 def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePlan:
     """The plan of a PDO: objects one behind the other, the lowest bit first."""
     signals = []
@@ -79,11 +96,7 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePla
         length = bits_of(variable)
         signed = variable.entry.data_type in _SIGNED
         if bound is None:
-            number = f"{variable.entry.index << 8 | variable.entry.sub:#x}"
-            storage = (
-                f"storage[{number}].value" if variable.read is None else f"shown({number}, now)"
-            )
-            source = Source(variable.entry.name, "", Group.GATEWAY, storage)
+            source = _stored(variable)
         else:
             source = bound.source
             paces.add(source.pace or source.group)
@@ -101,7 +114,7 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Mapped]) -> MessagePla
                 high=(1 << length - signed) - 1,
                 not_available=not_available,
                 error=not_available,
-                slope=source.per_unit**0 if bound is None else bound.slope,
+                slope=Fraction(1) if bound is None else bound.slope,
                 source=source,
                 esc=None if source.group is Group.GATEWAY else 0,
             )
@@ -450,8 +463,7 @@ class Tpdo:
         if not self._mapped:
             return
         plan = message_plan(f"TPDO {self.number + 1}", self.cob_id, self._mapped)
-        names = {"storage": self._dictionary.variables, "shown": self._shown}
-        self._pack = compile_pack(plan, names)
+        self._pack = compile_pack(plan)
         self._length = plan.length
         carries_link = False
         status = []
@@ -466,17 +478,10 @@ class Tpdo:
                 status.append(signal)
         if status:
             self._status_mask = sum(place(signal.pieces, -1) for signal in status)
-            self._status = compile_pack(replace(plan, signals=tuple(status)), names)
+            self._status = compile_pack(replace(plan, signals=tuple(status)))
         for pace in plan.paces:
             self.triggers |= _EVENT_OF_PACE[pace]
         if self._status_mask:
             self.triggers |= Event.LIVE | Event.LINK | Event.INFO
         live = any(entry.bound and entry.bound.source.group is Group.LIVE for entry in self._mapped)
         self._needs_live = live and not carries_link
-
-    def _shown(self, number: int, now: int) -> Value:
-        """What a service's object holds; -1, which no unsigned object can hold, where it has nothing (1003h)."""
-        try:
-            return self._dictionary.value(self._dictionary.variables[number], now)
-        except SdoAbort:
-            return -1

@@ -161,7 +161,7 @@ class Replay:
     def _take_up(self, state: Mapping[str, Any]) -> None:
         """Go on with what was counted before recording began."""
         for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
-            esc.energy, esc.run_time, esc.losses = (
+            esc.energy_mw_ns, esc.run_time, esc.losses = (
                 found[name] for name in ("energy", "run_time", "losses")
             )
         if "started_ns" in state:

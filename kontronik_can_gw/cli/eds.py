@@ -10,7 +10,7 @@ from kontronik_can_gw.canopen.eds import dcf
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
-from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.storage import VERIFY
 from kontronik_can_gw.cli.common import canopen_of, load_all, write_output
 from kontronik_can_gw.config.nodes import shipped_canopen
@@ -87,15 +87,10 @@ def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, file_name: 
 
 def active_values(node: Node) -> dict[tuple[int, int], Value]:
     """What a node is configured with, by index and sub-index: every readable value but telemetry, states and commands."""
-    telemetry = bindings(node.esc.settings)
     values: dict[tuple[int, int], Value] = {}
     for variable in node.dictionary.variables.values():
         key = variable.entry.index, variable.entry.sub
-        if (
-            not variable.readable
-            or key in telemetry
-            or variable.entry.index in _STATES_AND_COMMANDS
-        ):
+        if not variable.readable or key in BINDINGS or variable.entry.index in _STATES_AND_COMMANDS:
             continue
         try:
             values[key] = node.dictionary.value(variable, 0)

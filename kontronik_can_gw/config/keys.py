@@ -23,7 +23,7 @@ from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
-from kontronik_can_gw.esc.values import sources
+from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.signals import units
 
 T = TypeVar("T")
@@ -765,7 +765,7 @@ def _ratio(value: Any) -> Fraction:
 
 def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -> None:
     """``escs`` by their number in the file: those with mistakes of their own are missing."""
-    names = {normalize(name) for name in sources(EscSettings())}
+    names = {normalize(name) for name in VALUES}
     for what in ("name", "port"):
         seen: dict[str, int] = {}
         for number, esc in escs.items():

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import Group, Source, sources
+from kontronik_can_gw.esc.values import VALUES, Group, Value
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -19,21 +19,19 @@ class Binder:
         self.escs = escs
         self.bind = bind
         self.used: set[str] = set()
-        self._sources = [sources(esc) for esc in escs]
-        self._by_key = {normalize(name): name for name in self._sources[0]}
+        self._by_key = {normalize(name): value for name, value in VALUES.items()}
         self._prefixes = sorted(
             ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
         )
 
-    def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Source, int | None] | None:
+    def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Value, int | None] | None:
         """The source of a normalized name, ``percent`` at its end ignored; ``esc`` None: unprefixed."""
-        name = self._by_key.get(key) or self._by_key.get(key.removesuffix("percent"))
-        if name is None:
+        source = self._by_key.get(key) or self._by_key.get(key.removesuffix("percent"))
+        if source is None:
             return None
-        source = self._sources[esc or 0][name]
         return (source, None) if source.group is Group.GATEWAY else (source, esc)
 
-    def by_name(self, name: str) -> tuple[Source, int | None] | None:
+    def by_name(self, name: str) -> tuple[Value, int | None] | None:
         """The source a signal name or a bound name means, and its ESC (None: the name says no ESC, or the gateway)."""
         key = normalize(name)
         if len(self.escs) == 1 and (found := self.gateway_or_esc(key, 0)):
@@ -57,7 +55,7 @@ class Binder:
         for prefix, _ in self._prefixes:
             key = key.removeprefix(prefix) or key
         near = difflib.get_close_matches(key, self._by_key, n=3, cutoff=0.5)
-        names = [self._by_key[n] for n in near]
+        names = [self._by_key[n].name for n in near]
         return f" Did you mean {' or '.join(names)}?" if names else ""
 
 

@@ -19,7 +19,7 @@ from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.reader import attribute, choose_node, listed
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
-from kontronik_can_gw.esc.values import Group, Source
+from kontronik_can_gw.esc.values import Divisor, Group, Value, divisor_of_settings
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import (
     FD_LENGTHS,
@@ -553,7 +553,7 @@ class _Compiler:
         self,
         where: str,
         signal: "Signal",
-        source: Source,
+        source: Value,
         esc: int | None,
         base: dict[str, Any],
         codes: Mapping[str, int],
@@ -585,16 +585,20 @@ class _Compiler:
         if source.unit and not unit:
             self.warnings.append(f"{where}: has no unit; {source.unit} is taken.")
         scale, shift = converted
-        slope = scale / source.per_unit / factor
+        slope = slope_of_esc = scale / source.per_unit / factor
         intercept = (shift - offset) / factor
         low, high = base["low"], base["high"]
         if numbers is None and not signal.is_float:
-            step = abs(1 / slope)
-            if step > 1 and source.whole:
+            if esc is not None:
+                slope_of_esc = slope / divisor_of_settings(source, self.binder.escs[esc])
+            step = abs(1 / slope_of_esc)
+            if step > 1 and source.divisor is not Divisor.CELLS:
                 notes.append(f"resolution {_number(abs(factor))} {unit or source.unit}".rstrip())
             if not source.rolls:
                 ends = [
-                    end * slope + intercept for end in (source.low, source.high) if end is not None
+                    end * slope_of_esc + intercept
+                    for end in (source.low, source.high)
+                    if end is not None
                 ]
                 if ends and (min(ends) < low - 2 or max(ends) > high + 2):
                     # more than NotAvailable and Error cost

@@ -31,7 +31,7 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
         assert flag.source is not None
         if source.name in _OF_LINK and flag.source.group is Group.LIVE:
             return signal
-        if source.group is flag.source.group and source.supplied is None and _has_code(signal):
+        if source.group is flag.source.group and not source.optional and _has_code(signal):
             return signal
     return None
 

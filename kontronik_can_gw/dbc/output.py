@@ -1,15 +1,14 @@
 """Plans, packers and schedule put together: telemetry events and time in, CAN frames out."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 from kontronik_can_gw.dbc.schedule import Schedule
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
-from kontronik_can_gw.esc.values import GatewayStatus, Group, Source, sources
+from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
+from kontronik_can_gw.esc.values import GatewayStatus, Group
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
 
 _new = tuple.__new__
 _EVENT_OF_PACE = {
@@ -140,18 +139,6 @@ class DbcOutput:
                 message.owed = list(range(len(message.pages)))
                 self._request(index, now)
 
-    def apply(self, esc: int, settings: EscSettings) -> None:
-        """Other pole pairs or gear of an ESC: the plans with values that depend on them are compiled anew."""
-        known = sources(settings)
-        for message in self._messages:
-            signals = tuple(
-                _rescaled(signal, known) if signal.esc == esc else signal
-                for signal in message.plan.signals
-            )
-            if signals != message.plan.signals:
-                message.plan = replace(message.plan, signals=signals)
-                message.pack = compile_pack(message.plan)
-
     def bits(self, index: int, now: int, page: int | None) -> int:
         """What a message would hold now, alive counter and CRC 0."""
         return self._messages[index].pack(self._escs, self._gateway, now, 0, page or 0)
@@ -262,10 +249,3 @@ class DbcOutput:
             self._schedule.sent(index, now)
             if message.owed:
                 self._schedule.wait(index, now)
-
-
-def _rescaled(signal: SignalPlan, known: Mapping[str, Source]) -> SignalPlan:
-    old = signal.source
-    if old is None or (new := known[old.name]).per_unit == old.per_unit:
-        return signal
-    return replace(signal, source=new, slope=signal.slope * old.per_unit / new.per_unit)

@@ -19,15 +19,14 @@ from fractions import Fraction
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.kontronik.states import Device
 
 MS = 1_000_000
 SECOND = 1000 * MS
 NS_PER_BYTE = 11 * SECOND // 115_200
 INFO_TIMEOUT_NS = 10 * SECOND
 """Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
-MW_NS_PER_WH = 3_600_000 * SECOND
-"""Energy is kept in milliwatt nanoseconds: one step of voltage (10 mV) by one of current (0.1 A) is exactly 1 mW."""
+MWS_PER_WH = 3_600_000
+"""Energy is kept in milliwatt seconds: one step of voltage (10 mV) by one of current (0.1 A) is exactly 1 mW."""
 _V4 = Layout.V4
 _LEGACY = 2
 _DEGRADED_DROPPED_SHARE = 10  # one dropped byte in so many received
@@ -80,25 +79,26 @@ class EscTelemetry:
     """One ESC's stream and what is known from it.
 
     Attributes read by the packers: ``live``, ``info`` (None where not available), ``link``, ``layout`` (0 unknown, 1 V4,
-    2 legacy), ``cells`` (0 unknown), ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``,
-    ``energy`` (drawn from the battery, milliwatt nanoseconds), ``run_time`` (ns with the motor turning), ``live_ns`` and
+    2 legacy), ``cells`` (0 unknown), ``pole_pairs``, ``output_divisor`` / ``gear_denominator`` (pole pairs x gear),
+    ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``,
+    ``energy`` (drawn from the battery, milliwatt seconds), ``run_time`` (ns with the motor turning), ``live_ns`` and
     ``last_info_ns`` (time of the newest live and info frame's last byte, as ages are shown, None before the first). ``live_bound_ns`` and
     ``info_bound_ns`` are the earliest that byte can have come, for time-outs. ``last_live`` and ``last_info`` are the newest ever, fresh or
     not, of the layout now on the line; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
     """
 
     def __init__(self, settings: EscSettings, now: int) -> None:
-        self.settings = settings
         self.live: LiveData | None = None
         self.info: InfoData | None = None
         self.last_live: LiveData | None = None
         self.last_info: InfoData | None = None
         self.link = LinkState.NEVER_SEEN
         self.layout = 0
-        self.cells = settings.cell_count
+        self.apply(settings)
         self.frame_rate: int | None = 0
         self.losses = 0
         self.energy = 0
+        self._energy_rest = 0  # milliwatt nanoseconds, less than a milliwatt second
         self.run_time = 0
         self.live_ns: int | None = None
         self.live_bound_ns = 0
@@ -130,11 +130,27 @@ class EscTelemetry:
         """True while live telemetry is fresh."""
         return self.live is not None
 
-    def bec_current_supplied(self, raw: int) -> bool:
-        """False where BEC current means nothing: on a JIVEPro, the last known one too, and at 0 as long as the device is not known."""
+    def supplies(self, not_on: frozenset[int], raw: int) -> bool:
+        """False for a value that the device (the last known one) does not have, and at 0 as long as the device is not known."""
         if self.info is not None:
-            return self.info.device != Device.JIVEPRO
-        return raw != 0 and (self.last_info is None or self.last_info.device != Device.JIVEPRO)
+            return self.info.device not in not_on
+        return raw != 0 and (self.last_info is None or self.last_info.device not in not_on)
+
+    @property
+    def last_cells(self) -> int:
+        """Number of cells, 0: unknown. While telemetry is lost that of the last value."""
+        if self.cells or self.live is not None or self.last_info is None:
+            return self.cells
+        return self.last_info.cell_count
+
+    @property
+    def energy_mw_ns(self) -> int:
+        """Energy drawn from the battery in milliwatt nanoseconds, as a capture holds it."""
+        return self.energy * SECOND + self._energy_rest
+
+    @energy_mw_ns.setter
+    def energy_mw_ns(self, energy: int) -> None:
+        self.energy, self._energy_rest = divmod(energy, SECOND)
 
     def age_ms(self, now: int) -> int | None:
         """Age of the newest live frame, None before the first."""
@@ -143,6 +159,9 @@ class EscTelemetry:
     def apply(self, settings: EscSettings) -> None:
         """Other settings from now on."""
         self.settings = settings
+        self.pole_pairs = settings.pole_pairs
+        self.output_divisor = settings.pole_pairs * settings.gear.numerator
+        self.gear_denominator = settings.gear.denominator
         self.cells = settings.cell_count or (self.info.cell_count if self.info else 0)
 
     def reset_statistics(self) -> None:
@@ -244,7 +263,11 @@ class EscTelemetry:
                 bound = self.live_bound_ns
             if self.live is not None:
                 if self._last_power > 0:
-                    self.energy += self._last_power * (when - before)
+                    rest = self._energy_rest + self._last_power * (when - before)
+                    if rest >= SECOND:
+                        self.energy += rest // SECOND
+                        rest %= SECOND
+                    self._energy_rest = rest
                 if self.live.electrical_speed:
                     self.run_time += when - before
         self._last_power = data.battery_voltage * data.battery_current

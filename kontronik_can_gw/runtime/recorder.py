@@ -351,7 +351,7 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
     """What a replay that begins now cannot know."""
     return {
         "escs": [
-            {"energy": esc.energy, "run_time": esc.run_time, "losses": esc.losses}
+            {"energy": esc.energy_mw_ns, "run_time": esc.run_time, "losses": esc.losses}
             for esc in gateway.escs
         ],
         "can_state": int(gateway.status.can_state),

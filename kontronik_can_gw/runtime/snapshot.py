@@ -7,12 +7,11 @@ made, or is null.
 import contextlib
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
@@ -26,8 +25,16 @@ from kontronik_can_gw.esc.kontronik.states import (
     peak_current_of,
     state_text,
 )
-from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, SECOND, EscSettings, EscTelemetry
-from kontronik_can_gw.esc.values import GatewayStatus, Group, Source, sources
+from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, SECOND, EscTelemetry
+from kontronik_can_gw.esc.values import (
+    VALUES,
+    GatewayStatus,
+    Group,
+    Value,
+    physical,
+    steps,
+    steps_of,
+)
 from kontronik_can_gw.gateway import Gateway
 
 if TYPE_CHECKING:
@@ -200,7 +207,9 @@ def snapshot(
             "counters": {name: getattr(status, name) for name in _STATUS_COUNTERS},
         },
         "units": _UNITS,
-        "escs": [_esc(esc, port, now) for esc, port in zip(gateway.escs, ports, strict=True)],
+        "escs": [
+            _esc(esc, port, status, now) for esc, port in zip(gateway.escs, ports, strict=True)
+        ],
         "nodes": [
             {
                 "esc": name,
@@ -251,7 +260,7 @@ def name_in_words(name: str) -> str:
     return name.lower().replace("_", "-")
 
 
-def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
+def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) -> Document:
     """One ESC. What is not fresh at ``now`` is None, whatever the last call of ``advance`` knew."""
     live, info = esc.live, esc.info
     if live is not None and now - esc.live_bound_ns > esc.settings.timeout_ns:
@@ -260,7 +269,6 @@ def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
         esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS
     ):
         info = None
-    readers = _readers(esc.settings.pole_pairs, esc.settings.gear)
     alarms = None if live is None else _alarms(live.operating_errors)
     return {
         "name": esc.settings.name,
@@ -299,9 +307,9 @@ def _esc(esc: EscTelemetry, port: PortFacts, now: int) -> Document:
         "statuses": None if alarms is None else alarms[Severity.STATUS],
         "selftest_errors": None if info is None else _selftest(info.selftest_errors),
         "values": {
-            **(readers.nothing_live if live is None else readers.live(esc, live, info)),
-            **(readers.nothing_known if info is None else readers.info(esc, live, info)),
-            **readers.link(esc, live, info),
+            **{value.name: physical(value, esc, steps_of(value, esc, live)) for value in _LIVE},
+            **{value.name: physical(value, esc, steps_of(value, esc, info)) for value in _INFO},
+            **{value.name: physical(value, esc, steps(value, esc, status, now)) for value in _LINK},
         },
     }
 
@@ -320,55 +328,20 @@ def _selftest(word: int) -> list[str]:
     return bit_texts(word, SelfTestError)
 
 
-Reader = Callable[[EscTelemetry, object, object], dict[str, float | None]]
-
-
-class _Readers(NamedTuple):
-    live: Reader
-    info: Reader
-    link: Reader
-    nothing_live: Mapping[str, None]
-    nothing_known: Mapping[str, None]
-
-
-@lru_cache(maxsize=64)
-def _readers(pole_pairs: int, gear: Fraction) -> _Readers:
-    """How the values of an ESC with this drive train are read: the sources' own expressions, compiled."""
-    settings = EscSettings(pole_pairs=pole_pairs, gear=gear)
-    groups = {group: [s for s in _values(settings) if s.group is group] for group in Group}
-    live, info, link = (_compiled(groups[group]) for group in (Group.LIVE, Group.INFO, Group.LINK))
-    nothing_live, nothing_known = (
-        dict.fromkeys(s.name for s in groups[group]) for group in (Group.LIVE, Group.INFO)
+def _numbers(*groups: Group) -> tuple[Value, ...]:
+    """The values of these groups that are numbers of the ESC: no flags, no names, no counters of the link."""
+    return tuple(
+        value
+        for value in VALUES.values()
+        if value.bit is None
+        and not value.names
+        and value.name not in _OTHERWISE
+        and value.group in groups
+        and (value.group is not Group.LINK or value.pace is Group.LIVE)
     )
-    return _Readers(live, info, link, nothing_live, nothing_known)
 
 
-def _values(settings: EscSettings) -> list[Source]:
-    """The sources whose values are numbers of the ESC: no flags, no names, no counters of the link."""
-    return [
-        source
-        for source in sources(settings).values()
-        if source.bit is None
-        and not source.names
-        and source.name not in _OTHERWISE
-        and (source.group in (Group.LIVE, Group.INFO) or source.pace is Group.LIVE)
-    ]
-
-
-def _compiled(listed: Sequence[Source]) -> Reader:
-    lines = []
-    for source in listed:
-        steps = source.per_unit
-        value = f"({source.expression})"
-        if steps != 1:
-            value = f"round({value} * {steps.denominator} / {steps.numerator}, 6)"
-        if source.supplied is not None:
-            value = f"({value} if {source.supplied} else None)"
-        lines.append(f"{source.name!r}: {value},")
-    names: dict[str, Any] = {}
-    exec("def read(esc, live, info):\n return {" + "\n".join(lines) + "}", names)  # noqa: S102  text made by us, from sources of ours
-    reader: Reader = names["read"]
-    return reader
+_LIVE, _INFO, _LINK = (_numbers(group) for group in (Group.LIVE, Group.INFO, Group.LINK))
 
 
 def _severities(bits: type[ErrorBit]) -> dict[str, Severity]:
@@ -376,7 +349,7 @@ def _severities(bits: type[ErrorBit]) -> dict[str, Severity]:
 
 
 _SEVERITIES = _severities(OperatingError)
-_UNITS = {source.name: source.unit for source in _values(EscSettings())}
+_UNITS = {value.name: value.unit for value in _numbers(Group.LIVE, Group.INFO, Group.LINK)}
 _STATUS_COUNTERS = tuple(
     f.name
     for f in fields(GatewayStatus)

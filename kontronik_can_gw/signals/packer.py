@@ -7,14 +7,14 @@ available its NotAvailable code; nothing wraps, nothing is clipped. Bit 0 of the
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry
-from kontronik_can_gw.esc.values import GatewayStatus, Group
+from kontronik_can_gw.esc.values import Divisor, GatewayStatus, Kind, Value
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
-_PLAIN_VALUE = re.compile(r"live\[\d+\]|info\[\d+\]")
+_PLAIN_VALUE = re.compile(r"reading\[\d+\]|x")
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
 
 
@@ -55,7 +55,7 @@ def alive_modulus(signal: SignalPlan, has_crc: bool) -> int:
 
 
 def source_text(plan: MessagePlan) -> str:
-    """The generated function. It names the tables of its enumerations."""
+    """The generated function. It names tables and functions of its signals (``compile_pack``)."""
     lines = ["def pack(escs, gateway, now, alive, page):"]
     constant = 0
     has_crc = any(signal.role is Role.CRC for signal in plan.signals)
@@ -79,22 +79,17 @@ def source_text(plan: MessagePlan) -> str:
     return "\n".join(lines) + "\n"
 
 
-def compile_pack(plan: MessagePlan, further: Mapping[str, object] | None = None) -> Pack:
-    """The function of ``source_text``, compiled. ``further``: what expressions of the plan's sources may name besides."""
-    names: dict[str, object] = {
-        "float_bits": float_bits,
-        "inf": math.inf,
-        **_tables(plan),
-        **(further or {}),
-    }
+def compile_pack(plan: MessagePlan) -> Pack:
+    """The function of ``source_text``, compiled."""
+    names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf}
+    for signal in plan.signals:
+        if signal.numbers:
+            names[_name("numbers", signal)] = {int(k): v for k, v in signal.numbers.items()}
+        if signal.source is not None:
+            names[_name("read", signal)] = signal.source.read
+            names[_name("not_on", signal)] = signal.source.not_on
     exec(compile(source_text(plan), f"<packer of {plan.name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
     return names.pop("pack")  # type: ignore[return-value]  # what its own globals hold would be a circle
-
-
-def _tables(plan: MessagePlan) -> dict[str, dict[int, int]]:
-    return {
-        _table_name(s): {int(k): v for k, v in s.numbers.items()} for s in plan.signals if s.numbers
-    }
 
 
 def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
@@ -104,48 +99,72 @@ def _body(plan: MessagePlan, page: int | None, has_crc: bool) -> list[str]:
     for signal in chosen:
         if signal.role is Role.ALIVE:
             lines.append(f"bits |= {_placed(signal, f'alive % {alive_modulus(signal, has_crc)}')}")
-    by_owner: dict[tuple[int | None, Group], list[SignalPlan]] = {}
+    by_reading: dict[tuple[int | None, str | None], list[SignalPlan]] = {}
     for signal in chosen:
         if signal.source is not None:
-            by_owner.setdefault((signal.esc, signal.source.group), []).append(signal)
-    for (esc, group), signals in by_owner.items():
+            key = (signal.esc, _reading(signal.source))
+            by_reading.setdefault(key, []).append(signal)
+    for (esc, reading), signals in by_reading.items():
         line = f"bits |= {' | '.join(_terms(signals))}"
-        if esc is not None:
-            lines.append(f"esc = escs[{esc}]")
-        if group in (Group.LIVE, Group.INFO):
-            nothing = 0
-            for signal in signals:
-                nothing |= not_available_bits(signal)
-            lines.append(f"{group.value} = esc.{group.value}")
-            lines.append(f"if {group.value} is None:")
-            lines.append(f"    bits |= {nothing:#x}")
-            lines.append("else:")
-            lines.append(f"    {line}")
-        else:
+        lines.append("esc = None" if esc is None else f"esc = escs[{esc}]")
+        if reading is None:
             lines.append(line)
+            continue
+        nothing = 0
+        for signal in signals:
+            nothing |= not_available_bits(signal)
+        lines.append(f"reading = esc.{reading}")
+        lines.append("if reading is None:")
+        lines.append(f"    bits |= {nothing:#x}")
+        lines.append("else:")
+        lines.append(f"    {line}")
     return lines
+
+
+def _reading(source: Value) -> str | None:
+    """The reading of the ESC that a value is taken from; None for one that is read by a function."""
+    if source.read is not None:
+        return None
+    if source.last:
+        return "last_info"
+    return source.group.value
 
 
 def _terms(signals: Sequence[SignalPlan]) -> list[str]:
     """Python text of each signal's bits; flags of one word that move together are one."""
     terms: list[str] = []
     # (word, distance moved up) -> bits of the word that move together
-    flags: dict[tuple[str, int], int] = {}
+    flags: dict[tuple[int, int], int] = {}
     for signal in signals:
         source = signal.source
         assert source is not None
         if source.bit is not None and _is_plain_flag(signal):
-            key = (source.expression, signal.pieces[0].at - source.bit)
+            key = (source.words[0], signal.pieces[0].at - source.bit)
             flags[key] = flags.get(key, 0) | 1 << source.bit
             continue
-        term = _placed(signal, _value(signal))
-        if source.supplied is not None:
-            term = f"({term} if {source.supplied} else {not_available_bits(signal):#x})"
+        steps, condition = _steps(signal, source)
+        term = _placed(signal, _value(signal, steps))
+        if condition is not None:
+            term = f"({term} if {condition} else {not_available_bits(signal):#x})"
         terms.append(term)
     for (word, distance), mask in flags.items():
         moved = f" << {distance}" if distance > 0 else f" >> {-distance}" if distance else ""
-        terms.append(f"({word} & {mask:#x}){moved}")
+        terms.append(f"(reading[{word}] & {mask:#x}){moved}")
     return terms
+
+
+def _steps(signal: SignalPlan, source: Value) -> tuple[str, str | None]:
+    """Python text of the value in steps before the divisor, and of when it is available (None: with its reading)."""
+    if source.read is not None:
+        return "x", f"(x := {_name('read', signal)}(esc, gateway, now)) is not None"
+    fields = [f"reading[{word}]" for word in source.words]
+    steps = " * ".join(fields)
+    if source.kind is Kind.BITS:
+        moved = f"{steps} >> {source.shift}" if source.shift else steps
+        steps = f"({moved} & {source.mask:#x})"
+    if source.not_on:
+        return steps, f"esc.supplies({_name('not_on', signal)}, {steps})"
+    return steps, "esc.cells" if source.divisor is Divisor.CELLS else None
 
 
 def _is_plain_flag(signal: SignalPlan) -> bool:
@@ -158,24 +177,23 @@ def _is_plain_flag(signal: SignalPlan) -> bool:
     )
 
 
-def _value(signal: SignalPlan) -> str:
+def _value(signal: SignalPlan, steps: str) -> str:
     """Python text of a signal's raw value, or of its Error code where it has none."""
     source = signal.source
     assert source is not None
-    expression = (
-        source.expression if source.bit is None else f"{source.expression} >> {source.bit} & 1"
-    )
     if signal.is_float:
-        scaled = f"({expression}) * {float(signal.slope)!r} + {float(signal.intercept)!r}"
-        if signal.numbers is not None:
-            scaled = f"{_table_name(signal)}.get({expression})"
         least, most = signal.limits
-        return f"float_bits({scaled}, {signal.length}, {least!r}, {most!r}, {signal.error}, {signal.not_available})"
+        number = (
+            _float(signal, steps)
+            if signal.numbers is None
+            else f"{_name('numbers', signal)}.get({steps})"
+        )
+        return f"float_bits({number}, {signal.length}, {least!r}, {most!r}, {signal.error}, {signal.not_available})"
     if signal.numbers is not None:
-        return f"{_table_name(signal)}.get({expression}, {signal.error})"
+        return f"{_name('numbers', signal)}.get({steps}, {signal.error})"
     if source.rolls:
-        return f"({expression}) % {signal.high + 1}"
-    value = scaled_text(expression, signal.slope, signal.intercept, source.whole)
+        return f"{_scaled(signal, steps)} % {signal.high + 1}"
+    value = _scaled(signal, steps)
     low, high = _ends(signal)
     unfit = [f"> {signal.high}"] if high is None or high > signal.high else []
     unfit += [f"< {signal.low}"] if low is None or low < signal.low else []
@@ -193,28 +211,48 @@ def _value(signal: SignalPlan) -> str:
     return f"{signal.error} if {tests} else {name}"
 
 
-def _table_name(signal: SignalPlan) -> str:
-    return f"numbers_at_{signal.pieces[0].at}_of_{signal.page or 0}"
+def _name(what: str, signal: SignalPlan) -> str:
+    """The name of a table or function of a signal in the generated text."""
+    return f"{what}_at_{signal.pieces[0].at}_of_{signal.page or 0}"
 
 
-def scaled_text(expression: str, slope: Fraction, intercept: Fraction, whole: bool) -> str:
-    """Python text of a source's value in steps x -> ``x * slope + intercept``, rounded to the nearest, halves up."""
-    if not whole:
-        return f"round(({expression}) * {float(slope)!r} + {float(intercept)!r})"
-    if slope == 1 and intercept == 0:
-        return expression
-    if slope.denominator == 1 and intercept.denominator == 1:
-        return f"({expression}) * {slope} + {intercept}"
+_DIVISORS = {
+    Divisor.ONE: ("", ""),
+    Divisor.POLE_PAIRS: (" * esc.pole_pairs", ""),
+    Divisor.OUTPUT: (" * esc.output_divisor", " * esc.gear_denominator"),
+    Divisor.CELLS: (" * esc.cells", ""),
+}
+"""Python text by which what divides a value, and the value, are multiplied."""
+
+
+def _scaled(signal: SignalPlan, steps: str) -> str:
+    """Python text of ``steps / divisor * slope + intercept``: multiplied first, rounded once to the nearest, halves up."""
+    assert signal.source is not None
+    slope, intercept = signal.slope, signal.intercept
+    by, over = _DIVISORS[signal.source.divisor]
+    if not by and slope.denominator == 1 and intercept.denominator == 1:
+        product = steps if slope == 1 else f"{steps} * {slope}"
+        return product if intercept == 0 else f"({product} + {intercept})"
     common = slope.denominator * intercept.denominator
-    a, b = int(slope * common), int(intercept * common)
-    return f"(({expression}) * {2 * a} + {2 * b + common}) // {2 * common}"
+    factor, offset = int(slope * common), int(intercept * common)
+    rest = f"{2 * offset + common}{by}"
+    return f"(({steps} * {2 * factor}{over} + {rest}) // ({2 * common}{by}))"
+
+
+def _float(signal: SignalPlan, steps: str) -> str:
+    """Python text of ``steps / divisor * slope + intercept`` as a double: one exact division."""
+    assert signal.source is not None
+    by, over = _DIVISORS[signal.source.divisor]
+    numerator, denominator = signal.slope.numerator, signal.slope.denominator
+    divided = f"{steps} * {numerator}{over} / ({denominator}{by})"
+    return divided if signal.intercept == 0 else f"{divided} + {float(signal.intercept)!r}"
 
 
 def _ends(signal: SignalPlan) -> tuple[Fraction | None, Fraction | None]:
-    """Least and greatest raw value that the source can give; None where it has no bound."""
+    """Least and greatest raw value that the source can give; None where it has no limit."""
     source = signal.source
     assert source is not None
-    if source.low is None or source.high is None or not source.whole:
+    if source.low is None or source.high is None or source.divisor is not Divisor.ONE:
         return None, None
     ends = [
         source.low * signal.slope + signal.intercept,

@@ -7,7 +7,7 @@ from enum import Enum, Flag
 from fractions import Fraction
 from typing import NamedTuple
 
-from kontronik_can_gw.esc.values import Group, Source
+from kontronik_can_gw.esc.values import Group, Value
 
 
 class SendType(Flag):
@@ -60,7 +60,7 @@ class SignalPlan:
     error: int
     slope: Fraction = Fraction(1)
     intercept: Fraction = Fraction(0)
-    source: Source | None = None
+    source: Value | None = None
     esc: int | None = None
     """Index of the ESC the source is read from; None for the gateway."""
     numbers: Mapping[int, int] | None = None

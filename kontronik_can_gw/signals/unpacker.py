@@ -145,11 +145,7 @@ def _lost_flags(signals: Sequence[SignalPlan]) -> list[str]:
     groups: dict[tuple[int | None, Group], tuple[list[str], list[str]]] = {}
     for index, signal in enumerate(signals):
         source = signal.source
-        if (
-            source is None
-            or source.group not in (Group.LIVE, Group.INFO)
-            or source.supplied is not None
-        ):
+        if source is None or source.group not in (Group.LIVE, Group.INFO) or source.optional:
             continue
         flags, others = groups.setdefault((signal.esc, source.group), ([], []))
         if _is_flag(signal):

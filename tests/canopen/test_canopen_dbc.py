@@ -188,7 +188,7 @@ def expected(esc: EscTelemetry) -> dict[str, Any]:
         )
     word = 0xFFFFFFFF if live is None else live.operating_errors
     found |= {pascal(bit.name): word >> bit & 1 for bit in OperatingError}
-    if not (esc.bec_current_supplied(live.bec_current) if live else False):
+    if not (esc.supplies(frozenset({Device.JIVEPRO}), live.bec_current) if live else False):
         found["BecCurrent"] = NA
     if info is None or info.device == Device.JIVEPRO:
         found["MaxBecCurrent"] = NA

@@ -11,7 +11,7 @@ import pytest
 from command_line import refused, run
 
 from kontronik_can_gw.canopen.eds import without
-from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
@@ -19,7 +19,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 
 EDS = shipped("eds/kontronik_esc.eds")
 Key = tuple[int, int]
-TELEMETRY = bindings(EscSettings())
+TELEMETRY = BINDINGS
 
 
 def command(*words: object) -> tuple[object, str, str]:

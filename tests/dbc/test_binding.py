@@ -19,7 +19,7 @@ from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
-from kontronik_can_gw.esc.values import sources
+from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals import e2e
@@ -103,7 +103,7 @@ def test_a_name_is_found_whatever_its_case_underscores_prefix_and_percent(
         assert raw_of(replace(signal, name=name)) == raw
 
 
-@pytest.mark.parametrize("source", sorted(sources(EscSettings())))
+@pytest.mark.parametrize("source", sorted(VALUES))
 def test_every_source_is_found_by_its_pascal_case_name_with_and_without_prefix(source: str) -> None:
     one = Binder([EscSettings("left")], {})
     two = Binder([EscSettings("left"), EscSettings("right_rear")], {})

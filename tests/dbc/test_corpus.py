@@ -18,11 +18,11 @@ from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc import values
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
-from kontronik_can_gw.esc.values import sources
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout
@@ -57,7 +57,7 @@ def by_unit(messages: list[Message]) -> Iterator[tuple[str, str, Signal]]:
             ):
                 continue
             for name in VALUES:
-                if conversion(sources(ESC)[name].unit, signal.unit or "") is not None:
+                if conversion(values.VALUES[name].unit, signal.unit or "") is not None:
                     yield f"{message.name}.{signal.name}", name, signal
                     break
 
@@ -153,7 +153,7 @@ def check_frames(database: Database, layout: Layout, bound: dict[str, str]) -> N
                         or planned.not_available == planned.constant
                     )
                     continue
-                factor, offset = conversion(sources(ESC)[source].unit, signal.unit or "") or (
+                factor, offset = conversion(values.VALUES[source].unit, signal.unit or "") or (
                     Fraction(0),
                     Fraction(0),
                 )

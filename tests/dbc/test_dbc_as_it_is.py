@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
-from kontronik_can_gw.esc.values import sources
+from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, Role, SendType
@@ -171,7 +171,7 @@ def spelled() -> list[tuple[str, str, str, str]]:
 def test_a_unit_is_known_however_it_is_spelled(
     source: str, value: str, meant: str, text: str
 ) -> None:
-    factor, offset = conversion(sources(EscSettings())[source].unit, text) or (
+    factor, offset = conversion(VALUES[source].unit, text) or (
         Fraction(0),
         Fraction(0),
     )

@@ -16,8 +16,8 @@ from kontronik_can_gw.canopen.emergency import GatewayError
 from kontronik_can_gw.desk.describe.facts import DATA_TYPES
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
-from kontronik_can_gw.esc.values import CanState, GatewayState, Group, sources
+from kontronik_can_gw.esc.telemetry import LinkState
+from kontronik_can_gw.esc.values import VALUES, CanState, GatewayState, Group
 
 Facts = dict[str, Any]
 
@@ -171,7 +171,7 @@ def test_emergencies_are_those_that_the_eds_enables(facts: Facts) -> None:
 
 
 def test_each_source_is_told_with_a_meaning_and_where_it_is_shown(facts: Facts) -> None:
-    known = sources(EscSettings())
+    known = VALUES
     told = {row["name"]: row for row in facts["sources"]}
     assert {name for name, row in told.items() if row["bindable"]} == set(known)
     assert all(row["meaning"] for row in told.values())

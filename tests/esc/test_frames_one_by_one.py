@@ -46,7 +46,7 @@ def test_values_counters_energy_and_run_time() -> None:
         assert read(telemetry, encode(data, Layout.V4), now) == [Event.LIVE]
         assert (telemetry.live, telemetry.last_live) == (data, data)
         assert telemetry.live_ns == now
-        assert telemetry.energy == energy
+        assert telemetry.energy_mw_ns == energy
         assert telemetry.run_time == run_time
         counters = telemetry.counters
         assert counters.live_v4 == counters.headers == 1 + number

@@ -16,8 +16,7 @@ from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError, Severity
 from kontronik_can_gw.esc.simulator import SECOND_NS, EscOptions
-from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import sources
+from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 
 ONE = layout_of(["esc1"])
@@ -226,7 +225,7 @@ def test_the_document_names_sources_and_has_null_for_what_is_not_available() -> 
     assert right["values"]["bec_current"] is not None
     assert right["errors"] == ["undervoltage"]
     assert left["device"].startswith("JIVEPro")
-    known = sources(EscSettings())
+    known = VALUES
     assert set(left["values"]) <= set(known)
     assert {"crc_errors", "dropped_bytes", "link_state"} <= set(left["values"])
     assert all(known[name].unit == unit for name, unit in document["units"].items())

@@ -9,7 +9,7 @@ import cantools.database
 
 from kontronik_can_gw.canopen.eds import ARRAY, RECORD, Eds, load
 from kontronik_can_gw.canopen.emergency import GatewayError, code_of_bit
-from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import (
     CanConfig,
     CanopenConfig,
@@ -22,8 +22,7 @@ from kontronik_can_gw.config.keys import (
     shipped,
 )
 from kontronik_can_gw.esc.kontronik.states import OperatingError
-from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import Group, sources
+from kontronik_can_gw.esc.values import VALUES, Group
 
 PROJECT = Path(__file__).resolve().parents[2]
 PAGES = {
@@ -119,11 +118,11 @@ def messages() -> str:
 def source_table() -> str:
     lines = ["| source | unit | available |", "|---|---|---|"]
     flags: dict[Group, list[str]] = {}
-    for source in sources(EscSettings()).values():
+    for source in VALUES.values():
         if source.bit is not None:
             flags.setdefault(source.group, []).append(f"`{source.name}`")
             continue
-        when = _WHEN[source.group] + (", if supplied" if source.supplied else "")
+        when = _WHEN[source.group] + (", if supplied" if source.optional else "")
         note = "; counter" if source.rolls else "; names" if source.names else ""
         lines.append(f"| `{source.name}` | {source.unit} | {when}{note} |")
     for group, names in flags.items():
@@ -147,7 +146,7 @@ def emergencies() -> str:
 
 def objects() -> str:
     eds = load(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
-    live = bindings(EscSettings())
+    live = BINDINGS
     lines = [
         "| object | name | type | access | default | limits | PDO |",
         "|---|---|---|---|---|---|---|",

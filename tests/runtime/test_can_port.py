@@ -567,13 +567,16 @@ def test_the_loop_answers_what_the_thread_brings_and_opens_an_adapter_anew_when_
         gateway = Gateway(loaded.escs, loaded.layout, 0, canopen=loaded.canopen)
         loop = Loop(gateway, [esc.path], loaded.config.can)
 
-        def answer_to(index: int) -> bytes:
-            other.send(message(0x601, bytes((0x40, index & 255, index >> 8, 0, 0, 0, 0, 0))))
+        def frame_of(can_id: int) -> bytes:
             while True:
                 frame = other.recv(120)
                 assert frame is not None
-                if frame.arbitration_id == 0x581:
+                if frame.arbitration_id == can_id:
                     return bytes(frame.data)
+
+        def answer_to(index: int) -> bytes:
+            other.send(message(0x601, bytes((0x40, index & 255, index >> 8, 0, 0, 0, 0, 0))))
+            return frame_of(0x581)
 
         loop.open()
         first = loop.can.port
@@ -581,14 +584,16 @@ def test_the_loop_answers_what_the_thread_brings_and_opens_an_adapter_anew_when_
         thread = threading.Thread(target=loop.run)
         thread.start()
         try:
+            assert frame_of(0x701) == b"\0"  # boot-up: from now on the node answers
             for index in range(0x9900, 0x9914):
                 assert answer_to(index)[1:3] == index.to_bytes(2, "little")
 
             def failing(timeout: float | None) -> None:
                 raise can.CanOperationError("unplugged")
 
+            old = readers()
             monkeypatch.setattr(first._bus, "recv", failing)
-            wait_for(lambda: loop.can.port not in (None, first), "another port")
+            wait_for(lambda: bool(set(readers()) - set(old)), "another reader")
             assert answer_to(0x1000)[0] == 0x43
         finally:
             loop.stop()

@@ -61,7 +61,6 @@ class Known:
     names: Mapping[int, str] = field(default_factory=dict)
     rolls: bool = False
     gateway: bool = False
-    exact: bool = True
 
 
 STATES, DEVICES = sheet.OPERATING_STATES, sheet.DEVICES
@@ -197,8 +196,8 @@ KNOWN: dict[str, Known] = {
     "output_speed": Known("1/min", _calculated(lambda e, v: v.electrical_speed / (e.settings.pole_pairs * e.settings.gear))),
     "battery_power": Known("W", _calculated(lambda _e, v: Fraction(v.battery_voltage * v.battery_current, 1000))),
     "mean_cell_voltage": Known(
-        "V", _calculated(lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None), exact=False),
-    "energy_used": Known("Wh", _of_esc(lambda e: Fraction(e.energy, 3600 * 1000 * 10**9))),
+        "V", _calculated(lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None)),
+    "energy_used": Known("Wh", _of_esc(lambda e: Fraction(e.energy, 3600 * 1000))),
     "motor_run_time": Known("s", _of_esc(lambda e: Fraction(e.run_time, 10**9))),
     "link_state": Known("", _of_esc(lambda e: int(e.link)), LINKS),
     "layout": Known("", _of_esc(lambda e: e.layout), LAYOUTS),
@@ -347,7 +346,7 @@ class Sig:
         )
 
     def allowed(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> set[int]:
-        """The raw values that are right: one, or two where the value lies halfway (or within a float's rounding of it)."""
+        """The raw value that is right: the nearest, halves up."""
         known = KNOWN[self.source]
         value = self.physical(esc, gateway, now)
         if value is None:
@@ -364,12 +363,7 @@ class Sig:
         if known.rolls:
             return {int(value) % (high + 1)}
         exact = (value - Fraction(self.offset)) / Fraction(self.factor)
-        slack = Fraction(0) if known.exact else abs(exact) / 10**12 + Fraction(1, 10**9)
-        nearest = {
-            math.floor(exact + Fraction(1, 2) + slack),
-            math.ceil(exact - Fraction(1, 2) - slack),
-        }
-        return {self._sent(raw, low, high) for raw in nearest}
+        return {self._sent(math.floor(exact + Fraction(1, 2)), low, high)}
 
     def _sent(self, raw: int, low: int, high: int) -> int:
         if not low <= raw <= high:

@@ -22,7 +22,7 @@ from kontronik_can_gw.canopen.emergency import GatewayError, code_of_bit, regist
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
-from kontronik_can_gw.canopen.objects import bindings
+from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES, Text
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
@@ -37,7 +37,7 @@ from kontronik_can_gw.esc.kontronik.states import (
     peak_current_of,
 )
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
-from kontronik_can_gw.esc.values import Group, sources
+from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals.plan import Role, SendType, SignalPlan
 
 FORMAT = "kontronik-can-gw description"
@@ -463,20 +463,19 @@ def _sources(
                 signals.setdefault(signal.source, []).append(f"{message.name}.{signal.name}")
     objects: dict[str, list[str]] = {}
     names: dict[str, str] = {}
-    bound = bindings(EscSettings())
+    bound = BINDINGS
     for entry in eds.entries if eds else ():
         if (entry.index, entry.sub) in bound:
             name = bound[entry.index, entry.sub].source.name
             objects.setdefault(name, []).append(f"{entry.index:04X}h:{entry.sub:02X}")
             names.setdefault(name, entry.name)
-    bindable = sources(EscSettings())
-    listed = dict(bindable)
+    listed = dict(VALUES)
     for binding in bound.values():
         listed.setdefault(binding.source.name, binding.source)
     for name, source in listed.items():
         in_signals, in_objects = tuple(signals.get(name, ())), tuple(objects.get(name, ()))
         meaning = meanings.get(name) or names.get(name) or name.replace("_", " ").capitalize()
-        available = _AVAILABLE[source.group] + (", where supplied" if source.supplied else "")
+        available = _AVAILABLE[source.group] + (", where supplied" if source.optional else "")
         texts = _values({int(number): text for number, text in source.names.items()})
         yield SourceFacts(
             name,
@@ -484,7 +483,7 @@ def _sources(
             available,
             meaning,
             source.rolls,
-            name in bindable,
+            name in VALUES,
             texts,
             in_signals,
             in_objects,
@@ -523,7 +522,7 @@ def _canopen(
 
 
 def _entry(entry: Entry, meanings: Mapping[str, str]) -> EntryFacts:
-    bound = bindings(EscSettings()).get((entry.index, entry.sub))
+    bound = BINDINGS.get((entry.index, entry.sub))
     source = None if bound is None else bound.source
     number = codec(entry.data_type)
     return EntryFacts(

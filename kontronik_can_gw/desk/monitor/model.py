@@ -23,7 +23,7 @@ from kontronik_can_gw.esc.kontronik.states import (
     state_text,
 )
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
-from kontronik_can_gw.esc.values import CanState, GatewayState, Group, sources
+from kontronik_can_gw.esc.values import VALUES, CanState, GatewayState, Group
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
@@ -148,11 +148,10 @@ class EscMonitor:
         self.spreads = {quantity.source: Spread() for quantity in QUANTITIES}
         self._settings = settings
         self._view = view
-        known = sources(settings)
-        columns = [(name, view.reader.column_of(name, index)) for name in known]
+        columns = [(name, view.reader.column_of(name, index)) for name in VALUES]
         self._columns = {name: column for name, column in columns if column is not None}
         self._factors = {
-            name: _to_source(view.reader.columns[column].unit, known[name].unit)
+            name: _to_source(view.reader.columns[column].unit, VALUES[name].unit)
             for name, column in self._columns.items()
         }
         flags = {bit.text for kind in (OperatingError, SelfTestError) for bit in kind}
@@ -160,12 +159,12 @@ class EscMonitor:
             group: [
                 column
                 for name, column in self._columns.items()
-                if known[name].group is group and name not in flags
+                if VALUES[name].group is group and name not in flags
             ]
             for group in (Group.LIVE, Group.INFO)
         }
         self.units = {
-            name: known[name].unit
+            name: VALUES[name].unit
             for name in self._columns
             if name not in {*flags, "operating_errors", "selftest_errors"}
         }
@@ -455,9 +454,7 @@ class Monitor:
                 continue
             if self.view.reader.column_of(column.source, column.esc) == first + offset:
                 esc = self.escs[column.esc]
-                factor = _to_source(
-                    column.unit, sources(self.bus.escs[column.esc])[column.source].unit
-                )
+                factor = _to_source(column.unit, VALUES[column.source].unit)
                 found.append((offset, esc.spreads[column.source], factor))
         return found
 

@@ -30,8 +30,8 @@ from kontronik_can_gw.esc.kontronik.states import (
     SelfTestError,
     Severity,
 )
-from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
-from kontronik_can_gw.esc.values import Group, sources
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
 ONLINE, OFFLINE = b"online", b"offline"
@@ -89,7 +89,7 @@ _WORDS: tuple[tuple[str, type[ErrorBit]], ...] = (
     ("operating_errors", OperatingError),
     ("selftest_errors", SelfTestError),
 )
-_SOURCES = sources(EscSettings())
+_SOURCES = VALUES
 
 
 class Message(NamedTuple):

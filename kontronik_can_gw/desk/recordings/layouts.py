@@ -11,7 +11,7 @@ from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.reader import choose_node, load_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import Group, sources
+from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
@@ -69,13 +69,11 @@ def esc_names(database: "Database", node: str) -> list[str]:
     """What stands in front of sources' names in the signals of ours, in the order of the messages; empty for a DBC of one ESC."""
     known = {
         normalize(name): source
-        for name, source in sources(EscSettings()).items()
+        for name, source in VALUES.items()
         if source.group is not Group.GATEWAY
     }
     of_gateway = {
-        normalize(name)
-        for name, source in sources(EscSettings()).items()
-        if source.group is Group.GATEWAY
+        normalize(name) for name, source in VALUES.items() if source.group is Group.GATEWAY
     }
     counts: dict[str, int] = {}
     for message in database.messages:

@@ -35,7 +35,7 @@ from kontronik_can_gw.esc.kontronik.states import (
     state_text,
 )
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
-from kontronik_can_gw.esc.values import GatewayState, sources
+from kontronik_can_gw.esc.values import VALUES, GatewayState
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
@@ -300,7 +300,6 @@ class _Esc:
         self.missing: list[str] = []
         self._events = events
         self._inputs: dict[str, _Input] = {}
-        base = sources(settings)
 
         def bind(source: str) -> int | None:
             found = reader.column_of(source, index)
@@ -312,7 +311,7 @@ class _Esc:
             found = reader.column_of(source, index)
             assert found is not None
             column = reader.columns[found]
-            factors = units.conversion(base[source].unit, column.unit) or (1, 0)
+            factors = units.conversion(VALUES[source].unit, column.unit) or (1, 0)
             self._inputs[source] = _Input(at, float(factors[0]), float(factors[1]), column)
         self._facts_at = {source: at for source in _FACTS if (at := bind(source)) is not None}
         states = [
