@@ -386,8 +386,8 @@ class _Compiler:
                 f"{where}: a float of {length} bits cannot be sent; 32 and 64 can."
             )
             return None
-        told = (signal.scale, signal.offset, signal.minimum or 0, signal.maximum or 0)
-        if not all(math.isfinite(number) for number in told):
+        given = (signal.scale, signal.offset, signal.minimum or 0, signal.maximum or 0)
+        if not all(math.isfinite(number) for number in given):
             self.problems.append(
                 f"{where}: has a factor, offset or limit that is no finite number."
             )
