@@ -1,10 +1,10 @@
-"""Mistakes of people, each with its exit code. The command line prints them as plain lines, never as a traceback."""
+"""Errors that a user can correct, each with its exit code. The command line prints them as plain lines, never as a traceback."""
 
 from kontronik_can_gw.printable import printable
 
 
 class UserError(Exception):
-    """Wrong usage, configuration or layout (exit code 2). Holds one line per mistake: what, where, remedy."""
+    """Wrong usage, configuration or layout (exit code 2). Holds one line per mistake: where, what, remedy."""
 
     exit_code = 2
 
@@ -14,6 +14,6 @@ class UserError(Exception):
 
 
 class RunError(UserError):
-    """Something outside failed while running or opening: a port, an interface, a file (exit code 1)."""
+    """A port, interface or file failed when it was opened or used (exit code 1)."""
 
     exit_code = 1

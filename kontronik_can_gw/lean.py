@@ -1,7 +1,7 @@
-"""Import python-can and cantools without what a gateway has no use for.
+"""Import python-can and cantools without the heavy libraries that they pull in.
 
-Where asammdf is installed python-can imports it for its MF4 files, and with it numpy and pandas: half a second, 90 MB and threads. And
-cantools as a whole imports python-can, for its tester; its database alone needs nothing of that.
+If asammdf is installed, python-can imports it for MF4 files, and with it numpy and pandas: half a second, 90 MB and threads. The
+top-level package of cantools imports python-can for its tester; its database does not need it.
 """
 
 import sys
@@ -14,7 +14,7 @@ from typing import Any
 
 @contextmanager
 def without_asammdf() -> Iterator[None]:
-    """What is imported inside does not find asammdf, unless it was imported before; of cantools the part that is asked for comes alone."""
+    """Imports inside this block do not find asammdf unless it is loaded already, and load only the requested part of cantools."""
     hide = "asammdf" not in sys.modules
     if hide:
         sys.modules["asammdf"] = None  # type: ignore[assignment]  # the documented way to make an import fail
@@ -32,12 +32,12 @@ def without_asammdf() -> Iterator[None]:
 
 
 class _Package(ModuleType):
-    """A package whose own code is run when something is asked for that it has not got yet; its modules can be imported before."""
+    """A package whose ``__init__`` runs at the first access to an attribute that is missing; its modules can be imported before."""
 
     def __getattr__(self, name: str) -> Any:
         if self.__spec__ is None or self.__spec__.loader is None:
             raise AttributeError(name)
-        self.__class__ = ModuleType  # type: ignore[assignment]  # from now on one as all others
+        self.__class__ = ModuleType  # type: ignore[assignment]  # an ordinary module from now on
         self.__spec__.loader.exec_module(self)
         return getattr(self, name)
 

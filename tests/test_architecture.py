@@ -1,8 +1,13 @@
 """The structure that docs/design.md shows: imports run one way, and only the edge touches time, files and threads."""
 
 import ast
+import io
+import re
 import subprocess
 import sys
+import tokenize
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -182,3 +187,83 @@ def test_only_the_packer_makes_functions_of_text_and_nobody_else_sees_it() -> No
     }
     still_to_follow = {"signals/unpacker.py", "desk/recordings/tables/text.py"}
     assert makers == {"signals/packer.py"} | still_to_follow
+
+
+# Ratchets: what is not clean yet stands in ratchet.txt and may only shrink.
+RATCHET = Path(__file__).with_name("ratchet.txt")
+BANNED_WORDS = re.compile(
+    r"\b(?i:told|tell(s|ing)?|ow(ed|es?|ing)|misfits?|pass(ed|es)? over|behind|so many|look(s|ed)? round|surroundings"
+    r"|who(m|ever)|images?|short ways?|who needs? them|goes without|stands? beside|(what|that|which) is none)\b|\b(MOST|LEAST)\b"
+)
+MAX_LINES = {"file": 350, "class": 250, "function": 50}
+MAX_METHODS = 25
+
+
+def _words(source: str, tree: ast.Module) -> int:
+    """Number of banned words in names, comments and docstrings (any string that is a statement)."""
+    texts = [
+        node.value.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    ]
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            texts.append(token.string)
+        elif token.type == tokenize.NAME:
+            texts.append(token.string.replace("_", " "))
+    return sum(len(BANNED_WORDS.findall(" ".join(str(text).split()))) for text in texts)
+
+
+def _sizes(tree: ast.AST, place: str) -> Iterator[tuple[str, int]]:
+    """Classes and functions over their limits, with lines or methods."""
+    for node in ast.iter_child_nodes(tree):
+        inside = place
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            inside = f"{place}:{node.name}"
+            kind = "class" if isinstance(node, ast.ClassDef) else "function"
+            lines = (node.end_lineno or 0) - node.lineno + 1
+            if lines > MAX_LINES[kind]:
+                yield f"{kind} {inside}", lines
+            methods = sum(isinstance(each, ast.FunctionDef) for each in node.body)
+            if kind == "class" and methods > MAX_METHODS:
+                yield f"methods {inside}", methods
+        yield from _sizes(node, inside)
+
+
+def _ratchet() -> dict[str, int]:
+    """Everything that is not clean: banned words of each room; files, classes and functions over their limits."""
+    found: Counter[str] = Counter()
+    for path in MODULES:
+        source = path.read_text(encoding="utf-8")
+        tree = ast.parse(source)
+        name = str(path.relative_to(PACKAGE))
+        found[f"words {_room(path)}"] += _words(source, tree)
+        if (lines := source.count("\n")) > MAX_LINES["file"]:
+            found[f"file {name}"] = lines
+        found.update(dict(_sizes(tree, name)))
+    return {key: number for key, number in sorted(found.items()) if number}
+
+
+def _allowed() -> dict[str, int]:
+    lines = RATCHET.read_text(encoding="utf-8").splitlines()
+    return {key: int(number) for key, number in (line.rsplit(" ", 1) for line in lines)}
+
+
+def test_banned_words_and_sizes_only_shrink() -> None:
+    allowed = _allowed()
+    grown = [
+        f"{key} is {number}, allowed {allowed.get(key, 0)}"
+        for key, number in _ratchet().items()
+        if number > allowed.get(key, 0)
+    ]
+    assert not grown, (
+        "Use the words of the field (docs/design.md), or split by subject:\n"
+        + "\n".join(grown)
+        + "\nAfter a move edit tests/ratchet.txt by hand; `python tests/test_architecture.py` takes out what became smaller."
+    )
+
+
+if __name__ == "__main__":
+    now = _ratchet()
+    kept = {key: min(number, now[key]) for key, number in _allowed().items() if key in now}
+    RATCHET.write_text("".join(f"{key} {number}\n" for key, number in kept.items()))

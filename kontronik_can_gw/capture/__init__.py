@@ -1,1 +1,1 @@
-"""Captures: every call that the core was given, to be played again."""
+"""Captures: every call to the core, recorded for replay."""

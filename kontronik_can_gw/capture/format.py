@@ -1,7 +1,7 @@
-"""The capture file (.kcap): what came in from the ESCs and from the bus, with times. Pure: bytes to entries and back.
+"""The capture file (.kcap): input from the ESCs and the bus, with times. Pure: bytes to entries and back.
 
-A file is a row of blocks, each written at once and good for itself, so that a loss of power costs the last block and a damaged stretch
-only what is in it. All numbers are little-endian. A block::
+A file is a sequence of blocks, each written at once and readable by itself: a loss of power costs only the last block, damage only the
+blocks that it hits. All numbers are little-endian. A block::
 
     4 bytes  "KCB1"
     u8       kind: "H" header (JSON), "I" information (JSON, adds to the header), "D" data, "E" end (empty: closed in good order)
@@ -13,18 +13,18 @@ only what is in it. All numbers are little-endian. A block::
     u32      CRC-32 (zlib) of the 20 bytes above and the payload as stored
     payload
 
-A file begins with a header block, which comes once more behind the first data, in case the first is damaged. The payload of a data block
-is a table, then the data of its entries one behind the other::
+A file begins with a header block, which is repeated after the first data in case the first is damaged. The payload of a data block is a
+table, followed by the data of its entries::
 
     u32      number of entries
     entries  16 bytes each: u64 time in ns of the recording machine's monotonic clock, u8 kind (``Kind``), u8 flags, u16 index (of the ESC),
              u32 length of its data
 
-From version 2 on the data of BYTES and FRAME begins with a u64 on the clock of the entry's time: none of the bytes had come by then; or
-the CAN frame came then. Version 1 does not tell: there it is the entry's own time.
+From version 2 on the data of BYTES and FRAME begins with a u64 time on the same clock as the entry's: for BYTES a moment before any of
+the bytes arrived, for FRAME the arrival of the CAN frame. In version 1 it is missing; the entry's own time is used.
 
-Times do not decrease. The entries are every call that the gateway's core was given, in order: played again they give every CAN frame that
-was sent, at its time.
+Times do not decrease. The entries are all calls to the gateway's core, in order: replayed, they give every CAN frame that was sent, at
+its time.
 """
 
 import json
@@ -40,7 +40,7 @@ SUFFIX = ".kcap"
 MAGIC = b"KCB1"
 FORMAT, VERSION = "kontronik-can-gw capture", 2
 VERSIONS = (1, 2)
-"""Those that are read."""
+"""Versions that can be read."""
 LARGEST_PAYLOAD = 1 << 23
 _PATIENCE = 1 << 28
 _HEAD = struct.Struct("<4scBHIII")
@@ -56,14 +56,14 @@ _CAME = struct.Struct("<Q")
 
 
 class Kind(IntEnum):
-    """What an entry tells; in brackets its data."""
+    """Kinds of entries; the data of each in brackets."""
 
     BYTES = 1
-    """Bytes of an ESC's UART, as they were read."""
+    """Bytes read from an ESC's UART."""
     FRAME = 2
     """A CAN frame that the gateway received (``frame_data``)."""
     ADVANCE = 3
-    """Time passed; then the frames to send were taken."""
+    """The time advanced; then the frames to send were taken."""
     START = 4
     """The gateway started; flags 1: the interface was open."""
     STOP = 5
@@ -75,22 +75,22 @@ class Kind(IntEnum):
     """flags: the state (``sources.CanState``)."""
     OVERRUN = 11
     SAVED = 12
-    """Parameters were stored; flags 1: they could not be (UTF-8: why)."""
+    """Parameters were stored; flags 1: storing failed (UTF-8: why)."""
     DAMAGED = 13
     COUNTERS = 14
     """The gateway's own counters were changed from outside (``counters_data``)."""
     LINE_ERRORS = 15
-    """Line errors of an ESC's port so far (u64)."""
+    """Total line errors of an ESC's port (u64)."""
     CLOCK = 16
     """The wall clock at this time: Unix time in ns (u64)."""
     LOST = 17
-    """So many entries could not be recorded (u64): what follows does not go on where what came before ended."""
+    """Number of entries that could not be recorded here (u64)."""
     NOT_SENT = 18
-    """The frames that were taken last were thrown away: the interface was down, or in bus-off."""
+    """The frames taken last were discarded: the interface was down or bus-off."""
     STATE = 19
-    """JSON: what a replay that begins here cannot know (energy, run time and losses of the ESCs, state of the bus)."""
+    """JSON: state that a replay needs to begin here (energy, run time and losses of the ESCs, state of the bus)."""
     HELD_UP = 20
-    """The process had been held up; flags 1: measurements that waited to be sent were dropped."""
+    """The process was delayed; flags 1: pending measurements were dropped."""
 
 
 _WITH_ARRIVAL = frozenset({Kind.BYTES, Kind.FRAME})
@@ -99,7 +99,7 @@ _WITH_ARRIVAL = frozenset({Kind.BYTES, Kind.FRAME})
 class Entry(NamedTuple):
     """One entry. Times: the recording machine's monotonic clock.
 
-    ``came_ns``: none of the BYTES had come by then, the FRAME came then; None where that is not known: at ``time_ns``.
+    ``came_ns``: for BYTES a moment before any of them arrived, for FRAME its arrival; None where not known: ``time_ns`` is used.
     """
 
     time_ns: int
@@ -120,7 +120,7 @@ class Block(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """Bytes that belong to no block."""
+    """Bytes that are part of no intact block."""
 
     offset: int
     length: int
@@ -136,12 +136,12 @@ def block(kind: bytes, number: int, payload: bytes) -> bytes:
 
 
 def json_payload(content: Mapping[str, Any]) -> bytes:
-    """Payload of a header or information block."""
+    """Encode a header or information block."""
     return json.dumps(content, ensure_ascii=False, sort_keys=True).encode("utf-8", "surrogatepass")
 
 
 def read_json(payload: bytes) -> dict[str, Any]:
-    """The content of a header or information block. ValueError for what is none."""
+    """The content of a header or information block. ValueError where it is no JSON object."""
     try:
         content = json.loads(payload.decode("utf-8", "surrogatepass"))
     except RecursionError:
@@ -152,7 +152,7 @@ def read_json(payload: bytes) -> dict[str, Any]:
 
 
 def data_payload(entries: Iterable[tuple[int, int, int, bytes, int, int | None]]) -> bytes:
-    """Payload of a data block, from tuples as of ``Entry``."""
+    """Payload of a data block, from tuples with the fields of ``Entry``."""
     table = bytearray()
     data = []
     count = 0
@@ -167,7 +167,7 @@ def data_payload(entries: Iterable[tuple[int, int, int, bytes, int, int | None]]
 
 
 def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
-    """The entries of a data block. ValueError where its table does not fit it."""
+    """The entries of a data block. ValueError where its table and its length disagree."""
     if len(payload) < _COUNT.size:
         raise ValueError("has no table")
     count = _COUNT.unpack_from(payload)[0]
@@ -247,22 +247,22 @@ def read_number(data: bytes) -> int:
 
 
 class Scanner:
-    """Finds every intact block in a stream of bytes, whatever stands between them. ``feed`` and ``flush``, as of a deframer."""
+    """Finds every intact block in a stream of bytes, whatever is between them. Used like a deframer: ``feed``, then ``flush``."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._offset = 0
-        """Of the buffer's first byte."""
+        """File offset of the buffer's first byte."""
         self._bad_from: int | None = None
         self._patience = _PATIENCE
 
     def feed(self, data: bytes) -> list[Block | Damage]:
-        """Take the next bytes; what is certain by now."""
+        """Take the next bytes; return what is certain now."""
         self._buffer += data
         return self._scan(final=False)
 
     def flush(self) -> list[Block | Damage]:
-        """The stream ended."""
+        """Return the rest at the end of the stream."""
         found = self._scan(final=True)
         self._skip(len(self._buffer))
         self._close_damage(found)
@@ -294,7 +294,7 @@ class Scanner:
                 continue
             payload = _payload(buffer, deflated, stored, size)
             if payload is None:
-                # what only looks like a block costs its length to find out: not more than so much in all
+                # checking a false block costs its length; the budget bounds the total cost
                 self._patience += 64 - stored
                 self._skip(1 if self._patience > 0 else HEAD_LENGTH + stored)
                 continue
@@ -320,7 +320,7 @@ class Scanner:
 
 
 def _payload(buffer: bytearray, deflated: int, stored: int, size: int) -> bytes | None:
-    """The inflated payload of the block at the buffer's beginning; None where it is not what it says."""
+    """The inflated payload of the block at the buffer's beginning; None where CRC or length is wrong."""
     payload = bytes(buffer[HEAD_LENGTH : HEAD_LENGTH + stored])
     crc = zlib.crc32(payload, zlib.crc32(buffer[: _HEAD.size]))
     if crc != _CRC.unpack_from(buffer, _HEAD.size)[0]:

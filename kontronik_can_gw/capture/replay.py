@@ -1,6 +1,6 @@
-"""A capture's entries through the gateway's core: the CAN frames that the recorded gateway sent, each at its time.
+"""Replays a capture through the gateway's core: the CAN frames that the recorded gateway sent, each at its time.
 
-The core is the same as live, and its clock is the recorded one; so frames and times are those of the live run, bit for bit, as long as no
+The core is that of a live run and gets the recorded times, so frames and times equal those of the live run bit for bit as long as no
 entry is missing. Nothing here waits or sends.
 """
 
@@ -23,7 +23,7 @@ from kontronik_can_gw.transmit_queue import Sent, TransmitQueue
 
 
 class TimedFrame(NamedTuple):
-    """A CAN frame at a time. ``received``: it came from the bus; otherwise the gateway sent it."""
+    """A CAN frame with its time. ``received``: from the bus; otherwise the gateway sent it."""
 
     time_ns: int
     frame: CanFrame
@@ -31,10 +31,10 @@ class TimedFrame(NamedTuple):
 
 
 class Replay:
-    """A gateway that is given entries. ``marked``: its state on the bus is REPLAY, not RUNNING.
+    """Feeds entries to a gateway. ``marked``: its state on the bus is REPLAY, not RUNNING.
 
-    ``state``: of a header, what had been counted before. Where the beginning of the run is missing, without a START entry, the gateway
-    starts with the first entry and takes up what the next STATE entry tells.
+    ``state``: counters in the header. If the beginning of the run is missing (no START entry), the gateway starts with the first entry
+    and adopts the next STATE entry.
     """
 
     def __init__(
@@ -42,25 +42,25 @@ class Replay:
     ) -> None:
         self.gateway = gateway
         self.lost = 0
-        """Entries that the recorder could not record."""
+        """Number of entries that the recorder could not record."""
         self.passed_over = 0
-        """Entries that make no sense."""
+        """Number of entries that are invalid."""
         self._marked = marked
         self._waiting = TransmitQueue()
         self._taken: list[TimedFrame] = []
-        """Of the last turn: whether they were sent, the next entry tells."""
+        """Frames of the last turn; the next entry shows whether they were sent."""
         self._started = False
         self._midway = False
         self._take_up(state or {})
 
     def follow(self, entries: Iterable[Entry]) -> Iterator[TimedFrame]:
-        """The frames received and sent, in order."""
+        """Yield the frames received and sent, in order."""
         for entry in entries:
             yield from self.play(entry)
         yield from self.finish()
 
     def play(self, entry: Entry) -> list[TimedFrame]:
-        """Give one entry to the gateway; the frames that it received with it, and those that were sent before."""
+        """Give one entry to the gateway; return the frames received with it and those sent before it."""
         if entry.kind == Kind.NOT_SENT:
             self._taken = []
             return []
@@ -68,12 +68,12 @@ class Replay:
         try:
             found += self._play(entry)
         except Exception:
-            # a damaged or hostile capture: what no gateway was ever given may raise anything
+            # a damaged or hostile capture can hold calls that no gateway ever made, which may raise anything
             self.passed_over += 1
         return found
 
     def finish(self) -> list[TimedFrame]:
-        """The entries have ended: the frames of the last turn."""
+        """Return the frames of the last turn, after the last entry."""
         found, self._taken = self._taken, []
         return found
 
@@ -82,7 +82,7 @@ class Replay:
         if came is None:
             came = now
         gateway = self.gateway
-        if not self._started and kind == Kind.ADVANCE:  # the beginning is missing
+        if not self._started and kind == Kind.ADVANCE:  # the beginning of the run is missing
             self._midway = True
             self._start(now, True)
         if kind == Kind.BYTES:
@@ -150,7 +150,7 @@ class Replay:
 
     def _take(self, now: int) -> None:
         gateway = self.gateway
-        gateway.take_saves()  # what nobody fetches would grow
+        gateway.take_saves()  # unread, the list would grow
         frames = in_order(gateway.take_frames(), self._waiting)
         gateway.status.sent_frames += len(frames)
         gateway.take_link_changes()
@@ -159,7 +159,7 @@ class Replay:
         self._taken = [TimedFrame(now, frame) for frame in frames]
 
     def _take_up(self, state: Mapping[str, Any]) -> None:
-        """Go on with what was counted before recording began."""
+        """Adopt the counters from before the recording began."""
         for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
             esc.energy_mw_ns, esc.run_time, esc.losses = (
                 found[name] for name in ("energy", "run_time", "losses")
@@ -171,7 +171,7 @@ class Replay:
 
 
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
-    """The frames of one turn as an interface that takes them all is given them; ``waiting``: the same one for each turn."""
+    """The frames of one turn in the order in which the interface gets them. ``waiting``: the queue, the same for each turn."""
     waiting.put_all(frames)
     sent: list[CanFrame] = []
 
@@ -184,7 +184,7 @@ def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
 
 
 def follow_bytes(gateway: Gateway, chunks: Iterable[tuple[int, bytes]]) -> Iterator[TimedFrame]:
-    """What a gateway sends that is given (time, bytes) of its first ESC, starts with them, and is never late."""
+    """The frames of a gateway that starts with the first of these (time, bytes) of its first ESC and is never late."""
     waiting = TransmitQueue()
     started = False
     for now, data in chunks:

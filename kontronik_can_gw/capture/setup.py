@@ -1,11 +1,11 @@
-"""What a capture's header holds of the gateway that was recorded: enough to make the same gateway again, on any machine.
+"""The gateway's setup in a capture's header: enough to rebuild the same gateway on any machine.
 
-JSON keys of the header (beside those that run and recorder add: created_ns, run, part, monotonic_ns, wall_ns, devices, state)::
+JSON keys of the header (run and recorder add created_ns, run, part, monotonic_ns, wall_ns, devices, state)::
 
     format, version      "kontronik-can-gw capture", 2
     program              version, python, machine
-    configuration        the effective TOML text; file: where it stood
-    escs                 settings of each ESC (gear as "31/4"), as they held
+    configuration        the effective TOML text; file: its path
+    escs                 settings of each ESC (gear as "31/4") that were in effect
     ports                their serial ports
     dbc                  file, text (one character a byte), fd, silent_on_loss and the fields of DbcSettings; null without it
     canopen              eds (file, text), nodes, stored, escs (settings as configured); null without it
@@ -41,7 +41,7 @@ Header = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class CaptureSetup:
-    """A gateway's making. ``dbc``: name and bytes of the DBC file, None without DBC output."""
+    """Everything that a gateway is built from. ``dbc``: name and bytes of the DBC file, None without DBC output."""
 
     escs: tuple[EscSettings, ...]
     ports: tuple[str, ...]
@@ -54,7 +54,7 @@ class CaptureSetup:
     file: str = ""
 
     def header(self) -> dict[str, Any]:
-        """As it stands in a capture."""
+        """The header's JSON content."""
         dbc: dict[str, Any] | None = None
         if self.dbc is not None:
             name, data = self.dbc
@@ -95,7 +95,7 @@ class CaptureSetup:
 
     @classmethod
     def of(cls, header: Header) -> "CaptureSetup":
-        """From a capture's header. ValueError, with the reason, for what is none of ours."""
+        """Read a capture's header. ValueError with the reason where it is not ours or invalid."""
         if header.get("format") != FORMAT:
             raise ValueError("the header is not that of a capture")
         if header.get("version") not in VERSIONS:
@@ -144,19 +144,19 @@ class CaptureSetup:
         )
 
     def database(self) -> tuple["Database", Layout] | None:
-        """The database of what was sent, and its layout; None without DBC output. UserError if this version refuses it."""
+        """The database that was sent by and its layout; None without DBC output. UserError if this version refuses it."""
         if self.dbc is None:
             return None
         name, data = self.dbc
         return prepare(parse_database(data, name), name, self.escs, self.dbc_settings, self.fd)
 
     def gateway(self, layout: Layout, now: int) -> Gateway:
-        """The gateway, as it was before its start."""
+        """The gateway in its state before the start."""
         return Gateway(self.escs, layout, now, self.silent_on_loss, self.canopen)
 
 
 def _dbc_settings(found: Mapping[str, Any]) -> DbcSettings:
-    """Checked as the configuration's are."""
+    """Settings checked like those of a configuration."""
     keys = {"bind": found["bind"], "e2e_data_ids": found["data_ids"]}
     keys |= {key: found[key] for key in ("node", "base_id", "id_step") if found[key] is not None}
     later = ("units", "messages", "unbound", "flags_on_loss")  # not in captures of 0.5.0
@@ -170,7 +170,7 @@ def _esc_json(esc: EscSettings) -> dict[str, Any]:
 
 
 def _esc(found: Mapping[str, Any]) -> EscSettings:
-    """Within the ranges of the configuration, or those of a master."""
+    """Settings of an ESC, within the ranges of the configuration or those that a master may write."""
     numerator, _, denominator = found["gear"].partition("/")
     gear = Fraction(_number(numerator, 1, 10**12), _number(denominator or "1", 1, 10**12))
     return EscSettings(
@@ -201,7 +201,7 @@ _LATEST = 1 << 62
 
 
 def _check(header: Header) -> None:
-    """The parts that readers use as they are. ValueError for what is not as the recorder writes it."""
+    """Check the parts that readers use unchanged. ValueError for what a recorder never writes."""
     for name in ("monotonic_ns", "wall_ns", "created_ns"):
         if header.get(name) is not None:
             _number(header[name], 0, _LATEST)
@@ -223,7 +223,7 @@ def _check(header: Header) -> None:
 
 
 def check_state(state: Mapping[str, Any]) -> None:
-    """ValueError for a state that no gateway can have."""
+    """ValueError for an impossible state."""
     for esc in state.get("escs", ()):
         for name in ("energy", "run_time", "losses"):
             _number(esc[name], 0, 1 << 100)

@@ -1,6 +1,6 @@
-"""The command line: ``kontronik-can-gw COMMAND``. One module per command; each imports what is heavy only when it runs.
+"""The command line: ``kontronik-can-gw COMMAND``. One module per command; each imports heavy modules only when it runs.
 
-Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data goes to standard output, talk to standard error.
+Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data goes to standard output, messages to standard error.
 """
 
 import argparse
@@ -23,10 +23,10 @@ from kontronik_can_gw.printable import printable
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
     "run": "the gateway: ESC telemetry in, CAN frames out",
-    "status": "how a running gateway is",
+    "status": "show the state of a running gateway",
     "check": "check a configuration and print what it will send",
-    "doctor": "look at machine, ports, CAN interface and configuration, and say what to do",
-    "service": "install the gateway as a systemd service, look at it, remove it",
+    "doctor": "check machine, ports, CAN interface and configuration, with remedies",
+    "service": "install the gateway as a systemd service, show its state, remove it",
     "init": "write a commented example configuration",
     "dbc": "write the DBC for several ESCs or for a configuration",
     "eds": "write the EDS, or the DCF of a CANopen node",
@@ -43,11 +43,11 @@ COMMANDS = {
 }
 
 _DESCRIPTORS = 64
-"""How many files any command may have open; a gateway needs two more for each ESC."""
+"""Open files that any command needs; a gateway needs two more for each ESC."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return its exit code."""
+    """Run one command and return its exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     command = next((word for word in words if not word.startswith("-")), None)
     try:
@@ -56,13 +56,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         for problem in error.problems:
             say(problem, command)
         return error.exit_code
-    except BrokenPipeError:  # the reader of our output has gone, as `| head` does
+    except BrokenPipeError:  # the reader of our output ended, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
             say(str(_too_few_files()), command)
         elif error.errno == errno.ENOSPC:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is buffered has nowhere to go
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # discards buffered output
             say(f"standard output: cannot be written: {error.strerror}", command)
         else:
             raise
@@ -84,7 +84,7 @@ def _main(words: list[str], command: str | None) -> int:
 
 
 def say(text: str, command: str | None = None) -> None:
-    """One line of talk on standard error."""
+    """Print one line on standard error."""
     print(
         printable(f"kontronik-can-gw{'' if command is None else f' {command}'}: {text}"),
         file=sys.stderr,
@@ -92,13 +92,13 @@ def say(text: str, command: str | None = None) -> None:
 
 
 def show(text: str = "") -> None:
-    """One line for people on standard output."""
+    """Print one line on standard output, made printable."""
     print(printable(text))
 
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Ctrl-C raises KeyboardInterrupt: before, while modules are loaded, and after, it ends the process (see __main__)."""
+    """Make Ctrl-C raise KeyboardInterrupt; before, while modules are loaded, and after, it ends the process (see __main__)."""
     ended_us = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     if ended_us:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -110,7 +110,7 @@ def _interruptible() -> Iterator[None]:
 
 
 def need_descriptors(more: int = 0) -> None:
-    """Let this process open as many files as it needs, ``more`` than any command does. RunError where it may not."""
+    """Raise the limit of open files as needed, with ``more`` than every command needs. RunError where that is not allowed."""
     import resource
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -129,11 +129,11 @@ def _too_few_files(needed: int = _DESCRIPTORS) -> RunError:
 
 
 def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """The parser of the whole program. Only the commands in ``complete`` have their options: a run needs those of one alone."""
+    """The parser of the program. Only commands in ``complete`` get their options; a run needs only those of one command."""
     parser = argparse.ArgumentParser(
         prog="kontronik-can-gw",
         description="Gateway from KONTRONIK ESC telemetry (UART) to CAN, described by a DBC.",
-        epilog="kontronik-can-gw COMMAND --help tells more of a command.",
+        epilog="kontronik-can-gw COMMAND --help describes a command.",
     )
     parser.add_argument("-V", "--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -147,22 +147,25 @@ def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.Argumen
 
 
 class _Plain(logging.Formatter):
-    """For what libraries log where nothing is set up for it: they quote files too."""
+    """Formats log records of libraries without a handler of their own; made printable, since they quote files."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(f"kontronik-can-gw: {record.getMessage()}")
 
 
 def _prepare_streams() -> None:
-    """No surprises from the three standard streams."""
+    """Make the three standard streams safe to use.
+
+    A closed one is replaced: if a serial port got its number, messages would be sent to an ESC.
+    """
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_Plain())
     for number in range(3):
         try:
             os.fstat(number)
-        except OSError:  # closed: a serial port must not get this number, or what is said would be sent to an ESC
+        except OSError:  # closed: no serial port may get this number, see below
             os.open(os.devnull, os.O_RDWR)
-    for name in ("stdout", "stderr"):  # talk must not go to standard output instead
+    for name in ("stdout", "stderr"):  # messages must not go to standard output instead
         if getattr(sys, name) is None:
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115  for the whole run
     for stream in (sys.stdout, sys.stderr):

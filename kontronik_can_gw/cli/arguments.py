@@ -1,4 +1,4 @@
-"""What several commands ask of their options."""
+"""Checks of options that several commands share."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -17,14 +17,14 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
     ): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
 }
-"""Command and option of earlier versions, as ("report", "--png"), and what to type instead, as a sentence.
+"""Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.
 
-A choice of an option that stays is written with it: ("describe", "--format html"). Each may go a year after its removal.
+A removed choice is written with its option: ("describe", "--format html"). Entries may be deleted a year after the removal.
 """
 
 
 def number_from(low: float, high: float, what: str = "number of seconds") -> Callable[[str], float]:
-    """A type for argparse: a number within a range."""
+    """An argparse type: a number within a range."""
 
     def read(text: str) -> float:
         try:
@@ -39,7 +39,7 @@ def number_from(low: float, high: float, what: str = "number of seconds") -> Cal
 
 
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
-    """UserError with what to type instead, where a command line has an option that was removed."""
+    """UserError with the replacement where a command line has a removed option."""
     options = words[: words.index("--")] if "--" in words else words
     parts = [
         part

@@ -1,4 +1,4 @@
-"""``-c`` and ``--dbc`` of the commands that read frames of ours."""
+"""``-c`` and ``--dbc`` of the commands that read the gateway's frames."""
 
 import argparse
 from pathlib import Path
@@ -27,7 +27,7 @@ def add_layout_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def bus_layout(config: Path | None, dbc: Path | None) -> BusLayout:
-    """The DBC that ``-c`` or ``--dbc`` means, the shipped one without both. UserError with every mistake."""
+    """The layout given by ``-c`` or ``--dbc``, by default the shipped one. UserError with every mistake."""
     if config is not None:
         from kontronik_can_gw.cli.common import load_all
 

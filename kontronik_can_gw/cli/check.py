@@ -1,4 +1,4 @@
-"""``check``: what a configuration means and will send, without opening anything."""
+"""``check``: shows what a configuration means and sends, without opening anything."""
 
 import argparse
 import struct
@@ -83,7 +83,7 @@ def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
 
 
 def pdo_timing(tpdo: Tpdo) -> str:
-    """When a PDO is sent, in words."""
+    """Transmission type and times of a PDO, in words."""
     if tpdo.type not in EVENT_TYPES:
         return "at a SYNC after news" if tpdo.type == 0 else f"every {tpdo.type} SYNC"
     words = ["on change" if tpdo.on_change else "with each frame"]
@@ -107,7 +107,7 @@ def table(layout: Layout, esc_names: list[str]) -> list[str]:
 
 
 def unbound(layout: Layout) -> list[str]:
-    """What is constant because it is bound to nothing, a line for each message."""
+    """Unbound signals with their constant values, a line for each message."""
     lines = []
     for message in layout.messages:
         if found := [signal for signal in message.signals if signal.unbound]:
@@ -119,7 +119,7 @@ def unbound(layout: Layout) -> list[str]:
 
 
 def shown(signal: SignalPlan, raw: int) -> str:
-    """The physical value of raw bits, or their text."""
+    """The physical value of raw bits, or their text in the value table."""
     if signal.is_float:
         (value,) = struct.unpack(
             "<f" if signal.length == 32 else "<d", raw.to_bytes(signal.length // 8, "little")
@@ -132,7 +132,7 @@ def shown(signal: SignalPlan, raw: int) -> str:
 
 
 def _lost(message: MessagePlan, signal: SignalPlan) -> str:
-    """What a reader of the signal loses."""
+    """What is lost in a signal: resolution, range, or the report of lost telemetry."""
     notes = list(signal.notes)
     if is_mute(signal) and (found := reporter(message, signal)) is not None:
         notes.append(f"{found.name} reports the loss")
@@ -140,7 +140,7 @@ def _lost(message: MessagePlan, signal: SignalPlan) -> str:
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines with the cells of each column one under the other."""
+    """Rows as lines with aligned columns."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -149,12 +149,12 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def can_id(message: MessagePlan) -> str:
-    """The id in hexadecimal as people write it: 3 digits for 11 bits, 8 for 29."""
+    """The id in hexadecimal: 3 digits for 11 bits, 8 for 29."""
     return f"{message.can_id:08X}h" if message.extended else f"{message.can_id:03X}h"
 
 
 def timing(message: MessagePlan) -> str:
-    """How a message is sent, in words."""
+    """Send type, cycle and minimum distance of a message, in words."""
     words = []
     if message.cycle_ns:
         words.append(f"every {message.cycle_ns // MS} ms")

@@ -1,4 +1,4 @@
-"""What several commands share: the log, signals, output files, and warnings of a configuration on standard error."""
+"""Shared by several commands: the log, signals, output files, and warnings of a configuration on standard error."""
 
 import io
 import logging
@@ -21,7 +21,7 @@ log = logging.getLogger("kontronik_can_gw")
 
 
 def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) -> Loaded:
-    """Everything that a configuration means, as ``load_configuration``; warnings are said."""
+    """Load a configuration as ``load_configuration`` does, and print its warnings."""
     loaded = load_configuration(path, store)
     for warning in (*loaded.layout.warnings, *loaded.warnings):
         say(f"warning: {warning}")
@@ -30,7 +30,7 @@ def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) 
 
 @contextmanager
 def logging_to_stderr() -> Iterator[None]:
-    """Log lines to standard error, by a thread; under systemd without time, with the priorities that journald reads."""
+    """Write log lines to standard error from a thread; under systemd without time, with journald's priorities."""
     from kontronik_can_gw.runtime.log_writer import BackgroundHandler
     from kontronik_can_gw.runtime.systemd import log_formatter
 
@@ -38,7 +38,7 @@ def logging_to_stderr() -> Iterator[None]:
     handler.setFormatter(
         log_formatter(sys.stderr) or logging.Formatter("%(asctime)s %(levelname)-7s %(message)s")
     )
-    # what python-can says is said again by us, with the remedy
+    # faults that python-can logs are logged by the gateway too, with the remedy
     logging.getLogger("can").addHandler(logging.NullHandler())
     logger = logging.getLogger("kontronik_can_gw")
     logger.addHandler(handler)
@@ -52,8 +52,8 @@ def logging_to_stderr() -> Iterator[None]:
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], None], is_service: bool = False) -> Iterator[None]:
-    """SIGTERM and SIGINT call ``stop``, once more end the process at once. SIGHUP ends a service only if its terminal has gone."""
-    # ignored: as by nohup
+    """SIGTERM and SIGINT call ``stop``, a second one ends the process at once. SIGHUP ends a service only if its terminal is closed."""
+    # ignored already: started by nohup
     has_terminal = _has_terminal() and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
 
     def end(_number: int, _frame: object) -> None:
@@ -82,7 +82,7 @@ def stopping_on_signals(stop: Callable[[], None], is_service: bool = False) -> I
 
 
 def _has_terminal() -> bool:
-    """True where the process has a controlling terminal that is still there."""
+    """True if the process has a controlling terminal that is still open."""
     try:
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC))
     except OSError:
@@ -91,7 +91,7 @@ def _has_terminal() -> bool:
 
 
 def canopen_of(loaded: Loaded) -> CanopenSetup:
-    """The nodes of a configuration. UserError where it has none."""
+    """The CANopen setup of a configuration. UserError where it has no nodes."""
     if loaded.canopen is None:
         raise UserError(
             f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. Set it to true."
@@ -100,7 +100,7 @@ def canopen_of(loaded: Loaded) -> CanopenSetup:
 
 
 def write_output(where: str, text: str, encoding: str) -> None:
-    """Text to a file, which is then told, or for ``-`` to standard output; line ends as they are. RunError where it cannot be written."""
+    """Write text to a file and say so, or to standard output for ``-``; line ends stay. RunError where it cannot be written."""
     if where == "-" and sys.stdout.isatty():
         text = printable(text, keep="\r\n\t")
     data = text.encode(encoding)
@@ -114,7 +114,7 @@ def write_output(where: str, text: str, encoding: str) -> None:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """All or nothing: a reader never sees half a file. What is no plain file (a pipe, /dev/stdout) is written to, not replaced."""
+    """Write a file atomically. Anything but a plain file (a pipe, /dev/stdout) is written to, not replaced."""
     import tempfile
 
     beside: Path | None = None

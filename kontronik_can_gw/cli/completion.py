@@ -1,4 +1,4 @@
-"""``completion``: a script that lets a shell complete commands, options, choices and file names. Made by shtab from the parser."""
+"""``completion``: prints a script for a shell to complete commands, options, choices and file names. shtab makes it from the parser."""
 
 import argparse
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ exit codes: 0 done, 1 the installed shtab does not know this shell, 2 wrong usag
 _FILES = frozenset({"FILE", "DBC", "PATH", "IN", "OUT"})
 _FOLDERS = frozenset({"DIR", "FOLDER"})
 _ENDINGS = {"config": ("*.toml",), "dbc": ("*.dbc", "*.DBC"), "source": ("*.dbc", "*.DBC")}
-"""Where only some files are meant, by the name under which the option is read."""
+"""File name endings for options, by their attribute name."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

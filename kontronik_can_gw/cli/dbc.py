@@ -1,4 +1,4 @@
-"""``dbc``: write the DBC of several ESCs from a one-ESC DBC, or of exactly what a configuration or its CANopen nodes send."""
+"""``dbc``: writes the DBC of several ESCs from a one-ESC DBC, or of exactly what a configuration or its CANopen nodes send."""
 
 import argparse
 import re
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)"
     )
     parser.epilog = (
-        "Prints a DBC that every tool reads; what should be known about it goes to standard error. "
+        "Prints a DBC that every tool reads; warnings go to standard error. "
         "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or DBC."
     )
 
@@ -75,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
 
     text = dbc_text(_canopen(args) if args.canopen else _database(args))
     try:
-        text.encode("cp1252")  # what tools take a DBC for; ASCII as a rule
+        text.encode("cp1252")  # the encoding that tools assume; usually the text is ASCII
         encoding = "cp1252"
     except UnicodeEncodeError:
         encoding = "utf-8"
@@ -87,7 +87,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _canopen(args: argparse.Namespace) -> "Database":
-    """The DBC of the configured nodes, or of as many by the shipped EDS, node-IDs from 1 on."""
+    """The DBC of the configured nodes, or of nodes from the shipped EDS with node-IDs from 1."""
     _refuse(
         args,
         ("from", "base_id", "id_step", "node"),
@@ -144,12 +144,12 @@ def _database(args: argparse.Namespace) -> "Database":
         raise UserError(f"{file}: for {len(escs)} ESCs, {reason}")
     prepare(
         database, str(file), escs, DbcSettings(bind, node), fd_allowed=True
-    )  # refuses what the gateway would refuse
+    )  # raises for mistakes that the gateway refuses
     return database
 
 
 def _refuse(args: argparse.Namespace, options: tuple[str, ...], beside: str) -> None:
-    """UserError for options that make no sense beside another one."""
+    """UserError for options that cannot be combined with another one."""
     given = [
         f"--{name.replace('_', '-')}"
         for name in options
@@ -160,7 +160,7 @@ def _refuse(args: argparse.Namespace, options: tuple[str, ...], beside: str) -> 
 
 
 def _escs(args: argparse.Namespace) -> list[EscSettings]:
-    """As many ESCs as ``--esc`` and ``--name`` say."""
+    """The ESCs given by ``--esc`` and ``--name``."""
     names = args.name or []
     count = args.esc if args.esc is not None else max(1, len(names))
     if names and len(names) != count:

@@ -1,7 +1,7 @@
-"""``demo``: the whole gateway without hardware, vcan or privileges.
+"""``demo``: runs the whole gateway without hardware, vcan or privileges.
 
-A simulated ESC on a pseudo terminal, the real serial path, the real packer and CANopen node, python-can's in-process bus, and on the
-screen what a logger with the DBC and a small CANopen master see on that bus. Nothing on the screen comes from anywhere but the bus.
+A simulated ESC on a pseudo terminal, the real serial path, packer and CANopen node, python-can's in-process bus, and a screen with what a
+logger with the DBC and a small CANopen master see. All values on the screen come from the bus.
 """
 
 import argparse
@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass
 class Logger:
-    """A bus participant with nothing but the DBC."""
+    """A bus participant that knows only the DBC."""
 
     database: "Database"
     values: dict[str, object] = field(default_factory=dict)
@@ -103,14 +103,14 @@ class Logger:
             self.values.update(known.decode_simple(bytes(message.data)))
 
     def text(self, name: str, digits: str = "0") -> str:
-        """A value as people read it; a dash for one that is not available."""
+        """A formatted value; a dash where it is not available."""
         value = self.values.get(name)
         if isinstance(value, (int, float)):
             return f"{value:,.{digits}f}".replace(",", " ")
         return "-" if value is None or str(value) == "NotAvailable" else str(value)
 
     def active(self) -> list[str]:
-        """Flags that are set while the flags mean anything."""
+        """Flags that are set, while flags are valid."""
         if self.text("OperatingState") == "-":
             return []
         return [
@@ -122,7 +122,7 @@ class Logger:
 
 @dataclass
 class Master:
-    """A CANopen master as small as can be: starts the node, reads one object a second, counts what the node sends."""
+    """A minimal CANopen master: starts the node, reads one object a second, counts the node's messages."""
 
     bus: "can.BusABC"
     node_id: int = 1
@@ -133,7 +133,7 @@ class Master:
     _next_poll: float = 0.0
 
     def take(self, message: "can.Message", seconds: float) -> None:
-        """Follow a frame, and do what a master does."""
+        """Process a frame and react as a master."""
         data, node_id = bytes(message.data), self.node_id
         match message.arbitration_id - node_id:
             case heartbeat.COB_ID:
@@ -159,12 +159,12 @@ class Master:
             self._send(node.SDO_REQUEST + node_id, bytes.fromhex("40 01 20 05 00 00 00 00"))
 
     def line(self) -> str:
-        """What the master knows."""
+        """One line with everything that the master knows."""
         pdos = (
             " ".join(f"TPDO{number} {count}" for number, count in sorted(self.counts.items()))
             or "no PDO yet"
         )
-        # no-break spaces: on a narrow terminal the line is broken in front of SDO, not behind it
+        # no-break space: a narrow terminal breaks the line before SDO, not after it
         return f"node {self.node_id} {self.state}  {pdos}  SDO\N{NO-BREAK SPACE}2001h:5 {self.cell_voltage}  EMCY {self.emergency}"
 
     def _send(self, cob_id: int, data: bytes) -> None:
@@ -183,7 +183,7 @@ def main(args: argparse.Namespace) -> int:
     from kontronik_can_gw.gateway import Gateway
     from kontronik_can_gw.runtime.loop import Loop
 
-    # the screen tells what the log would
+    # the screen shows what the log would
     logging.getLogger("kontronik_can_gw").addHandler(logging.NullHandler())
     channel = f"demo-{os.getpid()}"
     stop = threading.Event()
@@ -281,7 +281,7 @@ def _show(
     end = None if seconds is None else begin + seconds
 
     def listen(pause: float) -> Iterator[None]:
-        """Decode what comes; yield each ``pause`` seconds until the end."""
+        """Decode incoming frames; yield each ``pause`` seconds until the end."""
         next_time = begin + pause
         while not stop.is_set():
             now = time.monotonic()

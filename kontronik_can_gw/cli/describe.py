@@ -1,4 +1,4 @@
-"""``describe``: documentation made from the sources of truth: the DBC and EDS in use, errors, states, the options themselves."""
+"""``describe``: generates documentation from the DBC and EDS in use, errors and states."""
 
 import argparse
 from pathlib import Path
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write the description. UserError for what is wrong with the files, RunError where it cannot be written."""
+    """Write the description. UserError for faulty input files, RunError where it cannot be written."""
     from kontronik_can_gw.cli.common import write_output
 
     write_output(args.output, printable(_text(args), keep="\n\t"), "utf-8")

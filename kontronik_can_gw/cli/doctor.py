@@ -1,4 +1,4 @@
-"""``doctor``: looks at the machine and the configuration, changes nothing, sends nothing, and says what to do."""
+"""``doctor``: checks machine and configuration and prints remedies; it changes nothing and sends nothing."""
 
 import argparse
 import os
@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
-    """All findings, and the exit code. What does not depend on a faulty part of the configuration is looked at all the same."""
+    """All findings, and the exit code. Parts that do not depend on a mistake in the configuration are checked nevertheless."""
     from kontronik_can_gw.desk.doctor.can_interface import check_can
     from kontronik_can_gw.desk.doctor.line import look
     from kontronik_can_gw.desk.doctor.machine import check_machine
@@ -89,11 +89,11 @@ def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
 
 
 def _load(path: Path, unit: "Unit | None") -> tuple[Config | None, Loaded | None, UserError | None]:
-    """As far as it goes: the configuration, what belongs to it, and why it went no further."""
+    """Configuration, the objects made from it, and the error; None for what could not be made."""
     config = None
     try:
         config = load(path)
-        if unit is not None and config.canopen.store is None:  # what systemd will tell it
+        if unit is not None and config.canopen.store is None:  # as set by systemd
             config = replace(config, canopen=replace(config.canopen, store=unit.state_folder))
         check_interface(config.can)
         return config, assemble(config), None
@@ -118,8 +118,8 @@ def _configuration(
         folder = str(parameter_folder(config).absolute())
         check_folder(system, findings, "config.store", "stored parameters", folder, unit)
     if (captures := record_folder(config)) is not None:
-        folder, least = str(captures.absolute()), config.record.min_free_mb * 1_000_000
-        check_folder(system, findings, "config.record", "captures", folder, unit, least)
+        folder, reserve = str(captures.absolute()), config.record.min_free_mb * 1_000_000
+        check_folder(system, findings, "config.record", "captures", folder, unit, reserve)
     if config.statistics_path is not None:
         folder = str(config.statistics_path.absolute().parent)
         check_folder(system, findings, "config.statistics", "statistics", folder, unit)
@@ -163,7 +163,7 @@ def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
 
 
 class _Piece(NamedTuple):
-    """A line of the screen: a word in a style, then text."""
+    """A line of the report: a styled word, then text."""
 
     word: str
     style: str
@@ -186,7 +186,7 @@ def _show(findings: list[Finding]) -> None:
 
 
 def _lines(findings: list[Finding], width: int) -> Iterator[_Piece]:
-    """The report. Commands are never broken, so that they can be copied."""
+    """The lines of the report. Commands are not wrapped, so that they can be copied."""
     group = ""
     for finding in findings:
         if finding.group != group:

@@ -1,4 +1,4 @@
-"""``eds``: write the EDS in use, or a DCF with the active values of one node."""
+"""``eds``: writes the EDS in use, or a DCF with the active values of one node."""
 
 import argparse
 from pathlib import Path
@@ -20,7 +20,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 _STATES_AND_COMMANDS = frozenset(
     {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, VERIFY, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE}
 )
-"""Objects that tell what is at the moment, or do something when they are written."""
+"""Objects with momentary state, or with an effect when they are written."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", metavar="FILE", default="-", help="where to (default: standard output)"
     )
     parser.epilog = (
-        "Prints the EDS as it is in use, byte by byte, or a DCF by CiA 306. "
+        "Prints the EDS in use, byte by byte, or a DCF by CiA 306. "
         "Exit code: 0 done, 1 it cannot be written, 2 wrong usage, configuration or EDS."
     )
 
@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
     else:
         loaded = load_all(args.config)
         setup, escs = canopen_of(loaded), loaded.escs
-    text = setup.eds.data.decode("latin-1")  # any bytes come back as they were
+    text = setup.eds.data.decode("latin-1")  # keeps all bytes
     if args.node_id is not None:
         text = _dcf(setup, escs, args.node_id, Path(args.output).name)
     write_output(args.output, text, "latin-1")
@@ -86,7 +86,7 @@ def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, file_name: 
 
 
 def active_values(node: Node) -> dict[tuple[int, int], Value]:
-    """What a node is configured with, by index and sub-index: every readable value but telemetry, states and commands."""
+    """A node's configuration by index and sub-index: every readable value but telemetry, states and commands."""
     values: dict[tuple[int, int], Value] = {}
     for variable in node.dictionary.variables.values():
         key = variable.entry.index, variable.entry.sub

@@ -1,4 +1,4 @@
-"""``init``: write the commented example configuration."""
+"""``init``: writes the commented example configuration."""
 
 import argparse
 import os

@@ -1,4 +1,4 @@
-"""``monitor``: a live screen of one to eight ESCs, from the CAN bus through the DBC or from a recording. It never sends anything."""
+"""``monitor``: a live screen of one to eight ESCs, from the CAN bus by the DBC or from a recording. It never sends anything."""
 
 import argparse
 import codecs
@@ -35,26 +35,26 @@ if TYPE_CHECKING:
 _REFRESH_S = 0.15
 _PLAIN_LINE_S = 1.0
 _ONCE_S = 3.0
-_AT_MOST_BEHIND_S = 0.5
+_MAX_LAG_S = 0.5
 _SUFFIX_OF_UTF8 = "utf-8"
 _LOOK_BACK = 1 << 20
-"""Bytes of a capture's end: a block is far shorter."""
+"""Bytes to read at a capture's end; a block is far shorter."""
 
 EPILOG = """\
-Without FILE it listens on the CAN bus, anywhere on it: it only needs the DBC (-c, --dbc) and never sends a frame.
+Without FILE it listens on the CAN bus, at any place: it only needs the DBC (-c, --dbc) and never sends a frame.
 With -c the interface and the channel are those of the configuration unless they are given.
 FILE is a capture (.kcap), a file of UART bytes or a CAN log (candump .log, .asc, .blf, .trc, .mf4); it is played in real time.
-It may be a pipe, or - for standard input, which is first read to its end, into a temporary file (in TMPDIR, else /tmp).
+A pipe, or - for standard input, is first read to its end into a temporary file (in TMPDIR, else /tmp).
 
 keys: q quit, r reset minimum and maximum, 1 to 9 one ESC with everything in it, a all, n and p pages, space pause (FILE)
 bars: power stage and BEC 0..110 degC, yellow from 80, red from 100; cell voltage 3.0..4.2 V, yellow from 3.5, red from 3.3 down;
 throttle and opening 0..100 %. A value beyond a limit is marked with ! and !!. These limits are the monitor's, not the ESC's.
 
 Where standard output is no terminal, or a dumb one, it writes one line for each ESC every second.
---once waits until each cyclic message of the DBC has come, or for --timeout, and prints one line of JSON; of a FILE what holds at its end.
+--once waits until each cyclic message of the DBC has come, or for --timeout, and prints one line of JSON; of a FILE the values at its end.
 Values there are in the units of "units", null where not available.
 
-exit codes: 0 ended by the person, end of FILE, or --once with values; 1 no frame came (--once), or something cannot be opened;
+exit codes: 0 ended by a key or signal, end of FILE, or --once with values; 1 no frame came (--once), or something cannot be opened;
 2 wrong usage
 """
 
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--speed",
         type=number_from(0.01, 1000, "factor"),
         metavar="FACTOR",
-        help="play FILE so many times as fast (0.01 to 1000, default 1)",
+        help="play FILE faster by this factor (0.01 to 1000, default 1)",
     )
     parser.add_argument(
         "--once", action="store_true", help="one line of JSON with everything, then end"
@@ -83,13 +83,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--timeout",
         type=number_from(0.1, 3600),
         metavar="S",
-        help=f"--once: wait at most so long (default {_ONCE_S:g})",
+        help=f"--once: maximum time to wait (default {_ONCE_S:g})",
     )
     parser.add_argument(
         "--interval",
         type=number_from(0.1, 3600),
         metavar="S",
-        help=f"draw every so many seconds (default {_REFRESH_S:g}; lines: {_PLAIN_LINE_S:g})",
+        help=f"time between screens (default {_REFRESH_S:g}; lines: {_PLAIN_LINE_S:g})",
     )
 
 
@@ -106,7 +106,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _check_usage(args: argparse.Namespace) -> None:
     if args.file is None and args.speed is not None:
-        raise UserError("--speed: is for a FILE; the bus comes as it comes. Leave it out.")
+        raise UserError("--speed: is for a FILE, not for the bus. Leave it out.")
     if args.file is not None and (args.interface is not None or args.channel is not None):
         raise UserError(
             f"{args.file}: is played, so --interface and --channel mean nothing. Leave them out."
@@ -115,7 +115,7 @@ def _check_usage(args: argparse.Namespace) -> None:
         raise UserError("--timeout: is for --once. Leave it out.")
 
 
-# --- where frames come from
+# --- sources of frames
 
 
 class Source(Protocol):
@@ -127,13 +127,13 @@ class Source(Protocol):
     paused: bool
 
     def pump(self, take: "Callable[[CanFrame, int], None]", until_s: float) -> None:
-        """Hand over the frames that come until this time of ``time.monotonic``; it may return sooner."""
+        """Pass on the frames that come until this time of ``time.monotonic``; may return sooner."""
 
     def now(self) -> int:
         """The present time on the clock of the frames, in ns."""
 
     def where(self) -> "Where":
-        """What is to be said of it."""
+        """State of the source, for the screen."""
 
     def wall_time(self) -> str | None:
         """Date and time of ``now``; None where not known."""
@@ -144,7 +144,7 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the channel or the file."""
+        """Name of the channel or the file."""
 
 
 @contextmanager
@@ -175,7 +175,7 @@ def _source_of(args: argparse.Namespace) -> Iterator[Source]:
 
 
 def last_ns(opened: "Input") -> int | None:
-    """When the last entry of a capture comes; None where a look at its end does not tell."""
+    """Time of a capture's last entry; None where its end does not show it."""
     from kontronik_can_gw.capture.format import Block, Scanner, read_entries
     from kontronik_can_gw.desk.recordings.inputs import CaptureInput
 
@@ -200,7 +200,7 @@ def last_ns(opened: "Input") -> int | None:
 
 
 def can_config(bus: "BusLayout", interface: str | None, channel: str | None) -> "CanConfig":
-    """The interface to listen on. UserError where it would be the port of an ESC, to which nothing may be sent."""
+    """The interface to listen on. UserError where it is the port of an ESC, to which nothing may be sent."""
     from kontronik_can_gw.config.keys import CanConfig
 
     if bus.config is None:
@@ -211,7 +211,7 @@ def can_config(bus: "BusLayout", interface: str | None, channel: str | None) -> 
         None,
         can.interface,
     ):
-        # options and a channel of another kind of interface mean nothing to it
+        # options and channel belong to another kind of interface
         can = replace(can, interface=interface, options={})
     can = replace(can, channel=channel or can.channel)
     check_devices(replace(bus.config, can=can))
@@ -219,7 +219,7 @@ def can_config(bus: "BusLayout", interface: str | None, channel: str | None) -> 
 
 
 class Bus:
-    """The CAN bus, now."""
+    """Frames from the CAN bus."""
 
     is_file = False
     ended = False
@@ -269,7 +269,7 @@ class Bus:
 
 
 class Recording:
-    """A file, played at its own pace times ``speed``; ``at_once``: as fast as it can be read."""
+    """Frames from a file, played in real time times ``speed``; ``at_once``: as fast as it can be read."""
 
     is_file = True
     problem = ""
@@ -293,8 +293,8 @@ class Recording:
 
     def pump(self, take: "Callable[[CanFrame, int], None]", until_s: float) -> None:
         begin = time.monotonic()
-        # what was not read in time is not made up for: then it plays slower than was asked for
-        passed = min(begin - self._last_pump, _AT_MOST_BEHIND_S)
+        # a delay is not made up for: a slow reader plays slower than asked for
+        passed = min(begin - self._last_pump, _MAX_LAG_S)
         self._last_pump = begin
         if not self.paused and not self.ended:
             self._clock += round(passed * self._speed * SECOND)
@@ -429,25 +429,25 @@ def _watch(source: Source, monitor: "Monitor", interval: float | None) -> int:
 def _lines(
     source: Source, monitor: "Monitor", interval: float, stopped: Callable[[], bool]
 ) -> None:
-    """Lines without any control of a terminal, until the end of a file or a signal."""
+    """Print plain lines, without terminal control, until the end of a file or a signal."""
     from kontronik_can_gw.cli.monitor_screen import notices, plain_lines
 
     monitor.advance(source.now())
     due = time.monotonic() + interval
-    told: list[str] = []
+    printed: list[str] = []
     while not stopped():
         source.pump(monitor.take, due)
         monitor.advance(source.now())
         if time.monotonic() < due and not source.ended:
             continue
-        due = max(due + interval, time.monotonic())  # what was slept through is not made up for
+        due = max(due + interval, time.monotonic())  # missed lines are not made up for
         said = [text for text, _ in notices(monitor, source.where())]
         for text in said:
-            if _news_of(text) not in told:
+            if _news_of(text) not in printed:
                 say(text)
-        if told and not said:
+        if printed and not said:
             say(f"{source.name}: frames come")
-        told = [_news_of(text) for text in said]
+        printed = [_news_of(text) for text in said]
         for line in plain_lines(monitor):
             print(line, flush=True)
         if source.ended:
@@ -455,7 +455,7 @@ def _lines(
 
 
 def _news_of(text: str) -> str:
-    """A notice without how long it lasts already, which is no news."""
+    """A notice without its duration, which changes all the time."""
     return text.rpartition(" for ")[0] if text.startswith("no frames") else text
 
 
@@ -510,7 +510,7 @@ def _live(
 
 
 def is_c_locale(environment: Mapping[str, str]) -> bool:
-    """True where the person's locale has ASCII alone, though Python itself then works in UTF-8."""
+    """True for an ASCII-only locale, with which Python itself still uses UTF-8."""
     name = next(
         (environment[key] for key in ("LC_ALL", "LC_CTYPE", "LANG") if environment.get(key)), "C"
     )
@@ -518,7 +518,7 @@ def is_c_locale(environment: Mapping[str, str]) -> bool:
 
 
 def _environment() -> dict[str, str]:
-    """As the process was given it: Python gives itself another LC_CTYPE where the locale is C."""
+    """The original environment of the process: in a C locale Python changes LC_CTYPE."""
     try:
         lines = Path("/proc/self/environ").read_bytes().split(b"\0")
     except OSError:
@@ -527,12 +527,12 @@ def _environment() -> dict[str, str]:
 
 
 def _retake(console: "Console") -> None:
-    """Take the screen anew behind Ctrl-Z and fg."""
+    """Set up the screen again after Ctrl-Z and fg."""
     console.set_alt_screen(True)
 
 
 def _obey(key: str, source: Source, monitor: "Monitor", choice: "Choice") -> bool:
-    """Do what a key means; False: end."""
+    """Handle a key; False: end."""
     match key.lower():
         case "q" | "\x03" | "\x04":
             return False
@@ -552,7 +552,7 @@ def _obey(key: str, source: Source, monitor: "Monitor", choice: "Choice") -> boo
 
 
 class Keys:
-    """Keys of the terminal as they are pressed, not shown; as context manager. Without a terminal at standard input there are none."""
+    """Reads single keys without echo, as context manager. No keys where standard input is no terminal."""
 
     def __init__(self) -> None:
         self.work = False
@@ -582,11 +582,11 @@ class Keys:
 
         signal.signal(signal.SIGCONT, self._old)
         if self._before is not None:
-            with contextlib.suppress(OSError, termios.error):  # the terminal has gone
+            with contextlib.suppress(OSError, termios.error):  # the terminal is closed
                 termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def pressed(self) -> str:
-        """What was pressed since; a key of several characters (an arrow) as nothing."""
+        """Keys pressed since the last call, without keys of several characters (arrows)."""
         if not self.work:
             return ""
         try:
@@ -595,7 +595,7 @@ class Keys:
             data = os.read(self._fd, 64)
         except OSError:
             data = b""
-        if not data:  # the terminal has gone
+        if not data:  # the terminal is closed
             self.work = False
         text = data.decode("ascii", "ignore")
         return text if len(text) == 1 or not text.startswith("\x1b") else ""

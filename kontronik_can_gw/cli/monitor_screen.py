@@ -1,6 +1,6 @@
-"""What ``monitor`` shows: lines of words and bars that fit a terminal of any size, in colour or without, in UTF-8 or ASCII. Pure.
+"""The screen of ``monitor``: lines of words and bars that fit a terminal of any size, with or without colour, in UTF-8 or ASCII. Pure.
 
-Where the ESCs find room side by side each has a column with everything in it; else they are a table, of two lines each or of one.
+If the ESCs fit side by side each has a column with all details; otherwise they are a table with two lines or one line each.
 """
 
 import textwrap
@@ -45,18 +45,18 @@ _TROUBLES = {
 }
 _FILLERS = {"from", "for", "target", "during", "operation"}
 _LABEL = 23
-"""Columns of what a value is called, with its unit."""
+"""Width of a value's name and unit."""
 _MIN_GROUP = 27
 _WIDEST_BAR = 36
 _MIN_HEIGHT = 16
-"""Lines without which there is no room for details."""
+"""Minimum number of lines for details."""
 MAX_ESCS = 8
 """On one page."""
 
 
 @dataclass(frozen=True)
 class Glyphs:
-    """Characters that the terminal has."""
+    """Characters available on the terminal."""
 
     full: str = "▇"
     empty: str = "▁"
@@ -71,32 +71,32 @@ ASCII = Glyphs(full="#", empty=".", degree="degC", cut="~", rule="-")
 
 @dataclass
 class Choice:
-    """What the person wants to see."""
+    """The user's choice of what to show."""
 
     page: int = 0
     esc: int | None = None
-    """Index of the only ESC to be shown; None: all."""
+    """Index of the only ESC to show; None: all."""
 
 
 class Where(NamedTuple):
-    """Where the frames come from. ``problem``: one line while it does not work; ``progress``: of a file, as ``12:03, 40 %``."""
+    """State of the source of frames. ``problem``: one line while it fails; ``progress``: of a file, as ``12:03, 40 %``."""
 
     name: str
     is_file: bool = False
     problem: str = ""
     progress: str = ""
     hints: tuple[str, ...] = ()
-    """What may be wrong where no frame comes."""
+    """Possible causes where no frame comes."""
     ended: bool = False
     """True at the end of a file."""
     keys: bool = True
-    """True where keys can be pressed."""
+    """True where keys are read."""
 
 
 def screen(
     monitor: Monitor, where: Where, size: tuple[int, int], choice: Choice, glyphs: Glyphs = UNICODE
 ) -> list[Line]:
-    """Everything, in at most ``size`` (columns, lines)."""
+    """The whole screen, within ``size`` (columns, lines)."""
     width, height = max(20, size[0]), max(4, size[1])
     head = [_title(monitor, where, width)]
     for text, style in notices(monitor, where):
@@ -116,7 +116,7 @@ def screen(
 
 
 def plain_lines(monitor: Monitor) -> Iterator[str]:
-    """A line for each ESC where there is no screen to draw on."""
+    """A line for each ESC, for output that is no terminal."""
     mark = "REPLAY  " if monitor.is_replay else ""
     for esc in monitor.escs:
         parts = [
@@ -135,7 +135,7 @@ def plain_lines(monitor: Monitor) -> Iterator[str]:
 
 
 def notices(monitor: Monitor, where: Where) -> Iterator[tuple[str, str]]:
-    """What must be said of all this, and its style."""
+    """Notices about gateway and source, with their style."""
     if monitor.is_replay and not where.is_file:
         yield "REPLAY: the gateway plays a recording; these are not values of a live ESC.", MARKED
     if where.problem:
@@ -159,7 +159,7 @@ def notices(monitor: Monitor, where: Where) -> Iterator[tuple[str, str]]:
 
 
 def fit(line: Line, width: int, glyphs: Glyphs) -> Line:
-    """The line, cut where it is too long."""
+    """The line, cut to the width."""
     room = width
     if sum(len(piece.text) for piece in line) <= room:
         return line
@@ -174,7 +174,7 @@ def fit(line: Line, width: int, glyphs: Glyphs) -> Line:
 
 
 def number(value: float | None, digits: int, width: int = 99) -> str:
-    """A value as people read it, in groups of three where there is room; a dash where it is not available."""
+    """A formatted value, in groups of three digits where they fit; a dash where it is not available."""
     if value is None:
         return "-"
     text = f"{value:,.{digits}f}".replace(",", " ")
@@ -182,7 +182,7 @@ def number(value: float | None, digits: int, width: int = 99) -> str:
 
 
 def bar(value: float | None, scale: Scale, width: int, glyphs: Glyphs) -> Line:
-    """A bar; its empty part shows by its colours where the limits lie."""
+    """A bar; the colours of its empty part show the limits."""
     text = glyphs.full * (0 if value is None else round(scale.share(value) * width))
     style = _ZONES[Zone.GOOD if value is None else scale.zone(value)]
     line = [Piece(text, style)] if text else []
@@ -248,7 +248,7 @@ def _foot(monitor: Monitor, where: Where, choice: Choice, pages: int, width: int
 
 
 def _shown(monitor: Monitor, choice: Choice, height: int) -> tuple[Sequence[EscMonitor], int]:
-    """The ESCs of the page that is wanted, and how many pages there are; the choice is set right."""
+    """The ESCs of the chosen page, and the number of pages; an invalid choice is corrected."""
     escs = monitor.escs
     if choice.esc is not None:
         choice.esc = choice.esc if choice.esc < len(escs) else None
@@ -269,7 +269,7 @@ def _state(esc: EscMonitor) -> str:
 
 
 def _short_state(esc: EscMonitor, width: int) -> str:
-    """The state without what it can be understood without, where there is no room for all of it."""
+    """The state, shortened where it does not fit."""
     state = _state(esc)
     return (
         state
@@ -290,7 +290,7 @@ def _link_style(esc: EscMonitor) -> str:
 
 
 def _speeds(esc: EscMonitor) -> list[str]:
-    """The speeds that the DBC has, the one that tells most first."""
+    """The speeds in the DBC, the most informative one first."""
     return [
         name for name in ("motor_speed", "electrical_speed", "output_speed") if esc.has(name)
     ] or ["motor_speed"]
@@ -304,12 +304,12 @@ def _name_style(esc: EscMonitor) -> str:
 
 
 def _mark(esc: EscMonitor) -> str:
-    """Behind the name, for those who see no colours."""
+    """A mark after the name, for displays without colour."""
     return {BAD: " !!", "bold yellow": " !"}.get(_name_style(esc), "")
 
 
 def _trouble(esc: EscMonitor) -> str:
-    """Why there are no values of an ESC though the gateway sends, with the remedy; empty where there are."""
+    """Why an ESC has no values although the gateway sends, with the remedy; empty where it has."""
     link = normalize(esc.link or "")
     if esc.is_fresh or link in ("", "ok"):
         return ""
@@ -319,15 +319,15 @@ def _trouble(esc: EscMonitor) -> str:
 
 
 def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool) -> list[Line]:
-    """What the ESCs report, errors first; closer together where there is little room; what finds none is counted."""
+    """Errors and warnings of the ESCs, errors first; compact where room is short; the rest is only counted."""
     width, room = size
-    told: list[tuple[Severity, str, str]] = []
+    alarms: list[tuple[Severity, str, str]] = []
     for esc in escs:
         name = f"{esc.name} " if named else ""
         if trouble := _trouble(esc):
-            told.append((Severity.ERROR, f"{name}LINK: ", trouble))
+            alarms.append((Severity.ERROR, f"{name}LINK: ", trouble))
         elif normalize(esc.link or "") == "degraded":
-            told.append(
+            alarms.append(
                 (
                     Severity.WARNING,
                     f"{name}LINK: ",
@@ -336,12 +336,12 @@ def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool)
             )
         for active in esc.alarms:
             kind = {Severity.STATUS: "note"}.get(active.severity, active.severity.value.upper())
-            told.append((active.severity, f"{name}{kind}: ", active.meaning))
-    told.sort(key=lambda each: list(Severity).index(each[0]))
-    lines = _wrapped(told, width)
+            alarms.append((active.severity, f"{name}{kind}: ", active.meaning))
+    alarms.sort(key=lambda each: list(Severity).index(each[0]))
+    lines = _wrapped(alarms, width)
     if len(lines) > room:
         joined: dict[tuple[Severity, str], list[str]] = {}
-        for severity, head, meaning in told:
+        for severity, head, meaning in alarms:
             joined.setdefault((severity, head), []).append(meaning)
         lines = _wrapped(
             [(severity, head, "; ".join(texts)) for (severity, head), texts in joined.items()],
@@ -356,16 +356,16 @@ def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool)
     return lines[: max(0, room)]
 
 
-def _wrapped(told: Sequence[tuple[Severity, str, str]], width: int) -> list[Line]:
+def _wrapped(alarms: Sequence[tuple[Severity, str, str]], width: int) -> list[Line]:
     return [
         [Piece(part, _SEVERITIES[severity])]
-        for severity, head, text in told
+        for severity, head, text in alarms
         for part in textwrap.wrap(head + text, width, subsequent_indent="  ")
     ]
 
 
 def _measure(esc: EscMonitor, quantity: Quantity, width: int) -> tuple[str, str]:
-    """A value and its style; beyond its limits it is marked, for those who see no colours."""
+    """A value and its style; beyond its limits it is marked, for displays without colour."""
     value = esc.number(quantity.source)
     text = number(value, quantity.digits, width)
     if value is None:
@@ -379,7 +379,7 @@ def _measure(esc: EscMonitor, quantity: Quantity, width: int) -> tuple[str, str]
 
 
 class _Row(NamedTuple):
-    """A line of the details: what it is, its unit, its cell for an ESC, how soon it is left out (greatest first)."""
+    """A line of the details: name, unit, cell for an ESC, rank for leaving it out (greatest first)."""
 
     label: str
     unit: str
@@ -393,7 +393,7 @@ def _details(escs: Sequence[EscMonitor], size: tuple[int, int], glyphs: Glyphs) 
     rows = _rows(escs, glyphs)
     alarms = _alarm_lines(escs, (width, 99), len(escs) > 1)
     kept = max(1, min(4, len(alarms)))
-    while len(rows) > max(1, height - kept - 1):  # one line parts values and alarms
+    while len(rows) > max(1, height - kept - 1):  # one line separates values and alarms
         rows.remove(max(rows, key=lambda row: row.rank))
     lines: list[Line] = []
     for row in rows:
@@ -473,7 +473,7 @@ def _rows(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Row]:
 
 
 def _cell_of(quantity: Quantity, glyphs: Glyphs) -> Callable[[EscMonitor, int], Line]:
-    """The cell of a measured value: now, its bar, least, greatest."""
+    """The cell of a measured value: present value, bar, minimum, maximum."""
 
     def cell(esc: EscMonitor, width: int) -> Line:
         now, bars, ends = _widths(width)
@@ -499,7 +499,7 @@ def _cell_of(quantity: Quantity, glyphs: Glyphs) -> Callable[[EscMonitor, int], 
 
 
 def _widths(width: int) -> tuple[int, int, int]:
-    """Columns of a value, its bar, and each of its extremes; 0 where there is no room for them."""
+    """Widths of a value, its bar, and each of its extremes; 0 where it does not fit."""
     now, ends = (9, 8) if width >= 40 else (7, 6)
     if now + 2 * ends + 2 > width:
         return now, max(0, width - now - 1), 0
@@ -512,15 +512,15 @@ def _padded(line: Line, width: int) -> Line:
 
 
 def age_text(milliseconds: float) -> str:
-    """How old data is."""
+    """The age of data, in words."""
     return f"{milliseconds:.0f} ms" if milliseconds < 10_000 else duration(milliseconds / 1000)
 
 
-# --- the table of many
+# --- the table of many ESCs
 
 
 class _Column(NamedTuple):
-    """A column of the table: two heads, width, what stands in both lines, how soon it is left out (greatest first)."""
+    """A column of the table: two heads, width, cells of both lines, rank for leaving it out (greatest first)."""
 
     heads: tuple[str, str]
     width: int
@@ -529,7 +529,7 @@ class _Column(NamedTuple):
     rank: int
     left: bool = False
     grows: bool = False
-    """True where it takes what is left of the width."""
+    """True where it takes the remaining width."""
 
 
 def _table(escs: Sequence[EscMonitor], size: tuple[int, int], glyphs: Glyphs) -> list[Line]:
@@ -543,9 +543,9 @@ def _table(escs: Sequence[EscMonitor], size: tuple[int, int], glyphs: Glyphs) ->
         for column in columns
     ]
     alarms = _alarm_lines(escs, (width, 99), True)
-    least = 2 if alarms else 1
-    two = 2 + 2 * len(escs) + least <= height
-    spare = height - 2 - 2 * len(escs) - least - 1
+    foot = 2 if alarms else 1
+    two = 2 + 2 * len(escs) + foot <= height
+    spare = height - 2 - 2 * len(escs) - foot - 1
     lines: list[Line] = [
         _table_line([[Piece(c.heads[0], FAINT)] for c in columns], columns, glyphs)
     ]
@@ -605,7 +605,7 @@ def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
             Piece(f"{percent} %".rjust(6), "" if value is not None else FAINT),
         ]
 
-    def measured(source: str, head: str, width: int, rank: int, least: bool = False) -> _Column:
+    def measured(source: str, head: str, width: int, rank: int, lowest: bool = False) -> _Column:
         quantity = QUANTITY[source]
 
         def now(esc: EscMonitor) -> Line:
@@ -613,10 +613,10 @@ def _columns(escs: Sequence[EscMonitor], glyphs: Glyphs) -> list[_Column]:
 
         def end(esc: EscMonitor) -> Line:
             spread = esc.spreads[source]
-            value = spread.low if least else spread.high
+            value = spread.low if lowest else spread.high
             return [Piece(number(value, quantity.digits, width), FAINT if value is None else "")]
 
-        return _Column((head, "min" if least else "max"), width, now, end, rank)
+        return _Column((head, "min" if lowest else "max"), width, now, end, rank)
 
     def count(source: str, digits: int) -> Callable[[EscMonitor], Line]:
         def cell(esc: EscMonitor) -> Line:

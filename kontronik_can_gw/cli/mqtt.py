@@ -1,4 +1,4 @@
-"""``mqtt``: publish what the gateway's frames on the bus say to an MQTT broker. It listens to the bus and sends nothing on it."""
+"""``mqtt``: publishes the values in the gateway's frames to an MQTT broker. It listens to the bus and sends nothing on it."""
 
 import argparse
 import logging
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 log = logging.getLogger("kontronik_can_gw")
 
 _TURN_S = 0.1
-"""A signal is noticed after so long at the latest."""
+"""Maximum delay until a signal is noticed."""
 _STOP_S = 0.3
 _LAST_S = 2.0
-"""At the end of a recording: for what is still to be sent."""
+"""Time at the end of a recording to send pending messages."""
 _PAUSE_S = 5
-"""Before the end of a service that cannot start."""
+"""Pause before the end of a service that cannot start."""
 _FILES = ("ca_file", "cert_file", "key_file", "password_file")
 _DEFAULT_DISCOVERY = "homeassistant"
 
@@ -96,17 +96,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=_DEFAULT_DISCOVERY,
         metavar="PREFIX",
-        help="tell Home Assistant of each value (prefix, default homeassistant)",
+        help="announce each value to Home Assistant (prefix, default homeassistant)",
     )
     what.add_argument(
         "--remove-discovery",
         action="store_true",
-        help="clear what the broker keeps of this gateway for Home Assistant, and end; if it is offline, its own topics too",
+        help="clear the broker's retained discovery of this gateway and end; if the gateway is offline, its own topics too",
     )
     parser.epilog = (
-        "The password is never given on the command line, where everybody could read it. A broker that is missing, goes away or does "
-        "not want us is told of once, and tried again for ever. SIGTERM and SIGINT publish 'offline' and end it within half a second. "
-        "link_state is as the bus last told it, in a message of its own: behind a gap it may still say Lost for up to that message's "
+        "The password is never given on the command line, where everybody could read it. A broker that is missing, lost or refuses "
+        "the connection is reported once, and tried again for ever. SIGTERM and SIGINT publish 'offline' and end it within half a second. "
+        "link_state is the last one on the bus, where it has its own message: after a gap it may still be Lost for up to that message's "
         "cycle while available is already true."
     )
 
@@ -132,7 +132,7 @@ def main(args: argparse.Namespace) -> int:
             refused = error
             for problem in error.problems:
                 log.error("%s", problem)
-    # the service manager starts us again: not ten times a second, for what a person has to mend
+    # the service manager restarts it: not ten times a second for a mistake that a user has to correct
     notifier.status(f"cannot start: {refused.problems[0]}")
     time.sleep(_PAUSE_S)
     return refused.exit_code
@@ -171,13 +171,13 @@ def _main(args: argparse.Namespace, notifier: "Notifier") -> int:
 
 
 def host_name() -> str:
-    """The host's name without its domain, as it can be part of a topic."""
+    """The host name without its domain, made valid for a topic."""
     name = re.sub(r"[^A-Za-z0-9_-]+", "-", socket.gethostname().partition(".")[0]).strip("-")
     return name[:64] or "gateway"
 
 
 def _settings(args: argparse.Namespace, bus: "BusLayout | None") -> MqttConfig:
-    """The table of the configuration, with its files where they are, and the options over it. UserError with every mistake."""
+    """The [mqtt] table with absolute file names, overridden by the options. UserError with every mistake."""
     table = MqttConfig()
     if bus is not None and bus.config is not None:
         table = bus.config.mqtt
@@ -229,7 +229,7 @@ def _broker(settings: MqttConfig, topics: "Topics") -> "Broker":
 
 
 def _remove(broker: "Broker", topics: "Topics", discovery: str) -> int:
-    """Clear the retained discovery; of a gateway that is not online its other retained topics too."""
+    """Clear the retained discovery, and all other retained topics of a gateway that is not online."""
     from kontronik_can_gw.desk.mqtt.client import remove
     from kontronik_can_gw.desk.mqtt.messages import OFFLINE, is_ours
 
@@ -239,7 +239,7 @@ def _remove(broker: "Broker", topics: "Topics", discovery: str) -> int:
         kept[topic] = payload
         return topic.startswith(f"{discovery}/") and is_ours(payload, topics)
 
-    # a client id of its own: it throws nobody out
+    # its own client id, so that no other client is disconnected
     by_hand = replace(broker, client_id=f"{broker.client_id}-remove")
     removed = remove(by_hand, [f"{discovery}/device/+/config", f"{topics.base}/#"], wanted)
     if kept.get(topics.online) == OFFLINE:
@@ -254,22 +254,22 @@ def _remove(broker: "Broker", topics: "Topics", discovery: str) -> int:
 
 
 class _Source(Protocol):
-    """Where frames come from."""
+    """A source of frames."""
 
     is_replay: bool
 
     @property
     def problem(self) -> str:
-        """What is wrong with it, in a line; else empty."""
+        """One line on its fault, else empty."""
 
     @property
     def bus(self) -> "BusLayout": ...
 
     def begin(self, keys: frozenset[int], wait: bool) -> bool:
-        """Open it; False where that is to be tried again."""
+        """Open it; False: try again later."""
 
     def receive(self, seconds: float) -> "tuple[int, list[tuple[int, CanFrame]]] | None":
-        """The time now, and frames with their times; waits so long at most. None at the end."""
+        """The present time, and frames with their times; waits at most ``seconds``. None at the end."""
 
     def wall_ns(self, now: int) -> int: ...
 
@@ -298,7 +298,7 @@ def _source(args: argparse.Namespace, bus: "BusLayout | None") -> _Source:
 
 
 class _Bus:
-    """The CAN bus."""
+    """Frames from the CAN bus."""
 
     is_replay = False
 
@@ -358,7 +358,7 @@ class _Bus:
 
 
 class _Recording:
-    """A recording, in its own time: ``now`` is that of the recording."""
+    """Frames from a recording in real time; ``now`` is on the recording's clock."""
 
     is_replay = True
     problem = ""
@@ -370,7 +370,7 @@ class _Recording:
         )
         self._next: tuple[int, CanFrame] | None = None
         self._ahead = 0
-        """What the recording's clock shows more than ours."""
+        """Offset of the recording's clock to ours."""
 
     @property
     def bus(self) -> "BusLayout":
@@ -410,7 +410,7 @@ class _Recording:
 
 
 class _Run:
-    """From the source to the broker, until a signal or the end of the source."""
+    """Publishes from the source to the broker, until a signal or the end of the source."""
 
     def __init__(
         self,
@@ -464,7 +464,7 @@ class _Run:
         self._stopping = True
 
     def _turn(self) -> bool:
-        """Take what has come, publish what is due. False at the end of the source."""
+        """Receive frames, publish due messages. False at the end of the source."""
         publisher, source = self._publisher, self._source
         came = source.receive(self._wait_s())
         if came is None:
@@ -489,7 +489,7 @@ class _Run:
         )
 
     def _supervise(self) -> None:
-        """What is wrong with the bus, the sign of life, and whether the other thread lives."""
+        """Report faults of the bus, feed the watchdog, and check that the client's thread is alive."""
         now = time.monotonic_ns()
         if problem := self._source.problem:
             self._conditions.begin("CAN", problem, now)

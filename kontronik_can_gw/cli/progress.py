@@ -1,4 +1,4 @@
-"""A bar on standard error that tells how far a long work is: rate and time left."""
+"""A progress bar on standard error with rate and remaining time."""
 
 import sys
 from typing import Self
@@ -7,9 +7,9 @@ from kontronik_can_gw.printable import printable
 
 
 class Progress:
-    """A bar, where a person looks on; else nothing. ``size``: bytes in all, None where nobody knows.
+    """A progress bar on a terminal, otherwise nothing. ``size``: total bytes, None where unknown.
 
-    ``data_on_screen``: the data itself goes to standard output, so that a bar on the same screen would be in its way.
+    ``data_on_screen``: data is written to standard output, so there is no bar if that is the same terminal.
     """
 
     def __init__(self, name: str, size: int | None, data_on_screen: bool = True) -> None:
@@ -48,15 +48,15 @@ class Progress:
 
     @property
     def is_shown(self) -> bool:
-        """True where a bar is on the screen."""
+        """True if the bar is visible."""
         return self._progress is not None
 
     def advance(self, size: int) -> None:
-        """So many bytes more are done."""
+        """Add ``size`` processed bytes."""
         if self._progress is not None:
             self._progress.advance(self._task, size)
 
     def reach(self, position: int) -> None:
-        """So many bytes are done in all."""
+        """Set the number of processed bytes."""
         if self._progress is not None:
             self._progress.update(self._task, completed=position)

@@ -1,4 +1,4 @@
-"""From a configuration to the recorder of a gateway."""
+"""Makes the recorder of a gateway from its configuration."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ _STATE = "state"
 
 
 def record_folder(config: Config, given: Path | None = None) -> Path | None:
-    """Where captures go: what was given on the command line, or what the configuration says; None where nothing is recorded."""
+    """The folder of captures, from the command line or the configuration; None: nothing is recorded."""
     if given is not None or config.record.directory is None:
         return given
     if config.record.directory == _STATE:
@@ -23,7 +23,7 @@ def record_folder(config: Config, given: Path | None = None) -> Path | None:
 
 
 def in_words(config: Config, folder: Path) -> str:
-    """Where recordings go and what is written, in a line."""
+    """Folder and limits of the captures, in a line."""
     record = config.record
     words = f"{folder}, parts of {record.part_mb} MB or {record.part_minutes} min"
     words += f", {record.keep_mb} MB in all" if record.keep_mb else ""
@@ -31,7 +31,7 @@ def in_words(config: Config, folder: Path) -> str:
 
 
 def recorder_of(config: Config, given: Path | None) -> Recorder | None:
-    """The recorder; None where nothing is to be recorded."""
+    """The recorder; None if nothing is recorded."""
     record = config.record
     folder = record_folder(config, given)
     if folder is None:
@@ -48,7 +48,7 @@ def recorder_of(config: Config, given: Path | None) -> Recorder | None:
 
 
 def setup_of(loaded: Loaded) -> CaptureSetup:
-    """What the header of a capture holds of a configuration."""
+    """The configuration as stored in the header of a capture."""
     config = loaded.config
     dbc = None
     if config.dbc.enabled:

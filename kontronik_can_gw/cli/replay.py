@@ -1,4 +1,4 @@
-"""``kontronik-can-gw replay``: what was recorded, once more: on a CAN bus, on pseudo terminals, or as a log."""
+"""``kontronik-can-gw replay``: plays a recording on a CAN bus, on pseudo terminals, or as a log."""
 
 import argparse
 import sys
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.can_port import CanPort
 
 EPILOG = """\
-FILE is a capture (.kcap; a folder, or the beginning of the names of one run's, for all its parts), a file of plain UART
+FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
 bytes, or a CAN log (candump, ASC, BLF, TRC, MF4); a pipe, or - for standard input, is read to its end first. A capture
-goes through the gateway's core with the recorded clock: frames and times are those that the live gateway sent, bit for
+is replayed through the gateway's core with the recorded clock: frames and times equal those of the live gateway bit for
 bit.
 
---to can  sends the frames on a CAN bus. They are old: the message with the gateway's state says Replay (GatewayState),
-          unless --unmarked says that they are to be exactly as recorded. Refused where a gateway of this machine sends the same
-          messages. Frames that the gateway had received are not sent; of a CAN log all frames are.
+--to can  sends the frames on a CAN bus. The gateway's state in them is set to Replay (GatewayState), since they are old;
+          with --unmarked they are sent exactly as recorded. Refused while a gateway on this machine sends the same messages.
+          Frames that the gateway had received are not sent; of a CAN log all frames are.
 --to pty  plays an ESC's bytes on a pseudo terminal, one for each ESC, for a gateway to read: prints "esc1 /dev/pts/5".
 --to log  writes the frames to -o FILE (.log, .asc, .blf, .trc, .mf4), or as a candump log to standard output, as fast as
           possible.
@@ -133,7 +133,7 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     suffix = Path(name).suffix
     if name != "-" and suffix not in SUFFIXES:
         raise UserError(
-            f"{name}: what log it is to be is told by its ending: {', '.join(SUFFIXES)}"
+            f"{name}: the ending of its name selects the format of the log: {', '.join(SUFFIXES)}"
         )
     target = Path(name)
     if name != "-" and target.exists():
@@ -162,7 +162,7 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
                 if pace.stopped:
                     break
                 time_ns = item.time_ns
-                if wall is not None:  # by the clock as it was then: it may have been set
+                if wall is not None:  # the wall clock of that time; it may have been set since
                     time_ns = (recording.wall_ns(time_ns) or wall) - wall + start
                 last = max(last, time_ns)
                 writer.write(last, item.frame, item.received)
@@ -205,7 +205,7 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     marker = Marker(layout)
     if not args.unmarked and not marker.can_mark:
         say(
-            "warning: no message of this DBC tells the gateway's state: nobody can see that it is a replay"
+            "warning: no message of this DBC has the gateway's state, so receivers cannot recognize the replay"
         )
     locks = Locks()
     if interface != "virtual":
@@ -221,7 +221,7 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     port = CanPort(can)
     count = 0
     try:
-        # a capture's core marks its frames itself, those of a log are changed one by one
+        # the core marks the frames of a capture itself; those of a log are changed one by one
         frames = recording.frames() if capture is None else capture.frames(marked=not args.unmarked)
         changed = capture is None and not args.unmarked
         for time_ns, frame, received in frames:
@@ -239,11 +239,11 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
 
 
 _BUSY_S = 0.0005
-_LONGEST_BUSY_S = 5
+_MAX_BUSY_S = 5
 
 
 def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> None:
-    """Hand over one frame; what is full is waited for. RunError where the bus takes nothing any more."""
+    """Send one frame; wait while the queue is full. RunError where the bus accepts no frames any more."""
     import time
 
     from kontronik_can_gw.transmit_queue import Sent
@@ -254,9 +254,9 @@ def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> Non
             raise RunError(f"CAN {channel}: went down, or away.")
         if pace.stopped:
             return
-        if time.monotonic() - since > _LONGEST_BUSY_S:
+        if time.monotonic() - since > _MAX_BUSY_S:
             raise RunError(
-                f"CAN {channel}: no frame can be sent for {_LONGEST_BUSY_S} s: nobody acknowledges, or the bus is full."
+                f"CAN {channel}: no frame can be sent for {_MAX_BUSY_S} s: nobody acknowledges, or the bus is full."
             )
         time.sleep(_BUSY_S)
 
@@ -304,7 +304,7 @@ def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
 
 
 _DRAIN_S = 0.2
-"""For a gateway to read the last bytes before the terminals go."""
+"""Time for a gateway to read the last bytes before the terminals are closed."""
 
 
 def _chunks(recording: "Input") -> "Iterator[tuple[int, int, bytes]]":

@@ -1,4 +1,4 @@
-"""``kontronik-can-gw report``: a recorded flight as one page for a browser."""
+"""``kontronik-can-gw report``: writes a recorded flight as one page for a browser."""
 
 import argparse
 from pathlib import Path
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from kontronik_can_gw.desk.report.analysis import Analysis
 
 EPILOG = """\
-IN is a capture (.kcap; a folder, or the beginning of the names of one run's, for all its parts), a file of plain UART bytes,
-or a CAN log (candump, ASC, BLF, TRC, MF4). Of a CAN log, say with -c or --dbc what the frames mean.
+IN is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
+bytes, or a CAN log (candump, ASC, BLF, TRC, MF4). For a CAN log give the DBC of its frames with -c or --dbc.
 
 The page is one file that needs no network: a summary (energy, charge, extremes with their time, cell voltage sag, quality
-of the data), plots with zoom, the operating states, errors with meaning and remedy. Several ESCs lie over each other.
-Numbers and events are of every row. Lines are thinned to --points points in a way that keeps every peak and every gap.
+of the data), plots with zoom, the operating states, errors with meaning and remedy. Several ESCs share the plots.
+Numbers and events are from every row. Lines are reduced to --points points in a way that keeps every peak and every gap.
 The same recording gives the same page, byte for byte. A file that exists is only replaced with --force.
 
 examples:
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="start",
         type=_seconds,
         metavar="S",
-        help="from so many seconds after the start",
+        help="begin at this time in seconds after the start",
     )
     parser.add_argument(
         "--to",
@@ -65,12 +65,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="end",
         type=_seconds,
         metavar="S",
-        help="up to so many seconds after the start",
+        help="end at this time in seconds after the start",
     )
 
 
 def main(args: argparse.Namespace) -> int:
-    """Report on args.input. UserError for wrong usage, RunError where something cannot be read or written."""
+    """Report on args.input. UserError for wrong usage, RunError where a file cannot be read or written."""
 
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.common import say, write_output
@@ -122,7 +122,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _check_target(source: Path, output: str, *, force: bool) -> None:
-    """UserError where the page cannot be written, or is there."""
+    """UserError where the page cannot be written, or exists."""
     from kontronik_can_gw.errors import UserError
 
     if output == "":
@@ -142,7 +142,7 @@ def _check_target(source: Path, output: str, *, force: bool) -> None:
 
 
 def _read(recording: "Input", analysis: "Analysis", name: str, data_on_screen: bool) -> bool:
-    """All rows into the analysis; False where a person stopped it."""
+    """Feed all rows to the analysis; False if the user stopped it."""
     from kontronik_can_gw.cli.common import say
     from kontronik_can_gw.cli.progress import Progress
 

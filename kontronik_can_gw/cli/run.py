@@ -1,4 +1,4 @@
-"""``run``: the gateway."""
+"""``run``: runs the gateway."""
 
 import argparse
 import gc
@@ -23,9 +23,9 @@ log = logging.getLogger("kontronik_can_gw")
 
 _NEVER = (1 << 31) - 1
 _LOCK_SWITCH_S = 0.0005
-"""So long the loop waits for another thread of ours that computes, before it asks for the interpreter."""
+"""Interpreter switch interval: the longest time that the loop waits for another thread of the process."""
 _PAUSE_S = 5
-"""Before the end of a service that cannot start; a signal ends it at once."""
+"""Pause before the end of a service that cannot start; a signal ends it at once."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--status",
         type=number_from(0.1, 1e6),
         metavar="SECONDS",
-        help="log a line about telemetry, CAN, NMT states and PDO traffic every so many seconds (default: changes only)",
+        help="log a line about telemetry, CAN, NMT states and PDO traffic at this interval in seconds (default: changes only)",
     )
     parser.add_argument(
         "--record",
@@ -77,14 +77,14 @@ def main(args: argparse.Namespace) -> int:
                 log.error("%s", problem)
     if refused is None:
         return 0
-    # the service manager starts us again: not ten times a second, for what a person has to mend
+    # the service manager restarts it: not ten times a second for a mistake that a user has to correct
     notifier.status(f"cannot start: {refused.problems[0]}")
     time.sleep(_PAUSE_S)
     return refused.exit_code
 
 
 class _Run:
-    """The gateway, from its configuration to its end."""
+    """Runs the gateway, from its configuration to its end."""
 
     def __init__(self, args: argparse.Namespace, notifier: "Notifier") -> None:
         from kontronik_can_gw.runtime.snapshot import program_facts
@@ -99,7 +99,7 @@ class _Run:
         self._stopping = False
 
     def main(self) -> None:
-        """Until a signal ends it."""
+        """Run until a signal ends it."""
         sys.setswitchinterval(_LOCK_SWITCH_S)
         with stopping_on_signals(self._stop, is_service=True):
             loop = self._opened()
@@ -113,7 +113,7 @@ class _Run:
             self._loop.stop()
 
     def _opened(self) -> "Loop":
-        """The loop, with everything open that it needs; the DBC's own tree goes with the end of this method."""
+        """The loop with everything open. The parsed DBC is freed at the end of this method."""
         from kontronik_can_gw.cli.recording import in_words, record_folder, recorder_of, setup_of
         from kontronik_can_gw.gateway import Gateway
         from kontronik_can_gw.runtime import realtime
@@ -133,7 +133,7 @@ class _Run:
             except RunError as error:
                 if not wait:
                     raise
-                log.error("%s Running without.", error)  # a late frame is better than none
+                log.error("%s Running without.", error)  # late frames are better than none
         silent = config.dbc.on_loss == "silent"
         created_ns = time.monotonic_ns()
         parts = (loaded.escs, loaded.layout, created_ns, silent, loaded.canopen)
@@ -159,7 +159,7 @@ class _Run:
             program=self._program,
             recorder=recorder,
         )
-        # first: a damaged file is moved aside by now, and must not go unsaid
+        # first, because a damaged file is moved aside by now and must be reported
         _say_parameters(loaded)
         folder = record_folder(config, self._record)
         if recorder is not None and folder is not None:
@@ -172,16 +172,16 @@ class _Run:
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
         self._loop = loop
-        if self._stopping:  # a signal came while there was no loop
+        if self._stopping:  # a signal came before the loop existed
             loop.stop()
         return loop
 
 
 def settle_memory() -> None:
-    """What is there now stays: no collection of garbage ever walks through it again.
+    """Freeze all present objects, so that garbage collections never scan them again.
 
-    The hot path makes no objects that refer to each other in a circle (tests/runtime/test_garbage.py), so only what is young is looked
-    through now and then; the whole only here, at the start.
+    The hot path makes no reference cycles (tests/runtime/test_garbage.py), so later collections only scan the young generation; a full
+    collection runs only here, at the start.
     """
     gc.collect()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""``schema``: the JSON Schema of the configuration, for editors."""
+"""``schema``: prints the JSON Schema of the configuration, for editors."""
 
 import argparse
 import json

@@ -1,6 +1,6 @@
-"""``service``: the gateway as a systemd service: installed, looked at, removed.
+"""``service``: installs the gateway as a systemd service, shows its state, removes it.
 
-Without --root it works on this machine, as root, and calls systemd's tools; with it only files below that folder are touched.
+Without --root it works on this machine, as root, and calls systemd's tools; with it only files below that folder are changed.
 """
 
 import argparse
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--root",
             type=Path,
             metavar="DIR",
-            help="only write below DIR, as for an image; call nothing",
+            help="only write below DIR, as for a disk image; call no tools",
         )
         sub.add_argument(
             "--dry-run", "--print", action="store_true", help="only show what would be done"
@@ -193,7 +193,7 @@ def _install(args: argparse.Namespace) -> int:
 
 
 def _enable(args: argparse.Namespace, own: Path, live: bool, root: Path) -> int:
-    """Enable it, and start it if that is wanted, once its configuration can be used."""
+    """Enable the service, and start it with --now, if its configuration is usable."""
     unit = files.unit(args.instance)
     if problems := _not_ready(own):
         then = f" When it is right: sudo systemctl enable --now {unit}" if live else ""
@@ -238,7 +238,7 @@ def _enable_unit(args: argparse.Namespace, unit: str, live: bool, root: Path, th
 
 
 def _not_ready(own: Path) -> list[str]:
-    """Why the service must not send yet: its configuration is faulty, or the example that nobody has edited."""
+    """Why the service must not send yet: its configuration is faulty, or the unedited example."""
     import tomllib
 
     from kontronik_can_gw.config.keys import parse
@@ -274,7 +274,7 @@ def _example() -> str:
 
 
 def _remove_examples(root: Path, channel: str) -> None:
-    """The active network file takes the place of its example."""
+    """Remove the examples that active network files replace."""
     for path in files.installed(root):
         if path.name.endswith(f"-{channel}.network.{files.EXAMPLE}") or path.name.endswith(
             f"-{channel}.link.{files.EXAMPLE}"

@@ -1,6 +1,6 @@
-"""The files that ``service`` installs: what is in them, where they go, and whether somebody changed them since.
+"""The files that ``service`` installs: content, place, and whether they were changed since.
 
-The first line of each holds a checksum of the rest, so that a file of ours can be told from one that was changed, without any record.
+The first line of each holds a checksum of the rest, which shows later changes.
 """
 
 import contextlib
@@ -29,11 +29,11 @@ _NETWORK_PREFIX = f"50-{NAME}-"
 _HEAD = re.compile(rf'# Written by "{NAME} service install" \S+, checksum ([0-9a-f]{{64}})\.')
 _PLACEHOLDER = re.compile(r"@[A-Z]+@")
 _SERIAL_GROUPS = ("dialout", "uucp")
-"""Debian's name of the group that owns serial ports, and Arch's."""
+"""Groups that own serial ports, on Debian and on Arch."""
 
 
 class State(Enum):
-    """What is where a file goes."""
+    """State of a file's place."""
 
     MISSING = "new"
     SAME = "as it is"
@@ -43,13 +43,13 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class PlannedFile:
-    """A file below the root, with its whole text."""
+    """A file below the root, with its text."""
 
     path: str
     text: str
 
     def state(self, root: Path) -> State:
-        """Compare with what is there. RunError where that cannot be read."""
+        """Compare with the present file. RunError where it cannot be read."""
         found = read(root / self.path)
         if found is None:
             return State.MISSING
@@ -60,37 +60,37 @@ class PlannedFile:
 
 @dataclass(frozen=True)
 class Choices:
-    """What the files depend on."""
+    """Parameters of the files."""
 
     executable: str
     home_visible: bool
-    """The program is below a home folder."""
+    """True if the program is below a home folder."""
     group: str
-    """That owns serial ports."""
+    """Group that owns serial ports."""
     channel: str = "can0"
     bitrate: int | None = None
-    """None: the network files are examples only."""
+    """CAN interface; None: the network files are examples only."""
     prometheus: bool = False
     mqtt: bool = False
 
 
 def unit(instance: str | None) -> str:
-    """Name the service of an instance; of the plain one for None."""
+    """Name of an instance's service; None: the plain one."""
     return f"{NAME}.service" if instance is None else f"{NAME}@{instance}.service"
 
 
 def mqtt_unit(instance: str | None) -> str:
-    """Name the service that publishes for an instance, for the plain one for None."""
+    """Name of an instance's MQTT service; None: the plain one."""
     return f"{NAME}-mqtt.service" if instance is None else f"{NAME}-mqtt@{instance}.service"
 
 
 def configuration(instance: str | None) -> str:
-    """The configuration's path below the root."""
+    """Path of the configuration below the root."""
     return f"{CONFIGURATIONS}/{instance or 'gateway'}.toml"
 
 
 def planned(choices: Choices, root: Path) -> list[PlannedFile]:
-    """All files, in the order in which they are written. An active network file is not joined by an example."""
+    """All files in the order of writing. Active network files have no examples."""
     common = {
         "EXECUTABLE": choices.executable,
         "GROUP": choices.group,
@@ -140,7 +140,7 @@ def planned(choices: Choices, root: Path) -> list[PlannedFile]:
 
 
 def installed(root: Path) -> list[Path]:
-    """Every file that an install may have written and that is there."""
+    """Every existing file that an install may have written."""
     patterns = (
         SYSUSERS,
         TMPFILES,
@@ -161,26 +161,26 @@ def installed(root: Path) -> list[Path]:
 
 
 def serial_group(root: Path) -> str:
-    """The group that owns serial ports on this system."""
+    """Group that owns serial ports on this system."""
     text = read(root / "etc/group") or ""
     groups = {line.split(":")[0] for line in text.splitlines()}
     return next((group for group in _SERIAL_GROUPS if group in groups), _SERIAL_GROUPS[0])
 
 
 def template(name: str) -> str:
-    """A file that comes with the package."""
+    """A template shipped with the package."""
     return (Path(__file__).parent.parent / "service" / name).read_text(encoding="utf-8")
 
 
 def is_ours(text: str) -> bool:
-    """True for a text that is as an install wrote it."""
+    """True for a text that is unchanged since an install wrote it."""
     head, _, body = text.partition("\n")
     found = _HEAD.fullmatch(head)
     return found is not None and found[1] == _checksum(body)
 
 
 def read(path: Path) -> str | None:
-    """The text of a file, None where there is none."""
+    """The text of a file; None where it does not exist."""
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:
@@ -190,7 +190,7 @@ def read(path: Path) -> str | None:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a file that all may read, with the folders above it; all or nothing."""
+    """Write a world-readable file and its folders, atomically."""
     beside: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
@@ -211,7 +211,7 @@ def write(path: Path, text: str) -> None:
 
 
 def check_inside(root: Path, paths: Iterable[Path]) -> None:
-    """RunError where a symbolic link in an image leads out of it, as one to /etc does: the files would be written to this machine."""
+    """RunError where a symbolic link leads out of the root, as one to /etc does: files would be written to this machine."""
     top = root.resolve()
     for path in paths:
         if not path.parent.resolve().is_relative_to(top):
@@ -219,7 +219,7 @@ def check_inside(root: Path, paths: Iterable[Path]) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a symbolic link, and say so. RunError where that fails."""
+    """Remove a file or a symbolic link and print it. RunError on failure."""
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
@@ -228,7 +228,7 @@ def remove(path: Path) -> None:
 
 
 def put_aside(path: Path) -> Path:
-    """Keep a file as .bak, in place of an older one."""
+    """Rename a file to .bak, replacing an older one."""
     kept = path.with_name(path.name + ".bak")
     try:
         path.replace(kept)

@@ -1,4 +1,4 @@
-"""The machine that ``service`` works on: systemd's tools, the service's user, and whether it could run the program."""
+"""The machine that ``service`` works on: systemd's tools, the service's user, and access to the program."""
 
 import contextlib
 import os
@@ -15,14 +15,16 @@ from kontronik_can_gw.errors import RunError, UserError
 _EXECUTABLE = re.compile(r"/[\w/.+@~=,:-]+")
 _HOMES = ("/home", "/root", "/run/user")
 _BOOTED = Path("/run/systemd/system")
-"""There where systemd runs (sd_booted)."""
-_HIDDEN = ("/tmp", "/var/tmp")  # noqa: S108  the service has its own, by PrivateTmp=
+"""Exists where systemd runs (sd_booted)."""
+_HIDDEN = ("/tmp", "/var/tmp")  # noqa: S108  the service has its own (PrivateTmp=)
 
 
 def check_rights(live: bool, root: Path, action: str) -> None:
     if not live:
         if not root.is_dir():
-            raise UserError(f"{root}: is not a folder. --root names the top of an image.")
+            raise UserError(
+                f"{root}: is not a folder. --root names the top folder of a disk image."
+            )
         return
     check_systemd()
     if os.geteuid() != 0:
@@ -34,7 +36,7 @@ def check_rights(live: bool, root: Path, action: str) -> None:
 def check_systemd() -> None:
     if not _BOOTED.is_dir():
         raise RunError(
-            "this system does not run systemd. Files for an image: --root DIR. Without systemd: run --wait"
+            "this system does not run systemd. For a disk image: --root DIR. Without systemd: run --wait"
         )
 
 
@@ -54,9 +56,7 @@ def run(*words: str) -> "subprocess.CompletedProcess[str]":
     except OSError as error:
         raise RunError(f"{words[0]}: cannot be started: {error.strerror}") from None
     except subprocess.TimeoutExpired:
-        raise RunError(
-            f"`{' '.join(words)}` does not end. It was given up after two minutes."
-        ) from None
+        raise RunError(f"`{' '.join(words)}` did not end within two minutes.") from None
 
 
 def output(*words: str) -> str:
@@ -64,7 +64,7 @@ def output(*words: str) -> str:
 
 
 def call(*words: str) -> None:
-    """Call a tool that must do its work. RunError with what it said."""
+    """Call a tool. RunError with its output where it fails."""
     done = run(*words)
     if done.returncode:
         said = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [
@@ -93,13 +93,13 @@ def make_user(group: str) -> None:
 
 
 def make_lock_folder() -> None:
-    """Now; from the next start of the machine on systemd does it."""
+    """Create the lock folder now; after the next start of the machine systemd does it."""
     if shutil.which("systemd-tmpfiles"):
         call("systemd-tmpfiles", "--create", f"/{TMPFILES}")
 
 
 def reload_devices() -> None:
-    """Let the rules act on what is plugged in already."""
+    """Apply the udev rules to devices that are plugged in already."""
     if shutil.which("udevadm") is None:
         say("no udevadm here: the udev rules act after the next start")
         return
@@ -120,7 +120,7 @@ def reload_network(channel: str) -> None:
 
 
 def own_executable() -> str:
-    """The installed program that belongs to this Python. UserError where there is none."""
+    """Path of the installed program of this Python. UserError where there is none."""
     import sysconfig
 
     for folder in (
@@ -134,7 +134,7 @@ def own_executable() -> str:
 
 
 def check_executable(executable: str, root: Path) -> bool:
-    """True if it is below a home folder. UserError where the service could not run it."""
+    """True if the program is below a home folder. UserError if the service could not run it."""
     if not _EXECUTABLE.fullmatch(executable) or ".." in Path(executable).parts:
         raise UserError(
             f"{executable}: must be an absolute path without spaces, quotes, % and the like: --executable"
@@ -162,7 +162,7 @@ def check_executable(executable: str, root: Path) -> bool:
 
 
 def _needed(program: Path) -> list[Path]:
-    """What is read to run it: the program, its interpreter, and the package if it is the one that runs now."""
+    """Files needed to run the program: itself, its interpreter, and the package if it is this one."""
     needed = [program, program.resolve()]
     with contextlib.suppress(OSError):
         first = program.open("rb").readline(4096).decode(errors="replace")
@@ -176,7 +176,7 @@ def _needed(program: Path) -> list[Path]:
 
 
 def closed_to_others(path: Path) -> Path | None:
-    """The folder or file on the way that others may not pass or read."""
+    """The first folder or file on the path without access for others; None: all are accessible."""
     for part in reversed([path, *path.parents]):
         with contextlib.suppress(OSError):
             if part.stat().st_mode & (1 if part.is_dir() else 4) == 0:

@@ -1,4 +1,4 @@
-"""``service uninstall``: stop, disable, and remove what an install wrote. What people wrote is kept."""
+"""``service uninstall``: stops, disables and removes what an install wrote. Files of the user are kept."""
 
 import argparse
 import contextlib
@@ -44,7 +44,7 @@ def uninstall(args: argparse.Namespace) -> int:
     for path in found:
         _remove_file(path)
     for kind in ("", "@"):
-        with contextlib.suppress(OSError):  # not there, or others' drop-ins are in it
+        with contextlib.suppress(OSError):  # missing, or it holds drop-ins of others
             (root / files.UNITS / f"{NAME}{kind}.service.d").rmdir()
     for path in doomed:
         _remove_tree(path)
@@ -98,7 +98,7 @@ def _kept_data(root: Path) -> list[Path]:
 
 
 def _remove_runtime_folders(root: Path, pattern: str) -> None:
-    """What the units keep when they stop."""
+    """Remove runtime folders that outlive the units."""
     held = (root / "proc/locks").read_text()
     for path in sorted((root / "run").glob(pattern)):
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""``service status``: what systemd and the journal know of the services, and their configurations."""
+"""``service status``: shows systemd's state of the services, their configurations and log lines."""
 
 import argparse
 import json
@@ -14,7 +14,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable
 
 NOT_RUNNING = 3
-"""Exit code, as systemctl's."""
+"""Exit code for "not running", as of systemctl."""
 _PRIORITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "", "debug")
 _WANTED = (
     "LoadState",
@@ -39,7 +39,7 @@ def status(args: argparse.Namespace) -> int:
 
 
 def _known_units() -> list[str]:
-    """The services that are loaded or enabled; the plain one is among them if there is no instance."""
+    """The loaded or enabled services; the plain one if there is no instance."""
     listed = output(
         "systemctl", "list-units", "--all", "--plain", "--no-legend", f"{NAME}@*.service"
     )
@@ -64,7 +64,7 @@ def properties(unit: str) -> dict[str, str]:
 
 
 def _show_unit(unit: str, lines: int) -> bool:
-    """Print what is known of a service; True if it runs."""
+    """Print the state of a service; True if it runs."""
     shown = properties(unit)
     state = shown.get("ActiveState", "unknown")
     if shown.get("LoadState") == "not-found":
@@ -125,11 +125,11 @@ def _log(unit: str, lines: int) -> list[str]:
 
 
 def _entry(text: str) -> str:
-    """A line for an entry of the journal; empty where it cannot be understood."""
+    """An entry of the journal as a line; empty where it is invalid."""
     try:
         entry = json.loads(text)
         message = entry["MESSAGE"]
-        if isinstance(message, list):  # bytes that are no text
+        if isinstance(message, list):  # bytes that are not UTF-8
             message = bytes(message).decode(errors="replace")
         time = datetime.fromtimestamp(int(entry["__REALTIME_TIMESTAMP"]) // 1_000_000).astimezone()
         word = _PRIORITIES[int(entry.get("PRIORITY", 6))]

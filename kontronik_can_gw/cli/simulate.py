@@ -1,4 +1,4 @@
-"""``kontronik-can-gw simulate``: ESCs on pseudo terminals, well-behaved or not."""
+"""``kontronik-can-gw simulate``: simulates ESCs on pseudo terminals, with or without faults."""
 
 import argparse
 import re
@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the motor never runs (default: a repeating flight of 50 s)",
     )
-    how.add_argument("--seconds", metavar="S", help="stop after so long (a TIME)")
+    how.add_argument("--seconds", metavar="S", help="stop after this TIME")
     how.add_argument(
         "--seed", metavar="N", default="0", help="seed of all that is random (default 0)"
     )
@@ -85,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where.add_argument(
         "--out",
         metavar="FILE",
-        help="write the bytes to FILE (- for standard output) as fast as can be, no pseudo terminal; {n} as for --link",
+        help="write the bytes to FILE (- for standard output) as fast as possible, no pseudo terminal; {n} as for --link",
     )
     faults = parser.add_argument_group("misbehaviour")
     faults.add_argument(
@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--flip-bits", metavar="SHARE", default="0", help="share of bits that are flipped"
     )
     faults.add_argument(
-        "--dropout", metavar="TIME/TIME", help="silence of so long in every so long: 2s/10s"
+        "--dropout", metavar="TIME/TIME", help="length and interval of silences: 2s/10s"
     )
     faults.add_argument(
         "--error",
@@ -146,7 +146,7 @@ def main(args: argparse.Namespace) -> int:
     for index in range(count):
         chosen = options[index % len(options)]
         assert chosen is not None
-        # Spread over the period, as ESCs know nothing of each other.
+        # Spread over the period, since real ESCs are not synchronized.
         escs.append(
             SimulatedEsc(chosen, seed=seed + index, start_ns=chosen.period_ns * index // count)
         )
@@ -260,7 +260,7 @@ def _to_terminals(escs: "list[SimulatedEsc]", link: str | None, seconds: float |
 
 
 def _discard_output() -> None:
-    """What is buffered for standard output has nowhere to go."""
+    """Discard the buffered standard output."""
     import os
     import sys
 
@@ -268,7 +268,7 @@ def _discard_output() -> None:
 
 
 class _Options:
-    """Reads option texts, gathers what is wrong with them."""
+    """Parses option texts and collects their mistakes."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         self._args = args
@@ -285,7 +285,7 @@ class _Options:
             return None
 
     def esc_options(self, number: int) -> "EscOptions | None":
-        """What the command line says of the ESC with this number, from 1."""
+        """Options of the ESC with this number, from 1."""
         from kontronik_can_gw.esc.kontronik import Device, Layout
         from kontronik_can_gw.esc.simulator import FLIGHT, IDLE, EscOptions, Faults
 
@@ -365,7 +365,7 @@ def _share(text: str) -> float:
 
 
 def _time(text: str) -> int:
-    """Nanoseconds."""
+    """A TIME in nanoseconds."""
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*(ms|s|min|h|)", text.strip())
     if not match:
         raise ValueError(f"{text!r} is not a time. Give for example 5s, 200ms or 2min")
@@ -376,7 +376,7 @@ def _time(text: str) -> int:
 
 
 def _choice(text: str, choices: dict[str, T]) -> T:
-    """The value under a name; case, ``-``, ``_`` and blanks do not matter."""
+    """The choice with this name; case, ``-``, ``_`` and blanks are ignored."""
     plain = {re.sub(r"[-_ ]", "", name).lower(): name for name in choices}
     key = re.sub(r"[-_ ]", "", text).lower()
     if key in plain:

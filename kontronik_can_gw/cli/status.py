@@ -1,4 +1,4 @@
-"""``status``: how a running gateway is, from the statistics file that it replaces each second. Nothing is asked of the gateway itself."""
+"""``status``: shows the state of a running gateway, from the statistics file that it replaces each second."""
 
 import argparse
 import json
@@ -35,20 +35,20 @@ _CAN_STYLES = {"error-active": _GOOD, "unknown": "", "error-warning": _POOR, "er
 _LINK_STYLES = {"ok": _GOOD, "degraded": _POOR}
 _COLUMNS = ("ESC", "link", "Hz", "age ms", "V", "A", "1/min", "°C", "CRC", "line", "lost")
 _WIDTHS = (3, 10, 3, 6, 5, 6, 6, 3, 5, 4, 4)
-"""At least: a display that is live does not jump."""
+"""Minimum widths of columns, so that the live display does not jump."""
 _LEFT = 2
-"""So many columns are words."""
+"""Number of left-aligned columns (words)."""
 
 
 class NotRunning(RunError):
-    """There is no gateway to be told of."""
+    """No gateway runs."""
 
     exit_code = NOT_RUNNING
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Words in one style (as rich names it; '' for none), printable whatever they are made of."""
+    """Text in one style (a name of rich, '' for none), made printable."""
 
     text: str
     style: str = ""
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=number_from(0.1, 3600),
         default=1.0,
         metavar="S",
-        help="live: look every so many seconds (default 1)",
+        help="live: interval in seconds (default 1)",
     )
     parser.epilog = (
         "Default: all gateways that run as a service. Exit code 0: running and healthy (also at the end of the live display); "
@@ -90,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Seen:
-    """What there is to tell of one gateway: exit code, a sentence, what is wrong, and its document (None where there is none)."""
+    """Result for one gateway: exit code, a sentence, faults, and its document or None."""
 
     file: Path
     code: int
@@ -101,7 +101,7 @@ class Seen:
 
 
 class Node:
-    """A part of a document that anybody may have written: what is not there, or of another kind, is nothing."""
+    """A part of an untrusted document: missing values and values of a wrong type read as empty."""
 
     def __init__(self, value: object) -> None:
         self._value: Mapping[str, Any] = value if isinstance(value, dict) else {}
@@ -211,13 +211,13 @@ def _no_file(configuration: str | None) -> str:
     )
 
 
-# --- from a file to a judgement
+# --- from a file to an exit code
 
 
 def look_at(file: Path, now: int) -> Seen:
-    """What a statistics file tells at ``now`` (monotonic)."""
+    """The result of a statistics file at ``now`` (monotonic)."""
     try:
-        if file.exists() and not file.is_file():  # a pipe would be waited for
+        if file.exists() and not file.is_file():  # reading a pipe would block
             return Seen(file, NOT_RUNNING, f"{file}: is no plain file. Look at statistics.file.")
         with file.open("rb") as opened:
             data = opened.read(_LARGEST_FILE)
@@ -255,10 +255,10 @@ def look_at(file: Path, now: int) -> Seen:
 
 
 def judge(file: Path, document: Node, now: int, alive: bool) -> Seen:
-    """The exit code for a document, and what is wrong in words."""
+    """The exit code for a document, with the faults in words."""
     age = now - document.count("monotonic_ns")
     age_s = age / SECOND
-    if not alive or age < -STALE_NS:  # from before the machine was started anew
+    if not alive or age < -STALE_NS:  # written before the machine restarted
         return Seen(file, NOT_RUNNING, "not running", (), age_s, document)
     if age > STALE_NS:
         said = f"does not answer since {duration(age_s)} (stopped, or the disk of its file is full)"
@@ -298,7 +298,7 @@ def _troubles(document: Node) -> Iterator[str]:
 
 
 def _is_alive(process: Node) -> bool:
-    """Whether the process that wrote is still there; True where that cannot be known."""
+    """True if the writing process still runs, or if that cannot be found out."""
     pid, ticks = process.count("pid"), process.count("start_ticks")
     if pid <= 0 or process.text("pid_namespace") != printable(pid_namespace()):
         return True
@@ -325,11 +325,11 @@ def _as_json(seen: Seen) -> dict[str, Any]:
     }
 
 
-# --- words for people
+# --- text
 
 
 def duration(seconds: float) -> str:
-    """A time span as people read it."""
+    """A time span in words."""
     whole = max(0, int(seconds))
     if whole < 100:
         return f"{whole} s"
@@ -341,7 +341,7 @@ def duration(seconds: float) -> str:
 
 
 def compact(count: float | None) -> str:
-    """A count in four or five places."""
+    """A count in four or five characters."""
     if count is None:
         return "-"
     for limit, divisor, unit in ((100_000, 1, ""), (10**8, 1000, "k"), (10**11, 10**6, "M")):
@@ -351,7 +351,7 @@ def compact(count: float | None) -> str:
 
 
 def screen(seen: Seen, size: tuple[int, int] | None = None) -> list[Line]:
-    """Everything about one gateway, what matters most first; with a ``size`` (columns, lines) it fits into that."""
+    """Everything about one gateway, most important first; cut to ``size`` (columns, lines) if given."""
     document = seen.document
     width, height = size or (None, None)
     if document is None:
@@ -442,7 +442,7 @@ def _can_lines(document: Node) -> list[Line]:
 
 
 def _esc_lines(document: Node) -> list[Line]:
-    """One line an ESC, 80 columns wide at most."""
+    """One line for each ESC, at most 80 columns wide."""
     rows: list[list[str]] = [list(_COLUMNS)]
     styles: list[str] = [_FAINT]
     for esc in document.parts("escs"):
@@ -468,7 +468,7 @@ def _esc_lines(document: Node) -> list[Line]:
         )
         styles.append(_LINK_STYLES.get(link, "") if fresh else _BAD)
     widths = [
-        max(least, *(len(row[column]) for row in rows)) for column, least in enumerate(_WIDTHS)
+        max(minimum, *(len(row[column]) for row in rows)) for column, minimum in enumerate(_WIDTHS)
     ]
     lines: list[Line] = []
     for row, style in zip(rows, styles, strict=True):
@@ -501,7 +501,7 @@ def _value(values: Node, key: str, digits: str) -> str:
 
 
 def _errors(document: Node) -> Iterator[tuple[str, str]]:
-    """What the ESCs themselves report, in words, and the style of it."""
+    """Errors that the ESCs report, in words, with their style."""
     shown = (
         ("errors", "error", _BAD),
         ("selftest_errors", "self-test error", _BAD),
@@ -519,7 +519,7 @@ def _errors(document: Node) -> Iterator[tuple[str, str]]:
 
 
 def _node_lines(document: Node, width: int | None) -> list[Line]:
-    """The CANopen nodes with their PDOs in a second, as many in a line as fit."""
+    """The CANopen nodes with their PDOs per second, as many in a line as fit."""
     rates = document.part("rates").numbers("pdos_per_s")
     words = []
     for number, node in enumerate(document.parts("nodes")):
@@ -534,7 +534,7 @@ def _node_lines(document: Node, width: int | None) -> list[Line]:
 
 
 def _recording_lines(document: Node) -> list[Line]:
-    """The capture that is being written."""
+    """The capture that is written now."""
     recording = document.part("recording")
     if not (file := recording.text("file")):
         return []
@@ -553,7 +553,7 @@ def _log_lines(document: Node) -> list[Line]:
 
 
 def _joined(parts: Sequence[list[Line]]) -> list[Line]:
-    """The gateways one below the other."""
+    """The gateways one after the other."""
     lines: list[Line] = []
     for part in parts:
         lines += [*([[]] if lines else []), *part]
@@ -572,7 +572,7 @@ def _rich(line: Line) -> "Text":
 
 
 def _live(console: Any, look: Any, interval: float) -> None:
-    """Until SIGINT or SIGTERM."""
+    """Refresh the display until SIGINT or SIGTERM."""
     from rich.console import Group
     from rich.live import Live
 

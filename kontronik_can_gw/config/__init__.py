@@ -1,1 +1,1 @@
-"""The TOML configuration: its keys, and everything that it means put together."""
+"""The TOML configuration: its keys, and the objects assembled from it."""

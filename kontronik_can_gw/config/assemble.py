@@ -1,4 +1,4 @@
-"""Everything that a configuration means: ESCs, DBC, CANopen nodes, what masters stored. All mistakes at once."""
+"""Loads a configuration and the files that it names: ESCs, DBC, CANopen nodes, stored parameters. Reports all mistakes at once."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def collecting(problems: list[str]) -> Iterator[None]:
-    """Mistakes of people are added to ``problems``; what failed outside goes on as it is."""
+    """Collect the lines of a UserError in ``problems``; a RunError is raised as usual."""
     try:
         yield
     except RunError:
@@ -43,8 +43,8 @@ def collecting(problems: list[str]) -> Iterator[None]:
         problems += error.problems
 
 
-def told_apart(config: Config) -> Config:
-    """Without the ESCs whose name, port or node-ID is that of another one or none at all, so that the rest can be looked at."""
+def without_clashing_escs(config: Config) -> Config:
+    """The configuration without ESCs whose name, port or node-ID is taken or invalid, so that the rest can be checked."""
     kept: list[EscConfig] = []
     seen: set[object] = set()
     for esc, node_id in zip(config.esc, config.node_ids, strict=True):
@@ -57,11 +57,11 @@ def told_apart(config: Config) -> Config:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A checked configuration and what belongs to it. ``database`` None: no DBC output; ``canopen`` None: no nodes."""
+    """A checked configuration and the objects made from it. ``database`` None: no DBC output; ``canopen`` None: no nodes."""
 
     config: Config
     escs: list[EscSettings]
-    """As they hold: with what masters stored worked in."""
+    """The settings in effect: configuration, then parameters that a master stored."""
     database: "Database | None"
     layout: Layout
     canopen: CanopenSetup | None
@@ -74,9 +74,9 @@ class Loaded:
 
 
 def load_configuration(path: Path, store: Callable[[Path], ParameterStore] | None = None) -> Loaded:
-    """Everything that a configuration means. UserError with every mistake.
+    """Load a configuration and the files that it names. UserError with every mistake.
 
-    ``store`` makes the store of what masters stored, for the one who runs; None: it is only looked at.
+    ``store`` makes the parameter store of a running gateway; None: stored parameters are only read.
     """
     config, problems = examine(path)
     if config is None:
@@ -85,7 +85,7 @@ def load_configuration(path: Path, store: Callable[[Path], ParameterStore] | Non
         check_interface(config.can)
     if problems:
         with collecting(problems):
-            assemble(told_apart(config))
+            assemble(without_clashing_escs(config))
         raise UserError(*problems)
     return assemble(
         config, store(parameter_folder(config)) if store and config.canopen.enabled else None
@@ -93,7 +93,7 @@ def load_configuration(path: Path, store: Callable[[Path], ParameterStore] | Non
 
 
 def check_devices(config: Config) -> None:
-    """What leads to one device by two names: two ESCs on one port, or the CAN adapter on an ESC's. UserError with each."""
+    """UserError where two names lead to one device: two ESCs on one port, or the CAN adapter on the port of an ESC."""
     problems = []
     ports: dict[str, str] = {}
     for esc in config.esc:
@@ -112,9 +112,9 @@ def check_devices(config: Config) -> None:
 
 
 def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
-    """What belongs to a configuration. Without a store its files are only looked at.
+    """The objects made from a configuration. Without a store its files are only read.
 
-    Configuration, DBC and EDS may be refused here. What masters stored may not: it gives way, with a warning, where it does not fit them.
+    A faulty configuration, DBC or EDS is refused. Stored parameters that do not fit them are ignored with a warning.
     """
     problems: list[str] = []
     with collecting(problems):

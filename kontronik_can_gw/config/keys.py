@@ -229,7 +229,7 @@ class EscConfig:
         Fraction(1),
     )
     cell_count: int = _key(
-        "cells of the battery; 0: as the ESC tells", "integer", 0, low=0, high=255
+        "cells of the battery; 0: as the ESC reports", "integer", 0, low=0, high=255
     )
     telemetry_timeout_ms: int = _key(
         "live values older than this are not available", "integer", 250, low=20, high=60_000
@@ -271,8 +271,8 @@ class RunConfig:
         False,
     )
     realtime_priority: int | None = _key(
-        "real-time priority (SCHED_FIFO) and memory that is never given away, so that no other program's load delays a frame "
-        "(default: a program as others)",
+        "real-time priority (SCHED_FIFO) and locked memory, so that the load of other programs delays no frame "
+        "(default: normal priority)",
         "integer",
         None,
         low=1,
@@ -298,7 +298,7 @@ class StatisticsConfig:
 
     @property
     def address(self) -> tuple[str, int] | None:
-        """Where to listen for Prometheus."""
+        """Address and port to listen on for Prometheus."""
         if self.prometheus is None:
             return None
         host, _, port = self.prometheus.rpartition(":")
@@ -354,7 +354,7 @@ class MqttConfig:
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """Captures of what comes in, to be replayed and converted later."""
+    """Captures of all input, to be replayed and converted later."""
 
     directory: str | None = _key(
         "folder of the captures, relative to this configuration; 'state' is a folder captures in the service's state folder "
@@ -363,10 +363,10 @@ class RecordConfig:
         None,
     )
     part_mb: int = _key(
-        "begin another file when one has so many megabytes", "integer", 64, low=1, high=4000
+        "begin another file at this size in megabytes", "integer", 64, low=1, high=4000
     )
     part_minutes: int = _key(
-        "begin another file after so many minutes", "integer", 60, low=1, high=10_000
+        "begin another file after this time in minutes", "integer", 60, low=1, high=10_000
     )
     keep_mb: int = _key(
         "remove the oldest captures of the folder when all together have more megabytes; 0: remove nothing",
@@ -474,7 +474,7 @@ For a year each is ignored with a warning: a gateway must not fall silent after 
 
 
 def shipped(name: str) -> Path:
-    """A file that comes with the package: inside it when installed, beside it in a checkout."""
+    """Path of a file shipped with the package: inside it when installed, next to it in a checkout."""
     package = Path(__file__).parent.parent
     installed = package / "shipped" / name
     return installed if installed.exists() else package.parent / name
@@ -489,9 +489,9 @@ def load(path: Path) -> Config:
 
 
 def examine(path: Path) -> tuple[Config | None, list[str]]:
-    """A configuration file and its mistakes; None where they leave nothing to look further at. UserError where it cannot be read."""
+    """A configuration and its mistakes; None where too little is valid to go on. UserError where the file cannot be read."""
     try:
-        text = path.read_bytes().decode("utf-8-sig")  # Windows' editors put a mark in front
+        text = path.read_bytes().decode("utf-8-sig")  # editors on Windows write a byte order mark
     except OSError as error:
         advice = (
             " `kontronik-can-gw init` writes an example."
@@ -507,7 +507,7 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
         ValueError,
         RecursionError,
     ) as error:
-        # beside TOMLDecodeError: numbers of 5000 digits, 1000 brackets
+        # besides TOMLDecodeError: numbers of 5000 digits, 1000 nested brackets
         raise UserError(f"{path}: is not valid TOML: {error}") from None
     return _parsed(tables, str(path))
 
@@ -613,7 +613,7 @@ def schema() -> dict[str, Any]:
 
 
 def as_toml(config: Config) -> str:
-    """The effective configuration as TOML, defaults included."""
+    """The effective configuration as TOML, including defaults."""
     lines: list[str] = []
     for name in ("can", "dbc", "canopen", "run", "statistics", "record", "mqtt"):
         lines += _toml_table(f"[{name}]", getattr(config, name))
@@ -697,7 +697,7 @@ def _value(value: Any, f: Field[Any]) -> Any:
 
 
 def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
-    """``Message.Signal = x`` without quotes is a nested table in TOML: taken as meant."""
+    """Keys joined by dots: ``Message.Signal = x`` without quotes is a nested table in TOML."""
     found: dict[str, Any] = {}
     for name, value in table.items():
         found |= (
@@ -723,7 +723,7 @@ def _entry(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
         isinstance(value, str) and value.strip(),
         isinstance(value, (int, float)) and value not in (math.inf, -math.inf),
     )
-    if isinstance(value, bool) or value != value or not (a_text or a_number):  # nan is not itself
+    if isinstance(value, bool) or value != value or not (a_text or a_number):  # value != value: NaN
         raise ValueError(f"{name}: {value!r} is neither the name of a source nor a number")
     return value
 
@@ -764,7 +764,7 @@ def _ratio(value: Any) -> Fraction:
 
 
 def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -> None:
-    """``escs`` by their number in the file: those with mistakes of their own are missing."""
+    """Check names, ports and ambiguity. ``escs`` by their number in the file, without those that are invalid themselves."""
     names = {normalize(name) for name in VALUES}
     for what in ("name", "port"):
         seen: dict[str, int] = {}
@@ -778,7 +778,7 @@ def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -
             seen.setdefault(key, number)
     for number, esc in escs.items():
         key = normalize(esc.name)
-        # "max" and "electrical_speed" is "max_electrical_speed"; so is "a_max" beside "a"
+        # "max" and "electrical_speed" give "max_electrical_speed", which is a source; "a" and "a_max" clash too
         starts = {"", *(normalize(other.name) for other in escs.values())}
         rests = {
             key.removeprefix(start) for start in starts if key.startswith(start) and key != start
@@ -794,7 +794,7 @@ def _check_escs(escs: Mapping[int, EscConfig], file: str, problems: list[str]) -
 
 
 def mqtt_with(config: MqttConfig, given: Mapping[str, Any]) -> MqttConfig:
-    """The same table with other values for some keys, each checked as in a file. UserError names a key as an option."""
+    """The table with some values replaced, each checked as in a file. UserError names a key as an option."""
     known = {f.name: f for f in fields(MqttConfig)}
     problems: list[str] = []
     values: dict[str, Any] = {}
@@ -864,7 +864,7 @@ def _check_outputs(config: Config, problems: list[str]) -> None:
 
 
 def name_problem(names: Sequence[str]) -> str | None:
-    """Why ESCs with these names cannot be told apart; None where they can."""
+    """Why these ESC names are ambiguous; None where they are not."""
     problems: list[str] = []
     _check_escs(
         {n: EscConfig(port=str(n), name=name) for n, name in enumerate(names, 1)}, "", problems

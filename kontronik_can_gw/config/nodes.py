@@ -1,7 +1,7 @@
-"""From a configuration to its CANopen nodes: EDS, node-IDs, serial numbers, and what masters stored.
+"""Builds the CANopen nodes of a configuration: EDS, node-IDs, serial numbers and stored parameters.
 
-A faulty configuration or EDS is refused. What was stored over the bus never keeps the gateway from starting: where it clashes with the
-configuration, another node or a DBC message, it gives way, and that is said.
+A faulty configuration or EDS is refused. Parameters stored over the bus never prevent a start: where they clash with the configuration,
+another node or a DBC message, they are ignored with a warning.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,7 +28,7 @@ from kontronik_can_gw.signals.plan import Layout, classic_bits
 
 @dataclass
 class Kept:
-    """What masters stored, ESC by ESC; ``damaged``: (ESC, why it could not be read)."""
+    """Stored parameters of each ESC; ``damaged``: (ESC, why they could not be read)."""
 
     stored: list[Stored] = field(default_factory=list)
     damaged: list[tuple[int, str]] = field(default_factory=list)
@@ -40,7 +40,7 @@ def load_eds(config: Config) -> Eds:
     path = config.eds_path
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)  # no more is needed to see that it is too large
+            data = file.read(MAX_BYTES + 1)  # one byte more shows that it is too large
     except OSError as error:
         raise UserError(
             f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file."
@@ -54,16 +54,16 @@ def load_eds(config: Config) -> Eds:
 
 
 def parameter_folder(config: Config) -> Path:
-    """Where masters' parameters are kept."""
+    """The folder of the stored parameters."""
     if config.canopen.store is None:
         return state_folder()
     return Path(config.file).parent / config.canopen.store
 
 
 def plain_setup(config: Config) -> CanopenSetup:
-    """The nodes by configuration and EDS alone."""
+    """The nodes from configuration and EDS, without stored parameters."""
     canopen, identity = config.canopen, machine_identity()
-    # block uploads take every second place on the bus
+    # SDO block uploads use at most half of the bus
     segment_ns = 2 * classic_bits(8) * SECOND // config.can.bitrate
     settings = []
     for number, (esc, node_id) in enumerate(zip(config.esc, config.node_ids, strict=True)):
@@ -89,15 +89,15 @@ def plain_setup(config: Config) -> CanopenSetup:
 
 
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:
-    """What masters stored. Without a store its files are only looked at."""
+    """Parameters that masters stored. Without a store its files are only read."""
     kept = Kept()
     if config.canopen.serial is None and not machine_identity():
         kept.warnings.append(
-            "this machine has no id, so serial numbers (1018h:4) are 0 and LSS cannot tell nodes apart: set canopen.serial"
+            "this machine has no id, so serial numbers (1018h:4) are 0 and LSS cannot distinguish the nodes: set canopen.serial"
         )
     for number, esc in enumerate(config.esc):
         if store is None:
-            found, reason = _look_at(parameter_file(parameter_folder(config), esc.name))
+            found, reason = _read_stored_file(parameter_file(parameter_folder(config), esc.name))
             if reason is not None:
                 kept.warnings.append(f"{esc.name}: stored parameters: {reason}")
         else:
@@ -111,8 +111,8 @@ def read_stored(config: Config, store: ParameterStore | None) -> Kept:
     return kept
 
 
-def _look_at(path: Path) -> tuple[Stored, str | None]:
-    """What a node stored, and why that cannot be read; nothing is changed."""
+def _read_stored_file(path: Path) -> tuple[Stored, str | None]:
+    """What is stored for a node, and why it cannot be read; nothing is changed."""
     try:
         return decode(path.read_bytes()), None
     except FileNotFoundError:
@@ -130,7 +130,7 @@ def with_stored(
     escs: Sequence[EscSettings],
     foreign: Mapping[int, str],
 ) -> tuple[CanopenSetup, list[str]]:
-    """The nodes with what masters stored, less what clashes; and what is to be said of that."""
+    """The nodes with stored parameters, except those that clash; and a warning for each of these."""
     if all(each == Stored() for each in stored):
         return plain, []
     said: list[str] = []
@@ -139,7 +139,7 @@ def with_stored(
     while clash := _clashing_node_ids(plain.settings, kept):
         for number in clash:
             said.append(
-                f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: it cannot be this node's"
+                f"{names[number]}: the stored node-ID {kept[number].node_id} is ignored: it cannot be this node's"
             )
             kept[number] = replace(kept[number], node_id=None).unverified()
     setup = replace(plain, stored=tuple(kept))
@@ -156,11 +156,11 @@ def with_stored(
                 }
                 kept[number] = replace(kept[number], communication=left).unverified()
                 said.append(
-                    f"{names[number]}: the stored COB-IDs are passed over: one is used otherwise now"
+                    f"{names[number]}: the stored COB-IDs are ignored: one of them is used otherwise now"
                 )
             elif kept[number].node_id is not None:
                 said.append(
-                    f"{names[number]}: the stored node-ID {kept[number].node_id} is passed over: its COB-IDs are used otherwise"
+                    f"{names[number]}: the stored node-ID {kept[number].node_id} is ignored: its COB-IDs are used otherwise"
                 )
                 kept[number] = replace(kept[number], node_id=None).unverified()
             else:
@@ -173,7 +173,7 @@ _WITH_COB_ID = frozenset({0x1005, 0x1014, *range(0x1800, 0x1A00)})
 
 
 def _clashing_node_ids(settings: Sequence[NodeSettings], kept: Sequence[Stored]) -> list[int]:
-    """Nodes whose stored node-ID is that of another, or none where LSS is refused."""
+    """Nodes whose stored node-ID is that of another node, or unconfigured although LSS is refused."""
     ids = [
         own.node_id if s.node_id is None else s.node_id
         for own, s in zip(settings, kept, strict=True)
@@ -190,7 +190,7 @@ def _clashing_node_ids(settings: Sequence[NodeSettings], kept: Sequence[Stored])
 
 
 def _clashing_nodes(nodes: Nodes, foreign: Mapping[int, str]) -> list[int]:
-    """Nodes with a COB-ID that another service, another node or a DBC message has."""
+    """Nodes with a COB-ID that another service, another node or a DBC message uses."""
     users: dict[int, list[tuple[int, str]]] = {}
     for number, node in enumerate(nodes.nodes):
         for cob_id, what in node.cob_ids():
@@ -207,7 +207,7 @@ def _clashing_nodes(nodes: Nodes, foreign: Mapping[int, str]) -> list[int]:
 def load_of_stored(
     before: str | None, layout: Layout, bitrate: int, data_bitrate: int, bits: float
 ) -> list[str]:
-    """A warning where it is what masters stored that fills the bus; such a gateway runs all the same."""
+    """A warning where only the stored parameters make the bus load too high; the gateway starts nevertheless."""
     load = layout.bus_load(bitrate, data_bitrate) + bits / bitrate
     if before is not None or load <= WARN_LOAD:
         return []
@@ -217,7 +217,7 @@ def load_of_stored(
 
 
 def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:
-    """Nodes by the shipped EDS, as they are without a configuration."""
+    """Nodes from the shipped EDS, without a configuration."""
     file = shipped("eds/kontronik_esc.eds")
     settings = tuple(NodeSettings(node_id, version=__version__) for node_id in node_ids)
     return CanopenSetup(eds_of(file.read_bytes(), str(file)), settings, (Stored(),) * len(settings))

@@ -1,4 +1,4 @@
-"""Which value a signal means: by its name, the ESC's prefix, or [dbc.bind]."""
+"""Finds the value that a signal is bound to: by its name, the ESC's prefix, or [dbc.bind]."""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Binder:
-    """Finds the source that a signal name means, for a given set of ESCs."""
+    """Resolves signal names to sources for a given set of ESCs."""
 
     def __init__(self, escs: Sequence[EscSettings], bind: Mapping[str, str | float]) -> None:
         self.escs = escs
@@ -25,14 +25,14 @@ class Binder:
         )
 
     def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Value, int | None] | None:
-        """The source of a normalized name, ``percent`` at its end ignored; ``esc`` None: unprefixed."""
+        """The source of a normalized name without a final ``percent``; ``esc`` None: the name has no prefix."""
         source = self._by_key.get(key) or self._by_key.get(key.removesuffix("percent"))
         if source is None:
             return None
         return (source, None) if source.group is Group.GATEWAY else (source, esc)
 
     def by_name(self, name: str) -> tuple[Value, int | None] | None:
-        """The source a signal name or a bound name means, and its ESC (None: the name says no ESC, or the gateway)."""
+        """The source of a signal name or a bound name, and its ESC (None: no ESC named, or the gateway)."""
         key = normalize(name)
         if len(self.escs) == 1 and (found := self.gateway_or_esc(key, 0)):
             return found
@@ -42,7 +42,7 @@ class Binder:
         return self.gateway_or_esc(key, None)
 
     def bound(self, message: str, signal: str) -> str | float | None:
-        """What ``[dbc.bind]`` says of a signal."""
+        """The entry of ``[dbc.bind]`` for a signal."""
         for key in (f"{message}.{signal}", signal):
             if key in self.bind:
                 self.used.add(key)
@@ -50,7 +50,7 @@ class Binder:
         return None
 
     def suggestions(self, name: str) -> str:
-        """A sentence with the nearest known names, or an empty text."""
+        """A sentence with the nearest known names, or an empty string."""
         key = normalize(name)
         for prefix, _ in self._prefixes:
             key = key.removeprefix(prefix) or key
@@ -60,7 +60,7 @@ class Binder:
 
 
 def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
-    """True if signals of ours mean an ESC's values, and none says of which ESC."""
+    """True if our signals are bound to values of an ESC, and none names which one."""
     escs = set()
     for message in database.messages:
         if node in message.senders:

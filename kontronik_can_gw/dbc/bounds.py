@@ -1,8 +1,8 @@
-"""What a DBC may ask for, judged before cantools reads it: one number in a file must not cost gigabytes or a minute.
+"""Limits for the numbers in a DBC, checked before cantools reads it: one number must not cost gigabytes or a minute.
 
-cantools makes an object of each page of a multiplexer, writes masks of one character a bit and counts ranges out, so the numbers that
-make it do so are looked at first. A DBC is syntax first: cantools reads a number only after it has parsed the whole file, so the patterns
-need be exact for well-formed text only.
+cantools makes an object for each page of a multiplexer, builds masks of one character per bit and expands ranges, so the numbers that
+control this are checked first. cantools uses numbers only after it has parsed the whole file, so the patterns need to be exact for
+well-formed text only.
 """
 
 import re
@@ -25,7 +25,7 @@ _MAX_BITS = _MAX_MESSAGE_BYTES * 8
 
 
 class _Bound(NamedTuple):
-    """What a number may be, in words and as limits."""
+    """The limits of a number, and its name for messages."""
 
     what: str
     low: int
@@ -50,7 +50,7 @@ _TOKEN = re.compile(r"\w+|[^\w\s]")
 _MANY_DIGITS = re.compile(rf"\d[\d_]{{{_MAX_DIGITS}}}")
 _POWER = re.compile(r"(?<![\w.])[\d_.]+[eE][-+]?([\d_]+)")
 _NUMBER_TEXT = re.compile(r'"\s*[-+]?[\d_.]+(?:[eE][-+]?[\d_]+)?\s*"')
-"""cantools takes the number out of an attribute's string too."""
+"""cantools also takes a number from an attribute's string."""
 _INTEGER = re.compile(r"[-+]?\d+")
 _NUMBER = r"([-+]?\d+)"
 _NODE_LIST = re.compile(r"BU_\s*:(?=([\w\s]*))")
@@ -64,7 +64,7 @@ _TABLE_NAME = re.compile(r"\s*([A-Za-z_]\w*)\s*\Z")
 
 
 def check_size(size: int, path: str) -> None:
-    """UserError for a file that is larger than any DBC."""
+    """UserError for a file larger than any real DBC."""
     if size > MAX_BYTES:
         raise UserError(
             f"{path}: is larger than {MAX_BYTES // 1_000_000} MB. Is it a DBC? Give one with fewer comments."
@@ -72,7 +72,7 @@ def check_size(size: int, path: str) -> None:
 
 
 def check_bounds(text: str, path: str) -> None:
-    """UserError with the first number of a DBC that is out of all bounds: where it is, what it is, what it may be."""
+    """UserError with the first number of a DBC that exceeds its limits: where it is, its value, the limits."""
     text = _TEXT.sub(_masked, text)
     if len(text) > _MAX_TOKENS and next(islice(_TOKEN.finditer(text), _MAX_TOKENS, None), None):
         raise UserError(
@@ -90,7 +90,7 @@ def check_bounds(text: str, path: str) -> None:
 
 
 def _masked(found: re.Match[str]) -> str:
-    """A string without what it says (its length is kept: value tables are measured by it), a comment as a blank."""
+    """A string of the same length without its content (value tables are measured by length), a comment as a blank."""
     if found[0].startswith("//"):
         return " "
     return found[0] if _NUMBER_TEXT.fullmatch(found[0]) else f'"{"_" * (len(found[0]) - 2)}"'
@@ -107,14 +107,14 @@ class _Message:
     name: str
     multiplexers: list[str] = field(default_factory=list)
     values: Counter[str] = field(default_factory=Counter)
-    """On how many pages a signal is."""
+    """Number of pages of each signal."""
     parents: dict[str, str] = field(default_factory=dict)
     """Multiplexers that SG_MUL_VAL_ names."""
     texts: Counter[str] = field(default_factory=Counter)
-    """Sizes of value tables: each text of a multiplexer's makes a page."""
+    """Sizes of value tables: each text of a multiplexer's table makes a page."""
 
     def pages(self) -> tuple[int, int]:
-        """How deep multiplexers are nested, and how many pages and signals on pages there are in all."""
+        """Nesting depth of multiplexers, and the total number of pages and signals on pages."""
         children: defaultdict[str | None, list[str]] = defaultdict(list)
         for name in self.values.keys() - set(self.multiplexers):
             children[self._parent(name)].append(name)
@@ -136,14 +136,14 @@ class _Message:
         return max((depth for depth, _ in sizes), default=0), sum(total for _, total in sizes)
 
     def _parent(self, name: str) -> str | None:
-        """As cantools has it: the only multiplexer is everybody's; where there are several SG_MUL_VAL_ decides."""
+        """Parent as cantools resolves it: a single multiplexer applies to all; among several, SG_MUL_VAL_ decides."""
         if len(self.multiplexers) == 1:
             return None if name == self.multiplexers[0] else self.multiplexers[0]
         return self.parents.get(name)
 
 
 def _numbers(text: str) -> Iterator[tuple[_Bound, int, str]]:
-    """Each number, what it is, and where."""
+    """Each number with its limits and its place."""
     for found in _POWER.finditer(text):
         yield _POWERS, int(found[1].replace("_", "") or "0"), f"line {_line(text, found)}: "
     for found in _NODE_LIST.finditer(text):
@@ -178,7 +178,7 @@ def _numbers(text: str) -> Iterator[tuple[_Bound, int, str]]:
 
 
 def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> Iterator[tuple[_Bound, int, str]]:
-    """SG_MUL_VAL_: as cantools has it, the second number of each pair stands after one more character."""
+    """Ranges of SG_MUL_VAL_; like cantools, any one character separates the two numbers."""
     total = 0
     for found in _RANGES.finditer(text):
         can_id, name, parent = int(found[1]), found[2], found[3]
@@ -199,7 +199,7 @@ def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> Iterator[tuple
 def _value_tables(
     text: str, messages: Mapping[int, list[_Message]]
 ) -> Iterator[tuple[_Bound, int, str]]:
-    """A table that many signals name takes as much as if it were written for each."""
+    """Sizes of value tables; one used by many signals counts once for each."""
     tables = {
         found[1]: (len(found[2]), found[2].count('"') // 2) for found in _VALUE_TABLE.finditer(text)
     }

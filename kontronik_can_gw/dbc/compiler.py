@@ -1,7 +1,7 @@
-"""DBC -> compiled layout. Everything that can be wrong with a DBC or its binding is found here, at start, all at once.
+"""Compiles a DBC to a layout. All mistakes in a DBC or its bindings are found here, at start, at once.
 
 A layout is the tuple of MessagePlans that the configured transmitter node sends. Ids, positions, byte order, sign, factor, offset,
-limits, value tables and timing come from the file and from nowhere else.
+limits, value tables and timing come only from the file.
 """
 
 import difflib
@@ -42,7 +42,7 @@ _ERROR_TEXTS = frozenset({"error", "err", "invalid"})
 _LARGEST_FLOAT = int(struct.unpack("<f", b"\xff\xff\x7f\x7f")[0])
 
 _MAX_PAGES = 1024
-"""Multiplexer values of a message of ours."""
+"""Maximum of multiplexer values in one of our messages."""
 
 _MANY = 5
 
@@ -59,21 +59,21 @@ class DbcSettings:
 
     bind: Mapping[str, str | float] = field(default_factory=dict)
     node: str | None = None
-    """The transmitter whose messages are ours; None: the only one that sends."""
+    """The transmitter node whose messages we send; None: the only one that sends."""
     base_id: int | None = None
     id_step: int | None = None
     data_ids: Mapping[str, int] = field(default_factory=dict)
     """Message name to E2E data id; otherwise the CAN id's low 16 bits."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Unit text of the DBC to the one that it means."""
+    """Unit text of the DBC to the unit that it means."""
     send_types: Mapping[str, str] = field(default_factory=dict)
-    """GenMsgSendType to the one of ``send_types.NAMES`` that it means."""
+    """GenMsgSendType to the entry of ``send_types.NAMES`` that it means."""
     messages: tuple[str, ...] = ()
-    """Patterns of the names of our messages, which ``prepare`` goes by; none: all."""
+    """Patterns that select our messages by name (used by ``prepare``); empty: all."""
     unbound: str = "error"
-    """What becomes of a signal without a source: "error", or its "start_value" for ever."""
+    """For a signal without a source: "error", or always send its "start_value"."""
     flags_on_loss: int | None = None
-    """What a flag without a code is without telemetry; None: its own start value, else 0."""
+    """Value without telemetry of a flag that has no code for it; None: its own start value, else 0."""
 
 
 def compile_layout(
@@ -84,9 +84,9 @@ def compile_layout(
     taken_ids: Mapping[int, str] | None = None,
     fd_allowed: bool = False,
 ) -> Layout:
-    """Compile every message of ours. UserError with all mistakes at once.
+    """Compile all of our messages. UserError with all mistakes at once.
 
-    ``taken_ids``: 11-bit ids that are used otherwise (COB-IDs of our CANopen nodes) and by what.
+    ``taken_ids``: 11-bit ids already in use (COB-IDs of our CANopen nodes), and their users.
     """
     node = choose_node(database, settings.node, file)
     compiler = _Compiler(database, file, escs, settings, fd_allowed)
@@ -151,10 +151,10 @@ class _Compiler:
         self.problems: list[str] = []
         self.warnings: list[str] = []
         self.units: set[str] = set()
-        """Unit texts that were met."""
+        """Unit texts found in our messages."""
         self.send_types: set[str] = set()
         self.while_active: list[str] = []
-        """Messages that others send only while something is active."""
+        """Messages whose send type means: only while a signal is active."""
         self.unbound = 0
 
     def check_ids(self, ours: Sequence["Message"], taken: Mapping[int, str]) -> None:
@@ -269,7 +269,7 @@ class _Compiler:
     def _check_e2e(
         self, message: "Message", where: str, crc: SignalPlan, alive: Sequence[SignalPlan]
     ) -> None:
-        """A checksum is sent only as AUTOSAR E2E profile 1, and only where that is said or its names are those of always."""
+        """A checksum is sent only as AUTOSAR E2E profile 1, if it is configured or has the well-known names."""
         asked = (
             message.name in self.settings.data_ids
             or self.binder.bound(message.name, crc.name) is not None
@@ -339,7 +339,7 @@ class _Compiler:
 
     def _check_overlap(self, message: "Message", where: str) -> None:
         used: Counter[int | None] = Counter()
-        """Bits in use, as a mask for each page."""
+        """Bit mask of the used bits, for each page."""
         placed: list[tuple[str, int, set[int | None]]] = []
         every: set[int | None] = {None} | {
             page for s in message.signals for page in s.multiplexer_ids or ()
@@ -370,7 +370,7 @@ class _Compiler:
             placed.append((signal.name, mask, pages))
 
     def _unit(self, signal: "Signal") -> str:
-        """A signal's unit, as ``dbc.units`` has it; empty where it says nothing."""
+        """A signal's unit after ``dbc.units``; empty where none is given."""
         text = (signal.unit or "").strip()
         self.units.add(text)
         text = self.settings.units.get(text, text)
@@ -380,14 +380,14 @@ class _Compiler:
         where = f"{self.file}: {message.name}.{signal.name}"
         length, signed, is_float = signal.length, signal.is_signed, signal.is_float
         if length > message.length * 8:
-            return None  # which _check_overlap reports
+            return None  # reported by _check_overlap
         if is_float and length not in (32, 64):
             self.problems.append(
                 f"{where}: a float of {length} bits cannot be sent; 32 and 64 can."
             )
             return None
-        told = (signal.scale, signal.offset, signal.minimum or 0, signal.maximum or 0)
-        if not all(math.isfinite(number) for number in told):
+        given = (signal.scale, signal.offset, signal.minimum or 0, signal.maximum or 0)
+        if not all(math.isfinite(number) for number in given):
             self.problems.append(
                 f"{where}: has a factor, offset or limit that is no finite number."
             )
@@ -424,7 +424,7 @@ class _Compiler:
         error = next((codes[t] for t in codes if t in _ERROR_TEXTS), None)
         if not_available is None:
             start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
-            # a default start value is nobody's statement that 0 means "not available"; a flag has nothing better
+            # a start value that is a mere default does not mean "not available"; a flag has nothing better
             usable = (start_is_set or length == 1) and _is_raw(start, low, high)
             not_available = int(start) if usable else low if signed else high
         if error is None:
@@ -514,7 +514,7 @@ class _Compiler:
     def _start_value(
         self, where: str, signal: "Signal", base: Mapping[str, Any], codes: Mapping[str, int]
     ) -> int | None:
-        """The raw bits of a signal that is bound to nothing: its own start value, else NotAvailable, else the default or 0."""
+        """The raw bits of an unbound signal: its own start value, else NotAvailable, else the default or 0."""
         is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
         if not is_set and _NOT_AVAILABLE_TEXTS & set(codes):
             return int(base["not_available"])
@@ -536,7 +536,7 @@ class _Compiler:
         return raw
 
     def _flag_on_loss(self, signal: "Signal", codes: Mapping[str, int]) -> int | None:
-        """What a flag without a code is without telemetry, 0 or 1; None: as its own start value has it."""
+        """Value without telemetry, 0 or 1, of a flag that has no code for it; None: its own start value."""
         if _NOT_AVAILABLE_TEXTS & set(codes):
             return None
         if (
@@ -601,7 +601,7 @@ class _Compiler:
                     if end is not None
                 ]
                 if ends and (min(ends) < low - 2 or max(ends) > high + 2):
-                    # more than NotAvailable and Error cost
+                    # more is lost than the codes NotAvailable and Error take
                     first, last = sorted(end * factor + offset for end in (low, high))
                     text = f"{_number(first)} to {_number(last)} {unit or source.unit}".rstrip()
                     notes.append(f"range {text}, beyond it Error")
@@ -613,7 +613,7 @@ class _Compiler:
                 return None
             if (on_loss := self._flag_on_loss(signal, codes)) is not None:
                 base |= {"not_available": raws[on_loss], "error": raws[on_loss]}
-                # a text "Error" at one of them is no code
+                # an "Error" in the value table at 0 or 1 is a value, not a code
                 base |= {
                     "low": min(raws),
                     "high": max(raws),
@@ -646,7 +646,7 @@ class _Compiler:
 
 
 def _is_raw(value: Any, low: int, high: int) -> bool:
-    """True for a number that is a raw value."""
+    """True for a whole number within the raw range."""
     return (
         isinstance(value, (int, float))
         and math.isfinite(value)
@@ -656,7 +656,7 @@ def _is_raw(value: Any, low: int, high: int) -> bool:
 
 
 def _value_texts(signal: "Signal") -> dict[int, str]:
-    """The value table without its codes."""
+    """The value table without the codes NotAvailable and Error."""
     table = {int(raw): str(text) for raw, text in (signal.choices or {}).items()}
     return {
         raw: text
@@ -668,7 +668,7 @@ def _value_texts(signal: "Signal") -> dict[int, str]:
 def _float_codes(
     signal: "Signal", factor: Fraction, offset: Fraction, codes: Mapping[str, int]
 ) -> dict[str, Any]:
-    """Limits and codes of a float signal: those of its value table as floats, else NaN."""
+    """Limits and codes of a float signal: from its value table as floats, else NaN."""
     code = "<f" if signal.length == 32 else "<d"
 
     def pattern(texts: frozenset[str]) -> int:
@@ -692,14 +692,14 @@ def _float_codes(
 
 
 def _exact(number: Any) -> Fraction:
-    """The decimal that stands in the file, not the float nearest to it."""
+    """The decimal number in the file, not the float nearest to it."""
     return Fraction(repr(number)) if isinstance(number, float) else Fraction(number)
 
 
 def _constant(
     value: float, factor: Fraction, offset: Fraction, length: int, signed: bool, is_float: bool
 ) -> int | None:
-    """The raw bits of a constant physical value; None where the signal cannot hold it (a float: within its precision)."""
+    """The raw bits of a constant physical value; None where the signal cannot hold it (floats are rounded)."""
     if not math.isfinite(value):
         return None
     raw = (_exact(value) - offset) / factor
@@ -731,7 +731,7 @@ def _bits(signal: "Signal") -> list[int]:
 
 
 def _pieces(signal: "Signal") -> tuple[Piece, ...]:
-    """Runs of neighbouring bits."""
+    """The signal as runs of adjacent bits."""
     pieces: list[Piece] = []
     for shift, at in enumerate(_bits(signal)):
         last = pieces[-1] if pieces else None

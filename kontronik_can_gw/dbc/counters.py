@@ -1,6 +1,6 @@
-"""Which names of signals mean a counter of frames, and which a checksum.
+"""Recognizes frame counters and checksums by the names of signals.
 
-Long endings say it by themselves; short ones only as a whole word, because they end other words too: an ErrorCounter counts no frames.
+Long endings are sufficient; short ones count only as a whole word, because they end other words too: an ErrorCounter counts no frames.
 """
 
 import re
@@ -26,7 +26,7 @@ _E2E_COUNTERS = (
     ),
 )
 _E2E_CHECKSUMS = ("crc", "crc8", "checksum")
-"""Beside each other they mean AUTOSAR E2E profile 1 without being asked, as they did in the first versions."""
+"""Together in a message they mean AUTOSAR E2E profile 1 without configuration, as in the first versions."""
 _ENDINGS = {
     Kind.COUNTER: (
         *(*_E2E_COUNTERS, "alivecnt", "alivecntr", "alivectr", "livecnt", "livecntr"),
@@ -45,7 +45,7 @@ _ENDINGS = {
     Kind.CHECKSUM: (*_E2E_CHECKSUMS, "chksum", "chksm", "cksum", "pruefsumme"),
 }
 _WORDS = {Kind.COUNTER: frozenset({"bz", "sqc"}), Kind.CHECKSUM: frozenset({"cs", "cks", "chk"})}
-"""As the last of a name's words."""
+"""Last words of a name."""
 _WHOLE = {"counter": Kind.COUNTER, "cntr": Kind.COUNTER, "cnt": Kind.COUNTER, "ctr": Kind.COUNTER}
 _SUSPECTS = {
     Kind.COUNTER: re.compile("alive|cntr|cnt|ctr|counter|zaehler|rolling", re.IGNORECASE),
@@ -54,7 +54,7 @@ _SUSPECTS = {
 
 
 def kind(name: str) -> Kind | None:
-    """What a signal's name, or what it is bound to, says."""
+    """The kind that a signal's name or binding means; None for others."""
     letters = normalize(name)
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
     last = words[-1].casefold() if words else ""
@@ -65,12 +65,12 @@ def kind(name: str) -> Kind | None:
 
 
 def is_e2e(checksum: str, counter: str) -> bool:
-    """True for two names that mean AUTOSAR E2E profile 1."""
+    """True for a pair of names that means AUTOSAR E2E profile 1."""
     return normalize(checksum).endswith(_E2E_CHECKSUMS) and normalize(counter).endswith(
         _E2E_COUNTERS
     )
 
 
 def suspect(name: str) -> Kind | None:
-    """What a name may mean that says nothing for certain."""
+    """The kind that a name might mean, for hints in messages."""
     return next((found for found, pattern in _SUSPECTS.items() if pattern.search(name)), None)

@@ -1,4 +1,4 @@
-"""A one-ESC DBC -> the DBC of several ESCs: names prefixed, ids moved, nothing lost."""
+"""Expands a one-ESC DBC to several ESCs: names prefixed, ids moved, nothing lost."""
 
 import re
 from collections import OrderedDict
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["dbc_text", "esc_prefix", "expand", "needs_expansion"]
 _NAME_LIMIT = 32
 _SDO_END, _RESTRICTED = 0x67F, 0x6E0
-"""Between them CiA 301 uses no 11-bit id: SDO requests end, restricted ids begin."""
+"""CiA 301 uses no 11-bit ids in this range: it is after the SDO requests and before the restricted ids."""
 
 
 def esc_prefix(name: str) -> str:
@@ -48,16 +48,18 @@ def expand(
 ) -> tuple["Database", dict[str, str | float]]:
     """The database for these ESCs and the bindings that go with it.
 
-    With one ESC names stay, with several each ESC's messages and signals get its name as prefix (a leading ``Esc`` of a message name
-    gives way) and its ids are moved by ``id_step`` an ESC: the smallest step without a clash where None. ``base_id`` becomes the
-    lowest of our ids. Messages of the gateway itself and of other nodes are taken over once. UserError for names or ids that do not fit.
+    With one ESC names stay. With several, messages and signals of each ESC get its name as prefix (in place of a leading ``Esc``) and ids
+    are moved by ``id_step`` for each ESC; None: the smallest step without a clash. ``base_id`` becomes the lowest of our ids. Messages of
+    the gateway itself and of other nodes are copied once. UserError for names or ids that do not fit.
     """
     import cantools.database.can
 
     bind = dict(bind or {})
     ours = [message for message in database.messages if node in message.senders]
     per_esc = (
-        [message for message in ours if _speaks_of_an_esc(message, bind)] if len(escs) > 1 else []
+        [message for message in ours if _has_values_of_an_esc(message, bind)]
+        if len(escs) > 1
+        else []
     )
     shift = 0 if base_id is None else base_id - min(message.frame_id for message in ours)
     once = [message for message in database.messages if message not in per_esc]
@@ -72,7 +74,7 @@ def expand(
     messages: list[Message] = []
     moved: dict[int, list[tuple[int, dict[str, str]]]] = {}
     moves: list[tuple[int, int, bool]] = []
-    out_bind = dict(bind)  # what is left of it belongs to no signal, which the compiler reports
+    out_bind = dict(bind)  # keys that match no signal stay, and the compiler reports them
     for message in database.messages:
         copies = enumerate(escs) if message in per_esc else [(0, None)]
         for index, esc in copies:
@@ -113,7 +115,7 @@ def expand(
 
 
 def among_canopen(database: "Database", expanded: "Database", node: str) -> str:
-    """What is wrong where 11-bit ids of ``node`` left the range that CANopen leaves free (CiA 301, 7.3.5); empty where none did."""
+    """A warning where 11-bit ids of ``node`` are moved out of the range that CANopen leaves free (CiA 301, 7.3.5), else empty."""
     low, high = _SDO_END + 1, _RESTRICTED - 1
 
     def ids(of: "Database") -> list[int]:
@@ -132,7 +134,7 @@ def among_canopen(database: "Database", expanded: "Database", node: str) -> str:
 def _id_problems(
     moves: Sequence[tuple[int, int, bool]], count: int, base_id: int | None
 ) -> list[str]:
-    """A line for ids that no frame can have. ``moves``: from, to, 29 bits."""
+    """A line for ids outside the range of CAN ids. ``moves``: from, to, 29 bits."""
     problems = []
     why = f"for {count} ESCs" if base_id is None else f"with {base_id:X}h as the lowest id"
     for extended, limit in ((False, 0x7FF), (True, 0x1FFFFFFF)):
@@ -153,7 +155,7 @@ def _check_lengths(
     problems: list[str],
     file: str,
 ) -> None:
-    """One line for names that become too long, however many they are."""
+    """One line for all names that become too long."""
     longest = max(
         (signal.name for message in per_esc for signal in message.signals), key=len, default=""
     )
@@ -173,7 +175,7 @@ def _check_lengths(
 def _relations(
     specifics: "DbcSpecifics | None", moved: Mapping[int, list[tuple[int, dict[str, str]]]]
 ) -> "DbcSpecifics | None":
-    """Attributes of relations (BA_REL_) point at messages and signals by id and name: they go with each copy."""
+    """Copies attributes of relations (BA_REL_), which refer to messages and signals by id and name."""
     specifics = deepcopy(specifics)
     relations = specifics.relation_attributes if specifics is not None else None
     if relations is not None:
@@ -192,7 +194,7 @@ def _relations(
     return specifics
 
 
-def _speaks_of_an_esc(message: "Message", bind: dict[str, str | float]) -> bool:
+def _has_values_of_an_esc(message: "Message", bind: dict[str, str | float]) -> bool:
     binder = Binder([EscSettings()], bind)
     for signal in message.signals:
         bound = binder.bound(message.name, signal.name)
@@ -226,7 +228,7 @@ def _step(
 
 
 def _copy(message: "Message") -> "Message":
-    """A message that can be moved and renamed; what is not changed is shared, which is most of what a message is."""
+    """A copy that can be moved and renamed; it shares everything that does not change."""
     made = copy(message)
     made._signals = [copy(signal) for signal in message.signals]
     if message.signal_groups is not None:

@@ -1,4 +1,4 @@
-"""Flags without a code for "not available": which signal of their message tells a reader that telemetry is lost."""
+"""Flags without a code for "not available": finds the signal of their message that reports lost telemetry."""
 
 import math
 import struct
@@ -10,7 +10,7 @@ _OF_LINK = frozenset({"link_state", "data_age"})
 
 
 def is_mute(signal: SignalPlan) -> bool:
-    """True for a flag that holds one of its two values without telemetry."""
+    """True for a flag that shows one of its two values without telemetry."""
     source = signal.source
     if (
         source is None
@@ -23,7 +23,7 @@ def is_mute(signal: SignalPlan) -> bool:
 
 
 def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
-    """The signal of the same message, and sent with the flag, that reports the loss."""
+    """The signal in the same frame as the flag that reports the loss."""
     for signal in message.signals:
         source = signal.source
         if source is None or signal.esc != flag.esc or signal.page not in (None, flag.page):
@@ -37,7 +37,7 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
 
 
 def _has_code(signal: SignalPlan) -> bool:
-    """True where "not available" is none of the values."""
+    """True where "not available" is a code of its own, outside the values."""
     if signal.is_float:
         code = "<f" if signal.length == 32 else "<d"
         (value,) = struct.unpack(code, signal.not_available.to_bytes(signal.length // 8, "little"))
@@ -48,7 +48,7 @@ def _has_code(signal: SignalPlan) -> bool:
 
 
 def unreported(layout: Layout, silent: bool) -> list[str]:
-    """A warning for each message that goes on without telemetry, and nobody can see it by its flags. ``silent``: ``dbc.on_loss``."""
+    """A warning for each message whose flags hide the loss of telemetry. ``silent``: ``dbc.on_loss``."""
     found = []
     for message in layout.messages:
         stops = bool(message.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in message.paces

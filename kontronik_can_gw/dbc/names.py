@@ -1,6 +1,6 @@
-"""How names are compared."""
+"""Normalizes names for comparison."""
 
 
 def normalize(name: str) -> str:
-    """A name as it is compared: letters and digits only, lower case."""
+    """Letters and digits of a name, in lower case."""
     return "".join(c for c in name.casefold() if c.isalnum())

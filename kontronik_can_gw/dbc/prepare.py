@@ -1,4 +1,4 @@
-"""From a DBC file and ESCs to what will be sent: the database (expanded to the ESCs where it describes one) and its layout."""
+"""Prepares what will be sent from a DBC file and the ESCs: the database (expanded if it describes one ESC) and its layout."""
 
 import difflib
 import fnmatch
@@ -27,7 +27,7 @@ def prepare(
     fd_allowed: bool = False,
     taken_ids: Mapping[int, str] | None = None,
 ) -> tuple["Database", Layout]:
-    """The exact database of what a gateway with these ESCs sends, and the compiled layout. UserError with every mistake."""
+    """The database of exactly what a gateway with these ESCs sends, and the compiled layout. UserError with every mistake."""
     node = choose_node(database, settings.node, file)
     if settings.messages:
         database = _with_chosen(database, node, settings.messages, file)
@@ -45,7 +45,7 @@ def prepare(
 
 
 def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file: str) -> "Database":
-    """The database without those messages of a node that no pattern names. UserError for patterns that name none."""
+    """The database with only those messages of a node that match a pattern. UserError for a pattern without a match."""
     import cantools.database.can
 
     ours = {message.name for message in database.messages if node in message.senders}
@@ -88,7 +88,7 @@ def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file:
 def check_load(
     layout: Layout, bitrate: int, data_bitrate: int = 2_000_000, further_bits: float = 0
 ) -> str | None:
-    """A warning above 50 % computed bus load, UserError above 100 %, else None. ``further_bits``: of CANopen nodes, in a second."""
+    """A warning above 50 % computed bus load, UserError above 100 %, else None. ``further_bits``: bits per second of CANopen nodes."""
     load = layout.bus_load(bitrate, data_bitrate) + further_bits / bitrate
     what = "the CANopen nodes" if not layout.messages else f"{layout.file}: the messages"
     if layout.messages and further_bits:

@@ -1,4 +1,4 @@
-"""A DBC file as it is -> cantools' database. What other tools write and cantools does not read is spelled out before."""
+"""Reads a DBC file with cantools, after rewriting what other tools write and cantools does not understand."""
 
 import re
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 _MAX_REASON = 300
-"""Characters: cantools may quote the whole file."""
+"""Maximum length of a reason in characters: cantools may quote the whole file."""
 
 
 def load_database(path: Path, warnings: list[str] | None = None) -> "Database":
-    """Read a DBC file, as ``parse_database``. UserError with one line for a file that cannot be read or is no DBC."""
+    """Read a DBC file with ``parse_database``. UserError with one line for a file that cannot be read or is no DBC."""
     return parse_database(read_dbc(path), str(path), warnings)
 
 
@@ -26,15 +26,15 @@ def read_dbc(path: Path) -> bytes:
     """The bytes of a DBC file. UserError with one line where it cannot be read."""
     try:
         with path.open("rb") as file:
-            return file.read(MAX_BYTES + 1)  # no more is needed to see that it is too large
+            return file.read(MAX_BYTES + 1)  # one byte more shows that it is too large
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> "Database":
-    """Read the bytes of a DBC file. UserError with one line that names ``path`` for what is no DBC.
+    """Parse the bytes of a DBC file. UserError with one line that names ``path`` where it is no DBC.
 
-    Entries for what the file does not have are ignored, with a line for ``warnings``.
+    Entries that refer to missing signals, tables or attributes are ignored, with a line in ``warnings``.
     """
     check_size(len(raw), path)
     if b"\0" in raw:
@@ -56,7 +56,7 @@ def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> 
         database = cantools.database.load_string(
             text, database_format="dbc", strict=False, sort_signals=None
         )
-    except Exception as error:  # cantools lets errors of every kind out for text that is no DBC
+    except Exception as error:  # cantools raises errors of many types for text that is no DBC
         reason = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
         raise UserError(f"{path}: is not a DBC that can be read: {reason}") from None
     if not isinstance(database, cantools.database.Database):
@@ -69,16 +69,16 @@ def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> 
 _STRING = re.compile(r'"(?:\\"|[^"])*"')
 
 _PAIRS = r'(?:[^\s";]+\s+"\0\d+\0"\s*)*'
-"""Values and their texts, masked. Never simply up to a semicolon: NS_ lists keywords without one."""
+"""Values and their masked texts. Not simply up to a semicolon: NS_ lists keywords without one."""
 
 _MASKED = re.compile(r'"\0(\d+)\0"')
 
 
 def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
-    """What other tools write and cantools does not read: a VAL_ that names a VAL_TABLE_, enumeration attributes by text.
+    """Rewrite what cantools does not read: a VAL_ that names a VAL_TABLE_, and enumeration attributes given by text.
 
-    Entries for signals, tables and attributes that the file does not have are taken out, each kind with a warning; cantools refuses the
-    whole file for them. Strings are masked meanwhile, so that no comment and no value text is touched, and lines keep their numbers.
+    Entries for missing signals, tables and attributes are removed, each kind with a warning; cantools would refuse the whole file. Strings
+    are masked meanwhile, so that comments and value texts stay unchanged and lines keep their numbers.
     """
     strings: list[str] = []
 
@@ -174,15 +174,15 @@ def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
     ]
 
 
-def listed(names: Sequence[str], most: int = 6) -> str:
-    """Each name once, and how many more there are."""
+def listed(names: Sequence[str], limit: int = 6) -> str:
+    """The first ``limit`` names, each once, and the number of further ones."""
     names = list(dict.fromkeys(names))
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more
 
 
 def choose_node(database: "Database", wanted: str | None, file: str) -> str:
-    """The transmitter node whose messages are ours."""
+    """The transmitter node whose messages we send. UserError where it is missing or ambiguous."""
     senders = sorted({sender for message in database.messages for sender in message.senders})
     if wanted is not None:
         if wanted in senders:
@@ -206,7 +206,7 @@ def choose_node(database: "Database", wanted: str | None, file: str) -> str:
 
 
 def attribute(owner: Any, name: str, database: "Database") -> Any:
-    """An attribute's value, its default where it is not set, None where it is not defined; enumerations as text."""
+    """An attribute's value, else its default; None where it is not defined. Enumerations as text."""
     definition = database.dbc.attribute_definitions.get(name) if database.dbc else None
     if definition is None:
         return None

@@ -1,4 +1,4 @@
-"""When a message is sent: GenMsgSendType as Vector's and OEM templates spell it."""
+"""Send types of messages: GenMsgSendType as Vector's and OEM templates spell it."""
 
 from collections.abc import Mapping
 
@@ -12,9 +12,9 @@ NAMES = {
     "CyclicAndEvent": SendType.CYCLIC | SendType.EVENT,
     "CyclicAndOnChange": SendType.CYCLIC | SendType.ON_CHANGE,
 }
-"""Those that ``dbc.send_type`` gives."""
+"""Meanings that ``dbc.send_type`` can give."""
 NONE = ""
-"""By the cycle time alone: cyclic with one, else with each frame."""
+"""Decided by the cycle time: cyclic with one, else sent with each new value."""
 
 _SPELLINGS: dict[str, tuple[str, ...]] = {
     "Cyclic": (
@@ -35,7 +35,7 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
         *("CyclicAndSpontaneousWD", "CyclicAndOnWrite", "CyclicEvent", "EventCyclic", "CE", "PE", "Mixed", "Mixte"),
     ),
     "CyclicAndOnChange": ("CyclicAndOnChange", "PeriodicAndOnChange", "CyclicOnChange", "CyclicAndChange"),
-    # only while a signal has a value that means activity: what is always sent holds that too
+    # "only while a signal is active" is covered by sending always
     "IfActive": ("IfActive", "CyclicIfActive", "CyclicIfActiveX", "CyclicIfActiveFast", "EnabledPeriodic", "IfActiveWithRepetition"),
     "IfActiveAndEvent": (
         *("CyclicIfActiveAndSpontaneousWD", "CyclicIfActiveAndSpontanWD", "CyclicIfActiveAndSpontaneous"),
@@ -58,6 +58,6 @@ _BY_KEY = {normalize(text): name for name, texts in _SPELLINGS.items() for text 
 
 
 def meaning(text: str, overrides: Mapping[str, str]) -> tuple[str | None, bool]:
-    """One of ``NAMES``, NONE, or None for a text that is not known; and True for one that is sent while something is active only."""
+    """One of ``NAMES``, NONE, or None for an unknown text; and True for a type that sends only while something is active."""
     name = overrides.get(text) or _BY_KEY.get(normalize(text))
     return (_WHILE_ACTIVE[name], True) if name in _WHILE_ACTIVE else (name, False)

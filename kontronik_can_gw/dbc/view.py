@@ -1,8 +1,8 @@
-"""What a participant of the bus knows now: the newest value of each signal, as long as it is fresh. Pure; time is handed in.
+"""The receiver's view of the bus: the newest value of each signal while it is fresh. Pure; time is an argument.
 
-A value is None before its first frame, when the gateway says that it is not available, and when its message stays away: a cyclic one for
-three cycles, one that comes with telemetry for a second, one that comes on change only when nothing of the gateway's has come for three of
-the shortest cycles (3 s at least; never where no message has a cycle, because then nobody knows).
+A value is None before its first frame, while the gateway sends it as not available, and when its message is missing: a cyclic one for
+three cycles, one sent with telemetry for a second, one sent on change when nothing of the gateway has come for three of the shortest
+cycles (at least 3 s; never if no message has a cycle).
 """
 
 from kontronik_can_gw.esc.telemetry import MS, SECOND
@@ -16,15 +16,15 @@ _MIN_SILENCE_NS = 3 * SECOND
 
 
 class View:
-    """The values of a layout's columns, in the order of ``reader.columns``. ``now``: nanoseconds of one clock, that of the frames."""
+    """The values of a layout's columns, in the order of ``reader.columns``. ``now``: nanoseconds on the clock of the frames."""
 
     def __init__(self, reader: SignalReader) -> None:
         self.reader = reader
         self.values: list[Value] = [None] * len(reader.columns)
         self.frames = 0
-        """Frames of the layout that were taken."""
+        """Number of frames of the layout received."""
         self.last_ns: int | None = None
-        """When the newest of them came."""
+        """Time of the newest frame."""
         self._part_of = {part.first: index for index, part in enumerate(reader.parts)}
         self._life = [_life(part) for part in reader.parts]
         self._seen: list[int | None] = [None] * len(reader.parts)
@@ -36,11 +36,11 @@ class View:
 
     @property
     def next_expiry(self) -> int | None:
-        """``expire`` has nothing to do up to this time; None: for ever."""
+        """``expire`` has nothing to do before this time; None: for ever."""
         return self._next_expiry
 
     def take(self, key: int, data: bytes, now: int) -> list[Chunk] | None:
-        """Take a frame (``key``: its id, with EXTENDED for 29 bits); what it brought, None where it is not of the layout."""
+        """Take a frame (``key``: its id, with EXTENDED for 29 bits); return its values, None where it is not of the layout."""
         chunks = self.reader.read(key, data)
         if chunks is None:
             return None
@@ -57,7 +57,7 @@ class View:
         return chunks
 
     def expire(self, now: int) -> bool:
-        """Forget what has stayed away for too long; True where something was forgotten."""
+        """Drop the values of missing messages; True where something was dropped."""
         if self._next_expiry is None or now <= self._next_expiry:
             return False
         dues = [self._due(index) for index in range(len(self._life))]
@@ -73,7 +73,7 @@ class View:
         return forgotten
 
     def _due(self, index: int) -> int | None:
-        """Until when a part's values hold; None: nobody knows, or there are none."""
+        """Until when a part's values hold; None: unknown, or there are none."""
         seen, life = self._seen[index], self._life[index]
         if seen is None:
             return None
@@ -86,13 +86,13 @@ class View:
         )
 
     def value(self, source: str, esc: int | None = None) -> Value:
-        """The value of the signal that is bound to a source; None where the layout has none too."""
+        """The value of the signal bound to a source; None also where the layout has no such signal."""
         index = self.reader.column_of(source, esc)
         return None if index is None else self.values[index]
 
 
 def _life(part: Part) -> int | None:
-    """How long a part's values hold without a new frame; None: as long as anything of the gateway's comes."""
+    """How long a part's values hold without a new frame; None: as long as any frame of the gateway comes."""
     plan = part.plan
     if plan.cycle_ns:
         return max(_MIN_NS, _CYCLES * plan.cycle_ns * len(plan.pages))

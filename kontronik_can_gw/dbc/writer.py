@@ -1,4 +1,4 @@
-"""A database -> DBC text, by the rules that every tool reads, and loss-free: what cantools holds is what it reads back.
+"""Writes a database as DBC text that every tool reads, without loss: cantools reads back the same database.
 
 cantools' own writer leaves out attributes that equal their default, rewrites start values as floats, and does not escape the quotes
 of database comments and text attributes.
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 _LONG_NAMES = frozenset(
     {f"System{kind}LongSymbol" for kind in ("Node", "Message", "Signal", "EnvVar")}
 )
-"""cantools has put the long names in their place already."""
+"""Attributes not written: cantools has already replaced the short names by these long ones."""
 
 
 def dbc_text(database: "Database") -> str:
-    """The text: sections in the usual order, signals in the order of their bits, LF, one line an entry."""
+    """The DBC text: sections in the usual order, signals in bit order, one line for each entry, LF line ends."""
     sections = [
         [f'VERSION "{_escaped(database.version or "")}"'],
         ["NS_ :"],
@@ -121,7 +121,7 @@ def _environment(database: "Database") -> Iterator[str]:
 
 
 def _owners(database: "Database") -> Iterator[tuple[str, Any]]:
-    """What comments and attributes can belong to, as DBC files name it."""
+    """Owners of comments and attributes, by their names in DBC files."""
     for node in database.nodes:
         yield f"BU_ {node.name} ", node
     for message in database.messages:

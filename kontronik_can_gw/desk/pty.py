@@ -1,7 +1,7 @@
-"""Simulated ESCs on pseudo terminals: the cable between a ``SimulatedEsc`` and a gateway that believes in serial ports.
+"""Simulated ESCs on pseudo terminals, which a gateway opens like serial ports.
 
-A real ESC must never be sent a byte (its line has an ASCII mode in which parameters can be written). So the other side of
-every pseudo terminal is watched: whatever a gateway sends, echo included, is counted in ``PtyEsc.received``.
+A real ESC must never be sent a byte (its line has an ASCII mode in which parameters can be written). So everything that a gateway sends,
+echo included, is counted in ``PtyEsc.received``.
 """
 
 import heapq
@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.simulator import SECOND_NS, Sent, SimulatedEsc
 class PtyEsc:
     """The ESC's end of a pseudo terminal, as context manager. The gateway opens ``path``, or the symbolic link ``link``.
 
-    An existing symbolic link at ``link`` is replaced, anything else there is left alone (RunError). The link goes at close.
+    An existing symbolic link at ``link`` is replaced, anything else there is a RunError. The link is removed at close.
     """
 
     __slots__ = (
@@ -36,9 +36,9 @@ class PtyEsc:
 
     def __init__(self, link: str | Path | None = None) -> None:
         self.dropped_bytes = 0
-        """Bytes not taken because nobody read and the terminal was full."""
+        """Bytes dropped because nobody read and the terminal was full."""
         self.received = 0
-        """Bytes that came from the gateway. Must stay 0."""
+        """Number of bytes from the gateway. Must stay 0."""
         self.first_received = b""
         """The first of them, at most 64."""
         self._link: Path | None = None
@@ -46,7 +46,7 @@ class PtyEsc:
             self._master, self._slave = os.openpty()
         except OSError as error:
             raise RunError(
-                f"no pseudo terminal to be had: {error.strerror}. Use fewer ESCs."
+                f"no pseudo terminal available: {error.strerror}. Use fewer ESCs."
             ) from None
         try:
             _set_raw(self._slave)
@@ -59,11 +59,11 @@ class PtyEsc:
             raise
 
     def fileno(self) -> int:
-        """The ESC's end, to poll for bytes from the gateway."""
+        """File descriptor of the ESC's end, to poll for bytes from the gateway."""
         return self._master
 
     def write(self, data: bytes) -> bool:
-        """Send without blocking. False, and counted in ``dropped_bytes``, if not everything was taken."""
+        """Send without blocking. If not everything was accepted, count the rest in ``dropped_bytes`` and return False."""
         if not data:
             return True
         try:
@@ -74,7 +74,7 @@ class PtyEsc:
         return taken == len(data)
 
     def check(self) -> int:
-        """Fetch what the gateway sent since the last call; return how many bytes. Anything but 0 is a fault of the gateway."""
+        """Read what the gateway sent since the last call; return the number of bytes. Other than 0 is a fault of the gateway."""
         total = 0
         try:
             while data := os.read(self._master, 4096):
@@ -92,7 +92,7 @@ class PtyEsc:
                 self._link.unlink(missing_ok=True)
             self._link = None
         if self._master >= 0:
-            os.close(self._slave)  # held open until now, so that readers may come and go
+            os.close(self._slave)  # open until now, so that readers can come and go
             os.close(self._master)
             self._master = self._slave = -1
 
@@ -119,9 +119,9 @@ def run(
 ) -> None:
     """Send in real time, all ESCs in this one thread.
 
-    Ends when what leaves before ``seconds`` was sent, or ``stop()`` is true (asked at least each 100 ms). The simulations'
+    Ends when all frames due before ``seconds`` were sent, or ``stop()`` is true (asked at least each 100 ms). The simulations'
     time 0 is ``origin_ns`` of time.monotonic_ns, the call's time unless given. ``on_sent`` gets the index of the ESC, the
-    frame, and whether the terminal took it; ``on_received`` the index of an ESC that was sent something.
+    frame, and whether the terminal accepted it; ``on_received`` the index of an ESC that received bytes.
     """
     if origin_ns is None:
         origin_ns = time.monotonic_ns()
@@ -147,7 +147,7 @@ def run(
                 if on_sent is not None:
                     on_sent(index, sent, taken)
             heapq.heapreplace(due, (esc.next_ns, index))
-        # At least 1 ms: what falls due within it goes in one round, so 64 ESCs cost no more rounds than 10.
+        # At least 1 ms, so that frames due within it share a round: 64 ESCs cost no more rounds than 10.
         until_ns = min(due[0][0] if due else now_ns + SECOND_NS, now_ns + SECOND_NS // 10)
         if end_ns is not None:
             until_ns = min(until_ns, end_ns)
@@ -173,7 +173,7 @@ def _make_link(link: Path, target: str) -> Path:
             raise RunError(
                 f"{link}: exists and is not a symbolic link. Remove it or give another --link."
             )
-        # made there and moved: never a moment without a link
+        # made under another name and moved, so that the link exists at all times
         beside = link.with_name(f".{link.name}.{os.getpid()}")
         beside.unlink(missing_ok=True)
         beside.symlink_to(target)

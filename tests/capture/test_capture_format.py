@@ -1,4 +1,4 @@
-"""The capture's format: every entry comes back, every intact block is found, damage is told and costs nothing else."""
+"""The capture's format: every entry comes back, every intact block is found, damage is reported and costs nothing else."""
 
 import random
 import struct

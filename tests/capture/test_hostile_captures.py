@@ -159,7 +159,7 @@ def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> 
 def test_what_only_looks_like_blocks_costs_no_more_than_a_while(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Heads that promise megabytes, one behind the other: each would have to be read to its end."""
+    """Heads that promise megabytes, one after the other: each would have to be read to its end."""
     head = struct.pack("<4scBHIII", MAGIC, b"D", 0, 0, 8_000_000, 8_000_000, 0) + b"\0\0\0\0"
     good = block(b"D", 7, b"good")
     data = head * 3000 + bytes(9_000_000) + good

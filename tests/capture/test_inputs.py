@@ -260,7 +260,7 @@ def test_pole_pairs_and_gear_are_those_of_the_capture_whatever_dbc_shows_it(tmp_
                 assert motor == (2 * electrical + poles) // (2 * poles)
 
 
-def test_a_part_without_a_header_is_told_and_the_others_are_read(tmp_path: Path) -> None:
+def test_a_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: Path) -> None:
     bench, _ = plain_run(1)
     (tmp_path / "20260101T000000Z-aaaaaa-00000.kcap").write_bytes(b"")
     capture(tmp_path / "20260101T000000Z-aaaaaa-00001.kcap", bench.setup, bench.entries, part=1)

@@ -119,7 +119,7 @@ def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_the_header_tells_where_it_comes_from(tmp_path: Path) -> None:
+def test_the_header_shows_where_it_comes_from(tmp_path: Path) -> None:
     it = begun(tmp_path)
     bench = Bench(*made(1))
     it.note(bench.gateway, 0)
@@ -142,7 +142,7 @@ def test_the_header_tells_where_it_comes_from(tmp_path: Path) -> None:
         assert abs((found.wall_ns(time.monotonic_ns()) or 0) - now) < SECOND
 
 
-def test_room_again_and_it_goes_on_and_the_loss_is_told(
+def test_room_again_and_it_goes_on_and_the_loss_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 10 * SECOND
@@ -217,7 +217,7 @@ def test_a_disk_that_fails_costs_what_is_counted(
 
     def write(fd: int, data: bytes) -> int:
         if broken.is_set():
-            real(fd, bytes(data)[:7])  # half a block stays behind
+            real(fd, bytes(data)[:7])  # half a block is left
             raise OSError(errno.EIO, "Input/output error")
         return real(fd, data)
 

@@ -67,7 +67,7 @@ def test_a_log_is_not_written_over_itself_and_has_no_bytes_of_escs(tmp_path: Pat
     )
 
 
-def test_it_stops_at_once_when_it_is_told_to(tmp_path: Path) -> None:
+def test_it_stops_at_once_when_asked(tmp_path: Path) -> None:
     bench = Bench(*made(1))
     bench.gateway.start(START)
     bench.take(START)

@@ -94,7 +94,7 @@ def test_a_removed_key_is_a_warning_of_every_command_that_reads_the_configuratio
 
 
 @pytest.mark.parametrize("kind", ["none", "file", "directory", "pipe", "null"])
-def test_what_is_no_serial_port_is_told_so_with_where_to_look(tmp_path: Path, kind: str) -> None:
+def test_what_is_no_serial_port_is_reported_with_where_to_look(tmp_path: Path, kind: str) -> None:
     port = Path("/dev/null") if kind == "null" else tmp_path / "port"
     if kind == "file":
         port.write_bytes(b"x")
@@ -152,7 +152,9 @@ def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
     assert ("usermod" in done.stderr) == (mode == 0o660)
 
 
-def test_a_second_gateway_on_a_port_is_told_who_has_it(tmp_path: Path, terminal: PtyEsc) -> None:
+def test_a_second_gateway_on_a_port_gets_the_name_of_the_first(
+    tmp_path: Path, terminal: PtyEsc
+) -> None:
     file = configuration(tmp_path, terminal.path)
     first = subprocess.Popen([*PROGRAM, "run", "-c", str(file)], stderr=subprocess.PIPE, text=True)
     try:
@@ -193,7 +195,7 @@ def test_only_a_configuration_that_is_not_there_is_answered_with_init(tmp_path: 
 # --- CAN interface
 
 
-def test_socketcan_that_is_not_there_is_told_with_the_command_that_makes_it(
+def test_socketcan_that_is_not_there_is_reported_with_the_command_that_makes_it(
     tmp_path: Path, terminal: PtyEsc
 ) -> None:
     file = configuration(tmp_path, terminal.path, can='channel = "nocan7"')
@@ -258,7 +260,7 @@ def test_a_dbc_goes_into_a_pipe_and_through_a_link_without_replacing_them(tmp_pa
 
 
 @pytest.mark.parametrize("words", [["schema"], ["init", "-"], ["dbc"]])
-def test_a_full_disk_behind_standard_output_is_one_line(words: list[str]) -> None:
+def test_a_full_disk_at_standard_output_is_one_line(words: list[str]) -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(
             [*PROGRAM, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
@@ -275,7 +277,7 @@ def test_a_closed_standard_output_is_no_reason_for_a_traceback(tmp_path: Path) -
     assert done.returncode == 0
 
 
-def test_a_reader_that_goes_away_is_not_told_about_it() -> None:
+def test_a_reader_that_goes_away_gets_no_message() -> None:
     done = subprocess.run(
         ["sh", "-c", f"{sys.executable} -m kontronik_can_gw dbc --esc 8 | head -c 10"],
         capture_output=True,

@@ -57,7 +57,7 @@ def test_several_escs_of_mixed_layouts_write_a_file_each(tmp_path: Path) -> None
     assert layouts == [{Layout.V4}, {Layout.LEGACY}, {Layout.V4}]
 
 
-def test_device_variant_firmware_and_cells_are_as_told(tmp_path: Path) -> None:
+def test_device_variant_firmware_and_cells_are_as_asked(tmp_path: Path) -> None:
     words = ["--device", "Kontrol_X", "--variant", "7", "--firmware", "3.9", "--cells", "12"]
     words += ["--seconds", "2", "--rate", "200", "--info-every", "50"]
     frames = written(tmp_path, *words)
@@ -68,7 +68,7 @@ def test_device_variant_firmware_and_cells_are_as_told(tmp_path: Path) -> None:
     assert infos[0].cell_count == 12
 
 
-def test_error_bits_and_device_swaps_come_when_told(tmp_path: Path) -> None:
+def test_error_bits_and_device_swaps_come_when_asked(tmp_path: Path) -> None:
     words = [
         "--error",
         "undervoltage@1s+500ms",

@@ -1,4 +1,4 @@
-"""The gateway at work on pseudo terminals and python-can's in-process bus; the parts of the runtime with a socket that is none."""
+"""The gateway at work on pseudo terminals and python-can's in-process bus; parts of the runtime on a fake socket."""
 
 import errno
 import os
@@ -186,7 +186,7 @@ def test_the_demonstration_in_a_pipe_prints_plain_lines() -> None:
     assert "0 bytes sent to the ESC" in done.stderr
 
 
-# --- the CAN port on a socket that is none
+# --- the CAN port on a fake socket
 
 
 class FakeSocket:
@@ -266,7 +266,7 @@ def test_frames_go_out_as_the_kernel_wants_them_and_nothing_waits(
         ([errno.EBADF], Sent.GONE, CanState.DOWN),
     ],
 )
-def test_a_refusal_of_the_kernel_tells_what_is_wrong(
+def test_a_refusal_of_the_kernel_shows_what_is_wrong(
     socket_port: tuple[CanPort, FakeSocket], faults: list[int], answer: Sent, state: CanState
 ) -> None:
     port, fake = socket_port
@@ -295,7 +295,7 @@ def error_frame(kind: int, detail: int = 0) -> bytes:
         (0x20, 0x40, CanState.UNKNOWN),  # no acknowledge: says nothing of the state
     ],
 )
-def test_error_frames_tell_the_controllers_state(
+def test_error_frames_show_the_controllers_state(
     socket_port: tuple[CanPort, FakeSocket], kind: int, detail: int, state: CanState
 ) -> None:
     port, fake = socket_port

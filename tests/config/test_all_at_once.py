@@ -61,7 +61,7 @@ def test_mistakes_of_every_file_come_together(
     ] * len(expected)
 
 
-def test_mistakes_in_a_table_are_told_alone_for_the_rest_depends_on_it(tmp_path: Path) -> None:
+def test_mistakes_in_a_table_are_reported_alone_for_the_rest_depends_on_it(tmp_path: Path) -> None:
     (tmp_path / "my.dbc").write_text(DBC)
     (tmp_path / "a.toml").write_text(
         '[dbc]\nfile = "my.dbc"\nnoode = 1\n[[esc]]\nport = "a"\n[[esc]]\nport = "a"\n'

@@ -340,7 +340,7 @@ def test_a_mistake_is_one_line_with_its_place_and_what_was_meant(
     assert ": unknown" not in line or line == f"a.toml: {said}"
 
 
-def test_all_mistakes_are_told_at_once() -> None:
+def test_all_mistakes_are_reported_at_once() -> None:
     wrong = {
         "canbus": {},
         "can": {"bitrate": 3, "chanel": "can0"},
@@ -366,7 +366,7 @@ def test_all_mistakes_are_told_at_once() -> None:
 @pytest.mark.parametrize(
     "names", [("a", "ab"), ("left", "left2"), ("esc1", "esc10", "esc11"), ("nose", "rear")]
 )
-def test_names_that_begin_alike_but_can_be_told_apart_are_taken(names: tuple[str, ...]) -> None:
+def test_names_that_begin_alike_but_can_be_distinguished_are_taken(names: tuple[str, ...]) -> None:
     config = parse(named(*names), "a.toml")
     assert [esc.name for esc in config.escs] == list(names)
 
@@ -442,7 +442,7 @@ def test_a_byte_order_mark_and_windows_line_ends_do_not_matter(tmp_path: Path) -
     assert load(file).esc[0].port == "COM3"
 
 
-def test_a_missing_file_and_a_directory_are_told_with_the_command_that_writes_an_example(
+def test_a_missing_file_and_a_directory_are_reported_with_the_command_that_writes_an_example(
     tmp_path: Path,
 ) -> None:
     for path, reason in (

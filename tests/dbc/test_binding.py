@@ -430,7 +430,7 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
     frames = gateway.take_frames()
     assert [get(frame.data, counter_at, 4, True) for frame in frames] == [n % 15 for n in range(41)]
     for frame in frames:
-        if at < 7:  # the package wants a byte behind the CRC
+        if at < 7:  # the package needs a byte after the CRC
             assert theirs(frame.data, at, data_id) == frame.data
             assert p01.e2e_p01_check(bytearray(frame.data), data_id, offset=at)
         moved = frame.data[at : at + 1] + frame.data[:at] + frame.data[at + 1 :]

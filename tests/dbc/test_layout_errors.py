@@ -273,7 +273,7 @@ def test_send_types_are_known_and_a_cycle_has_a_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("attribute", ["GenMsgCycleTime", "GenMsgDelayTime"])
 @pytest.mark.parametrize("value", ['"soon"', '"inf"', '"nan"', '"-1"'])
-def test_a_time_that_is_none_is_refused(tmp_path: Path, attribute: str, value: str) -> None:
+def test_an_invalid_time_is_refused(tmp_path: Path, attribute: str, value: str) -> None:
     text = timed(f'BA_ "{attribute}" BO_ 256 {value};').replace(
         f'"{attribute}" INT 0 65535', f'"{attribute}" STRING '
     )

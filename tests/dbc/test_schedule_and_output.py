@@ -241,8 +241,8 @@ def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too
             bench.take()
         bench.live()
         lives += 1
-    assert bench.raws(8, 16)[0] == 1  # Searching, told while there are no live frames yet
-    assert {2, 3} <= set(bench.raws(8, 16))  # Ok and Degraded, told with live frames
+    assert bench.raws(8, 16)[0] == 1  # Searching, reported before the first live frame
+    assert {2, 3} <= set(bench.raws(8, 16))  # Ok and Degraded, reported with live frames
     assert len(bench.times()) == 1 + lives
 
 

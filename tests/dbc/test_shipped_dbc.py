@@ -118,7 +118,7 @@ def test_one_esc_loads_the_bus_below_ten_percent_and_eight_fit_on_it(
 @pytest.mark.parametrize(
     "name", ["Losses", "CrcErrors", "DroppedBytes", "SentFrames", "ReplacedFrames", "SendFailures"]
 )
-def test_the_comment_of_a_rolling_counter_tells_its_greatest_value(name: str) -> None:
+def test_the_comment_of_a_rolling_counter_shows_its_greatest_value(name: str) -> None:
     db = parse(DATA)
     found = next(signal for signal in db.signals if signal.name == name)
     assert f"starts again at 0 after {found.maximum}." in dict(db.comments)[("SG_", *found.key)]

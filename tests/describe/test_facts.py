@@ -170,7 +170,7 @@ def test_emergencies_are_those_that_the_eds_enables(facts: Facts) -> None:
     assert {e["code"]: e["register"] for e in of_esc}[0x3220] == 0b101
 
 
-def test_each_source_is_told_with_a_meaning_and_where_it_is_shown(facts: Facts) -> None:
+def test_each_source_is_reported_with_a_meaning_and_where_it_is_shown(facts: Facts) -> None:
     known = VALUES
     told = {row["name"]: row for row in facts["sources"]}
     assert {name for name, row in told.items() if row["bindable"]} == set(known)
@@ -188,7 +188,7 @@ def test_each_source_is_told_with_a_meaning_and_where_it_is_shown(facts: Facts) 
 # --- by a configuration
 
 
-def test_of_two_escs_each_has_its_signals_and_cob_ids_and_the_objects_are_told_once(
+def test_of_two_escs_each_has_its_signals_and_cob_ids_and_the_objects_are_reported_once(
     tmp_path: Path, facts: Facts
 ) -> None:
     two = by_configuration(tmp_path, TWO_ESCS)

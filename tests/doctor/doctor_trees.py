@@ -15,7 +15,7 @@ _ROOM = FileSystem(False, 1 << 30, 100_000)
 
 
 class Tree(System):
-    """A machine below a folder. What it is not told of is not there."""
+    """A machine below a folder. Only what a test adds exists."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)

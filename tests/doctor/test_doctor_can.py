@@ -123,7 +123,7 @@ DOWN = {"flags": ["NOARP"]}
         (info(termination=120), PLAIN, "can.termination", NOTE, "120 ohm"),
     ],
 )
-def test_what_is_not_as_it_should_be_is_told_with_the_command(
+def test_what_is_not_as_it_should_be_is_reported_with_the_command(
     tree: Tree, change: dict[str, Any], can: CanConfig, check: str, severity: Severity, said: str
 ) -> None:
     interface(tree, merged(controller(), change))
@@ -150,7 +150,7 @@ def test_a_good_interface_has_nothing_but_ok(
     assert grave(check_can(tree, can)) == {}
 
 
-def test_a_missing_interface_is_told_with_those_there_are(tree: Tree) -> None:
+def test_a_missing_interface_is_reported_with_those_there_are(tree: Tree) -> None:
     found = only(check_can(tree, PLAIN), "can.exists")
     assert (found.severity, found.command) == (
         ERROR,
@@ -161,7 +161,7 @@ def test_a_missing_interface_is_told_with_those_there_are(tree: Tree) -> None:
     assert only(check_can(tree, PLAIN), "can.exists").remedy == "Set can.channel: can1"
 
 
-def test_slcan_cannot_restart_and_is_not_told_to(tree: Tree) -> None:
+def test_slcan_cannot_restart_and_is_not_asked_to(tree: Tree) -> None:
     """The kernel's slcan driver: fixed rates, no bit timing, no restart."""
     change = info(
         bittiming=None,
@@ -197,7 +197,7 @@ def test_without_ip_or_with_one_that_knows_no_json_sys_is_read(
     assert only(check_can(tree, PLAIN), "can.up").severity is ERROR
 
 
-def test_a_kernel_without_socketcan_is_told_with_the_package(tmp_path: Path) -> None:
+def test_a_kernel_without_socketcan_is_reported_with_the_package(tmp_path: Path) -> None:
     tree = Tree(tmp_path)
     found = only(check_can(tree, PLAIN), "can.kernel")
     assert found.severity is ERROR

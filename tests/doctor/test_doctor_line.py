@@ -55,7 +55,7 @@ def test_a_port_that_somebody_may_have_set_up_is_not_touched(
     assert termios.tcgetattr(slave) == before
 
 
-def test_what_cannot_be_opened_is_told(tmp_path: Path) -> None:
+def test_what_cannot_be_opened_is_reported(tmp_path: Path) -> None:
     found = look(str(tmp_path / "none"), alone=True)
     assert found.trouble == "No such file or directory"
     assert not found.busy

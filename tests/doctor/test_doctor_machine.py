@@ -85,7 +85,7 @@ def test_a_good_machine_has_nothing_but_ok(tree: Tree) -> None:
         ),
     ],
 )
-def test_what_is_not_as_it_should_be_is_told(
+def test_what_is_not_as_it_should_be_is_reported(
     tree: Tree, files: dict[str, str], check: str, severity: Severity
 ) -> None:
     for name, text in files.items():
@@ -110,7 +110,7 @@ def test_what_is_not_as_it_should_be_is_told(
         ({}, OK, ""),
     ],
 )
-def test_how_the_service_fares_is_told(
+def test_how_the_service_fares_is_reported(
     tree: Tree, shown: dict[str, str], severity: Severity, word: str
 ) -> None:
     assert "systemd does not run" in only(machine(tree), "machine.service").text
@@ -180,7 +180,7 @@ def test_a_folder_of_ones_own_must_be_the_services_and_the_unit_must_let_it_writ
         (FileSystem(False, 1 << 20, 1000), WARNING, "1024 kB"),
     ],
 )
-def test_a_full_or_read_only_file_system_is_told(
+def test_a_full_or_read_only_file_system_is_reported(
     tree: Tree, left: FileSystem, severity: Severity, word: str
 ) -> None:
     tree.folder(STORE)

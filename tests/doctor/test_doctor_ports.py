@@ -237,7 +237,7 @@ DEVICES = file(
         ),
     ],
 )
-def test_what_is_found_is_told_and_the_port_is_opened_only_where_nobody_else_needs_it(
+def test_what_is_found_is_reported_and_the_port_is_opened_only_where_nobody_else_needs_it(
     tree: Tree, given: Set, port: str, opened: bool, name: str, severity: Severity, said: str
 ) -> None:
     given(tree)
@@ -299,7 +299,7 @@ def test_a_port_that_only_the_running_gateway_may_open_is_no_error(tree: Tree) -
         ),
     ],
 )
-def test_what_the_port_itself_answers_is_told(
+def test_what_the_port_itself_answers_is_reported(
     tree: Tree, line: Line, name: str, severity: Severity, word: str
 ) -> None:
     tree.ftdi()
@@ -308,7 +308,7 @@ def test_what_the_port_itself_answers_is_told(
     assert word in found.text
 
 
-def test_a_lock_tells_who_has_the_port_where_nothing_else_may_be_seen(tree: Tree) -> None:
+def test_a_lock_shows_who_has_the_port_where_nothing_else_may_be_seen(tree: Tree) -> None:
     tree.ftdi()
     tree.process(80, *RUN)
     inode = tree.devices[USB0].st_ino

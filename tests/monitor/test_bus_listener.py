@@ -1,4 +1,4 @@
-"""The listener on python-can's in-process bus, and on a port that is none where an interface is to go away."""
+"""The listener on python-can's in-process bus, and on a fake port where an interface disappears."""
 
 import itertools
 
@@ -73,7 +73,7 @@ def test_it_is_tried_at_most_each_half_second(
     assert all(later - earlier >= 0.5 for earlier, later in itertools.pairwise(looked))
 
 
-def test_bus_off_is_told_until_a_frame_comes(clock: Clock) -> None:
+def test_bus_off_is_reported_until_a_frame_comes(clock: Clock) -> None:
     listener = BusListener(CanConfig(), frozenset({0x123}))
     (port,) = FakePort.opened
     port.state = CanState.BUS_OFF

@@ -77,7 +77,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_log(tmp_path_factory.mktemp("logs") / "flight.log", flight(ONE, 12))
 
 
-def test_once_of_a_log_tells_what_holds_at_its_end(log: Path) -> None:
+def test_once_of_a_log_shows_what_holds_at_its_end(log: Path) -> None:
     found = document(run("monitor", log, "--once"))
     frames = flight(ONE, 12)
     assert (found["file"], found["frames"]) == ("flight.log", len(frames))

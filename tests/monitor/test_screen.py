@@ -27,7 +27,7 @@ KINDS = ["good", "errors", "lost", "silent", "replay", "none"]
 
 @cache
 def seen(count: int, kind: str = "good") -> Monitor:
-    """A monitor of so many ESCs in flight; the first with errors, silent, or all as they should be."""
+    """A monitor of ``count`` ESCs in flight; the first with errors, silent, or all without faults."""
     bus = layout_of([f"esc{index + 1}" for index in range(count)])
     errors = with_errors(OperatingError.UNDERVOLTAGE, OperatingError.BEC_OVERCURRENT)
     first = errors if kind == "errors" else EscOptions(device=Device.JIVEPRO)

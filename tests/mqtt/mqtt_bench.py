@@ -138,7 +138,7 @@ class Subscriber:
         return [heard for heard in list(self.heard) if heard.topic == topic]
 
     def wait(self, topic: str, payload: bytes | None = None, count: int = 1) -> Heard:
-        """Wait for so many messages of a topic (with this payload)."""
+        """Wait for ``count`` messages of a topic (with this payload)."""
 
         def found() -> list[Heard]:
             return [

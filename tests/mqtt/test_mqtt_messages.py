@@ -119,7 +119,7 @@ def test_the_json_of_an_esc_has_each_value_as_cantools_reads_it(names: tuple[str
             else:
                 assert value == wanted[source], source
             compared += 1
-        # every signal is there, but for flags (they are lists) and what is none of the ESC's values
+        # every signal is there, but for flags (they are lists) and values that are not the ESC's
         signals = {c.source for c in SignalReader(bus.layout).columns if c.esc == index}
         assert signals - set(found) == flags & signals
         assert compared == len(signals - flags)
@@ -175,7 +175,7 @@ def changes(published: Published, key: str) -> list[tuple[int, Any]]:
     return found
 
 
-def test_an_error_is_told_at_once_however_slow_the_rate() -> None:
+def test_an_error_is_reported_at_once_however_slow_the_rate() -> None:
     window = ErrorWindow(OperatingError.OVERVOLTAGE, 3 * SECOND_NS, SECOND_NS)
     options = EscOptions(profile=QUIET.profile, faults=Faults(errors=(window,)))
     frames = flight(layout_of(["esc1"]), 6, [options])
@@ -186,7 +186,7 @@ def test_an_error_is_told_at_once_however_slow_the_rate() -> None:
         assert 0 <= told - happened <= 0.2 * SECOND_NS + 2 * STEP_NS
 
 
-def test_a_new_kind_of_state_and_a_lost_link_are_told_at_once_and_a_new_speed_is_not() -> None:
+def test_a_new_kind_of_state_and_a_lost_link_are_reported_at_once_and_a_new_speed_is_not() -> None:
     options = EscOptions(
         profile=(
             Phase("off", 2, 0, OperatingState.MotorOff, 0),
@@ -348,12 +348,12 @@ def discoveries(published: Iterable[tuple[int, Message]]) -> list[tuple[int, dic
     return [(now, json.loads(m.payload)) for now, m in published if m.topic == topic]
 
 
-def test_an_esc_is_told_of_once_when_it_is_known() -> None:
+def test_an_esc_is_announced_once_when_it_is_known() -> None:
     told = discoveries(run(publisher("esc1", discovery="ha"), flight(layout_of(["esc1"]), 20), 20))
     assert [found["device"]["model"] for _, found in told] == ["KOSMIK"]
 
 
-def test_an_esc_that_does_not_tell_what_it_is_is_told_of_all_the_same() -> None:
+def test_an_esc_that_does_not_identify_itself_is_announced_nevertheless() -> None:
     """Info frames are missing; what was published before a restart is not overwritten too soon."""
     bus = layout_of(["esc1"])
     info = {

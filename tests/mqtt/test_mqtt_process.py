@@ -219,7 +219,7 @@ def test_the_same_gateway_twice_on_a_machine_is_refused(
         assert program.process.poll() is None
 
 
-def test_the_service_manager_is_told_and_the_watchdog_fed(
+def test_the_service_manager_is_reported_and_the_watchdog_fed(
     tmp_path: Path, bus: Path, broker: Mosquitto
 ) -> None:
     told: list[str] = []

@@ -17,7 +17,7 @@ UNITS = "etc/systemd/system"
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """The top of an image, with a program."""
+    """The root of a disk image, with a program."""
     program = tmp_path / "opt/kontronik-can-gw"
     program.parent.mkdir()
     program.write_text("#!/bin/sh\n")

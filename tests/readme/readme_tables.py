@@ -179,7 +179,7 @@ def objects() -> str:
 
 
 def _pdo(eds: Eds, index: int) -> str:
-    """What a PDO is by default, behind the name of its parameters."""
+    """The default of a PDO, shown after the name of its parameters."""
     entries = {(e.index, e.sub): e for e in eds.entries}
     value = {at: entry.default for at, entry in entries.items() if isinstance(entry.default, int)}
     if index in range(0x1800, 0x1A00):

@@ -63,7 +63,7 @@ def gateway(channel: str, store: Path, node_id: int) -> Iterator[None]:
         simulated = SimulatedEsc(EscOptions(faults=Faults(errors=windows)), seed=1)
         feeder = threading.Thread(target=lambda: pty.run([(simulated, esc)], stop=stop.is_set))
         runner = threading.Thread(target=loop.run)
-        gc.freeze()  # what thousands of tests before left behind must not be walked through while the gateway is to answer
+        gc.freeze()  # objects left by thousands of earlier tests must not be scanned while the gateway has to answer
         feeder.start()
         runner.start()
         # it has come round: a node that waits for LSS does not say when it listens

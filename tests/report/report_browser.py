@@ -20,7 +20,7 @@ _TIMEOUT_S = 60
 
 
 class Browser:
-    """One page of one browser. ``errors``: what scripts threw or the console told as error; ``requests``: addresses asked for."""
+    """One page of one browser. ``errors``: errors that scripts threw or the console reported; ``requests``: addresses asked for."""
 
     def __init__(self, profile: Path) -> None:
         assert PROGRAM is not None, MISSING

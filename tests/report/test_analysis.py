@@ -1,4 +1,4 @@
-"""The summary's numbers against pandas and numpy on simulated flights; events against what the simulator was told to do."""
+"""The summary's numbers against pandas and numpy on simulated flights; events against the options of the simulator."""
 
 from itertools import pairwise
 
@@ -260,7 +260,7 @@ def test_many_events_and_states_stay_bounded() -> None:
 
 
 @pytest.mark.parametrize("points", [100, 20_000])
-def test_rows_far_apart_are_not_joined_even_without_a_row_that_tells_the_loss(points: int) -> None:
+def test_rows_far_apart_are_not_joined_even_without_a_row_that_shows_the_loss(points: int) -> None:
     """As in a log that was stopped for a while: 2 s of rows, nothing for 1.1 s, and so on."""
     bus = shipped_bus()
     live = column(bus, "battery_voltage")

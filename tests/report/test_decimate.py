@@ -46,7 +46,7 @@ SPARSE = st.lists(st.tuples(st.integers(0, 3999), st.integers(0, 2)), max_size=6
 def test_gaps_and_extremes_are_kept_however_the_rows_are_cut(
     rows: list[tuple[Number, Number]], steps: list[int], points: int, most: int, cuts: list[int]
 ) -> None:
-    """Also with more gaps than can be told apart: they become wider."""
+    """Also with more gaps than are kept separate: they become wider."""
     times = list(accumulate(steps[: len(rows) - 1], initial=0))
     decimator, whole = Decimator(2, points, most), Decimator(2, points, most)
     at = 0

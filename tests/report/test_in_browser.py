@@ -1,4 +1,4 @@
-"""The page in a real browser (headless Chromium): nothing fails, everything is drawn, and it does what it is told."""
+"""The page in a real browser (headless Chromium): nothing fails, everything is drawn, and it reacts to input."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -154,7 +154,7 @@ def test_encoding_is_exact(values: list[Number]) -> None:
     assert decode(encode(values)) == values
 
 
-def test_what_the_dbc_does_not_have_is_left_out_and_told(tmp_path: Path) -> None:
+def test_what_the_dbc_does_not_have_is_left_out_and_reported(tmp_path: Path) -> None:
     text = shipped("dbc/kontronik_esc.dbc").read_text(encoding="utf-8")
     text = re.sub(r"^ SG_ Bec(Current|Voltage) .*\n", "", text, flags=re.MULTILINE)
     text = re.sub(

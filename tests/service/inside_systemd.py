@@ -105,7 +105,7 @@ def trial(facts: Facts) -> None:
     write_configuration(CONFIGURATION, "vcan0", LINK)
     facts["install now"] = service("install", "--now")
     facts["fresh after"] = fresh()
-    until(lambda: "telemetry ok" in shown()["StatusText"])  # which is told once a second
+    until(lambda: "telemetry ok" in shown()["StatusText"])  # which is reported once a second
     facts["running"] = shown()
     pid = facts["running"]["MainPID"]
     facts["process"] = Path(f"/proc/{pid}/status").read_text()

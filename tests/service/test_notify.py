@@ -1,4 +1,4 @@
-"""What the gateway tells systemd, read from a socket that stands in for systemd's; and how its log lines look to the journal."""
+"""What the gateway reports to systemd, read from a socket in place of systemd's; and how its log lines look to the journal."""
 
 import logging
 import os
@@ -42,7 +42,7 @@ def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]
         yield found
 
 
-def test_a_life_is_told_in_systemds_words(manager: Manager) -> None:
+def test_a_life_is_reported_in_systemds_words(manager: Manager) -> None:
     notifier = Notifier(manager.environment(WATCHDOG_USEC=10_000_000, WATCHDOG_PID=os.getpid()))
     notifier.ready("two ESCs")
     notifier.status("one ESC")
@@ -57,7 +57,7 @@ def test_a_life_is_told_in_systemds_words(manager: Manager) -> None:
     ]
 
 
-def test_a_status_is_told_only_when_it_changes(manager: Manager) -> None:
+def test_a_status_is_reported_only_when_it_changes(manager: Manager) -> None:
     notifier = Notifier(manager.environment())
     for text in ("a", "a", "b", "b", "a", "a ", ""):
         notifier.status(text)
@@ -127,7 +127,7 @@ def test_what_a_full_socket_did_not_take_is_dropped_when_it_holds_no_more(manage
     assert manager.told() == [["STOPPING=1"]]
 
 
-def test_a_manager_that_comes_back_is_told_again(tmp_path: Path) -> None:
+def test_a_manager_that_comes_back_is_reported_again(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     first = Manager(str(path))
     notifier = Notifier(first.environment())

@@ -50,7 +50,7 @@ def edit(root: Path, name: str = CONFIGURATION) -> None:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """An image with the program in it."""
+    """A root folder with the program in it."""
     program = tmp_path / "image" / EXECUTABLE.lstrip("/")
     program.parent.mkdir(parents=True)
     program.write_text("#!/bin/sh\n")
@@ -133,7 +133,7 @@ def test_an_instance_has_its_own_configuration_and_goes_alone(root: Path) -> Non
     assert list(wants.iterdir()) == []
 
 
-def test_a_faulty_configuration_is_told_and_not_enabled(root: Path) -> None:
+def test_a_faulty_configuration_is_reported_and_not_enabled(root: Path) -> None:
     install(root)
     (root / CONFIGURATION).write_text("[can]\nbitrat = 5\n")
     done = install(root)
@@ -187,7 +187,7 @@ def test_an_active_network_file_takes_the_place_of_its_example(root: Path) -> No
     assert sorted(path.name for path in network.iterdir()) == active
 
 
-def test_the_group_of_serial_ports_comes_from_the_image(root: Path) -> None:
+def test_the_group_of_serial_ports_comes_from_the_root(root: Path) -> None:
     (root / "etc").mkdir()
     (root / "etc/group").write_text("root:x:0:\nuucp:x:986:\n")
     install(root)
@@ -218,7 +218,7 @@ def test_uninstall_keeps_what_was_changed_by_hand_aside(root: Path) -> None:
     assert not rules.exists()
 
 
-def test_a_link_that_leads_out_of_an_image_is_not_followed(root: Path, tmp_path: Path) -> None:
+def test_a_link_that_leads_out_of_the_root_is_not_followed(root: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (root / "etc").symlink_to(tmp_path / "elsewhere")
     assert "leads out of" in the_line(install(root), 1)
@@ -261,7 +261,7 @@ def test_a_dry_run_shows_everything_and_does_nothing(root: Path, option: str) ->
         (["uninstall", "--force"], "unrecognized arguments: --force"),
     ],
 )
-def test_a_wrong_use_is_told_in_the_last_line(words: list[str], said: str) -> None:
+def test_a_wrong_use_is_reported_in_the_last_line(words: list[str], said: str) -> None:
     done = run("service", *words)
     assert (done.code, done.out) == (2, "")
     assert said in done.err.splitlines()[-1]

@@ -1,4 +1,4 @@
-"""The installed service under a real systemd, in a virtual machine: it starts, is caged, comes back, and goes without a trace.
+"""The installed service under a real systemd, in a virtual machine: it starts, is confined, is restarted, and is removed completely.
 
 One run of inside_systemd.py gathers the facts, which takes a minute or two; the tests look at them.
 """
@@ -140,7 +140,7 @@ def test_a_killed_process_is_started_again(facts: Facts) -> None:
     assert facts["killed"]["NRestarts"] == "1"
 
 
-def test_a_frozen_process_is_replaced_and_tells_where_it_was(facts: Facts) -> None:
+def test_a_frozen_process_is_replaced_and_shows_where_it_was(facts: Facts) -> None:
     assert facts["running again after freeze"] >= 5, "not before the watchdog's time is over"
     assert facts["frozen"]["NRestarts"] == "2"
     assert any("most recent call first" in str(message) for _, message in facts["log"])

@@ -1,1 +1,1 @@
-"""Documentation made from the sources of truth: DBC and EDS in use, sources, error bits, states. ``facts`` gathers, the rest renders."""
+"""Documentation generated from DBC and EDS in use, sources, error bits and states. ``facts`` collects, the rest renders."""

@@ -1,4 +1,4 @@
-"""A description as a document: titles, lines and tables, which ``markdown`` writes down. Pure."""
+"""Turns a description into a document of titles, lines and tables, which ``markdown`` renders. Pure."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -48,7 +48,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """``lead``: lines in front of the first section."""
+    """``lead``: lines before the first section."""
 
     title: str
     lead: tuple[str, ...]
@@ -56,7 +56,7 @@ class Document:
 
 
 def document(facts: Description) -> Document:
-    """The description as a document for people."""
+    """The description as a document."""
     titled: list[tuple[str, int, list[str | Table]]] = []
     if facts.dbc is not None:
         titled += _messages(facts.dbc, several=len(facts.escs) > 1)
@@ -99,7 +99,7 @@ def _lead(facts: Description) -> Iterator[str]:
 
 
 def _anchor(title: str, taken: set[str]) -> str:
-    """As GitHub makes it of a heading."""
+    """The anchor that GitHub makes from a heading."""
     plain = re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") or "section"
     anchor, number = plain, 0
     while anchor in taken:
@@ -232,11 +232,11 @@ def _faults(facts: Description) -> Iterator[tuple[str, int, list[str | Table]]]:
     yield "CAN states", 2, ["The gateway's CAN controller.", _states(facts.can_states)]
     yield "Gateway states", 2, [_states(facts.gateway_states)]
     found = tuple((Code(f.name), f.meaning, f.remedy) for f in facts.gateway_faults)
-    told = "Told as emergencies on CANopen nodes, in the log and by kontronik-can-gw status."
+    where = "Reported as emergencies on CANopen nodes, in the log and by kontronik-can-gw status."
     yield (
         "Faults that the gateway finds",
         2,
-        [told, Table(("fault", "meaning", "what to do"), found)],
+        [where, Table(("fault", "meaning", "what to do"), found)],
     )
 
 
@@ -304,7 +304,7 @@ def _object(item: ObjectFacts) -> Table:
 
 
 def _entry(e: EntryFacts) -> tuple[str, ...]:
-    # a live value has none of its own
+    # a live value has no default of its own
     default = "" if e.default is None or e.source is not None else _hex(e.default)
     if e.plus_node_id:
         default = f"$NODEID + {default}"
@@ -345,7 +345,7 @@ def _sources(found: Iterable[SourceFacts]) -> Table:
 
 
 def _number(value: float | None) -> str:
-    """A number as people write it; nothing for no limit."""
+    """A number in the usual notation; empty for None."""
     if value is None:
         return ""
     return str(value) if isinstance(value, int) else f"{value:.10g}"

@@ -1,7 +1,7 @@
-"""Everything that can be told of what a gateway sends, as plain data: the content of ``describe --format json``.
+"""Collects everything about what a gateway sends as plain data: the content of ``describe --format json``.
 
-Nothing is written down here: messages and signals are from the DBC in use, objects from the EDS in use, what fills them from the compiled
-layout and the bindings, errors and states from where they are defined. Ids, indices and bit numbers are integers; times in ms.
+Nothing is defined here: messages and signals are from the DBC in use, objects from the EDS in use, their sources from the compiled layout
+and the bindings, errors and states from their definitions. Ids, indices and bit numbers are integers; times in ms.
 """
 
 import math
@@ -42,10 +42,10 @@ from kontronik_can_gw.signals.plan import Role, SendType, SignalPlan
 
 FORMAT = "kontronik-can-gw description"
 VERSION = 1
-"""Grows when something is renamed or removed; what is added does not count."""
+"""Version of the document: grows when something is renamed or removed, not when something is added."""
 
 BY_GATEWAY = 0xFF
-"""Byte 3 of an emergency that is no bit of the ESC."""
+"""Byte 3 of an emergency that is no error bit of the ESC."""
 DATA_TYPES: Mapping[int, str] = {
     0x01: "BOOLEAN",
     0x02: "INTEGER8",
@@ -63,7 +63,7 @@ DATA_TYPES: Mapping[int, str] = {
     0x15: "INTEGER64",
     0x1B: "UNSIGNED64",
 }
-"""CiA 301, table 44: the types that an EDS may use here."""
+"""CiA 301, table 44: the types supported in an EDS."""
 _KINDS = {DOMAIN: "DOMAIN", VAR: "VAR", ARRAY: "ARRAY", RECORD: "RECORD"}
 _SEND_TYPES = {SendType.CYCLIC: "cyclic", SendType.EVENT: "event", SendType.ON_CHANGE: "on change"}
 _AVAILABLE = {
@@ -74,7 +74,7 @@ _AVAILABLE = {
 }
 _BEGINS_WITH = re.compile(r"(?:[0-9A-F]{4}h(?::[0-9A-F]{1,2})?(?:, | and | to | / )?)+: ")
 _MASK = (at.SETTINGS, 6)
-"""The object that says which error bits are told as emergencies."""
+"""The object that selects the error bits reported as emergencies."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ class SignalFacts:
     offset: float
     minimum: float | None
     maximum: float | None
-    """As the DBC says, else what can be sent; None: no limit."""
+    """Limits in the DBC, else of what can be sent; None: no limit."""
     not_available: int | None
-    """Raw value; None where the signal has no such code."""
+    """Raw value of the code; None where the signal has none."""
     error: int | None
     page: int | None
     role: str
@@ -112,7 +112,7 @@ class SignalFacts:
     comment: str
     values: tuple[ValueFacts, ...]
     notes: tuple[str, ...]
-    """What resolution or range of the source is lost."""
+    """Notes on the resolution or range of the source that is lost."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class MessageFacts:
     send_type: tuple[str, ...]
     cycle_ms: float
     delay_ms: float
-    """Least distance between two frames."""
+    """Minimum distance between two frames."""
     comment: str
     signals: tuple[SignalFacts, ...]
 
@@ -144,19 +144,19 @@ class DbcFacts:
 
 @dataclass(frozen=True)
 class SourceFacts:
-    """A value that signals and objects can show."""
+    """A value that signals and objects can carry."""
 
     name: str
     unit: str
     available: str
     meaning: str
     counter: bool
-    """It starts again at 0 behind the greatest value."""
+    """It restarts at 0 after the maximum."""
     bindable: bool
-    """A signal can be bound to it; the others are for objects only."""
+    """True if a signal can be bound to it; otherwise it is for objects only."""
     values: tuple[ValueFacts, ...]
     signals: tuple[str, ...]
-    """``Message.Signal`` that show it."""
+    """``Message.Signal`` names that carry it."""
     objects: tuple[str, ...]
     """As ``2000h:02``."""
 
@@ -169,14 +169,14 @@ class EntryFacts:
     name: str
     type: str
     bits: int | None
-    """None for texts and domains."""
+    """Length in bits; None for texts and domains."""
     access: str
     readable: bool
     writable: bool
     mappable: bool
     default: int | float | str | None
     plus_node_id: bool
-    """The node-ID is added to the default."""
+    """True if the node-ID is added to the default."""
     low: int | None
     high: int | None
     unit: str
@@ -198,7 +198,7 @@ class ObjectFacts:
 
 @dataclass(frozen=True)
 class PdoFacts:
-    """A transmit PDO that is sent. ``mapped``: as ``2000h:02 Battery voltage``, from the lowest bit up."""
+    """An enabled transmit PDO. ``mapped``: as ``2000h:02 Battery voltage``, from the lowest bit up."""
 
     number: int
     cob_id: int
@@ -210,7 +210,7 @@ class PdoFacts:
 
 @dataclass(frozen=True)
 class CobIdFacts:
-    """A COB-ID that a node sends with or listens to."""
+    """A COB-ID that a node sends or receives."""
 
     id: int
     use: str
@@ -234,7 +234,7 @@ class EmergencyFacts:
     byte3: int
     byte4: int | None
     register: int
-    """The bits of 1001h that it sets."""
+    """Bits of 1001h that it sets."""
     name: str
     severity: str
     meaning: str
@@ -243,12 +243,12 @@ class EmergencyFacts:
 
 @dataclass(frozen=True)
 class CanopenFacts:
-    """The CANopen nodes and the object dictionary that each of them has."""
+    """The CANopen nodes and their common object dictionary."""
 
     file: str
     read_only: bool
     notes: tuple[str, ...]
-    """Lines of the EDS's comment that name no object of it."""
+    """Lines of the EDS's comment that name none of its objects."""
     nodes: tuple[NodeFacts, ...]
     objects: tuple[ObjectFacts, ...]
     emergencies: tuple[EmergencyFacts, ...]
@@ -267,7 +267,7 @@ class ErrorFacts:
 
 @dataclass(frozen=True)
 class StateFacts:
-    """A state of something."""
+    """A state with its meaning."""
 
     value: int
     name: str
@@ -277,7 +277,7 @@ class StateFacts:
 
 @dataclass(frozen=True)
 class DeviceFacts:
-    """A kind of ESC. ``peak_current``: whose it is, None where that is not known."""
+    """A kind of ESC. ``peak_current``: the meaning of its peak current, None where not known."""
 
     value: int
     name: str
@@ -287,7 +287,7 @@ class DeviceFacts:
 
 @dataclass(frozen=True)
 class FaultFacts:
-    """What the gateway itself finds, and the emergency that tells of it on a CANopen node."""
+    """A fault that the gateway detects, and the emergency that reports it on a CANopen node."""
 
     name: str
     meaning: str
@@ -297,7 +297,7 @@ class FaultFacts:
 
 @dataclass(frozen=True)
 class Description:
-    """All of it. ``dbc`` or ``canopen`` None: the gateway has no such output."""
+    """The whole description. ``dbc`` or ``canopen`` None: the gateway has no such output."""
 
     program: str
     escs: tuple[str, ...]
@@ -321,7 +321,7 @@ class Description:
 def describe(
     bus: BusLayout | None, canopen: CanopenSetup | None, escs: Sequence[EscSettings]
 ) -> Description:
-    """What a gateway with this DBC, these CANopen nodes and these ESCs sends. None: without that output."""
+    """Describe a gateway with this DBC, these CANopen nodes and these ESCs. None: without that output."""
     names = tuple(esc.name for esc in escs)
     dbc = None if bus is None else _dbc(bus, names)
     meanings = _meanings()
@@ -380,7 +380,7 @@ def _dbc(bus: BusLayout, escs: Sequence[str]) -> DbcFacts:
 
 
 class _Stated(Protocol):
-    """What is taken from a DBC as it stands there: a signal of cantools, which only some modules may import."""
+    """The attributes used of a cantools signal; cantools itself is imported only in some modules."""
 
     @property
     def start(self) -> int: ...
@@ -437,7 +437,7 @@ def _signal(plan: SignalPlan, signal: _Stated, escs: Sequence[str]) -> SignalFac
 
 
 def _meanings() -> dict[str, str]:
-    """Source to what it means: of a flag the bit's meaning, else the comment of the shipped signal that shows it."""
+    """Meaning of each source: of a flag that of the bit, else the comment of the shipped signal bound to it."""
     shown = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
     comments = {
         (m.name, s.name): _line(s.comment) for m in shown.database.messages for s in m.signals
@@ -563,7 +563,7 @@ def _comments(eds: Eds) -> list[str]:
 
 
 def _named(line: str) -> set[int]:
-    """The indices that a comment is about: those it begins with, as ``2100h:5 and 2101h: ...``, else all that it names."""
+    """Indices that a comment describes: those at its beginning, as ``2100h:5 and 2101h: ...``, else all in it."""
     head = _BEGINS_WITH.match(line)
     return {int(text, 16) for text in re.findall(r"\b([0-9A-F]{4})h\b", head[0] if head else line)}
 
@@ -591,7 +591,7 @@ def _node(node: Node, esc: EscSettings) -> NodeFacts:
 
 
 def _emergencies(eds: Eds) -> Iterator[EmergencyFacts]:
-    """Those of the ESC's bits that the EDS enables, those of the gateway, and the end of all."""
+    """Emergencies of the ESC's bits that the EDS enables, of the gateway's faults, and of "no error"."""
     mask = Dictionary(eds).number(*_MASK)
     bits = {int(bit): bit for bit in OperatingError}
     for bit in range(32):
@@ -663,7 +663,7 @@ def _finite(value: float) -> float | None:
 
 
 def _text(data: bytes) -> str:
-    """A text as it is, other bytes in hexadecimal."""
+    """Printable text unchanged, other bytes in hexadecimal."""
     return (
         data.decode("ascii")
         if data.isascii() and data.decode("ascii").isprintable()

@@ -1,4 +1,4 @@
-"""What the states of line, CAN controller and gateway mean, and what to do. Names and numbers are in telemetry and sources."""
+"""Meanings and remedies of the states of link, CAN controller and gateway. Names and numbers are in telemetry and sources."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,7 +11,7 @@ NOTHING = "Nothing to do."
 
 
 class Text(NamedTuple):
-    """What a state means, and what to do."""
+    """Meaning of a state, and remedy."""
 
     meaning: str
     remedy: str = NOTHING
@@ -37,7 +37,7 @@ LINK_STATES: Mapping[LinkState, Text] = {
     ),
 }
 CAN_STATES: Mapping[CanState, Text] = {
-    CanState.UNKNOWN: Text("the CAN interface does not tell"),
+    CanState.UNKNOWN: Text("the CAN interface does not report it"),
     CanState.ERROR_ACTIVE: Text("works"),
     CanState.ERROR_WARNING: Text(
         "works, but there are errors on the bus",

@@ -1,4 +1,4 @@
-"""A document as Markdown (CommonMark, with the tables of GitHub). Whatever is in a text, it is shown as that text."""
+"""Renders a document as Markdown (CommonMark with GitHub's tables). All texts are escaped."""
 
 import re
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from kontronik_can_gw.desk.describe.document import Code, Document, Section, Tab
 
 
 def markdown(document: Document) -> str:
-    """The text, ending with a line end."""
+    """The Markdown text, ending with a line end."""
     return "\n\n".join(_blocks(document)) + "\n"
 
 
@@ -33,7 +33,7 @@ def _table(table: Table) -> str:
 
 
 def cell(content: str) -> str:
-    """A cell of a table: one line, no bar that ends it."""
+    """A cell of a table: one line, with bars escaped."""
     if not isinstance(content, Code):
         return text(content)
     plain = " ".join(content.split())
@@ -45,12 +45,12 @@ def cell(content: str) -> str:
 
 
 def text(content: str) -> str:
-    """Running text in one line, every character that Markdown could take for syntax masked."""
+    """Running text in one line, with every character of Markdown syntax escaped."""
     plain = " ".join(content.split())
     masked = re.sub(r"([\\`*\[\]<>|~&$])", r"\\\1", plain)
     masked = re.sub(r"(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])", r"\\_", masked)
-    # no link that nobody meant
+    # no accidental links
     masked = re.sub(r"(https?|ftp)(://)|(www)(\.)", r"\1\3<!-- -->\2\4", masked)
-    # a heading, a list; the end of a heading
+    # no headings or lists, no closing of a heading
     masked = re.sub(r"^([#+=-])|(?<= )(#+)$", r"\\\1\2", masked)
     return re.sub(r"^(\d+)([.)])(?= |$)", r"\1\\\2", masked)

@@ -1,1 +1,1 @@
-"""What `doctor` looks at: the serial ports, the CAN interface, the folders and the machine. Nothing is changed, nothing is sent."""
+"""The checks of `doctor`: serial ports, CAN interface, folders and machine. They change nothing and send nothing."""

@@ -1,4 +1,4 @@
-"""The CAN interface: is it there, up, at the right bit rate, able to recover from bus-off, and is the bus well."""
+"""Checks the CAN interface: existence, state, bit rate, recovery from bus-off, and health of the bus."""
 
 import platform
 from importlib import import_module
@@ -10,7 +10,7 @@ from kontronik_can_gw.desk.doctor.system import System
 from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER, is_held, lock_folder, lock_name
 
 SHORTEST_QUEUE = 8
-"""Frames: more than the gateway's own share, which is all that it ever has in there."""
+"""Frames: more than the few that the gateway keeps in the queue itself."""
 GOOD_QUEUE = 128
 _FD_MTU = 72
 _VIRTUAL = ("vcan", "vxcan")
@@ -20,7 +20,7 @@ _LONG_RESTART_MS = 1000
 
 
 def check_can(system: System, can: CanConfig) -> list[Finding]:
-    """Everything about the CAN interface."""
+    """All findings about the CAN interface."""
     findings = Findings(f"CAN {can.channel}")
     if can.interface != "socketcan":
         _driver(findings, can)
@@ -44,7 +44,7 @@ def check_can(system: System, can: CanConfig) -> list[Finding]:
 
 
 def _driver(findings: Findings, can: CanConfig) -> None:
-    """An interface that python-can drives without the kernel: only its import can be tried without opening it."""
+    """Check a python-can driver that bypasses the kernel: without opening it only its import can be tested."""
     from kontronik_can_gw.lean import without_asammdf
 
     with without_asammdf():
@@ -52,7 +52,7 @@ def _driver(findings: Findings, can: CanConfig) -> None:
     module = BACKENDS.get(can.interface, ("", ""))[0]
     try:
         import_module(module)
-    except Exception as error:  # a driver without its vendor's library fails in its own way
+    except Exception as error:  # without its vendor's library a driver fails in its own way
         findings.error(
             "can.driver",
             f"{can.interface}: its driver cannot be loaded: {error}",
@@ -143,7 +143,7 @@ def _link(findings: Findings, link: Link, can: CanConfig) -> None:
             "sudo apt install iproute2",
         )
     elif not virtual:
-        if link.up or link.bitrate:  # else the command that starts it sets both
+        if link.up or link.bitrate:  # otherwise the command that starts it sets both
             _bit_timing(findings, link, can)
             _restart(findings, link, can)
         _controller(findings, link, can)
@@ -214,7 +214,7 @@ def _restart(findings: Findings, link: Link, can: CanConfig) -> None:
 
 def _controller(findings: Findings, link: Link, can: CanConfig) -> None:
     counters = link.error_counters
-    told = (
+    counts = (
         ""
         if counters is None
         else f", error counters: transmit {counters[0]}, receive {counters[1]}"
@@ -222,20 +222,22 @@ def _controller(findings: Findings, link: Link, can: CanConfig) -> None:
     bus = "Check the wires, both 120 ohm terminators, the bit rate, and that another node is on and acknowledges"
     match link.state:
         case "ERROR-ACTIVE":
-            findings.ok("can.state", f"controller error active{told}")
+            findings.ok("can.state", f"controller error active{counts}")
         case "ERROR-WARNING":
-            findings.warning("can.state", f"controller at its warning limit{told}", bus)
+            findings.warning("can.state", f"controller at its warning limit{counts}", bus)
         case "ERROR-PASSIVE":
-            findings.warning("can.state", f"controller error passive{told}", bus)
+            findings.warning("can.state", f"controller error passive{counts}", bus)
         case "BUS-OFF":
             command = f"sudo ip link set {can.channel} type can restart"
             if not link.can_restart:
                 command = f"sudo ip link set {can.channel} down; sudo ip link set {can.channel} up"
-            findings.error("can.state", f"controller bus-off{told}", f"{bus}; then:", command)
+            findings.error("can.state", f"controller bus-off{counts}", f"{bus}; then:", command)
         case None | "STOPPED":
-            pass  # it is down, which has been said
+            pass  # it is down, as reported above
         case other:
-            findings.warning("can.state", f"controller {other.lower()}{told}", "", _up_command(can))
+            findings.warning(
+                "can.state", f"controller {other.lower()}{counts}", "", _up_command(can)
+            )
     off = {"LISTEN-ONLY": "listen-only", "LOOPBACK": "loopback"}
     for mode, option in off.items():
         if mode in link.modes:
@@ -257,7 +259,7 @@ def _controller(findings: Findings, link: Link, can: CanConfig) -> None:
 
 
 def _queue(findings: Findings, link: Link, can: CanConfig, virtual: bool) -> None:
-    """The gateway keeps at most about six frames in there, and is told when there is room again; other programs share it."""
+    """Check the transmit queue. The gateway keeps at most about six frames in it, but other programs share it."""
     length = link.queue_length
     if length is None or virtual:
         return
@@ -294,7 +296,7 @@ def _statistics(findings: Findings, link: Link) -> None:
 
 
 def _other_gateways(system: System, findings: Findings, channel: str) -> None:
-    """By the locks that are held: a file may be left by a gateway that was killed."""
+    """Find other gateways by held locks; a lock file alone may be left by a killed gateway."""
     namespace = system.status("/proc/self/ns/net")
     held = system.text("/proc/locks") or ""
     found = []

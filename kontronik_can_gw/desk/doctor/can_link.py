@@ -1,4 +1,4 @@
-"""A network interface as `ip` shows it, or, where there is no `ip`, as /sys and the kernel's own answer show it."""
+"""Reads a network interface's state from `ip`, or without `ip` from /sys and the kernel."""
 
 import json
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ _ABILITIES = ("bus_off", "error_passive", "restarts", "arbitration_lost", "bus_e
 
 @dataclass(frozen=True)
 class Link:
-    """None: not known. Bit rates in bit/s, 0 where none is set."""
+    """State of a network interface. None: not known. Bit rates in bit/s, 0 where none is set."""
 
     is_can: bool
     up: bool
@@ -28,17 +28,17 @@ class Link:
     sample_point: float | None = None
     restart_ms: int | None = None
     can_restart: bool = True
-    """False for slcan, whose driver cannot."""
+    """Restart after bus-off possible; False for slcan, whose driver has none."""
     state: str | None = None
     error_counters: tuple[int, int] | None = None
-    """Of the controller: transmit, receive."""
+    """The controller's error counters: transmit, receive."""
     modes: tuple[str, ...] = ()
     termination: int | None = None
     events: Mapping[str, int] = field(default_factory=dict)
-    """How often what happened since the interface was made: bus_off, error_passive ..."""
+    """Counts of events since the interface was created: bus_off, error_passive ..."""
     statistics: Mapping[str, int] = field(default_factory=dict)
     complete: bool = True
-    """False: without `ip` not everything is known."""
+    """False without `ip`: some fields are not known."""
 
 
 def can_interfaces(system: System) -> list[str]:
@@ -82,7 +82,7 @@ def _from_ip(found: Mapping[str, Any], slcan: bool) -> Link:
         kind=kind,
         mtu=int(found.get("mtu", 16)),
         queue_length=found.get("txqlen"),
-        # a driver that knows fixed rates only, as slcan, has no further timing
+        # a driver with fixed rates only, as slcan, has no further timing
         bitrate=timing.get("bitrate", data.get("bittiming_bitrate", 0 if kind == "can" else None)),
         data_bitrate=data.get("data_bittiming", {}).get(
             "bitrate", data.get("data_bittiming_bitrate")

@@ -1,4 +1,4 @@
-"""What stands behind a serial port: driver, USB adapter, device tree, stable names. Read from /sys and /dev/serial only."""
+"""Identifies the hardware of a serial port: driver, USB adapter, device tree, stable names. Reads only /sys and /dev/serial."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ from kontronik_can_gw.desk.doctor.system import System
 from kontronik_can_gw.runtime.serial_port import MINI_UART
 
 _BUS_DRIVERS = ("port", "ctrl", "usb", "")
-"""Not the UART's own driver: newer kernels put two devices of the serial core in between."""
+"""Drivers of the serial core, which newer kernels insert between tty and UART."""
 
 
 @dataclass(frozen=True)
 class Adapter:
-    """The hardware behind a tty. ``usb`` is the folder of the USB device in /sys, empty for others."""
+    """The hardware of a tty. ``usb`` is the folder of the USB device in /sys, empty for others."""
 
     driver: str = ""
     usb: str = ""
@@ -31,7 +31,7 @@ class Adapter:
 
 
 def adapter_of(system: System, tty: str) -> Adapter:
-    """The hardware behind a tty's name, as ttyUSB0."""
+    """The hardware of a tty given by name, as ttyUSB0."""
     driver, mini_uart = "", False
     for folder in _ancestors(system, f"/sys/class/tty/{tty}/device"):
         if system.exists(f"{folder}/driver"):
@@ -48,7 +48,7 @@ def adapter_of(system: System, tty: str) -> Adapter:
 
 
 def _ancestors(system: System, folder: str) -> Iterator[str]:
-    """A device's folder in /sys and those of the devices above it."""
+    """A device's folder in /sys and those of its parents."""
     if not system.exists(folder):
         return
     at = system.real(folder)
@@ -58,7 +58,7 @@ def _ancestors(system: System, folder: str) -> Iterator[str]:
 
 
 def stable_names(system: System, port: str) -> list[str]:
-    """Names of a port that do not change: by the adapter's serial number (only where it has one), else by the socket it is in."""
+    """Stable names of a port: by the adapter's serial number if it has one, else by the USB socket."""
     real = system.real(port)
     tty = real.rpartition("/")[2]
     kinds = ("by-id", "by-path") if adapter_of(system, tty).serial else ("by-path", "by-id")
@@ -74,11 +74,11 @@ def stable_names(system: System, port: str) -> list[str]:
 
 
 def ports_there(system: System) -> list[str]:
-    """Serial ports that an ESC could be on, by their best names."""
+    """Serial ports usable for an ESC, by their most stable names."""
     found = []
     for tty in system.names("/sys/class/tty"):
         if system.exists(f"/sys/class/tty/{tty}/device") and system.exists(f"/dev/{tty}"):
-            # Linux makes ttyS0..3 whether there is hardware or not: type 0 is none
+            # Linux creates ttyS0..3 even without hardware; then the type is 0
             if system.text(f"/sys/class/tty/{tty}/type") == "0":
                 continue
             found.append(next(iter(stable_names(system, f"/dev/{tty}")), f"/dev/{tty}"))

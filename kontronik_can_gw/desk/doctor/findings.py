@@ -1,4 +1,4 @@
-"""What a check found, how grave it is, and what to do about it."""
+"""Findings of checks with severity and remedy."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from enum import StrEnum
 from typing import Any
 
 FORMAT = 1
-"""Version of the JSON document: a reader can rely on its keys as long as this is the same."""
+"""Version of the JSON document; its keys stay the same as long as this does."""
 
 
 class Severity(StrEnum):
@@ -24,7 +24,7 @@ class Finding:
 
     group: str
     check: str
-    """A stable name for programs, as ``port.parity``."""
+    """Stable name for programs, as ``port.parity``."""
     severity: Severity
     text: str
     remedy: str = ""

@@ -1,4 +1,4 @@
-"""Files and folders: may the service read its configuration and fill its folders, and is there room."""
+"""Checks files and folders: access of the service to its configuration and folders, and free space."""
 
 from pathlib import Path, PurePath
 from stat import S_ISDIR
@@ -17,7 +17,7 @@ _HOMES = ("/home", "~root", "/run/user")
 def check_readable(
     system: System, findings: Findings, check: str, file: str, unit: Unit | None
 ) -> None:
-    """The service can read a file. Nothing is said where there is no service."""
+    """Check that the service can read a file. No finding without a service."""
     if unit is None or unit.user is None:
         return
     who = unit.user
@@ -55,11 +55,11 @@ def check_folder(
     what: str,
     folder: str,
     unit: Unit | None,
-    least: int = 0,
+    reserve: int = 0,
 ) -> None:
-    """Files can be made in a folder, or it can be made, and there is room.
+    """Check that a folder exists or can be created, is writable and has free space.
 
-    ``what``: for whom, as "stored parameters". ``least``: with fewer bytes free nothing is written there.
+    ``what``: its use, as "stored parameters". ``reserve``: with fewer bytes free nothing is written there.
     """
     there = folder
     while there != "/" and not system.exists(there):
@@ -125,8 +125,8 @@ def check_folder(
         return
     else:
         findings.ok(check, f"{what}: {folder}{made}")
-    if left is not None and left.free_bytes < least:
-        text = f"{what}: {left.free_bytes // 1_000_000} MB are free in {there}: nothing is written with less than {least // 1_000_000} MB"
+    if left is not None and left.free_bytes < reserve:
+        text = f"{what}: {left.free_bytes // 1_000_000} MB are free in {there}: nothing is written with less than {reserve // 1_000_000} MB"
         findings.error(check, text, "Make room:", f"df -h {there}")
     elif left is not None and left.free_bytes < _LOW_BYTES:
         text = f"{what}: only {left.free_bytes // 1024} kB are free in {there}"

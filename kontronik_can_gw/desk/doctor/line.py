@@ -1,7 +1,7 @@
-"""A short look through an open serial port: can it do even parity, and what line errors has it counted.
+"""Opens a serial port for a moment to check even parity and read its line error counts.
 
-Nothing is written, and the settings of a port that somebody else may be using are not touched: the caller says whether nobody is. What is
-set, 115200 baud with even parity and without echo, is what the gateway sets too, and is left so: an echo would be sent to the ESC.
+Nothing is written, and the settings of a port that another program may use are not changed (the caller knows). The settings used,
+115200 baud with even parity and without echo, are those of the gateway and are kept: an echo would be sent to the ESC.
 """
 
 import contextlib
@@ -15,30 +15,30 @@ from dataclasses import dataclass, field
 
 _GET_COUNTS, _COUNTS = 0x545D, struct.Struct("=20i")
 _COUNTERS = {6: "framing", 8: "parity", 7: "overrun", 9: "break", 10: "buffer overrun"}
-"""Places in struct serial_icounter_struct."""
+"""Indices in struct serial_icounter_struct."""
 _GET_SERIAL, _SERIAL_SIZE, _FLAGS_AT, _LOW_LATENCY = 0x541E, 128, 16, 1 << 13
-"""struct serial_struct: flags is its fifth integer."""
+"""Index of flags in struct serial_struct."""
 _STICKY_PARITY = 0o10000000000
 
 
 @dataclass(frozen=True)
 class Line:
-    """What a port told. None: not known."""
+    """Result of the check of a port. None: not known."""
 
     trouble: str | None = None
-    """Why it could not be opened."""
+    """Why the port could not be opened."""
     busy: bool = False
-    """It could not be opened because somebody has it for himself."""
+    """True if it could not be opened because another program has it exclusively."""
     touched: bool = False
     even_parity: bool | None = None
     low_latency: bool | None = None
     errors: Mapping[str, int] = field(default_factory=dict)
-    """Line errors since the driver began to count, by kind; empty where it does not count."""
+    """Line errors since the driver was loaded, by kind; empty where it does not count."""
     counts: bool = False
 
 
 def look(path: str, alone: bool) -> Line:
-    """Open a port for a moment. ``alone``: nobody else has it open; otherwise only a port nobody has set up yet is tried."""
+    """Open a port for a moment. ``alone``: no other program has it open; otherwise parity is tried only on an unconfigured port."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
@@ -60,17 +60,17 @@ def look(path: str, alone: bool) -> Line:
 
 
 def _try_even_parity(fd: int, alone: bool) -> bool | None:
-    """Set 115200 baud, 8E1, raw; say if the port took it. None: not tried."""
+    """Set 115200 baud, 8E1, raw; True if the port accepted it. None: not tried."""
     mode = termios.tcgetattr(fd)
     if not alone and not mode[3] & termios.ICANON and not _is_ours(mode):
-        return None  # someone has set it up for himself
+        return None  # another program has configured it
     mode[0] = 0
     mode[1] &= ~termios.OPOST
     mode[2] &= ~(termios.CSIZE | termios.CSTOPB | termios.PARODD | termios.CRTSCTS | _STICKY_PARITY)
     mode[2] |= termios.CS8 | termios.PARENB | termios.CREAD | termios.CLOCAL
     mode[3] = 0
     mode[4] = mode[5] = termios.B115200
-    with contextlib.suppress(termios.error):  # what it took is read back
+    with contextlib.suppress(termios.error):  # the result is read back
         termios.tcsetattr(fd, termios.TCSANOW, mode)
     return _is_ours(termios.tcgetattr(fd))
 
@@ -92,7 +92,7 @@ def _line_errors(fd: int) -> dict[str, int] | None:
 
 
 def _low_latency(fd: int) -> bool | None:
-    """Is the driver's low-latency flag on? None where it has none."""
+    """State of the driver's low-latency flag; None where it has none."""
     try:
         found = fcntl.ioctl(fd, _GET_SERIAL, bytes(_SERIAL_SIZE))
     except OSError:

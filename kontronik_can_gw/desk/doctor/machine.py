@@ -1,4 +1,4 @@
-"""The machine: clock, load, memory, power, log, versions."""
+"""Checks the machine: clock, load, memory, power, log, versions."""
 
 import os
 import platform
@@ -17,7 +17,7 @@ _SLOW_CLOCKS = ("acpi_pm", "hpet", "jiffies", "pit")
 
 
 def check_machine(system: System, unit: Unit | None, year: int | None = None) -> list[Finding]:
-    """Everything about the machine. ``year``: that of the wall clock, for tests."""
+    """All findings about the machine. ``year``: replaces that of the wall clock in tests."""
     findings = Findings("Machine")
     check_service(system, findings, unit)
     _clock(system, findings, time.gmtime().tm_year if year is None else year)
@@ -89,7 +89,7 @@ def _memory(system: System, findings: Findings) -> None:
 
 
 def _power(system: System, findings: Findings) -> None:
-    """A Raspberry Pi notices when its supply is too weak; USB adapters are the first to suffer."""
+    """Check for undervoltage, which a Raspberry Pi detects and which affects USB adapters first."""
     for name in system.names("/sys/class/hwmon"):
         folder = f"/sys/class/hwmon/{name}"
         if system.text(f"{folder}/name") != "rpi_volt":

@@ -1,4 +1,4 @@
-"""The serial port of one ESC: is it there, may we open it, does somebody else use it or write to it, can it do even parity."""
+"""Checks the serial port of one ESC: existence, permission, other programs that use it or write to it, even parity."""
 
 import os
 import stat
@@ -17,7 +17,7 @@ _UNSTABLE = ("ttyUSB", "ttyACM")
 
 
 def check_port(system: System, esc: str, port: str, unit: Unit | None, look: Look) -> list[Finding]:
-    """Everything about the port of one ESC. ``unit``: the service that runs it; None: there is none."""
+    """All findings about the port of one ESC. ``unit``: the service that uses it, or None."""
     service = unit.user if unit is not None else None
     findings = Findings(f"Serial port of {esc}")
     status = system.status(port)
@@ -30,7 +30,7 @@ def check_port(system: System, esc: str, port: str, unit: Unit | None, look: Loo
     real = system.real(port)
     if real.startswith("/dev/pts/"):
         findings.ok("port.exists", f"{port} is a pseudo terminal: a simulated ESC")
-        # the simulator has it too
+        # the simulator has it open too
         holders = [process for process in system.openers(status)[0] if process.is_gateway]
         if not holders and not system.may_open(port):
             findings.error(
@@ -134,7 +134,7 @@ def _permission(
     service: User | None,
     gateway: bool,
 ) -> None:
-    """Whoever runs the gateway may open the port. Where that is neither the service nor known, it is us."""
+    """Check that the gateway's user may open the port: the service's user, that of a running gateway, else the current one."""
     group, me = system.group_name(status.st_gid), system.user.name
     shared = status.st_mode & 0o060 == 0o060 and status.st_gid != 0
     open_to_group = f"sudo chgrp dialout {port} && sudo chmod g+rw {port}"
@@ -171,7 +171,7 @@ def _permission(
 def _device_kind(
     system: System, findings: Findings, status: os.stat_result, unit: Unit | None
 ) -> None:
-    """The unit allows only some kinds of devices, by the names in /proc/devices."""
+    """Check that the unit's DeviceAllow covers the port, by the names in /proc/devices."""
     if unit is None or unit.devices is None:
         return
     lines = (
@@ -194,7 +194,7 @@ def _device_kind(
 
 
 def _console(system: System, findings: Findings, tty: str) -> bool:
-    """The kernel writes its messages to a console: they would reach the ESC."""
+    """Check that the port is no kernel console, whose messages would reach the ESC."""
     words = (system.text("/proc/cmdline") or "").split()
     named = [
         word for word in words if word.startswith("console=") and word[8:].partition(",")[0] == tty
@@ -214,7 +214,7 @@ def _console(system: System, findings: Findings, tty: str) -> bool:
 
 
 def _getty(system: System, findings: Findings, tty: str) -> tuple[bool, list[Process]]:
-    """Is a login prompt on this port, and by which programs."""
+    """Check for a login prompt on the port; return whether there is one, and its programs."""
     found = [
         p
         for p in system.processes
@@ -239,13 +239,13 @@ def _getty(system: System, findings: Findings, tty: str) -> tuple[bool, list[Pro
 
 
 def _meddlers(system: System, findings: Findings, tty: str, adapter: Adapter) -> None:
-    """Services that open serial adapters on their own."""
+    """Check for services that open serial adapters by themselves."""
     if not adapter.usb:
         return
     names = {process.name for process in system.processes}
     if "ModemManager" in names:
-        told = system.run("udevadm", "info", "--query=property", f"--name=/dev/{tty}") or ""
-        if "ID_MM_DEVICE_IGNORE=1" in told.split() or "ID_MM_PORT_IGNORE=1" in told.split():
+        facts = system.run("udevadm", "info", "--query=property", f"--name=/dev/{tty}") or ""
+        if "ID_MM_DEVICE_IGNORE=1" in facts.split() or "ID_MM_PORT_IGNORE=1" in facts.split():
             findings.ok("port.modem_manager", "ModemManager leaves this adapter alone")
         else:
             findings.warning(
@@ -297,7 +297,7 @@ def _power_and_latency(
     system: System, findings: Findings, tty: str, adapter: Adapter, gateway: bool
 ) -> None:
     latency = system.number(f"/sys/class/tty/{tty}/device/latency_timer")
-    if latency is not None and latency > 1 and gateway:  # which has asked for less, in vain
+    if latency is not None and latency > 1 and gateway:  # which asked for less
         text = f"latency timer {latency} ms: the adapter holds bytes back that long"
         findings.warning(
             "port.latency", text, "", f"echo 1 | sudo tee /sys/class/tty/{tty}/device/latency_timer"

@@ -1,4 +1,4 @@
-"""The installed systemd service: which unit runs a configuration, as whom, and how it fares."""
+"""Checks the installed systemd service: the unit that runs a configuration, its user and its state."""
 
 from dataclasses import dataclass
 from pathlib import PurePath
@@ -17,7 +17,7 @@ _SHOWN = (
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit that systemd knows."""
+    """A systemd unit."""
 
     name: str
     user: User | None
@@ -28,20 +28,20 @@ class Unit:
     enabled: bool
     restarts: int
     strict: bool = False
-    """All folders but its own and ``writable`` are read-only for it."""
+    """True if all folders but its own and ``writable`` are read-only for it."""
     writable: tuple[str, ...] = ()
     hides_homes: bool = False
     devices: tuple[str, ...] | None = None
-    """Kinds of devices that it may use, as char-ttyUSB; None: all."""
+    """Kinds of devices that it may use, as char-ttyUSB; None: all kinds."""
 
     @property
     def state_folder(self) -> str:
-        """Where its parameters are kept if the configuration does not say."""
+        """Default folder of its stored parameters."""
         return f"/var/lib/{self.name.removesuffix('.service').replace('@', '-')}"
 
 
 def unit_of(system: System, config: str) -> Unit | None:
-    """The unit that runs a configuration file, or would if it were installed there; None where systemd has none."""
+    """The unit for a configuration file; None where systemd has none."""
     path = PurePath(config)
     instance = path.stem if str(path.parent) == _FOLDER and path.stem != "gateway" else ""
     name = f"{NAME}@{instance}.service" if instance else f"{NAME}.service"
@@ -50,7 +50,7 @@ def unit_of(system: System, config: str) -> Unit | None:
     lines = (system.run("systemctl", "show", name, f"--property={_SHOWN}") or "").splitlines()
     shown: dict[str, str] = {}
     for key, _, value in (line.partition("=") for line in lines):
-        # DeviceAllow has a line for each
+        # DeviceAllow has one line for each kind
         shown[key] = f"{shown[key]} {value}" if key in shown else value
     if shown.get("LoadState") != "loaded":
         return None
@@ -76,7 +76,7 @@ def unit_of(system: System, config: str) -> Unit | None:
 
 
 def check_service(system: System, findings: Findings, unit: Unit | None) -> None:
-    """Installed, enabled, running, and how often it was restarted."""
+    """Check whether it is installed, enabled and running, and how often it was restarted."""
     if not system.has_systemd:
         findings.note(
             "machine.service",

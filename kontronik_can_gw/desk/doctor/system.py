@@ -1,6 +1,6 @@
-"""What the checks see of the machine: files below a root, programs that only show, processes. Nothing is changed.
+"""Access of the checks to the machine: files below a root, read-only programs, processes. Nothing is changed.
 
-Names are absolute paths as the machine has them; tests give another root.
+Names are absolute paths on the machine; tests use another root.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 PROGRAM_PATH = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
-"""Where programs are looked for: `ip` is not on every user's path."""
+"""Search path for programs: `ip` is not on every user's path."""
 _PATIENCE_S = 5.0
 
 
@@ -41,7 +41,7 @@ class Process(NamedTuple):
 
 @dataclass(frozen=True)
 class User:
-    """Someone who opens files: a name, a user-ID and the IDs of all groups."""
+    """A user: name, user-ID and the IDs of all groups."""
 
     name: str
     uid: int
@@ -56,7 +56,7 @@ class User:
 
 
 class FileSystem(NamedTuple):
-    """What a folder's file system has left."""
+    """Free space of a folder's file system."""
 
     read_only: bool
     free_bytes: int
@@ -90,7 +90,7 @@ class System:
             return None
 
     def names(self, folder: str) -> list[str]:
-        """What is in a folder; nothing where it cannot be read."""
+        """Names in a folder; empty where it cannot be read."""
         try:
             return sorted(each.name for each in self.path(folder).iterdir())
         except OSError:
@@ -130,7 +130,7 @@ class System:
     # --- programs
 
     def run(self, *command: str) -> str | None:
-        """What a program prints; None where it is missing or takes too long. Its exit code says nothing here."""
+        """Output of a program, whatever its exit code; None where it is missing or takes too long."""
         program = shutil.which(command[0], path=PROGRAM_PATH)
         if program is None:
             return None
@@ -157,7 +157,7 @@ class System:
 
     @cached_property
     def user(self) -> User:
-        """Who we are."""
+        """The user of this process."""
         uid = os.geteuid()
         name = str(uid)
         with contextlib.suppress(KeyError):
@@ -165,7 +165,7 @@ class System:
         return User(name, uid, frozenset((*os.getgroups(), os.getegid())))
 
     def user_named(self, name: str, more_groups: tuple[str, ...] = ()) -> User | None:
-        """Another user, with the groups that the system gives him and ``more_groups``; None where there is none."""
+        """A user by name, with the groups from the system and ``more_groups``; None where there is none."""
         for line in (self.text("/etc/passwd") or "").splitlines():
             words = line.split(":")
             if words[0] == name and len(words) > 3 and words[2].isdigit() and words[3].isdigit():
@@ -177,7 +177,7 @@ class System:
         return None
 
     def dynamic_user(self, name: str, groups: tuple[str, ...]) -> User:
-        """A user that systemd makes up when the service starts."""
+        """A user that systemd creates when the service starts (DynamicUser)."""
         return User(name, -1, frozenset(self._groups(name, groups)))
 
     def _groups(self, user: str, more: tuple[str, ...]) -> list[int]:
@@ -202,7 +202,7 @@ class System:
 
     @cached_property
     def processes(self) -> list[Process]:
-        """All programs that we may see, but ourselves."""
+        """All visible processes except this one."""
         found = []
         for pid in self.names("/proc"):
             if not pid.isdigit() or int(pid) == os.getpid():
@@ -214,7 +214,7 @@ class System:
         return found
 
     def openers(self, device: os.stat_result) -> tuple[list[Process], bool]:
-        """Who has a character device open or locked; False if there may be others that we may not see."""
+        """Processes that have a character device open or locked; False if there may be others that this user cannot see."""
         found: dict[int, Process] = {}
         complete = bool(self.processes) and self.exists("/proc/1/comm")
         for process in self.processes:
@@ -224,7 +224,7 @@ class System:
             except PermissionError:
                 complete = False
                 continue
-            except OSError:  # it has ended
+            except OSError:  # it ended meanwhile
                 continue
             for number in numbers:
                 status = self.status(f"{folder}/{number}")
@@ -236,7 +236,7 @@ class System:
         return [found[pid] for pid in sorted(found)], complete
 
     def _lockers(self, file: os.stat_result) -> set[int]:
-        """Who has locked a file, which everybody may see."""
+        """Processes that have locked a file; every user can see them."""
         where = f"{os.major(file.st_dev):02x}:{os.minor(file.st_dev):02x}:{file.st_ino}"
         lines = [line.split() for line in (self.text("/proc/locks") or "").splitlines()]
         return {

@@ -1,1 +1,1 @@
-"""The live screen's model, that CAN frames go into."""
+"""The model of the live screen, fed with CAN frames."""

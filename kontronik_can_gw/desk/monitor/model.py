@@ -1,7 +1,7 @@
-"""What a person who looks on wants to know of one to eight ESCs: newest values, extremes, state, errors, link. Pure; time is handed in.
+"""The model of the live screen for one to eight ESCs: newest values, extremes, state, errors, link. Pure; time is an argument.
 
-Everything is asked for by the names of sources (values.py), never by those of signals: so it works with any DBC, and in the units of
-the sources, whatever units the DBC has. A value that is not available is None, never an old one.
+Values are addressed by the names of sources (values.py), not of signals, so any DBC works, and units are those of the sources. A value
+that is not available is None, never an old one.
 """
 
 import re
@@ -29,7 +29,7 @@ from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 SILENCE_NS = 5 * SECOND
-"""So long without a frame it is said in words what may be wrong."""
+"""After this time without a frame the screen shows possible causes."""
 _WORKING = ("ok", "degraded")
 _BELIEVED = 2
 _RATE_NS = 2 * SECOND
@@ -37,7 +37,7 @@ _RATE_STEP_NS = 100 * MS
 
 
 class Zone(Enum):
-    """How a value stands to its limits."""
+    """A value's relation to its limits."""
 
     GOOD = 0
     WARNING = 1
@@ -45,7 +45,7 @@ class Zone(Enum):
 
 
 class Scale(NamedTuple):
-    """A bar from ``low`` to ``high``; from ``warning`` and from ``alarm`` on (downward if they lie the other way) it is to be looked at."""
+    """A bar from ``low`` to ``high`` with limits for a warning and an alarm; if ``alarm`` is below ``warning`` they are lower limits."""
 
     low: float
     high: float
@@ -53,7 +53,7 @@ class Scale(NamedTuple):
     alarm: float | None = None
 
     def share(self, value: float) -> float:
-        """Which part of the bar is filled, 0 to 1."""
+        """The filled part of the bar, 0 to 1."""
         return min(1.0, max(0.0, (value - self.low) / (self.high - self.low)))
 
     def zone(self, value: float) -> Zone:
@@ -67,13 +67,13 @@ class Scale(NamedTuple):
 
 PERCENT = Scale(0, 100)
 TEMPERATURE = Scale(0, 110, 80, 100)
-"""degC. The ESC has limits of its own, which it does not tell; these are where a look at the cooling is worth while."""
+"""degC. The ESC does not report its own limits; above these the cooling should be checked."""
 CELL = Scale(3.0, 4.2, 3.5, 3.3)
-"""V of a lithium polymer cell: under load below 3.5 V it is nearly empty, below 3.3 V it takes harm."""
+"""V of a lithium polymer cell: under load it is nearly empty below 3.5 V and is damaged below 3.3 V."""
 
 
 class Quantity(NamedTuple):
-    """A measured value with its extremes. ``rank``: what is left out first where there is no room (greatest first)."""
+    """A measured value with its extremes. ``rank``: the greatest is left out first where there is no room."""
 
     source: str
     label: str
@@ -109,7 +109,7 @@ _NO_ALARM = {OperatingError.PROGRAMMING_ALLOWED.text}
 
 
 class Spread:
-    """Least and greatest of the values so far; None before the first."""
+    """Minimum and maximum so far; None before the first value."""
 
     __slots__ = ("high", "low")
 
@@ -141,7 +141,7 @@ def words(text: str) -> str:
 
 
 class EscMonitor:
-    """One ESC as the bus tells of it. All values are those of the last ``Monitor.advance``."""
+    """One ESC as seen on the bus. All values are those of the last ``Monitor.advance``."""
 
     def __init__(self, settings: EscSettings, index: int, view: View) -> None:
         self.name = settings.name
@@ -168,20 +168,20 @@ class EscMonitor:
             for name in self._columns
             if name not in {*flags, "operating_errors", "selftest_errors"}
         }
-        """Unit of each source that the DBC has, in the order of the sources; without flags and words of flags."""
+        """Unit of each source in the DBC, in the order of the sources, except flags and words of flags."""
         link = self._columns.get("link_state", -1)
         self._link_part = next(
             (p.first for p in view.reader.parts if p.first <= link < p.first + p.count), None
         )
-        self._told = 0
-        """How often the link's state came behind the first values after a gap."""
+        self._link_reports = 0
+        """Number of link state messages since the first values after a gap."""
 
     def has(self, source: str) -> bool:
-        """True where the DBC has a signal for a source."""
+        """True where the DBC has a signal for the source."""
         return source in self._columns
 
     def value(self, source: str) -> Value:
-        """In the source's unit; None where it is not available."""
+        """The value in the source's unit; None where it is not available."""
         column = self._columns.get(source)
         if column is None:
             return None
@@ -191,7 +191,7 @@ class EscMonitor:
         return _converted(value, self._factors[source])
 
     def number(self, source: str) -> float | None:
-        """The same for a source that is a number. The cell voltage is computed where the DBC has none but the cells are known."""
+        """The value of a numeric source. The cell voltage is computed if the DBC has none and the number of cells is known."""
         value = self.value(source)
         if value is None and source == "mean_cell_voltage":
             cells = self._settings.cell_count or self.number("cell_count")
@@ -202,12 +202,12 @@ class EscMonitor:
 
     @property
     def is_fresh(self) -> bool:
-        """True while there is any measured value."""
+        """True while any measured value is available."""
         return any(self._view.values[column] is not None for column in self._plain[Group.LIVE])
 
     @property
     def state(self) -> str | None:
-        """The operating state's name; a number that has none as it is; None where it is not available."""
+        """The operating state's name, or its number if it has none; None where it is not available."""
         value = self.value("operating_state")
         if value is None:
             value = self.value("operating_state_raw")
@@ -219,8 +219,8 @@ class EscMonitor:
     def link(self) -> str | None:
         """The link state's name; None where it is not available.
 
-        It has a message of its own, which comes up to a cycle behind the first values after a gap, and may have been on its way when
-        they came: until its second time the values tell that the link is good.
+        It has its own message, which comes up to a cycle later than the first values after a gap and may have been sent before them:
+        until its second reception the values show that the link is good.
         """
         value = self.value("link_state")
         if isinstance(value, (int, float)):
@@ -228,18 +228,18 @@ class EscMonitor:
         if (
             value is None
             or normalize(value) in _WORKING
-            or self._told >= _BELIEVED
+            or self._link_reports >= _BELIEVED
             or not self.is_fresh
         ):
             return value
         return _enumerated(LinkState, LinkState.OK)
 
     def note(self, firsts: Collection[int], was_fresh: bool) -> None:
-        """A frame came, with the parts that begin at these columns."""
+        """Take note of a frame with the parts that begin at these columns."""
         if not was_fresh and self.is_fresh:
-            self._told = 0
+            self._link_reports = 0
         elif self._link_part is not None and self._link_part in firsts:
-            self._told += 1
+            self._link_reports += 1
 
     @property
     def device(self) -> str:
@@ -262,7 +262,7 @@ class EscMonitor:
 
     @property
     def active(self) -> list[Active]:
-        """The bits that are set, errors first. A flag means nothing while nothing else of its frame is available."""
+        """The bits that are set, errors first. A flag counts only while another value of its frame is available."""
         found = [
             *self._active(OperatingError, "operating_errors", Group.LIVE),
             *self._active(SelfTestError, "selftest_errors", Group.INFO),
@@ -271,12 +271,12 @@ class EscMonitor:
 
     @property
     def alarms(self) -> list[Active]:
-        """What of it is to be told to people: without what is no alarm, and without a summary of what is told anyway."""
-        told = [active for active in self.active if active.name not in _NO_ALARM]
-        plain = {active.severity for active in told if active.name not in _SUMMARIES}
+        """The active bits to show: without those that are no alarm, and without a summary of bits that are shown anyway."""
+        alarms = [active for active in self.active if active.name not in _NO_ALARM]
+        plain = {active.severity for active in alarms if active.name not in _SUMMARIES}
         return [
             active
-            for active in told
+            for active in alarms
             if active.name not in _SUMMARIES or active.severity not in plain
         ]
 
@@ -300,7 +300,7 @@ class EscMonitor:
 
 
 class Monitor:
-    """The ESCs and the gateway of a layout. ``now``: nanoseconds of one clock, that of the frames."""
+    """The ESCs and the gateway of a layout. ``now``: nanoseconds on the clock of the frames."""
 
     def __init__(self, bus: BusLayout) -> None:
         self.bus = bus
@@ -309,7 +309,7 @@ class Monitor:
             EscMonitor(settings, index, self.view) for index, settings in enumerate(bus.escs)
         )
         self.start_ns: int | None = None
-        """When watching began, or the extremes were reset."""
+        """Time of the start, or of the last reset of the extremes."""
         self._now = 0
         self._samples: deque[tuple[int, int]] = deque()
         parts = self.view.reader.parts
@@ -319,12 +319,12 @@ class Monitor:
 
     @property
     def keys(self) -> frozenset[int]:
-        """CAN ids that are of interest, with EXTENDED for 29 bits."""
+        """CAN ids of the layout, with EXTENDED for 29 bits."""
         return self.view.reader.keys
 
     @property
     def is_complete(self) -> bool:
-        """True when every message that comes cyclicly has come."""
+        """True once every cyclic message has come."""
         return not self._missing
 
     @property
@@ -332,7 +332,7 @@ class Monitor:
         return self.view.frames
 
     def take(self, frame: CanFrame, now: int) -> None:
-        """A frame that came at ``now``. What is not of the layout is left alone."""
+        """Take a frame that came at ``now``; frames outside the layout are ignored."""
         if frame.remote:
             return
         self._now = now = max(now, self._now)
@@ -351,7 +351,7 @@ class Monitor:
                     spread.take(_converted(value, factor))
 
     def advance(self, now: int) -> None:
-        """Time has passed: what has stayed away for too long is not available any more."""
+        """Advance the time: values of missing messages become not available."""
         self._now = now = max(now, self._now)
         if self.start_ns is None:
             self.start_ns = now
@@ -363,7 +363,7 @@ class Monitor:
                 samples.popleft()
 
     def reset(self) -> None:
-        """Extremes begin anew."""
+        """Restart the extremes."""
         for esc in self.escs:
             for spread in esc.spreads.values():
                 spread.low = spread.high = None
@@ -371,7 +371,7 @@ class Monitor:
 
     @property
     def frame_rate(self) -> float | None:
-        """Frames of the layout in a second; None before there is a second to count in."""
+        """Frames of the layout per second; None during the first second."""
         if len(self._samples) < 2:
             return None
         (begin, first), (end, last) = self._samples[0], self._samples[-1]
@@ -379,12 +379,12 @@ class Monitor:
 
     @property
     def watched_s(self) -> float:
-        """Since the start, or since the extremes were reset."""
+        """Seconds since the start, or since the extremes were reset."""
         return 0.0 if self.start_ns is None else (self._now - self.start_ns) / SECOND
 
     @property
     def silent_ns(self) -> int:
-        """Since the last frame, or since the start where none came yet."""
+        """Time since the last frame, or since the start before the first one."""
         last = self.view.last_ns if self.view.last_ns is not None else self.start_ns
         return 0 if last is None else max(0, self._now - last)
 
@@ -400,16 +400,16 @@ class Monitor:
 
     @property
     def is_replay(self) -> bool:
-        """True where the gateway says that it plays a recording."""
+        """True where the gateway reports that it plays a recording."""
         return normalize(self.gateway_state or "") == "replay"
 
     def gateway_number(self, source: str) -> float | None:
-        """A number of the gateway's own, as ``esc_count``."""
+        """A numeric value of the gateway itself, as ``esc_count``."""
         value = self.view.value(source)
         return value if isinstance(value, (int, float)) else None
 
     def document(self) -> dict[str, Any]:
-        """Everything for a program: source names, values in the units that stand beside; None for what is not available."""
+        """Everything as JSON: source names, values and their units; None for what is not available."""
         return {
             "frames": self.frames,
             "gateway": {
@@ -446,7 +446,7 @@ class Monitor:
     def _tracked_of(
         self, first: int, count: int
     ) -> list[tuple[int, Spread, tuple[float, float] | None]]:
-        """Which of a part's values have extremes, and where those are kept."""
+        """The values of a part that have extremes, and where these are kept."""
         found = []
         for offset in range(count):
             column = self.view.reader.columns[first + offset]
@@ -460,7 +460,7 @@ class Monitor:
 
 
 def _to_source(unit: str, source_unit: str) -> tuple[float, float] | None:
-    """Factor and offset from a signal's unit to that of its source; None where they are the same."""
+    """Factor and offset from a signal's unit to that of its source; None where the units are equal."""
     found = units.conversion(unit or source_unit, source_unit)
     if found is None:
         return None

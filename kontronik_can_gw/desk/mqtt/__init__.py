@@ -1,1 +1,1 @@
-"""The MQTT publisher: topics and messages, and a client that reconnects."""
+"""The MQTT publisher: topics and messages, and a client that reconnects by itself."""

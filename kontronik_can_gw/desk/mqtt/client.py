@@ -1,8 +1,8 @@
-"""The way to an MQTT broker: a thread of its own that connects, publishes and connects again, for ever.
+"""The MQTT client: a thread that connects to a broker, publishes, and reconnects for ever.
 
-Nothing piles up: of each topic the newest message waits, and it is given to the connection only when that has sent what it had. What is
-lasting (``keep``) is published anew after each connection. What may touch what: any thread may call ``offer``, ``stop`` and read the
-properties; all else, paho's client among it, belongs to the thread. A broker that does not answer holds up this thread only.
+The queue is bounded: only the newest message of each topic waits, and it is handed to the connection only when that has sent the previous
+ones. Lasting messages are published again after each reconnection. Any thread may call ``offer`` and ``stop`` and read the properties;
+everything else, including paho's client, belongs to the client's thread. A broker that does not answer blocks only this thread.
 """
 
 import contextlib
@@ -27,18 +27,18 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.retry import Retry
 
 LONGEST_PAUSE_NS = 30 * SECOND
-"""Between two attempts to connect."""
+"""Maximum time between two attempts to connect."""
 KEEPALIVE_S = 15
-"""The broker publishes the last will one and a half times this after the last sign of life."""
+"""The broker publishes the last will after 1.5 times this without a packet."""
 CONNECT_S = 5.0
 TAKEN_OVER_PAUSE_NS = 60 * SECOND
-"""Two programs with one client id throw each other out: not several times a second."""
+"""Two programs with one client id disconnect each other; the pause keeps this from happening many times a second."""
 SLOW_NS = 2 * SECOND
 _SEND_BUFFER = 1 << 15
 _MAX_UNACKNOWLEDGED = 10
 _SHORT_NS = 5 * SECOND
 _MAX_SHORT = 3
-"""So many connections in a row, each ended by the broker within ``_SHORT_NS``, are no accident."""
+"""After this number of connections in a row that the broker ended within ``_SHORT_NS`` a client id conflict is assumed."""
 # Reason codes of MQTT 5, to which paho translates those of MQTT 3.
 _UNSUPPORTED_VERSION, _BAD_CLIENT_ID, _TAKEN_OVER = 132, 133, 142
 _NOT_ALLOWED = (134, 135)
@@ -49,7 +49,7 @@ log = logging.getLogger("kontronik_can_gw")
 
 @dataclass(frozen=True)
 class Broker:
-    """Where to connect and how. Files of TLS and the password are read at each connection: they may be renewed meanwhile."""
+    """Where to connect and how. TLS files and the password file are read at each connection, since they may be renewed."""
 
     host: str
     port: int
@@ -67,7 +67,7 @@ class Broker:
 
 
 class Offer(NamedTuple):
-    """A message on its way."""
+    """A message to publish."""
 
     topic: str
     payload: bytes
@@ -76,19 +76,19 @@ class Offer(NamedTuple):
 
 
 class _Refused(Exception):
-    """The broker or its TLS does not want us: what a person should do."""
+    """The broker or its TLS refuses the connection. The text includes the remedy."""
 
 
 class _NoAnswer(_Refused):
-    """The broker ended the connection instead of answering: an old one may do that where it does not understand us."""
+    """The broker closed the connection instead of answering, as old brokers do with an unknown protocol version."""
 
 
 class _KnowsOnlyMqtt3(Exception):
-    """The next attempt is one that it understands."""
+    """The broker does not support MQTT 5; the next attempt uses 3.1.1."""
 
 
 def check(broker: Broker) -> list[str]:
-    """Look at what can be known without the broker: the library and the files. RunError where it cannot work; returns warnings."""
+    """Check the library and the files, without connecting. Returns warnings; RunError where it cannot work."""
     try:
         import paho.mqtt.client as paho
     except ImportError:
@@ -115,7 +115,7 @@ def check(broker: Broker) -> list[str]:
 
 
 def password(file: Path) -> str:
-    """The first line of a file."""
+    """The password in the first line of a file."""
     try:
         text = file.read_text(encoding="utf-8")
     except OSError as error:
@@ -161,17 +161,17 @@ def _is_loopback(host: str) -> bool:
 
 
 class _Link:
-    """One connection from its making to its end; one thread uses it. What paho raises on rubbish from the broker ends the connection."""
+    """One connection, used by one thread. An error that paho raises for malformed packets ends the connection."""
 
     def __init__(self, broker: Broker, version: int, will_topic: str | None) -> None:
         import paho.mqtt.client as paho
         from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
         self.end: Any = None
-        """The reason code that the connection ended with."""
+        """Reason code of the end of the connection."""
         self.unacknowledged: set[int] = set()
         self.received: deque[tuple[str, bytes]] = deque()
-        """Topic and payload of what the broker had kept."""
+        """Topic and payload of received retained messages."""
         self._broker = broker
         self._answer: Any = None
         protocol = MQTTProtocolVersion.MQTTv5 if version == 5 else MQTTProtocolVersion.MQTTv311
@@ -196,7 +196,7 @@ class _Link:
             client.will_set(will_topic, b"offline", qos=1, retain=True)
 
     def open(self, stopping: threading.Event, wake: socket.socket | None = None) -> bool:
-        """Connect. False where the process ends meanwhile; raises _Refused, _KnowsOnlyMqtt3, OSError, ValueError where that fails."""
+        """Connect. False if the process ends meanwhile; raises _Refused, _KnowsOnlyMqtt3, OSError or ValueError on failure."""
         broker, client = self._broker, self._client
         if broker.username is not None:
             client.username_pw_set(
@@ -221,7 +221,7 @@ class _Link:
         return True
 
     def turn(self, seconds: float, wake: socket.socket | None = None) -> bool:
-        """Wait for the broker, for ``wake`` or for room to send, at most so long; do what is due. False where the connection has ended."""
+        """Wait at most ``seconds`` for the broker, ``wake`` or room to send; do what is due. False if the connection has ended."""
         client = self._client
         sock = client.socket()
         if sock is None or self.end is not None:
@@ -247,7 +247,7 @@ class _Link:
 
     @property
     def has_room(self) -> bool:
-        """True where a message would be sent now, and not wait behind others."""
+        """True if a message would be sent at once, without waiting for others."""
         return (
             self._client.socket() is not None
             and not self._client.want_write()
@@ -256,30 +256,30 @@ class _Link:
 
     @property
     def is_stuck(self) -> bool:
-        """True while the connection takes nothing."""
+        """True while the connection accepts no data."""
         return self._client.want_write()
 
     def publish(self, offer: Offer) -> None:
         """Hand a message to the connection."""
         info = self._client.publish(offer.topic, offer.payload, offer.qos, offer.retain)
         if offer.qos:
-            # it is no use to ask ``info``: it raises where the connection was lost meanwhile
+            # ``info`` is not asked: it raises if the connection was lost meanwhile
             self.unacknowledged.add(info.mid)
 
     def subscribe(self, topic: str) -> None:
-        """Ask for what the broker keeps."""
+        """Subscribe to a topic, to get its retained messages."""
         _, mid = self._client.subscribe(topic, 1)
         if mid is not None:
             self.unacknowledged.add(mid)
 
     def part(self) -> None:
-        """Say good-bye: the broker then publishes no last will."""
+        """Send DISCONNECT, so that the broker publishes no last will."""
         self._client.disconnect()
         while self._client.want_write() and self.turn(0.05):
             pass
 
     def close(self) -> None:
-        """Take the connection down, without a good-bye."""
+        """Close the connection without DISCONNECT."""
         if (sock := self._client.socket()) is not None:
             with contextlib.suppress(OSError):
                 sock.close()
@@ -314,16 +314,16 @@ class _Link:
 
 
 class MqttClient:
-    """One connection to a broker, kept up until ``stop``. ``online_topic`` says whether it is there: "online", "offline" (retained)."""
+    """Keeps one connection to a broker until ``stop``. ``online_topic`` holds its state: "online", "offline" (retained)."""
 
     def __init__(self, broker: Broker, online_topic: str) -> None:
         self.broker = broker
         self.connected = False
         self.published = 0
         self.replaced = 0
-        """Messages that were not sent, because a newer one of their topic came first."""
+        """Number of messages that were replaced by a newer one of the same topic before they were sent."""
         self.failure: BaseException | None = None
-        """What ended the thread, which nothing should."""
+        """The unexpected error that ended the thread."""
         self._online_topic = online_topic
         self._conditions = FaultLog()
         self._lock = threading.Lock()
@@ -340,13 +340,13 @@ class MqttClient:
         self._thread = threading.Thread(target=self._work, name="mqtt", daemon=True)
 
     def start(self) -> None:
-        """Begin to connect."""
+        """Start the thread."""
         self._thread.start()
 
     def offer(
         self, topic: str, payload: bytes, *, lasting: bool = False, retain: bool = False
     ) -> None:
-        """Let a message be published; one of the same topic that still waits is replaced. ``lasting``: again after each connection."""
+        """Queue a message; a pending one of the same topic is replaced. ``lasting``: publish it again after each reconnection."""
         offer = Offer(topic, payload, 1 if lasting else 0, retain)
         with self._lock:
             if lasting:
@@ -354,7 +354,7 @@ class MqttClient:
             if self._waiting.pop(topic, None) is not None:
                 self.replaced += 1
             self._waiting[topic] = offer
-        with contextlib.suppress(OSError):  # full: it is awake
+        with contextlib.suppress(OSError):  # full: it is awake already
             self._wake_in.send(b"x")
 
     @property
@@ -364,16 +364,16 @@ class MqttClient:
 
     @property
     def problem(self) -> str:
-        """What is wrong with the connection, in a line; empty while it is up."""
+        """One line on the fault of the connection; empty while it is up."""
         return self._conditions.reason("broker")
 
     @property
     def waiting(self) -> int:
-        """So many messages were offered and not sent yet."""
+        """Number of pending messages."""
         return len(self._waiting)
 
     def stop(self, seconds: float) -> None:
-        """Publish "offline" and end the connection; for so long at most."""
+        """Publish "offline" and end the connection, within ``seconds``."""
         self._stopping.set()
         with contextlib.suppress(OSError):
             self._wake_in.send(b"x")
@@ -387,7 +387,7 @@ class MqttClient:
             while not self._stopping.is_set():
                 self._connection()
                 self._pause()
-        except BaseException as error:  # it must not end unseen: the main thread tells
+        except BaseException as error:  # the main thread reports it
             self.failure = error
 
     def _pause(self) -> None:
@@ -399,14 +399,14 @@ class MqttClient:
             self._stopping.wait(min((self._retry.due - now) / SECOND, 1))
 
     def _connection(self) -> None:
-        """One connection, from the attempt to its end."""
-        # a new one: nothing of an old one is sent again
+        """Open and serve one connection until its end."""
+        # a new object, so that nothing of the previous connection is sent again
         link = _Link(self.broker, self._version, self._online_topic)
         try:
             if not link.open(self._stopping, self._wake_out):
                 return
             began = time.monotonic_ns()
-            self._welcome()
+            self._after_connect()
             self._run(link)
             if self._stopping.is_set():
                 self._part(link)
@@ -424,8 +424,8 @@ class MqttClient:
             self.connected = False
             link.close()
 
-    def _welcome(self) -> None:
-        """Connected: all that is lasting goes first, behind it what waits."""
+    def _after_connect(self) -> None:
+        """Queue all lasting messages before the pending ones."""
         now = time.monotonic_ns()
         self.connected = True
         if self._greeted:
@@ -443,7 +443,7 @@ class MqttClient:
             self._waiting = first
 
     def _run(self, link: _Link) -> None:
-        """Until the connection or the process ends."""
+        """Publish until the connection or the process ends."""
         began = time.monotonic_ns()
         stuck: int | None = None
         while not self._stopping.is_set():
@@ -469,17 +469,17 @@ class MqttClient:
             return self._waiting.popitem(last=False)[1] if self._waiting else None
 
     def _part(self, link: _Link) -> None:
-        """Say "offline" and good-bye; the one who called ``stop`` waits only so long."""
+        """Publish "offline" and disconnect; ``stop`` limits the time."""
         link.unacknowledged.clear()
         link.publish(Offer(self._online_topic, b"offline", 1, True))
         while link.unacknowledged and link.turn(0.05):
             pass
         link.part()
 
-    # --- the end of a connection, and none at all
+    # --- lost and failed connections
 
     def _ended(self, end: Any, lasted: int) -> None:
-        """The connection was lost, not by us."""
+        """Handle a connection that the broker or the network ended."""
         if not self._knows_only_3:
             self._version = 5
         if end is not None and end.value == _TAKEN_OVER:
@@ -502,7 +502,7 @@ class MqttClient:
     def _failed(self, reason: str) -> None:
         now = time.monotonic_ns()
         pause = self._retry.failed(now) - now
-        # a fleet does not come all at once
+        # random, so that the gateways of a fleet do not reconnect at the same time
         self._retry.due = now + random.randrange(pause * 3 // 4, pause * 5 // 4)
         if not self._stopping.is_set():
             self._conditions.begin("broker", f"{self.broker}: {reason}", now)
@@ -511,7 +511,7 @@ class MqttClient:
 def remove(
     broker: Broker, filters: Iterable[str], wanted: Callable[[str, bytes], bool]
 ) -> list[str]:
-    """Clear what the broker keeps in topics that match ``filters`` and are ``wanted``; returns them. RunError where that fails."""
+    """Clear the retained messages that match ``filters`` and are ``wanted``; return their topics. RunError on failure."""
     link = _Link(broker, 5, None)
     try:
         try:
@@ -539,7 +539,7 @@ def remove(
 
 
 def _settle(link: _Link, silence_s: float = 0.5) -> None:
-    """Until all is acknowledged, and nothing more has come for a while."""
+    """Wait until everything is acknowledged and no message has come for a while."""
     end = time.monotonic() + 2 * CONNECT_S
     quiet, known = time.monotonic(), len(link.received)
     while link.unacknowledged or time.monotonic() - quiet < silence_s:
@@ -550,7 +550,7 @@ def _settle(link: _Link, silence_s: float = 0.5) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """Why no connection was made, with what to do."""
+    """Why connecting failed, with the remedy."""
     if isinstance(error, _Refused):
         return str(error)
     if isinstance(error, ssl.SSLCertVerificationError):
@@ -569,7 +569,7 @@ def _reason(error: Exception) -> str:
 
 
 def _limit_buffer(sock: Any) -> None:
-    """What the kernel holds cannot be replaced by something newer: little, and what is sent goes at once."""
+    """Keep the kernel's buffer small, since data in it cannot be replaced by newer, and send without delay."""
     with contextlib.suppress(OSError, AttributeError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,15 +1,15 @@
-"""What is published by MQTT, and when: topics, JSON and Home Assistant's discovery from the frames of a layout. Pure; time is handed in.
+"""Makes MQTT messages from the frames of a layout: topics, JSON, Home Assistant's discovery, and their timing. Pure; time is an argument.
 
-``<topic>/<gateway>/`` is in front of every topic but those of discovery; ESC is the name of an ESC.
+Every topic but those of discovery begins with ``<topic>/<gateway>/``; ESC is the name of an ESC.
 
-    online            "online" or "offline": the publisher and its way to the broker (retained; "offline" is the last will)
-    available         "online" or "offline": frames of the gateway come over CAN (retained)
+    online            "online" or "offline": the publisher's connection to the broker (retained; "offline" is the last will)
+    available         "online" or "offline": frames of the gateway arrive over CAN (retained)
     state             JSON: the gateway's own values
-    ESC/available     "online" or "offline": live telemetry of this ESC comes (retained)
+    ESC/available     "online" or "offline": live telemetry of this ESC arrives (retained)
     ESC/state         JSON: every value of the ESC
 
-A state is published at a rate, and at once when errors, the kind of operating state, the link or the availability change: then with 0.2 s
-in between at least, and after 30 such changes only once a second, until they become fewer.
+A state is published at a fixed rate, and at once when errors, the kind of operating state, the link or the availability change. Such
+changes are at least 0.2 s apart, and limited to one a second after a burst of 30.
 """
 
 import json
@@ -38,14 +38,14 @@ ONLINE, OFFLINE = b"online", b"offline"
 PROGRAM = "kontronik-can-gw"
 MAKER = "KONTRONIK"
 SILENCE_NS = 3 * SECOND
-"""Without any frame of the gateway for so long it is not available."""
+"""After this time without a frame the gateway is not available."""
 MIN_PAUSE_NS = 200 * MS
 MAX_CHANGES = 30
 IDENTITY_NS = 6 * SECOND
-"""An ESC that is heard tells its device and firmware about every second, some every five."""
+"""Time to wait for device and firmware: an ESC sends them about every second, some every five."""
 _CHANGE_EVERY_NS = SECOND
 _FIRST_NS = SECOND // 2
-"""So long nothing is published at first: by then the bus has told what there is."""
+"""Delay of the first state, so that the first frames of all messages can arrive."""
 
 _KINDS = {
     "idle": (
@@ -79,7 +79,7 @@ _KINDS = {
     "fault": (OperatingState.Error_Selftest, OperatingState.CutOffDuringOperation),
 }
 KIND_OF_STATE = {state: kind for kind, states in _KINDS.items() for state in states}
-"""What the motor does, in five words."""
+"""Kind of each operating state, as published in "motor"."""
 
 _FLAGS: dict[str, ErrorBit] = {
     bit.text: bit for bits in (OperatingError, SelfTestError) for bit in bits
@@ -93,7 +93,7 @@ _SOURCES = VALUES
 
 
 class Message(NamedTuple):
-    """What is to be published. ``lasting``: the broker keeps it, and gets it again after each connection."""
+    """A message to publish. ``lasting``: retained, and published again after each reconnection."""
 
     topic: str
     payload: bytes
@@ -126,18 +126,18 @@ class Topics:
         return f"{prefix}/device/{self.identifier(esc)}/config"
 
     def identifier(self, esc: str | None) -> str:
-        """What Home Assistant knows a device by: the same as long as gateway and ESC keep their names."""
+        """Home Assistant's identifier of a device, constant as long as gateway and ESC keep their names."""
         return f"kontronik_{self.gateway}" if esc is None else f"kontronik_{self.gateway}_{esc}"
 
 
 class _Member:
-    """The gateway (``esc`` None) or an ESC: its columns and when it was published."""
+    """The gateway (``esc`` None) or an ESC: its columns and the state of its publication."""
 
     def __init__(self, view: View, esc: int | None, name: str | None) -> None:
         self.esc, self.name = esc, name
         self.columns: dict[str, int] = {}
         self.flags: list[tuple[str, int, int | None]] = []
-        """Name, index, and the bit in a word that is sent whole (None: a signal of its own)."""
+        """Flags: name, column, and the bit in an error word (None: a signal of its own)."""
         for index, column in enumerate(view.reader.columns):
             if column.esc != esc or column.source in self.columns:
                 continue
@@ -155,9 +155,9 @@ class _Member:
         ]
         self.kinds = _kinds(view, self.columns)
         self.changed = True
-        """It may have: worth a look."""
+        """True if something may have changed since the last check."""
         self.shown: tuple[object, ...] | None = None
-        """What was published of that which counts as a change."""
+        """Published values whose change triggers a message."""
         self.published_ns: int | None = None
         self.due: int | None = None
         self.heard_ns: int | None = None
@@ -174,13 +174,13 @@ def _kinds(view: View, columns: Mapping[str, int]) -> dict[Value, str]:
 
 
 def _by_number(texts: Sequence[tuple[int, str]]) -> list[tuple[int, str]]:
-    """The operating states of a value table, whose raw values may be others than the ESC's numbers: told by name."""
+    """The operating states of a value table, matched by name, since its raw values may differ from the ESC's numbers."""
     known = {normalize(state.text): int(state) for state in OperatingState}
     return [(known[normalize(text)], text) for _, text in texts if normalize(text) in known]
 
 
 class Publisher:
-    """Frames in, messages out. ``now``: nanoseconds of one clock; ``wall_ns``: Unix time."""
+    """Takes frames, returns messages. ``now``: nanoseconds of one clock; ``wall_ns``: Unix time."""
 
     def __init__(
         self,
@@ -204,23 +204,23 @@ class Publisher:
         self._of_esc = {member.esc: member for member in self._members}
         self._whose = [self._of_esc[column.esc] for column in self.view.reader.columns]
         self._live = frozenset(at for member in self._members for at in member.live)
-        self._said: dict[str, bytes] = {}
-        """What is lasting, as it was published."""
+        self._published: dict[str, bytes] = {}
+        """Lasting messages as published, by topic."""
         self._identity: dict[int | None, tuple[str | None, str | None]] = {}
-        self._told: dict[int | None, tuple[str | None, str | None]] = {}
-        """Device and firmware that the discovery was made with."""
+        self._discovered: dict[int | None, tuple[str | None, str | None]] = {}
+        """Device and firmware in the published discovery."""
 
     @property
     def escs(self) -> list[str]:
-        """Names of the ESCs that the layout has values of."""
+        """Names of the ESCs with values in the layout."""
         return [member.name for member in self._members if member.name is not None]
 
     def take(self, key: int, data: bytes, now: int) -> None:
-        """A frame came."""
+        """Take a frame."""
         chunks = self.view.take(key, data, now)
         if chunks is None:
             return
-        self._members[0].changed = True  # it is heard
+        self._members[0].changed = True  # its availability
         for first, values in chunks:
             for at, value in enumerate(values, first):
                 self._whose[at].changed = True
@@ -230,7 +230,7 @@ class Publisher:
                         self._whose[at].first_heard_ns = now
 
     def due(self, now: int) -> int:
-        """When ``messages`` is to be asked at the latest."""
+        """Latest time of the next call of ``messages``."""
         times = []
         for member in self._members:
             times.append(now if member.due is None else member.due)
@@ -240,7 +240,7 @@ class Publisher:
         return min(times)
 
     def messages(self, now: int, wall_ns: int) -> list[Message]:
-        """What is to be published now."""
+        """The messages to publish now."""
         if self.view.expire(now) or self._gateway_is_silent(now):
             for member in self._members:
                 member.changed = True
@@ -256,8 +256,8 @@ class Publisher:
                 if notable == member.shown:
                     member.changed = False
                     continue
-                if not self._may_tell(member, now):
-                    continue  # it stays changed, and is looked at again
+                if not self._may_publish_change(member, now):
+                    continue  # it stays changed and is checked again
             else:
                 member.due = _next(member.due, self._period, now)
             member.changed, member.shown, member.published_ns = False, notable, now
@@ -267,7 +267,7 @@ class Publisher:
         return made
 
     def state(self, esc: int | None, now: int, wall_ns: int) -> dict[str, Any]:
-        """The JSON of an ESC (None: of the gateway)."""
+        """The state of an ESC (None: of the gateway) as JSON."""
         member, values = self._of_esc[esc], self.view.values
         made: dict[str, Any] = {"time": iso(wall_ns)}
         if self._replay:
@@ -307,8 +307,8 @@ class Publisher:
             None if link is None else self.view.values[link],
         )
 
-    def _may_tell(self, member: _Member, now: int) -> bool:
-        """Whether a change may go now: the first ones of a row, and with a pause behind what went before."""
+    def _may_publish_change(self, member: _Member, now: int) -> bool:
+        """True if a change may be published now, within the pause and the rate limit."""
         if member.published_ns is not None and now - member.published_ns < MIN_PAUSE_NS:
             return False
         member.budget = min(
@@ -321,7 +321,7 @@ class Publisher:
         return True
 
     def _gateway_is_silent(self, now: int) -> bool:
-        """True while the silence is not told yet."""
+        """True while the gateway's silence is not published yet."""
         member = self._members[0]
         return (
             member.shown is not None
@@ -332,13 +332,13 @@ class Publisher:
     def _is_available(self, member: _Member, now: int) -> bool:
         if member.esc is None:
             return self.view.last_ns is not None and now - self.view.last_ns <= SILENCE_NS
-        looked_at = member.live or list(member.columns.values())
-        return any(self.view.values[at] is not None for at in looked_at)
+        checked = member.live or list(member.columns.values())
+        return any(self.view.values[at] is not None for at in checked)
 
     # --- errors and states
 
     def _has_state(self, member: _Member) -> bool:
-        """Flags cannot say 'not available': they count only while the operating state is there."""
+        """True while flags are valid: they have no 'not available', so the operating state must be available."""
         known = [
             member.columns[s]
             for s in ("operating_state", "operating_state_raw")
@@ -347,7 +347,7 @@ class Publisher:
         return any(self.view.values[at] is not None for at in known or member.live)
 
     def _has_info(self, member: _Member) -> bool:
-        """The same of the self-test flags, with the device."""
+        """True while self-test flags are valid: the device must be available."""
         info: list[str] = [s for s in ("device", "device_raw") if s in member.columns]
         info = info or [s for s in member.columns if _SOURCES[s].group is Group.INFO]
         return any(self.view.values[member.columns[s]] is not None for s in info)
@@ -379,26 +379,28 @@ class Publisher:
         at = member.columns.get("operating_state", member.columns.get("operating_state_raw"))
         return None if at is None else member.kinds.get(self.view.values[at])
 
-    # --- what is lasting
+    # --- lasting messages
 
     def _lasting(self, member: _Member, now: int) -> list[Message]:
         wanted: dict[str, bytes] = {}
         known = self._known_identity(member)
         if (
             self._discovery is not None
-            and self._told.get(member.esc) != known
-            and self._may_be_told_of(member, now)
+            and self._discovered.get(member.esc) != known
+            and self._may_discover(member, now)
         ):
-            self._told[member.esc] = known
+            self._discovered[member.esc] = known
             topic = self.topics.discovery(self._discovery, member.name)
             wanted[topic] = json.dumps(self._device(member, *known), ensure_ascii=False).encode()
         wanted[self.topics.available(member.name)] = (
             ONLINE if self._is_available(member, now) else OFFLINE
         )
         news = {
-            topic: payload for topic, payload in wanted.items() if self._said.get(topic) != payload
+            topic: payload
+            for topic, payload in wanted.items()
+            if self._published.get(topic) != payload
         }
-        self._said |= news
+        self._published |= news
         return [
             Message(topic, payload, lasting=True, retain=True) for topic, payload in news.items()
         ]
@@ -433,7 +435,7 @@ class Publisher:
         for key, component in components.items():
             components[key] = {**component, "unique_id": f"{identifier}_{key}"}
             if key in _SOURCES and _SOURCES[key].group is Group.LINK:
-                # what is told of the link is true, and wanted most, while the ESC is not heard
+                # values of the link are valid, and most useful, while the ESC sends nothing
                 components[key] |= {
                     "availability": [online, {"topic": topics.available(None)}],
                     "availability_mode": "all",
@@ -447,14 +449,14 @@ class Publisher:
             "components": components,
         }
 
-    def _may_be_told_of(self, member: _Member, now: int) -> bool:
-        """An ESC is told of once it is known, or heard for long without that: what the broker keeps from before may say more."""
+    def _may_discover(self, member: _Member, now: int) -> bool:
+        """True once device and firmware are known, or stay unknown for long: the retained discovery may be more complete."""
         if member.esc is None or None not in self._identity[member.esc]:
             return True
         return member.first_heard_ns is not None and now - member.first_heard_ns >= IDENTITY_NS
 
     def _known_identity(self, member: _Member) -> tuple[str | None, str | None]:
-        """Device and firmware as they were last known: a device's page is no place for "unknown"."""
+        """Device and firmware last known, so that Home Assistant never shows "unknown" again."""
         device, firmware = self._identity.get(member.esc, (None, None))
         at = member.columns.get("device")
         if at is not None and isinstance(text := self.view.values[at], str):
@@ -475,7 +477,7 @@ class Publisher:
 
 
 def _next(due: int, period: int, now: int) -> int:
-    """The next time of an even row; what was missed is left out."""
+    """The next time on a fixed grid; missed times are skipped."""
     return due + period * ((now - due) // period + 1)
 
 
@@ -515,13 +517,13 @@ _MEASURED: dict[str, tuple[str, str | None]] = {
     "%": ("%", None),
     "us": ("µs", None),
 }
-"""Our unit: theirs, and the device class. Revolutions and charge have none; of the throttle's % nothing is humidity or battery."""
+"""Our unit: Home Assistant's unit and device class. Speed and charge have no class, and % here is neither humidity nor battery."""
 _TOTALS: dict[str, tuple[str, str | None]] = {
     "Wh": ("Wh", "energy"),
     "mAh": ("mAh", None),
     "s": ("s", "duration"),
 }
-"""What only grows, until the ESC or the gateway starts anew."""
+"""Values that only grow until the ESC or the gateway restarts."""
 _DIAGNOSTIC = {Group.LINK, Group.INFO, Group.GATEWAY}
 _OF_USE = {"energy_used", "motor_run_time", "link_state"}
 _SHORT = {
@@ -542,7 +544,7 @@ _LEFT_OUT = {
     "operating_errors",
     "selftest_errors",
 }
-"""They say again what something else says."""
+"""Sources without an entity, because another one shows the same."""
 _MOTOR: dict[str, Any] = {
     "platform": "sensor",
     "name": "Motor",
@@ -577,7 +579,7 @@ def _in_words(source: str) -> str:
 
 
 def entity(source: str, column: Column) -> dict[str, Any] | None:
-    """What Home Assistant is told of one value; None where another one says the same."""
+    """Home Assistant's entity of a value; None where another one shows the same."""
     if source in _LEFT_OUT:
         return None
     about = _SOURCES[source]
@@ -593,7 +595,7 @@ def entity(source: str, column: Column) -> dict[str, Any] | None:
             "device_class": "enum",
             "options": list(dict.fromkeys(text for _, text in column.texts)),
         }
-    if about.names:  # sent as a bare number
+    if about.names:  # sent as a plain number
         return made
     unit = column.unit or about.unit
     if unit in _TOTALS:
@@ -615,11 +617,11 @@ def entity(source: str, column: Column) -> dict[str, Any] | None:
 
 
 def is_ours(payload: bytes, topics: Topics) -> bool:
-    """True for the discovery of this gateway or one of its ESCs, whatever version published it."""
+    """True for the discovery of this gateway or one of its ESCs, published by any version."""
     try:
-        told = json.loads(payload)
+        found = json.loads(payload)
         return (
-            told["origin"]["name"] == PROGRAM and {"topic": topics.online} in told["availability"]
+            found["origin"]["name"] == PROGRAM and {"topic": topics.online} in found["availability"]
         )
     except (ValueError, KeyError, TypeError):
         return False

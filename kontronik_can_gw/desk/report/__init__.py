@@ -1,1 +1,1 @@
-"""A recorded flight as one page for people. analysis (with decimate, ledger, fit) makes a flight of rows; page shows it."""
+"""A recorded flight as an HTML page. analysis (with decimate, ledger, fit) turns rows into a flight; page renders it."""

@@ -1,8 +1,8 @@
-"""What happened in a recording: rows of values in, numbers, events and points to draw out. Pure, one pass, bounded memory.
+"""Analyses a recording: rows of values in; numbers, events and points to draw out. Pure, one pass, bounded memory.
 
-Every value is found by its source (``SignalReader.column_of``) and brought to the source's own unit, so any DBC will do. What the DBC does
-not have is left out and named in ``missing``. A value holds until the next row; two rows further apart than the time-out have a gap
-between them. Times are ns of the recording's clock.
+Every value is found by its source (``SignalReader.column_of``) and converted to the source's unit, so any DBC works. Values that the DBC
+does not have are left out and named in ``missing``. A value holds until the next row; between rows further apart than the time-out there
+is a gap. Times are ns of the recording's clock.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -40,15 +40,15 @@ from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 
 CHUNK = 4096
-"""Rows that are looked at together."""
+"""Rows that are processed together."""
 MAX_EVENTS = 5000
-"""Of one kind (errors, states, link): more are only counted."""
+"""Limit for each kind of event (errors, states, link): more are only counted."""
 MAX_SEGMENTS = 4000
-"""Of one ESC's band of states: beyond it, the shorter of two neighbours is left out."""
+"""Limit for the state segments of an ESC: beyond it, the shorter of two neighbours is left out."""
 
 
 class Analysis:
-    """Takes the rows of a recording. ``window``: seconds after the first row, (from, to); None: no bound."""
+    """Takes the rows of a recording. ``window``: seconds after the first row, (from, to); None: no limit."""
 
     def __init__(
         self,
@@ -89,7 +89,7 @@ class Analysis:
 
     @property
     def has_anything(self) -> bool:
-        """Whether the DBC has a value that can be drawn."""
+        """True if the DBC has a value that can be drawn."""
         return bool(self._drawn)
 
     def _pick(self, column: int) -> int:
@@ -98,7 +98,7 @@ class Analysis:
         return self._picked.index(column)
 
     def take(self, time_ns: int, values: Sequence[Value]) -> bool:
-        """A row; False where it is behind the window, as all that follow."""
+        """Take a row; False where it and all following rows are after the window."""
         if self._origin_ns is None:
             self._origin_ns = time_ns
         since = time_ns - self._origin_ns
@@ -111,7 +111,7 @@ class Analysis:
         elif time_ns - self._last_ns > self._gap_ns:
             self._times.append(self._last_ns)
             self._pending.append(self._blank)
-        elif time_ns < self._last_ns:  # clocks of loggers do that
+        elif time_ns < self._last_ns:  # loggers' clocks can step back
             time_ns = self._last_ns
         self._last_ns = time_ns
         self._rows += 1
@@ -122,7 +122,7 @@ class Analysis:
         return True
 
     def finish(self) -> Flight:
-        """All rows are in."""
+        """Return the flight after the last row."""
         self._flush()
         start = self._start_ns
         end = start if self._last_ns is None else self._last_ns
@@ -167,7 +167,7 @@ class Analysis:
             self._decimator.feed(times, numbers)
 
     def _same_speeds(self) -> set[str]:
-        """Speeds that are another one under a second name, of all ESCs: no pole pairs, no gear. Their extremes are removed, too."""
+        """Speeds that equal another one for all ESCs (one pole pair, no gear). Their extremes are removed, too."""
         same = set()
         for slow, fast in (
             ("output_speed", "motor_speed"),
@@ -179,7 +179,7 @@ class Analysis:
                 for e in (esc.summary.extremes for esc in self._escs)
             ]
             tops = [(a.value, b.value) for a, b in pairs if a is not None and b is not None]
-            # from a log the two come in different messages, so their tops may differ a little
+            # in a log the two come in different messages, so their maxima may differ a little
             if tops and all(abs(a - b) <= _SAME_SPEED * b for a, b in tops):
                 same.add(slow)
         for esc in self._escs:
@@ -188,7 +188,7 @@ class Analysis:
         return same
 
     def _plots(self, points: Points) -> list[PlotData]:
-        """The plots that have something to show; a line that is the same as one above it is left out."""
+        """The plots with data; a line that equals an earlier one is left out."""
         found = []
         same = self._same_speeds()
         by_key = {
@@ -238,7 +238,7 @@ class _Events:
 
 
 class _Input(NamedTuple):
-    """Where a source's values are in a chunk, and how they come to the source's unit."""
+    """Column of a source in a chunk, and its conversion to the source's unit."""
 
     at: int
     slope: float
@@ -284,7 +284,7 @@ _SAME_SPEED = 0.005
 
 
 class _Esc:
-    """One ESC of an analysis."""
+    """The analysis of one ESC."""
 
     def __init__(
         self,
@@ -391,7 +391,7 @@ class _Esc:
     def take(
         self, times: tuple[int, ...], columns: Sequence[tuple[Value, ...]]
     ) -> list[Sequence[Number]]:
-        """A chunk of rows; the columns that are drawn."""
+        """Take a chunk of rows; return the columns to draw."""
         numbers = {source: found.read(columns) for source, found in self._inputs.items()}
         if "cell_count" in numbers:
             known = next((value for value in reversed(numbers["cell_count"]) if value), None)
@@ -430,7 +430,7 @@ class _Esc:
         return [numbers[source] for source in self.drawn]
 
     def finish(self, end_ns: int) -> None:
-        """No more rows: close what is open."""
+        """Close open events and segments after the last row."""
         if self._state is not None:
             self._add_segment(Segment(self._state[1], end_ns, self._state[0]))
         if self._gap is not None:
@@ -507,7 +507,7 @@ class _Esc:
                         time_ns,
                         None,
                         "OK",
-                        "Link in order again",
+                        "Link ok again",
                         momentary=True,
                     )
                 )
@@ -681,21 +681,21 @@ _Named = TypeVar("_Named", bound=IntEnum)
 
 
 def _named(value: Value, names: type[_Named]) -> _Named | None:
-    """What a value of an enumeration means, whatever way the DBC spells it, or as a number."""
+    """The member of an enumeration for a value, given as any spelling of its name or as a number."""
     if isinstance(value, str):
         return next((name for name in names if normalize(name.name) == normalize(value)), None)
     return next((name for name in names if name == value), None)
 
 
 def _end(event: Event, time_ns: int, *, lost: bool) -> None:
-    """``lost``: not the error ended but what is known of it (a flag is sent as 0 then)."""
+    """End an event. ``lost``: telemetry was lost (flags are 0 then); the error itself may continue."""
     event.end_ns = time_ns
     if lost:
         event.note = "until telemetry was lost"
 
 
 def state_name(number: int) -> str:
-    """The sheet's spelling, or the number."""
+    """A state's name as the data sheet spells it, or the number."""
     return state_text(number) or (f"state {number}" if number >= 0 else "unknown state")
 
 

@@ -1,13 +1,12 @@
-"""Many rows -> few points that look the same. Pure, one pass, bounded memory.
+"""Reduces many rows to few points that look the same in a plot. Pure, one pass, bounded memory.
 
-Rows that follow each other share a bucket; a bucket keeps, of each column, its least and its greatest value in the order in which they
-came. When there are too many buckets, neighbours are merged and each holds twice as many rows. So every extreme survives exactly, its time
-to within a bucket, and as long as there are not more rows than points nothing is changed at all.
+Consecutive rows share a bucket, which keeps the minimum and the maximum of each column in the order in which they came. When there are
+too many buckets, neighbours are merged and each holds twice as many rows. So every extreme is kept exactly, its time to within a bucket,
+and with no more rows than points nothing is changed.
 
-A bucket never holds rows of which a column has a value in one and none in another: where a column begins or ceases to be available a new
-bucket begins, however few rows that leaves in one. So each line ends at its last value in front of a gap and begins again at its first
-behind it, and a gap of one row is as safe as a long one. Only beyond MAX_RUNS such places the closest of them are blurred: merged into
-mixed buckets, in which the values of a column that has gaps stand alone, joined with nothing.
+A bucket never mixes rows with and without a value of a column: where a column becomes available or not available a new bucket begins. So
+each line ends at the last value before a gap and begins again at the first after it, even for a gap of one row. Only beyond MAX_RUNS such
+places the closest of them are blurred: merged into mixed buckets, in which the values of a column with gaps are single points.
 """
 
 from array import array
@@ -17,13 +16,13 @@ from itertools import pairwise
 Number = int | float | None
 MIN_POINTS = 8
 MAX_RUNS = 4000
-"""Stretches of rows with the same columns available that are told apart, whatever the number of points."""
+"""Limit for runs of rows with the same columns available that are kept separate, whatever the number of points."""
 _MIXED = -1
 _MIN_BLUR_NS = 1_000_000
 
 
 class Points:
-    """What is drawn: ``times`` (ns, never falling) and for each column as many values, None in a gap."""
+    """Points to draw: ``times`` (ns, never falling) and as many values of each column, None in a gap."""
 
     def __init__(self, times: list[int], columns: list[list[Number]]) -> None:
         self.times = times
@@ -31,11 +30,11 @@ class Points:
 
 
 class Decimator:
-    """Rows of ``width`` columns in, at most ``points`` points out, and a few more for each gap."""
+    """Takes rows of ``width`` columns; returns at most ``points`` points, and a few more for each gap."""
 
-    def __init__(self, width: int, points: int, most_runs: int = MAX_RUNS) -> None:
+    def __init__(self, width: int, points: int, max_runs: int = MAX_RUNS) -> None:
         self._points = max(points, MIN_POINTS) // 4 * 4
-        self._most_runs = max(most_runs, 2)
+        self._max_runs = max(max_runs, 2)
         self._rows = 1  # of a full bucket
         self._runs = 0
         self._blur_ns = _MIN_BLUR_NS
@@ -50,15 +49,15 @@ class Decimator:
 
     @property
     def rows_in_bucket(self) -> int:
-        """1: nothing was left out."""
+        """Rows in a full bucket; 1: nothing was left out."""
         return self._rows
 
     def feed(self, times: Sequence[int], columns: Sequence[Sequence[Number]]) -> None:
-        """Take rows, given as columns; ``times`` in ns, never falling."""
+        """Take rows as columns; ``times`` in ns, never falling."""
         for begin, end, gaps in _runs(columns, len(times)):
             if not self._gaps or self._gaps[-1] != gaps:
                 self._runs += 1
-                if self._runs > self._most_runs:
+                if self._runs > self._max_runs:
                     self._blur()
             at = begin
             while at < end:
@@ -98,7 +97,7 @@ class Decimator:
         return Points(times, columns)
 
     def _room(self, gaps: int) -> int:
-        """Rows of the same kind that can be taken before buckets must be merged."""
+        """Rows with these gaps that fit before buckets must be merged."""
         most = (self._points if self._rows == 1 else self._points // 2) + self._runs - 1
         is_open = self._gaps and self._gaps[-1] == gaps
         return (most - len(self._begin)) * self._rows + (
@@ -113,7 +112,7 @@ class Decimator:
         stop: int,
         gaps: int,
     ) -> None:
-        """Rows that all have the same gaps, as many as there is room for."""
+        """Take rows that all have the same gaps and fit."""
         rows = self._rows
         if rows == 1:
             self._begin.extend(times[at:stop])
@@ -150,7 +149,7 @@ class Decimator:
         ):
             mixed += bytes(len(starts))
             part = values[at:stop]
-            if part.count(part[0]) == len(part):  # nothing moves: most columns, most of the time
+            if part.count(part[0]) == len(part):  # constant, as most columns most of the time
                 first += [part[0]] * len(starts)
                 second += [part[0]] * len(starts)
                 continue
@@ -160,7 +159,7 @@ class Decimator:
                 second.append(b)
 
     def _merge(self) -> None:
-        """Twice as many rows to a bucket: neighbours with the same gaps become one."""
+        """Double the rows of a bucket: merge neighbours with the same gaps."""
         self._rows *= 2
         groups: list[list[int]] = []
         rows = 0
@@ -180,7 +179,7 @@ class Decimator:
         self._regroup(groups)
 
     def _blur(self) -> None:
-        """Too many runs: neighbours become one where together they are short, whatever their gaps, until half as many are left."""
+        """Merge the shortest neighbours, whatever their gaps, until half of the runs are left."""
         while True:
             groups: list[list[int]] = []
             for index, end in enumerate(self._end):
@@ -190,14 +189,14 @@ class Decimator:
                     groups.append([index])
             self._regroup(groups)
             self._rows = max(self._rows, 2)
-            # with the one that comes
+            # with the next one
             self._runs = 2 + sum(a != b or b == _MIXED for a, b in pairwise(self._gaps))
-            if self._runs <= self._most_runs // 2 or len(self._begin) == 1:
+            if self._runs <= self._max_runs // 2 or len(self._begin) == 1:
                 return
             self._blur_ns *= 2
 
     def _regroup(self, groups: Sequence[Sequence[int]]) -> None:
-        """Each group of neighbours becomes one bucket."""
+        """Merge each group of neighbours into one bucket."""
         self._begin = array("q", [self._begin[group[0]] for group in groups])
         self._end = array("q", [self._end[group[-1]] for group in groups])
         count, gaps = self._count, self._gaps
@@ -222,7 +221,7 @@ class Decimator:
 
 
 def _runs(columns: Sequence[Sequence[Number]], count: int) -> list[tuple[int, int, int]]:
-    """Stretches of rows with the same columns without a value: from, to, a bit for each such column."""
+    """Runs of rows with the same columns missing: from, to, a bit for each missing column."""
     if not count:
         return []
     gaps = 0
@@ -246,7 +245,7 @@ def _runs(columns: Sequence[Sequence[Number]], count: int) -> list[tuple[int, in
 
 
 def _reduce(part: Sequence[Number]) -> tuple[Number, Number]:
-    """Least and greatest in the order in which they came, of values only or of None only."""
+    """Minimum and maximum in the order in which they came; of values only or of None only."""
     if part[0] is None:
         return None, None
     low, high = min(part), max(part)  # type: ignore[type-var]  # no None here
@@ -258,7 +257,7 @@ def _reduce(part: Sequence[Number]) -> tuple[Number, Number]:
 def _join(
     a1: Number, a2: Number, a_mixed: int, b1: Number, b2: Number, b_mixed: int
 ) -> tuple[Number, Number, int]:
-    """The same for two buckets that follow each other, and whether the column has values and gaps in them."""
+    """Minimum and maximum of two consecutive buckets, and whether the column has both values and gaps."""
     if a1 is None or a2 is None:
         return b1, b2, b_mixed or int(b1 is not None)
     if b1 is None or b2 is None:

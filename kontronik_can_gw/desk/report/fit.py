@@ -1,8 +1,8 @@
-"""The battery's internal resistance from voltage over current.
+"""Estimates the battery's internal resistance from voltage over current.
 
-The open voltage falls as the battery empties, so one line through a whole flight would count that as resistance. So a line is fitted
-through each stretch of ten seconds, if the current moves enough in it, and the median of the slopes is given, with the half width of the
-middle half of them as spread. With fewer than three such stretches nothing is said. Leads and plugs between battery and ESC are part of it.
+The open-circuit voltage falls as the battery empties, so one line through a whole flight would count that as resistance. So a line is
+fitted through each ten seconds in which the current varies enough. The result is the median of the slopes, with half of their
+interquartile range as spread; with fewer than three slopes there is none. It includes leads and plugs between battery and ESC.
 """
 
 from typing import NamedTuple
@@ -12,12 +12,12 @@ from kontronik_can_gw.esc.telemetry import SECOND
 STRETCH_NS = 10 * SECOND
 MIN_PAIRS = 20
 MIN_SPREAD = 2.0
-"""A: standard deviation of the current that a stretch needs."""
+"""A: minimum standard deviation of the current in an interval."""
 MIN_STRETCHES = 3
 
 
 class Resistance(NamedTuple):
-    """In ohm."""
+    """A resistance and its spread in ohm."""
 
     value: float
     spread: float
@@ -25,7 +25,7 @@ class Resistance(NamedTuple):
 
 
 class ResistanceFit:
-    """Takes pairs of V and A in order of time."""
+    """Takes pairs of voltage and current in order of time."""
 
     def __init__(self) -> None:
         self._slopes: list[float] = []
@@ -33,7 +33,7 @@ class ResistanceFit:
         self._restart(0.0, 0.0)
 
     def take(self, time_ns: int, voltage: float, current: float) -> None:
-        """A pair."""
+        """Take a pair (V, A)."""
         if self._begin_ns is None or time_ns - self._begin_ns >= STRETCH_NS:
             self._close()
             self._begin_ns = time_ns
@@ -46,7 +46,7 @@ class ResistanceFit:
         self._xy += x * y
 
     def finish(self) -> Resistance | None:
-        """None where the data do not tell."""
+        """The resistance; None where the data are not sufficient."""
         self._close()
         self._restart(0.0, 0.0)
         slopes = sorted(self._slopes)
@@ -74,7 +74,7 @@ class ResistanceFit:
 
 
 def _quantile(ordered: list[float], share: float) -> float:
-    """Between neighbours by a line, as numpy does."""
+    """A quantile, interpolated linearly as numpy does."""
     place = share * (len(ordered) - 1)
     low = int(place)
     high = min(low + 1, len(ordered) - 1)

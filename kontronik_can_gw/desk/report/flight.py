@@ -1,4 +1,4 @@
-"""What is known of a recorded flight: what the page and the pictures are made of. Times are ns of the recording's clock."""
+"""The data of a recorded flight, from which the page is made. Times are ns of the recording's clock."""
 
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -10,7 +10,7 @@ Kind = Literal["error", "state", "link", "device"]
 
 
 class Extreme(NamedTuple):
-    """A value and when it stood first."""
+    """A value and the time of its first occurrence."""
 
     value: float
     time_ns: int
@@ -18,26 +18,26 @@ class Extreme(NamedTuple):
 
 @dataclass(slots=True)
 class Event:
-    """Something that began, and ended or was still so at the end (``end_ns`` None). ``esc`` None: of the gateway."""
+    """An event with its duration; ``end_ns`` None: it lasts until the end. ``esc`` None: of the gateway."""
 
     kind: Kind
     esc: int
     begin_ns: int
     end_ns: int | None
     name: str
-    """As signals are bound to it, or a state's name."""
+    """Name of the source, or of the state."""
     text: str
     """In words."""
     severity: str = ""
     remedy: str = ""
     note: str = ""
-    """How it ended, where that is not plain."""
+    """How it ended, where that is not obvious."""
     momentary: bool = False
-    """It has no length."""
+    """True for an event without duration."""
 
 
 class Segment(NamedTuple):
-    """A stretch of one operating state; ``state`` is its number."""
+    """A period in one operating state; ``state`` is its number."""
 
     begin_ns: int
     end_ns: int
@@ -46,20 +46,20 @@ class Segment(NamedTuple):
 
 @dataclass
 class Summary:
-    """Numbers of one ESC. None: the recording does not tell."""
+    """Numbers of one ESC. None: not in the recording."""
 
     telemetry_ns: int = 0
     """With telemetry."""
     turning_ns: int | None = None
-    """With the motor turning."""
+    """Time with the motor turning."""
     energy_counter: float | None = None
     """Wh, by the source energy_used."""
     energy_drawn: float | None = None
-    """Wh, the positive power integrated."""
+    """Wh, the integral of positive power."""
     energy_returned: float | None = None
-    """Wh, given back to the battery."""
+    """Wh, returned to the battery."""
     charge: float | None = None
-    """mAh by the ESC's counter."""
+    """mAh, from the ESC's counter."""
     charge_resets: int = 0
     power_turning: float | None = None
     """W, mean while the motor turns."""
@@ -69,7 +69,7 @@ class Summary:
     rest_voltage: float | None = None
     """V of the battery before the first load."""
     load_voltage: Extreme | None = None
-    """V of the battery, least under load."""
+    """V of the battery, minimum under load."""
     resistance: Resistance | None = None
     losses: int | None = None
     crc_errors: int | None = None
@@ -79,20 +79,20 @@ class Summary:
 
     @property
     def energy(self) -> float | None:
-        """Wh: the counter's, integrated where there is none."""
+        """Wh, from the counter; integrated where there is none."""
         return self.energy_drawn if self.energy_counter is None else self.energy_counter
 
 
 @dataclass
 class Facts:
-    """What an ESC is, by its info frames: newest known."""
+    """Device data of an ESC from its info frames, the newest."""
 
     device: str | None = None
     variant: int | None = None
     firmware: str | None = None
     layout: str | None = None
     devices: list[tuple[int, str]] = field(default_factory=list)
-    """Each that there was, in words, and since when; one where none was changed."""
+    """Every device seen, in words, and since when; usually one."""
 
 
 @dataclass
@@ -101,7 +101,7 @@ class Line:
 
     esc: int
     quantity: int
-    """Index among the plot's quantities that there are."""
+    """Index in the plot's available quantities."""
     source: str
     values: list[Number]
 
@@ -113,12 +113,12 @@ class PlotData:
     plot: int
     lines: list[Line]
     labels: list[str]
-    """Of the quantities that there are; a line's ``quantity`` is an index of it."""
+    """Titles of the available quantities; a line's ``quantity`` is an index of them."""
 
 
 @dataclass
 class Flight:
-    """All that a report shows. Times count from ``start_ns``'s clock."""
+    """Everything that a report shows. Times are on the clock of ``start_ns``."""
 
     origin_ns: int
     """The recording's first row: time 0."""
@@ -133,8 +133,8 @@ class Flight:
     segments: list[list[Segment]]
     events: list[Event]
     left_out: dict[Kind, int]
-    """Events that were only counted."""
+    """Numbers of events that were only counted."""
     missing: list[str]
-    """What the DBC does not have, in words."""
+    """Values that the DBC does not have, in words."""
     rows_in_bucket: int
     replayed: bool = False

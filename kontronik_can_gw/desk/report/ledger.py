@@ -1,4 +1,4 @@
-"""Sums of one ESC: counters that reset or roll, time, energy, load and resistance. One pass."""
+"""Sums of one ESC: counters that reset or overflow, time, energy, load and resistance. One pass."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -11,15 +11,15 @@ from kontronik_can_gw.signals.unpacker import Column, Value
 
 HOUR_NS = 3600 * SECOND
 REST_CURRENT = 1.0
-"""A: below it, either way, the battery is at rest."""
+"""A: below this magnitude the battery is at rest."""
 LOAD_CURRENT = 5.0
-"""A: from it on, the battery is under load."""
+"""A: at or above it the battery is under load."""
 REST_NS = 2 * SECOND
-"""The rest voltage is the mean of at most so long before the first load."""
+"""The rest voltage is the mean over at most this time before the first load."""
 
 
 class Counter:
-    """What a counter went up by in all, over resets and over the end of its range."""
+    """Total increase of a counter, across resets and overflows."""
 
     def __init__(self, column: Column) -> None:
         self._top = column.high
@@ -48,12 +48,12 @@ class Counter:
         self._last = last
 
     def _rolls(self, last: float, value: float) -> bool:
-        """From the last eighth of its range to the first."""
+        """True for an overflow: from the last eighth of the range to the first."""
         return last > self._top * 7 / 8 and value < self._top / 8
 
 
 class Ledger:
-    """Time, energy, load and resistance of one ESC, from the values that hold between two rows."""
+    """Time, energy, load and resistance of one ESC; values hold from row to row."""
 
     def __init__(self, summary: Summary) -> None:
         self._summary = summary
@@ -125,8 +125,8 @@ class Ledger:
                 if self._rest:
                     self._summary.rest_voltage = sum(v for _, v in self._rest) / len(self._rest)
                     self._rest.clear()
-            least = self._summary.load_voltage
-            if least is None or voltage < least.value:
+            lowest = self._summary.load_voltage
+            if lowest is None or voltage < lowest.value:
                 self._summary.load_voltage = Extreme(voltage, time_ns)
         elif not self._loaded and abs(current) <= REST_CURRENT and voltage > 0:
             self._rest.append((time_ns, voltage))

@@ -1,4 +1,4 @@
-"""A flight as one HTML page that needs no network: the template's files, uPlot, and the data in base64. The same flight, the same bytes."""
+"""Renders a flight as one HTML page that needs no network: template files, uPlot, and data in base64. The output is deterministic."""
 
 import base64
 import hashlib
@@ -18,7 +18,7 @@ from kontronik_can_gw.esc.telemetry import SECOND
 
 HERE = Path(__file__).parent
 MAX_DEVICES = 8
-"""Of one ESC, that the head names."""
+"""Limit for the devices of an ESC named in the head."""
 Json = dict[str, "Json"] | list["Json"] | str | int | float | bool | None
 
 
@@ -31,7 +31,7 @@ def render(
     wall_ns: int | None = None,
     damage: Sequence[str] = (),
 ) -> str:
-    """The page. ``source``: the input's name; ``wall_ns``: Unix time of the recording's time 0, None where not known."""
+    """Render the page. ``source``: the input's name; ``wall_ns``: Unix time of the recording's time 0, None where not known."""
     styles = _file("vendor/uPlot.min.css") + _file("page.css")
     library, script = _file("vendor/uPlot.iife.min.js"), _file("page.js")
     policy = (
@@ -118,7 +118,7 @@ def _data(flight: Flight, wall_ns: int | None) -> Json:
 
 
 def encode(values: Sequence[Number]) -> dict[str, Json]:
-    """Values as whole steps where they are decimals, else as doubles. None: the least number of the type, or NaN."""
+    """Values as integer steps if they are decimals, else as doubles. None: the lowest number of the type, or NaN."""
     known = [value for value in values if value is not None]
     for scale in (1, 10, 100, 1000):
         steps = [round(value * scale) for value in known]
@@ -137,8 +137,8 @@ def encode(values: Sequence[Number]) -> dict[str, Json]:
             "type": "f64",
             "data": _blob(array("d", [nan if value is None else value for value in values])),
         }
-    code, least = ("h", -(1 << 15)) if reach < 1 << 15 else ("i", -(1 << 31))
-    packed = array(code, [least if value is None else round(value * scale) for value in values])
+    code, none = ("h", -(1 << 15)) if reach < 1 << 15 else ("i", -(1 << 31))
+    packed = array(code, [none if value is None else round(value * scale) for value in values])
     return {"type": "i16" if code == "h" else "i32", "scale": scale, "data": _blob(packed)}
 
 
@@ -176,7 +176,7 @@ def duration(length_ns: int) -> str:
 
 
 def number(value: float, digits: int) -> str:
-    """With a thin space between thousands and a real minus."""
+    """Format with a thin space between thousands and a minus sign."""
     return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 
 
@@ -205,14 +205,14 @@ def _head(
     if wall_ns is not None:
         facts.append(("Begin", wall_clock(wall_ns + flight.start_ns - flight.origin_ns)))
     for name, fact in zip(flight.names, flight.facts, strict=True):
-        words, told = fact_words(fact, flight.origin_ns), provenance.get(name, "")
-        if words or told:
+        words, noted = fact_words(fact, flight.origin_ns), provenance.get(name, "")
+        if words or noted:
             facts.append(
                 (
                     name,
-                    ", at ".join(filter(None, (words, told.rpartition(", at ")[2])))
+                    ", at ".join(filter(None, (words, noted.rpartition(", at ")[2])))
                     if words
-                    else told,
+                    else noted,
                 )
             )
     if flight.replayed:
@@ -230,7 +230,7 @@ def _head(
 
 
 def fact_words(facts: Facts, origin_ns: int) -> str:
-    """What an ESC is, in a few words; where it was changed all that there were, with their times; empty where nothing is known."""
+    """The device in a few words; if it was replaced, every device with its time; empty where nothing is known."""
     words = []
     if len(facts.devices) > 1:
         shown = facts.devices[:MAX_DEVICES]
@@ -261,7 +261,7 @@ def _at(time_ns: int, flight: Flight) -> str:
 
 
 def _tiles(flight: Flight) -> str:
-    """The numbers that are asked for first; of several ESCs the outermost, and whose it is."""
+    """The most important numbers; with several ESCs the extreme and the name of its ESC."""
     several = len(flight.names) > 1
     tiles: list[tuple[str, str, str]] = [
         ("Duration", duration(flight.end_ns - flight.start_ns), "")
@@ -313,7 +313,7 @@ Cell = Callable[[Summary], str | None]
 
 
 def _summary(flight: Flight) -> str:
-    """A table: a line for each number, a column for each ESC; what nobody knows is left out."""
+    """A table: a row for each number, a column for each ESC; unknown numbers are left out."""
 
     def extreme(key: str, unit: str, digits: int) -> Cell:
         return lambda s: _extreme(s.extremes.get(key), unit, digits, flight)
@@ -444,9 +444,11 @@ def _per_cell(voltage: float | None, summary: Summary) -> str | None:
 
 
 def _under_load(summary: Summary, flight: Flight) -> str | None:
-    least = summary.load_voltage
+    lowest = summary.load_voltage
     return (
-        None if least is None else f"{_per_cell(least.value, summary)} {_at(least.time_ns, flight)}"
+        None
+        if lowest is None
+        else f"{_per_cell(lowest.value, summary)} {_at(lowest.time_ns, flight)}"
     )
 
 
@@ -480,8 +482,8 @@ def _notes(flight: Flight) -> str:
         lines.append(f"Not in the DBC, so not here: {', '.join(flight.missing)}.")
     if flight.rows_in_bucket > 1:
         lines.append(
-            f"Lines are drawn from the least and the greatest value of each {flight.rows_in_bucket} rows: no peak is lost, its place is "
-            "exact to within them. All numbers in the summary are of every row."
+            f"Lines are drawn from the minimum and the maximum of each {flight.rows_in_bucket} rows: no peak is lost, its time is "
+            "exact to within them. All numbers in the summary are from every row."
         )
     for kind, count in flight.left_out.items():
         lines.append(f"{count} more {_KINDS[kind]} are not listed.")

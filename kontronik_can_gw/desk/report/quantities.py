@@ -1,4 +1,4 @@
-"""What the report shows: plots and their lines, classes of operating states. The one home of titles, order and colours."""
+"""Plots and their lines, and classes of operating states in the report: the only place of titles, order and colours."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from kontronik_can_gw.esc.kontronik.states import OperatingState
 
 @dataclass(frozen=True)
 class Quantity:
-    """A line of a plot: a source of values.py, in the source's own unit whatever the DBC has."""
+    """A line of a plot: a source of values.py, in the source's unit whatever the unit in the DBC."""
 
     source: str
     label: str
@@ -72,7 +72,7 @@ PLOTS = (
 
 @dataclass(frozen=True)
 class StateClass:
-    """Operating states that mean the same to who looks on. Colours: for a light and for a dark page."""
+    """Operating states shown alike. Colours: for a light and for a dark page."""
 
     key: str
     label: str
@@ -149,14 +149,14 @@ def class_of(state: int) -> int:
 
 @dataclass(frozen=True)
 class LineStyle:
-    """How a line looks: colour on a light and on a dark page, dashes in pixels. Told apart without colour, too."""
+    """Style of a line: colour on a light and on a dark page, dashes in pixels (distinguishable without colour)."""
 
     light: str
     dark: str
     dash: tuple[int, ...]
 
 
-# After Okabe and Ito's palette for all kinds of colour vision, darkened or lightened where a page's ground asks for it.
+# Palette of Okabe and Ito for all kinds of colour vision, darkened or lightened for the background.
 STYLES = (
     LineStyle("#0072b2", "#4aa8e0", ()),
     LineStyle("#d55e00", "#ff8c42", (8, 4)),
