@@ -57,7 +57,7 @@ ONLY_IN = {
     "asammdf": ("desk",),
     "paho": ("desk",),
     "shtab": ("cli",),
-    "canopen": ("canopen/eds.py", "canopen/dictionary.py"),
+    "canopen": (),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

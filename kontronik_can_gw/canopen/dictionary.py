@@ -6,7 +6,6 @@ Built from an EDS. A variable is either plain storage or bound: ``read`` then gi
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.eds import Eds, Entry
@@ -20,11 +19,25 @@ _LONGEST_DOMAIN = 0x10000
 _DOMAIN = 0x0F
 
 
-def codec(data_type: int) -> Any:
-    """The canopen library's codec of a number type (``pack``, ``unpack``, ``size`` like a struct.Struct); None for texts and domains."""
-    from canopen.objectdictionary import ODVariable
+_CODECS = {
+    0x01: struct.Struct("<?"),
+    0x02: struct.Struct("<b"),
+    0x03: struct.Struct("<h"),
+    0x04: struct.Struct("<i"),
+    0x05: struct.Struct("<B"),
+    0x06: struct.Struct("<H"),
+    0x07: struct.Struct("<I"),
+    0x08: struct.Struct("<f"),
+    0x11: struct.Struct("<d"),
+    0x15: struct.Struct("<q"),
+    0x1B: struct.Struct("<Q"),
+}
+"""Number types by their code (CiA 301, table 44)."""
 
-    return ODVariable.STRUCT_TYPES.get(data_type)
+
+def codec(data_type: int) -> struct.Struct | None:
+    """The codec of a number type; None for texts and domains."""
+    return _CODECS.get(data_type)
 
 
 def key(index: int, sub: int) -> int:
@@ -68,8 +81,7 @@ class Variable:
         """Bytes of the type; None for texts and domains."""
         if self.codec is None:
             return None
-        size: int = self.codec.size
-        return size
+        return self.codec.size
 
     @property
     def readable(self) -> bool:
@@ -84,8 +96,7 @@ class Variable:
         if self.codec is None:
             assert isinstance(value, bytes)
             return value
-        data: bytes = self.codec.pack(value)
-        return data
+        return self.codec.pack(value)
 
     def decode(self, data: bytes) -> Value:
         """The value of bytes of the right size."""

@@ -1,7 +1,6 @@
 """Electronic data sheets of CiA 306: reading with every check, writing a DCF, dropping objects. Text in, objects or text out.
 
-The object sections are read by the ``canopen`` library. It lets much pass (wrong numbers, counts, lists, CompactSubObj), so each section
-is checked here first and handed to it in one spelling: our refusals name file, section, key and remedy, all at once.
+Refusals name file, section, key and remedy, all at once.
 
 Choices where CiA 306 leaves room: section and key names in any case; LF as well as CR LF; a key without a value is a key that is not there;
 section names that CiA 306 does not know are passed over. Types of 24, 40, 48 and 56 bits and times are refused; 64-bit types are plain
@@ -9,15 +8,13 @@ storage, so they are taken from 2000h on only.
 """
 
 import codecs
-import io
 import re
 import struct
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePath
 
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.lean import without_asammdf
 
 DOMAIN, VAR, ARRAY, RECORD = 2, 7, 8, 9
 """Object codes (CiA 301, table 42)."""
@@ -213,7 +210,7 @@ class _Variable:
     mappable: bool
     low: int | None
     high: int | None
-    default: int | float | str | None
+    default: int | float | bytes | None
     relative: bool
 
 
@@ -702,23 +699,25 @@ class _Checker:
         )
         return None
 
-    def _default(self, section: _Section, data_type: int) -> tuple[int | float | str | None, bool]:
-        """The default for the canopen library, and whether the node-ID is to be added to it."""
+    def _default(
+        self, section: _Section, data_type: int
+    ) -> tuple[int | float | bytes | None, bool]:
+        """The default, and whether the node-ID is to be added to it."""
         text = section.get("DefaultValue")
         if not text or not data_type:
             return None, False
         if data_type in (_VISIBLE_STRING, _UNICODE_STRING):
-            return text, False
+            coding = "utf-16-le" if data_type == _UNICODE_STRING else "ascii"
+            return text.encode(coding, "replace"), False
         if data_type in (_OCTET_STRING, _DOMAIN_TYPE):
             try:
-                bytes.fromhex(text)
+                return bytes.fromhex(text), False
             except ValueError:
                 self._say(
                     section.name,
                     f"DefaultValue={text}: not bytes. Write pairs of hexadecimal digits, or nothing.",
                 )
                 return None, False
-            return text, False
         if data_type in _FLOATS:
             return self._real(section, text, data_type), False
         if match := _NODE_ID.match(text.replace(" ", "")):
@@ -828,58 +827,23 @@ class _Checker:
 
 
 def _entries(objects: Mapping[int, _Object]) -> Iterator[Entry]:
-    """What the canopen library reads from the sections in one spelling, node-ID 0."""
-    with without_asammdf():
-        from canopen.objectdictionary.eds import import_eds
-
-    source = io.StringIO(_one_spelling(objects.values()))
-    dictionary = import_eds(source, 0)  # type: ignore[no-untyped-call]  # import_od wants a file with a name
     for index in sorted(objects):
-        for sub in sorted(objects[index].subs):
-            variable = dictionary.get_variable(index, sub)
-            assert variable is not None
-            default = variable.default
-            if isinstance(default, str):
-                default = default.encode(
-                    "utf-16-le" if variable.data_type == _UNICODE_STRING else "ascii"
-                )
+        item = objects[index]
+        for sub in sorted(item.subs):
+            variable = item.subs[sub]
             yield Entry(
                 index,
                 sub,
                 variable.name,
-                objects[index].subs[sub].data_type,
-                variable.access_type,
-                variable.pdo_mappable,
-                variable.min,
-                variable.max,
-                default,
+                variable.data_type,
+                variable.access,
+                variable.mappable,
+                variable.low,
+                variable.high,
+                variable.default,
                 variable.relative,
-                objects[index].kind,
+                item.kind,
             )
-
-
-def _one_spelling(objects: Iterable[_Object]) -> str:
-    lines = ["[DeviceInfo]"]
-    for item in objects:
-        lists = item.kind in (ARRAY, RECORD)
-        if lists:
-            lines += [
-                f"[{item.index:04X}]",
-                f"ParameterName={item.name}",
-                f"ObjectType={item.kind}",
-            ]
-        for sub, variable in item.subs.items():
-            lines += [
-                f"[{_spelling(item.index, sub if lists else None)}]",
-                f"ParameterName={variable.name}",
-            ]
-            lines += [f"ObjectType={VAR if lists else item.kind}", f"DataType={variable.data_type}"]
-            lines += [f"AccessType={variable.access}", f"PDOMapping={int(variable.mappable)}"]
-            lines += [f"LowLimit={variable.low}"] * (variable.low is not None)
-            lines += [f"HighLimit={variable.high}"] * (variable.high is not None)
-            if variable.default is not None:
-                lines.append(f"DefaultValue={'$NODEID+' * variable.relative}{variable.default}")
-    return "\n".join(lines)
 
 
 def _blocks(text: str) -> list[tuple[str, list[str]]]:
