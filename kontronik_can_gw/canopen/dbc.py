@@ -10,15 +10,18 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen import emergency, heartbeat
+from kontronik_can_gw.canopen import emergency_codes
 from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.bound_values import Mapped, message_plan
+from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
 from kontronik_can_gw.canopen.eds import Entry
-from kontronik_can_gw.canopen.emergency import GatewayError, code_of_bit
+from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import Nodes
-from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Mapped, Tpdo, message_plan
+from kontronik_can_gw.canopen.pdo import Tpdo
+from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
 from kontronik_can_gw.dbc.expand import esc_prefix
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import (
@@ -200,7 +203,7 @@ class _NodeMessages:
             if tpdo.valid and tpdo.mapped:
                 yield self._tpdo(tpdo)
         yield self._heartbeat()
-        cob_id = self._node.emergency_id
+        cob_id = self._node.emergencies.cob_id
         if not cob_id >> 31:
             yield self._emergency(cob_id & 0x7FF)
 
@@ -228,7 +231,7 @@ class _NodeMessages:
             f"every {period} ms" if period else "off (1017h is 0), only the boot-up message is sent"
         )
         name = self._message_names.take(self._message_prefix, "Heartbeat")
-        cob_id = heartbeat.COB_ID + self._node.node_id
+        cob_id = HEARTBEAT + self._node.node_id
         comment = f"Heartbeat of {self._who}, {told}."
         return _Message(
             cob_id, name, 1, comment, "Cyclic" if period else "Event", period, 0, [state]
@@ -384,12 +387,12 @@ class _NodeMessages:
 
 
 _REGISTER = {
-    emergency.GENERIC: "Generic",
-    emergency.CURRENT: "Current",
-    emergency.VOLTAGE: "Voltage",
-    emergency.TEMPERATURE: "Temperature",
-    emergency.COMMUNICATION: "Communication",
-    emergency.MANUFACTURER: "Manufacturer",
+    emergency_codes.GENERIC: "Generic",
+    emergency_codes.CURRENT: "Current",
+    emergency_codes.VOLTAGE: "Voltage",
+    emergency_codes.TEMPERATURE: "Temperature",
+    emergency_codes.COMMUNICATION: "Communication",
+    emergency_codes.MANUFACTURER: "Manufacturer",
 }
 
 

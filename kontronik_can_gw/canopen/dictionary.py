@@ -113,7 +113,7 @@ class Variable:
 
 
 class Dictionary:
-    """All variables of one node. What is asked or told over the bus goes through ``upload`` and ``download``."""
+    """All variables of one node. What is read or written over the bus goes through ``upload`` and ``download``."""
 
     def __init__(self, eds: Eds) -> None:
         self.variables = {key(entry.index, entry.sub): Variable(entry) for entry in eds.entries}
@@ -126,6 +126,23 @@ class Dictionary:
     def get(self, index: int, sub: int = 0) -> Variable | None:
         """The variable, None where there is none."""
         return self.variables.get(key(index, sub))
+
+    def bind(
+        self,
+        index: int,
+        sub: int = 0,
+        *,
+        read: Read | None = None,
+        check: Callable[[int], None] | None = None,
+        written: Callable[[int], bool] | None = None,
+    ) -> None:
+        """Give an object to its service: what it shows, which values it refuses, what follows a download.
+
+        Does nothing where the EDS has no such object.
+        """
+        variable = self.get(index, sub)
+        if variable is not None:
+            variable.read, variable.check, variable.written = read, check, written
 
     def number(self, index: int, sub: int = 0, otherwise: int | None = None) -> int:
         """The whole number that a variable holds. Where the EDS has no such variable ``otherwise``, None: the shipped EDS's default."""
@@ -199,37 +216,37 @@ class Dictionary:
 
     # --- power-on and storage
 
-    def reset(self, first: int, last: int, node_id: int, stored: Mapping[int, bytes]) -> list[int]:
+    def reset(self, profile: range, node_id: int, stored: Mapping[int, bytes]) -> list[int]:
         """Give the variables of these indices their power-on values: the stored one where there is one, else the default.
 
-        Returns the keys of stored values that do not fit this EDS (any more); they are passed over.
+        Returns the keys of stored values that are rejected: they do not fit this EDS (any more).
         """
-        misfits = [number for number in stored if number not in self.variables]
+        rejected = [number for number in stored if number not in self.variables]
         for number, variable in self.variables.items():
-            if not first <= number >> 8 <= last:
+            if number >> 8 not in profile:
                 continue
             variable.value = variable.default(node_id)
             if (data := stored.get(number)) is None:
                 continue
             if not variable.writable or (variable.size is not None and len(data) != variable.size):
-                misfits.append(number)
+                rejected.append(number)
                 continue
             value = variable.decode(data)
             entry = variable.entry
             low = -math.inf if entry.low is None else entry.low
             high = math.inf if entry.high is None else entry.high
             if not isinstance(value, bytes) and not low <= value <= high:
-                misfits.append(number)
+                rejected.append(number)
                 continue
             variable.value = value
-        return misfits
+        return rejected
 
-    def to_store(self, first: int, last: int, node_id: int) -> dict[int, bytes]:
+    def to_store(self, profile: range, node_id: int) -> dict[int, bytes]:
         """What differs from the defaults: all that a parameter store needs to keep, so that $NODEID stays alive in the rest."""
         return {
             number: variable.encode(variable.value)
             for number, variable in self.variables.items()
-            if first <= number >> 8 <= last
+            if number >> 8 in profile
             and "rw" in variable.entry.access
             and variable.read is None
             and variable.value != variable.default(node_id)
@@ -257,3 +274,14 @@ def fits(variable: Variable, low: int, high: int) -> bool:
     except (struct.error, ValueError, OverflowError):
         return False
     return True
+
+
+def range_of(variable: Variable) -> tuple[int, int]:
+    """Smallest and greatest value of a whole-number type; (0, -1) for other types."""
+    size = variable.size
+    if size is None:
+        return 0, -1
+    bits = 8 * size
+    if fits(variable, -1, 1):
+        return -(1 << bits - 1), (1 << bits - 1) - 1
+    return 0, (1 << bits) - 1

@@ -15,9 +15,10 @@ from packer_oracle import pascal, read
 
 from kontronik_can_gw.canopen import dbc as canopen_dbc
 from kontronik_can_gw.canopen import eds as reader
+from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.emergency import GatewayError
-from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
+from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli import main
@@ -129,7 +130,7 @@ class Bench:
 
     def of_message(self, can_id: int) -> int:
         nodes = enumerate(self.nodes.nodes)
-        return next(n for n, node in nodes if can_id in dict(node.cob_ids()))
+        return next(n for n, node in nodes if can_id in dict(all_ids(node)))
 
     def check(self, esc: EscTelemetry, prefix: str, values: Mapping[str, Any]) -> None:
         known = expected(esc)
