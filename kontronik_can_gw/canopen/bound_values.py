@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.data_types import BOOLEAN, FLOATS, SIGNED
 from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable, range_of
 from kontronik_can_gw.canopen.eds import Entry
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings, reader_text
@@ -19,9 +20,6 @@ from kontronik_can_gw.esc.values import GatewayStatus, Group, Source
 from kontronik_can_gw.signals.packer import Pack, compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
 
-_BOOLEAN = 0x01
-_SIGNED = frozenset({0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15})
-_FLOAT = frozenset({0x08, 0x11})
 _LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
 _EVENT_OF_PACE = {
     Group.LIVE: Event.LIVE,
@@ -68,7 +66,7 @@ class CompiledPdo:
 
 def bits_of(variable: Variable) -> int:
     """Length of a variable in a PDO; 0 where it has no fixed one."""
-    return 1 if variable.entry.data_type == _BOOLEAN else 8 * (variable.size or 0)
+    return 1 if variable.entry.data_type == BOOLEAN else 8 * (variable.size or 0)
 
 
 class BoundValues:
@@ -188,7 +186,7 @@ def _signal_plan(mapped: Mapped, at_bit: int) -> SignalPlan:
     variable, bound = mapped
     entry = variable.entry
     length = bits_of(variable)
-    signed = entry.data_type in _SIGNED
+    signed = entry.data_type in SIGNED
     if bound is None:
         number = f"{entry.index << 8 | entry.sub:#x}"
         storage = f"storage[{number}].value" if variable.read is None else f"shown({number}, now)"
@@ -202,7 +200,7 @@ def _signal_plan(mapped: Mapped, at_bit: int) -> SignalPlan:
         role=Role.SOURCE,
         length=length,
         signed=signed,
-        is_float=entry.data_type in _FLOAT,
+        is_float=entry.data_type in FLOATS,
         pieces=(Piece(0, length, at_bit),),
         low=-(1 << length - 1) if signed else 0,
         high=(1 << length - signed) - 1,

@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.data_types import DOMAIN_TYPE, codec
 from kontronik_can_gw.canopen.eds import Eds, Entry
 
 Value = int | float | bytes
@@ -16,28 +17,6 @@ Read = Callable[[int], Value]
 
 _LONGEST_TEXT = 255
 _LONGEST_DOMAIN = 0x10000
-_DOMAIN = 0x0F
-
-
-_CODECS = {
-    0x01: struct.Struct("<?"),
-    0x02: struct.Struct("<b"),
-    0x03: struct.Struct("<h"),
-    0x04: struct.Struct("<i"),
-    0x05: struct.Struct("<B"),
-    0x06: struct.Struct("<H"),
-    0x07: struct.Struct("<I"),
-    0x08: struct.Struct("<f"),
-    0x11: struct.Struct("<d"),
-    0x15: struct.Struct("<q"),
-    0x1B: struct.Struct("<Q"),
-}
-"""Number types by their code (CiA 301, table 44)."""
-
-
-def codec(data_type: int) -> struct.Struct | None:
-    """The codec of a number type; None for texts and domains."""
-    return _CODECS.get(data_type)
 
 
 def key(index: int, sub: int) -> int:
@@ -192,7 +171,7 @@ class Dictionary:
         variable = self.find(index, sub)
         if variable.size is not None:
             return variable.size
-        return _LONGEST_DOMAIN if variable.entry.data_type == _DOMAIN else _LONGEST_TEXT
+        return _LONGEST_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _LONGEST_TEXT
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
         """Write. False where the confirmation comes later."""
@@ -254,7 +233,7 @@ class Dictionary:
 
 
 def _check_size(variable: Variable, size: int) -> None:
-    most = _LONGEST_DOMAIN if variable.entry.data_type == _DOMAIN else _LONGEST_TEXT
+    most = _LONGEST_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _LONGEST_TEXT
     least = 0
     if variable.size is not None:
         least = most = variable.size

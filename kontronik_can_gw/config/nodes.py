@@ -11,7 +11,8 @@ from pathlib import Path
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds
 from kontronik_can_gw.canopen.cob_ids import all_ids
-from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds, without
+from kontronik_can_gw.canopen.dcf import without
+from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node_settings import NodeSettings

@@ -29,15 +29,6 @@ HUGE = "9" * 5_000
             "[2800] CompactSubObj=999",
         ),
         (
-            SHIPPED + f"\n[2800]\n{VARIABLE}ObjectType=8\nSubNumber=0xFFFFFFFF\n",
-            "[2800] SubNumber=4294967295",
-        ),
-        (
-            SHIPPED.replace("SupportedObjects=", f"SupportedObjects={HUGE}", 1),
-            "SupportedObjects=999",
-        ),
-        (SHIPPED.replace("SupportedObjects=3", f"SupportedObjects=3\n{HUGE}=0x1000"), "listed"),
-        (
             SHIPPED + COMPACT.format(index=0x2800) + f"[2800Name]\nNrOfEntries=1\n{HUGE}=x\n",
             "not a sub-index from 1 to",
         ),

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import cantools.database
 
-from kontronik_can_gw.canopen.eds import ARRAY, RECORD, Eds, load
+from kontronik_can_gw.canopen.data_types import ARRAY, RECORD
+from kontronik_can_gw.canopen.eds import Eds, load
 from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit
 from kontronik_can_gw.canopen.objects import bindings
 from kontronik_can_gw.config.keys import (

@@ -16,9 +16,10 @@ from typing import Any, Protocol
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.cob_ids import all_ids
+from kontronik_can_gw.canopen.data_types import ARRAY, DOMAIN, RECORD, VAR, codec
 from kontronik_can_gw.canopen.dbc import pascal_case
-from kontronik_can_gw.canopen.dictionary import Dictionary, codec
-from kontronik_can_gw.canopen.eds import ARRAY, DOMAIN, RECORD, VAR, Eds, Entry
+from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit, register_of
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
