@@ -14,6 +14,7 @@ from eds_text import variable, with_object
 from packer_oracle import pascal, read
 
 from kontronik_can_gw.canopen import dbc as canopen_dbc
+from kontronik_can_gw.canopen import dbc_names
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import Eds
@@ -569,7 +570,7 @@ def test_a_name_in_any_spelling_becomes_pascal_case() -> None:
         ("SyncStandBy", ("Sync_StandBy",)),
         ("X1", ("x1",)),
     ):
-        assert {canopen_dbc.pascal_case(name) for name in spellings} == {pascal_case}
+        assert {dbc_names.pascal_case(name) for name in spellings} == {pascal_case}
 
 
 # --- other readers -------------------------------------------------------------------------------------------------------

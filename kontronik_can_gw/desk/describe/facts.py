@@ -17,7 +17,7 @@ from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.data_types import ARRAY, DOMAIN, RECORD, VAR, codec
-from kontronik_can_gw.canopen.dbc import pascal_case
+from kontronik_can_gw.canopen.dbc_names import pascal_case
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit, register_of
