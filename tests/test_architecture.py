@@ -62,7 +62,7 @@ ONLY_IN = {
     "asammdf": ("desk",),
     "paho": ("desk",),
     "shtab": ("cli",),
-    "canopen": ("canopen/eds.py", "canopen/dictionary.py"),
+    "canopen": ("canopen/eds_import.py",),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -4,21 +4,15 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import SdoAbort
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, fits
+from kontronik_can_gw.canopen.cob_ids import SDO_ANSWER, SDO_REQUEST, default_ids
+from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, fits, range_of
 from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.node import (
-    CHECKED,
-    COMMUNICATION_PROFILE,
-    SDO_ANSWER,
-    SDO_REQUEST,
-    NodeSettings,
-    configured_settings,
-    default_ids,
-    range_of,
-)
+from kontronik_can_gw.canopen.node_settings import NodeSettings, configured_settings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.canopen.objects import BINDINGS
-from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAPPING
+from kontronik_can_gw.canopen.parameters import CHECKED
+from kontronik_can_gw.canopen.pdo_parameters import COMMUNICATION, MAPPING
+from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROFILE
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
@@ -141,7 +135,7 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
         setup, [EscTelemetry(settings, 0)], GatewayStatus(), lambda _esc, _settings: None
     ).nodes
     dictionary = node.dictionary
-    dictionary.reset(*COMMUNICATION_PROFILE, node_id, {})
+    dictionary.reset(COMMUNICATION_PROFILE, node_id, {})
     for variable in dictionary.variables.values():
         if variable.entry.index not in CHECKED or variable.check is None:
             continue
@@ -154,7 +148,7 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     for tpdo in node.tpdos:
         try:
             tpdo.configure(0)
-            tpdo.check(lambda _cob_id: False)
+            tpdo.check()
         except SdoAbort as error:
             yield (
                 f"TPDO {tpdo.number + 1}: the defaults of {COMMUNICATION + tpdo.number:04X}h and "

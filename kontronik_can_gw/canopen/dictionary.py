@@ -6,10 +6,11 @@ Built from an EDS. A variable is either plain storage or bound: ``read`` then gi
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.eds import Eds, Entry
+from kontronik_can_gw.canopen.data_types import DOMAIN_TYPE, codec
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.eds_object import Entry
 
 Value = int | float | bytes
 Read = Callable[[int], Value]
@@ -17,14 +18,6 @@ Read = Callable[[int], Value]
 
 _LONGEST_TEXT = 255
 _LONGEST_DOMAIN = 0x10000
-_DOMAIN = 0x0F
-
-
-def codec(data_type: int) -> Any:
-    """The canopen library's codec of a number type (``pack``, ``unpack``, ``size`` like a struct.Struct); None for texts and domains."""
-    from canopen.objectdictionary import ODVariable
-
-    return ODVariable.STRUCT_TYPES.get(data_type)
 
 
 def key(index: int, sub: int) -> int:
@@ -68,8 +61,7 @@ class Variable:
         """Bytes of the type; None for texts and domains."""
         if self.codec is None:
             return None
-        size: int = self.codec.size
-        return size
+        return self.codec.size
 
     @property
     def readable(self) -> bool:
@@ -84,8 +76,7 @@ class Variable:
         if self.codec is None:
             assert isinstance(value, bytes)
             return value
-        data: bytes = self.codec.pack(value)
-        return data
+        return self.codec.pack(value)
 
     def decode(self, data: bytes) -> Value:
         """The value of bytes of the right size."""
@@ -102,7 +93,7 @@ class Variable:
 
 
 class Dictionary:
-    """All variables of one node. What is asked or told over the bus goes through ``upload`` and ``download``."""
+    """All variables of one node. What is read or written over the bus goes through ``upload`` and ``download``."""
 
     def __init__(self, eds: Eds) -> None:
         self.variables = {key(entry.index, entry.sub): Variable(entry) for entry in eds.entries}
@@ -115,6 +106,23 @@ class Dictionary:
     def get(self, index: int, sub: int = 0) -> Variable | None:
         """The variable, None where there is none."""
         return self.variables.get(key(index, sub))
+
+    def bind(
+        self,
+        index: int,
+        sub: int = 0,
+        *,
+        read: Read | None = None,
+        check: Callable[[int], None] | None = None,
+        written: Callable[[int], bool] | None = None,
+    ) -> None:
+        """Give an object to its service: what it shows, which values it refuses, what follows a download.
+
+        Does nothing where the EDS has no such object.
+        """
+        variable = self.get(index, sub)
+        if variable is not None:
+            variable.read, variable.check, variable.written = read, check, written
 
     def number(self, index: int, sub: int = 0, otherwise: int | None = None) -> int:
         """The whole number that a variable holds. Where the EDS has no such variable ``otherwise``, None: the shipped EDS's default."""
@@ -164,7 +172,7 @@ class Dictionary:
         variable = self.find(index, sub)
         if variable.size is not None:
             return variable.size
-        return _LONGEST_DOMAIN if variable.entry.data_type == _DOMAIN else _LONGEST_TEXT
+        return _LONGEST_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _LONGEST_TEXT
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
         """Write. False where the confirmation comes later."""
@@ -188,37 +196,37 @@ class Dictionary:
 
     # --- power-on and storage
 
-    def reset(self, first: int, last: int, node_id: int, stored: Mapping[int, bytes]) -> list[int]:
+    def reset(self, profile: range, node_id: int, stored: Mapping[int, bytes]) -> list[int]:
         """Give the variables of these indices their power-on values: the stored one where there is one, else the default.
 
-        Returns the keys of stored values that do not fit this EDS (any more); they are passed over.
+        Returns the keys of stored values that are rejected: they do not fit this EDS (any more).
         """
-        misfits = [number for number in stored if number not in self.variables]
+        rejected = [number for number in stored if number not in self.variables]
         for number, variable in self.variables.items():
-            if not first <= number >> 8 <= last:
+            if number >> 8 not in profile:
                 continue
             variable.value = variable.default(node_id)
             if (data := stored.get(number)) is None:
                 continue
             if not variable.writable or (variable.size is not None and len(data) != variable.size):
-                misfits.append(number)
+                rejected.append(number)
                 continue
             value = variable.decode(data)
             entry = variable.entry
             low = -math.inf if entry.low is None else entry.low
             high = math.inf if entry.high is None else entry.high
             if not isinstance(value, bytes) and not low <= value <= high:
-                misfits.append(number)
+                rejected.append(number)
                 continue
             variable.value = value
-        return misfits
+        return rejected
 
-    def to_store(self, first: int, last: int, node_id: int) -> dict[int, bytes]:
+    def to_store(self, profile: range, node_id: int) -> dict[int, bytes]:
         """What differs from the defaults: all that a parameter store needs to keep, so that $NODEID stays alive in the rest."""
         return {
             number: variable.encode(variable.value)
             for number, variable in self.variables.items()
-            if first <= number >> 8 <= last
+            if number >> 8 in profile
             and "rw" in variable.entry.access
             and variable.read is None
             and variable.value != variable.default(node_id)
@@ -226,7 +234,7 @@ class Dictionary:
 
 
 def _check_size(variable: Variable, size: int) -> None:
-    most = _LONGEST_DOMAIN if variable.entry.data_type == _DOMAIN else _LONGEST_TEXT
+    most = _LONGEST_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _LONGEST_TEXT
     least = 0
     if variable.size is not None:
         least = most = variable.size
@@ -246,3 +254,14 @@ def fits(variable: Variable, low: int, high: int) -> bool:
     except (struct.error, ValueError, OverflowError):
         return False
     return True
+
+
+def range_of(variable: Variable) -> tuple[int, int]:
+    """Smallest and greatest value of a whole-number type; (0, -1) for other types."""
+    size = variable.size
+    if size is None:
+        return 0, -1
+    bits = 8 * size
+    if fits(variable, -1, 1):
+        return -(1 << bits - 1), (1 << bits - 1) - 1
+    return 0, (1 << bits) - 1

@@ -1,26 +1,35 @@
 """Heartbeat: the producer's tick (1017h) and the watch over other nodes (1016h). CiA 301, 7.2.8.2.2 and 7.5.2.19/20."""
 
-from collections.abc import Iterable
+from collections.abc import Callable
+from functools import partial
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 
-COB_ID = 0x700
 NEVER = 1 << 62
 """A deadline that does not come."""
+_CATCHING_UP_NS = SECOND // 2
+"""After a hold-up no heartbeat is missed for this long unless it was seen to be late: what came meanwhile is read piece by piece."""
 
 
 class Producer:
     """When the next heartbeat is due. A period of 0 produces none."""
 
-    def __init__(self) -> None:
+    def __init__(self, dictionary: Dictionary) -> None:
         self.due = NEVER
+        self._dictionary = dictionary
         self._period = 0
+        dictionary.bind(0x1017, written=self._written)
 
-    def configure(self, period_ms: int, now: int) -> None:
-        """A changed period holds from now on: the first heartbeat comes one period later."""
-        self._period = period_ms * MS
+    def configure(self, now: int) -> None:
+        """Take over 1017h. A changed period holds from now on: the first heartbeat comes one period later."""
+        self._period = self._dictionary.number(0x1017) * MS
         self.due = now + self._period if self._period else NEVER
+
+    def stop(self) -> None:
+        """Produce none, whatever 1017h is: the node has no node-ID."""
+        self._period, self.due = 0, NEVER
 
     def beat(self, now: int) -> None:
         """Let the next one come at once, if there are any."""
@@ -36,6 +45,10 @@ class Producer:
             self.due = now + self._period
         return True
 
+    def _written(self, now: int) -> bool:
+        self.configure(now)
+        return True
+
 
 class _Watched:
     def __init__(self, node_id: int, timeout: int) -> None:
@@ -46,61 +59,109 @@ class _Watched:
 
 
 class Consumer:
-    """The nodes that are watched. ``lost``: node-IDs whose heartbeat stayed away."""
+    """The watch over other nodes (1016h).
 
-    def __init__(self) -> None:
+    ``changed`` is called with a node-ID, whether its heartbeat is lost (or no longer), and the time.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        changed: Callable[[int, bool, int], None],
+        rerouted: Callable[[int], bool],
+    ) -> None:
+        self._dictionary = dictionary
+        self._changed = changed
+        self._rerouted = rerouted
         self._watched: dict[int, _Watched] = {}
+        self._judged_from = -NEVER
+        for variable in dictionary.subs(0x1016):
+            variable.check = partial(self._check, variable)
+            variable.written = self._written
 
-    def configure(self, values: Iterable[int]) -> None:
-        """From the entries of 1016h: bits 23..16 node-ID, bits 15..0 time in ms; 0 in either leaves it unused.
-
-        A watch that stays as it was goes on.
-        """
-        before, self._watched = self._watched, {}
-        for value in values:
-            node_id, timeout = value >> 16 & 0xFF, (value & 0xFFFF) * MS
-            if 1 <= node_id <= 127 and timeout:
-                old = before.get(node_id)
-                kept = old if old is not None and old.timeout == timeout else None
-                self._watched[node_id] = kept or _Watched(node_id, timeout)
+    def reset(self) -> None:
+        """All watches begin anew."""
+        self._watched = {}
+        self._configure()
 
     @property
     def node_ids(self) -> tuple[int, ...]:
         return tuple(self._watched)
 
     @property
-    def lost(self) -> list[int]:
-        return [w.node_id for w in self._watched.values() if w.lost]
-
-    @property
     def due(self) -> int:
-        return min((w.due for w in self._watched.values()), default=NEVER)
+        if not self._watched:
+            return NEVER
+        return max(self._judged_from, min(watched.due for watched in self._watched.values()))
 
-    def receive(self, node_id: int, at: int) -> bool:
-        """A heartbeat (or boot-up message) came. True if the node had been lost."""
+    def held_up(self, now: int) -> None:
+        """The process was held up until ``now``: a heartbeat may still wait to be read."""
+        self._judged_from = now + _CATCHING_UP_NS
+
+    def receive(self, node_id: int, data: bytes, now: int, at: int) -> None:
+        """A heartbeat (or boot-up message) that came ``at``."""
         watched = self._watched.get(node_id)
-        if watched is None:
-            return False
+        if len(data) != 1 or watched is None:
+            return
+        self._judge(at, now)  # it may have come too late, and others not at all
         watched.due = at + watched.timeout
-        was_lost, watched.lost = watched.lost, False
-        return was_lost
+        if watched.lost:
+            watched.lost = False
+            self._changed(node_id, False, now)
 
-    def advance(self, now: int) -> list[int]:
-        """Node-IDs whose time ran out by now."""
-        found = [w for w in self._watched.values() if now >= w.due]
-        for watched in found:
+    def advance(self, now: int) -> None:
+        """Let time pass."""
+        if now >= self._judged_from:
+            self._judge(now, now)
+
+    def _judge(self, until: int, now: int) -> None:
+        late = [watched for watched in self._watched.values() if until >= watched.due]
+        for watched in late:
             watched.due, watched.lost = NEVER, True
-        return [w.node_id for w in found]
+        for watched in late:
+            self._changed(watched.node_id, True, now)
+
+    def _configure(self) -> None:
+        """Bits 23..16 of an entry are the node-ID, bits 15..0 the time in ms; 0 in either leaves it unused.
+
+        A watch that stays as it was goes on.
+        """
+        before, self._watched = self._watched, {}
+        for value in _values(self._dictionary):
+            node_id, timeout = value >> 16 & 0xFF, (value & 0xFFFF) * MS
+            if 1 <= node_id <= 127 and timeout:
+                old = before.get(node_id)
+                kept = old if old is not None and old.timeout == timeout else None
+                self._watched[node_id] = kept or _Watched(node_id, timeout)
+
+    def _written(self, now: int) -> bool:
+        lost = [watched.node_id for watched in self._watched.values() if watched.lost]
+        self._configure()
+        for node_id in lost:
+            if node_id not in self._watched or not self._watched[node_id].lost:
+                self._changed(node_id, False, now)
+        return self._rerouted(now)
+
+    def _check(self, own: Variable, value: int) -> None:
+        """A new entry. SdoAbort 06040043h where another entry watches the node already (CiA 301, 7.5.2.19)."""
+        node_id = value >> 16 & 0xFF
+        if value >> 24:
+            raise SdoAbort(Abort.VALUE)  # reserved bits
+        if (
+            value & 0xFFFF
+            and 1 <= node_id <= 127
+            and any(
+                other & 0xFFFF and other >> 16 & 0xFF == node_id
+                for other in _values(self._dictionary, own)
+            )
+        ):
+            raise SdoAbort(Abort.INCOMPATIBLE)
 
 
-def check_consumer(value: int, others: Iterable[int]) -> None:
-    """A new entry of 1016h. SdoAbort 06040043h where another entry watches the node already (CiA 301, 7.5.2.19)."""
-    node_id = value >> 16 & 0xFF
-    if value >> 24:
-        raise SdoAbort(Abort.VALUE)  # reserved bits
-    if (
-        value & 0xFFFF
-        and 1 <= node_id <= 127
-        and any(o & 0xFFFF and o >> 16 & 0xFF == node_id for o in others)
-    ):
-        raise SdoAbort(Abort.INCOMPATIBLE)
+def _values(dictionary: Dictionary, but: Variable | None = None) -> list[int]:
+    """The entries of 1016h."""
+    return [
+        variable.value
+        for variable in dictionary.subs(0x1016)
+        if variable is not but and isinstance(variable.value, int)
+    ]

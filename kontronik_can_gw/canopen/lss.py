@@ -63,7 +63,7 @@ STORE_NOT_SUPPORTED = 1
 STORE_FAILED = 2
 SPECIFIC_ERROR = 0xFF
 BUS_WRITES_OFF = 1
-"""The specific error behind FFh: writing over the bus is switched off in the configuration."""
+"""The specific error after FFh: writing over the bus is switched off in the configuration."""
 
 SCAN_RESET = 0x80
 """BitChecked of the frame that begins a fastscan."""
@@ -117,7 +117,7 @@ class LssSlave:
         return self._configuring
 
     def reset(self) -> None:
-        """Back to waiting state, at an NMT reset: partial selections and scans are forgotten, a late result of a saving is not told."""
+        """Back to waiting state, at an NMT reset: partial selections and scans are forgotten, a late result of a saving is not sent."""
         self._enter(configuring=False)
 
     def receive(self, data: bytes, now: int) -> None:

@@ -1,12 +1,16 @@
-"""Network management, slave side: states and commands (CiA 301, 7.2.8.2 and 7.3.2)."""
+"""Network management, slave side: states and commands (CiA 301, 7.2.8.2 and 7.3.2), objects 1029h and 1F80h."""
 
+from collections.abc import Callable
 from enum import IntEnum
 
-COB_ID = 0
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.dictionary import Dictionary
+
+_SELF_START_OFF = 4
 
 
 class NmtState(IntEnum):
-    """As heartbeats tell it. ``INITIALISING`` is also that of a node without a node-ID: LSS only."""
+    """As heartbeats report it. ``INITIALISING`` is also that of a node without a node-ID: LSS only."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -34,7 +38,7 @@ STATE_AFTER = {
 def command(data: bytes, node_id: int) -> Command | None:
     """The command that an NMT message holds for this node: byte 0 command, byte 1 node-ID or 0 for all.
 
-    None for what is meant for others, unknown, or not exactly two bytes long.
+    None for commands to other nodes, unknown, or not exactly two bytes long.
     """
     if len(data) != 2 or data[1] not in (0, node_id) or data[0] not in Command._value2member_map_:
         return None
@@ -48,3 +52,58 @@ def is_reset_of_all(data: bytes) -> bool:
         and data[1] == 0
         and data[0] in (Command.RESET_NODE, Command.RESET_COMMUNICATION)
     )
+
+
+class Nmt:
+    """The state machine of one node. ``entered`` is called with the time after each change of state by ``enter``."""
+
+    def __init__(
+        self, dictionary: Dictionary, self_start: bool, entered: Callable[[int], None]
+    ) -> None:
+        self.state = NmtState.INITIALISING
+        self._dictionary = dictionary
+        self._self_start = self_start
+        self._entered = entered
+        dictionary.bind(0x1F80, check=_check_startup)
+
+    @property
+    def starts_itself(self) -> bool:
+        """Whether the node enters OPERATIONAL without a command: bit 2 of 1F80h is 0."""
+        otherwise = 0 if self._self_start else None
+        return not self._dictionary.number(0x1F80, otherwise=otherwise) & _SELF_START_OFF
+
+    @property
+    def communicates(self) -> bool:
+        """Whether SDO, SYNC and EMCY work: PRE-OPERATIONAL or OPERATIONAL."""
+        return self.state in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
+
+    @property
+    def boots_after_outage(self) -> bool:
+        """1029h:1 = 0."""
+        return self._dictionary.number(0x1029, 1) == 0
+
+    def enter(self, state: NmtState, now: int) -> None:
+        if state is not self.state:
+            self.state = state
+            self._entered(now)
+
+    def communication_error(self, now: int) -> None:
+        """Behave as 1029h:1 says."""
+        self._behave(self._dictionary.number(0x1029, 1), now)
+
+    def telemetry_lost(self, now: int) -> None:
+        """Behave as 1029h:2 says."""
+        self._behave(self._dictionary.number(0x1029, 2), now)
+
+    def _behave(self, behaviour: int, now: int) -> None:
+        """Error behaviour of 1029h: 0 PRE-OPERATIONAL (if OPERATIONAL), 1 no change, 2 STOPPED."""
+        if behaviour == 0 and self.state is NmtState.OPERATIONAL:
+            self.enter(NmtState.PRE_OPERATIONAL, now)
+        elif behaviour == 2 and self.communicates:
+            self.enter(NmtState.STOPPED, now)
+
+
+def _check_startup(value: int) -> None:
+    """A new 1F80h of a slave: only the bits about starting by itself (2) and starting others (3, without meaning here)."""
+    if value & ~0x0C:
+        raise SdoAbort(Abort.VALUE)

@@ -1,32 +1,31 @@
 """All CANopen nodes of a gateway on one bus: routing by COB-ID, one stream of frames out, no node disturbing another."""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from kontronik_can_gw.canopen import heartbeat, nmt
+from kontronik_can_gw.canopen.cob_ids import (
+    HEARTBEAT,
+    LSS_REQUEST,
+    NMT,
+    OF_NODE_ID,
+    chosen_ids,
+    default_ids,
+    transmit_ids,
+)
 from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.emergency import GatewayError
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
-from kontronik_can_gw.canopen.node import (
-    LSS_REQUEST,
-    SDO_ANSWER,
-    SDO_REQUEST,
-    FrameTaker,
-    Node,
-    NodeSettings,
-    esc_settings,
-    make_dictionary,
-)
+from kontronik_can_gw.canopen.nmt import is_reset_of_all
+from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
+from kontronik_can_gw.canopen.reception import FrameTaker
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import CanState, GatewayStatus
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.signals.plan import classic_bits
 
-_FIRST_IDS = (0x80, SDO_ANSWER, SDO_REQUEST, heartbeat.COB_ID)
-"""COB-IDs of EMCY, SDO and heartbeat, less the node-ID."""
 SettingsChanged = Callable[[int, EscSettings], None]
 
 
@@ -65,8 +64,8 @@ class Nodes:
     Frames are appended to ``frames``, which ``take`` hands over, requests to store to ``saves`` as (ESC, parameters), which the owner
     empties.
 
-    ``foreign_ids``: 11-bit ids that the gateway sends otherwise; no PDO may be given one. ``settings_changed`` is told the ESC's index
-    and its new settings when a master writes 2100h.
+    ``foreign_ids``: 11-bit ids that the gateway sends otherwise; no PDO may be given one. ``settings_changed`` is called
+    with the ESC's index and its new settings when a master writes 2100h.
     """
 
     def __init__(
@@ -114,13 +113,13 @@ class Nodes:
         if frame.extended or frame.remote or frame.fd:
             return
         begin = len(self.frames)
-        if frame.can_id == nmt.COB_ID and nmt.is_reset_of_all(frame.data):
+        if frame.can_id == NMT and is_reset_of_all(frame.data):
             for node in self.nodes:
-                node.release_ids()
+                node.tpdos.release_ids()
         for taker in self._routes.get(frame.can_id, ()):
             taker(frame.data, now, at)
         if frame.can_id == LSS_REQUEST:
-            # what several slaves say at the same time is one frame on a bus
+            # what several slaves send at the same time is one frame on a bus
             self.frames[begin:] = dict.fromkeys(self.frames[begin:])
         self._after(now)
 
@@ -137,8 +136,8 @@ class Nodes:
     def on_can_state(self, state: CanState, now: int) -> None:
         """The CAN controller's state changed."""
         for node in self.nodes:
-            node.on_can_state(state, now)
-        self._after(now)
+            node.can_faults.on_state(state, now)
+        self._after_all(now)
 
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost, or for the first time."""
@@ -146,44 +145,45 @@ class Nodes:
             self.start(now)
             return
         for node in self.nodes:
-            node.can_returned(now)
-        self._after(now)
+            node.can_faults.frames_pass(now)
+        self._after_all(now)
 
     def held_up(self, now: int) -> None:
         """The process was held up until ``now``."""
         for node in self.nodes:
-            node.held_up(now)
-        self._after(now)
+            node.tpdos.held_up(now)
+            node.consumer.held_up(now)
+        self._after_all(now)
 
     def make_anew(self, now: int) -> None:
-        """PDOs that waited to be sent were dropped: say once more what is."""
+        """PDOs that waited to be sent were dropped: send once more what is sent on change only."""
         for node in self.nodes:
-            node.make_anew(now)
-        self._after(now)
+            node.tpdos.repeat(now)
+        self._after_all(now)
 
     def collision(self, node_index: int, present: bool, now: int) -> None:
-        """Somebody else begins, or has ceased, to send with an id of this node."""
-        self.nodes[node_index].set_error(GatewayError.ID_COLLISION, present, now)
-        self._after(now)
+        """Another device begins, or has ceased, to send with an id of this node."""
+        self.nodes[node_index].emergencies.set(GatewayError.ID_COLLISION, present, now)
+        self._after_all(now)
 
     def own_ids(self) -> dict[int, tuple[int, str]]:
         """COB-IDs that only our nodes send with: which node (0 ...), and what for."""
         return {
             cob_id: (index, what)
             for index, node in enumerate(self.nodes)
-            for cob_id, what in node.transmit_ids()
+            for cob_id, what in transmit_ids(node)
         }
 
     def overrun(self, now: int) -> None:
         """The CAN controller lost received frames."""
         for node in self.nodes:
-            node.overrun(now)
-        self._after(now)
+            node.can_faults.overrun(now)
+        self._after_all(now)
 
     def parameters_damaged(self, esc: int, now: int) -> None:
         """A node's parameter file could not be read: it runs on defaults."""
-        self.nodes[esc].set_error(GatewayError.PARAMETER_FILE, True, now)
-        self._after(now)
+        self.nodes[esc].emergencies.set(GatewayError.PARAMETER_FILE, True, now)
+        self._after_all(now)
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
         """The oldest request of an ESC's node to store is on disk, or failed for a reason."""
@@ -199,29 +199,7 @@ class Nodes:
                 node.advance(now)
         self._after(now)
 
-    def cob_ids(self) -> dict[int, str]:
-        """Every COB-ID the nodes use, and what for."""
-        return {cob_id: what for node in self.nodes for cob_id, what in node.cob_ids()}
-
-    def frames_per_second(self) -> float:
-        """Frames to be expected from PDOs and heartbeats when all is well."""
-        return sum(rate for _, rate in self._traffic())
-
-    def bits_per_second(self) -> float:
-        """What these need on the bus, with the most stuffing."""
-        return sum(classic_bits(size) * rate for size, rate in self._traffic())
-
-    def _traffic(self) -> Iterator[tuple[int, float]]:
-        """(data bytes, frames a second)."""
-        for node in self.nodes:
-            if node.node_id == UNCONFIGURED:
-                continue
-            if period := node.dictionary.number(0x1017):
-                yield 1, 1000 / period
-            for tpdo in node.tpdos:
-                yield 8, tpdo.rate_hz
-
-    # --- what nodes ask (node.Surroundings)
+    # --- what nodes ask (owner.Owner)
 
     def send(self, frame: CanFrame) -> None:
         self.frames.append(frame)
@@ -237,7 +215,7 @@ class Nodes:
     def routes_changed(self) -> None:
         self._rerouted = True
 
-    def passed_over(self, node: Node, keys: list[int]) -> None:
+    def rejected(self, node: Node, keys: list[int]) -> None:
         self.misfits += [(self.nodes.index(node), key) for key in keys]
 
     def state_changed(self) -> None:
@@ -246,21 +224,26 @@ class Nodes:
     def cob_id_taken(self, cob_id: int, user: object) -> bool:
         if cob_id in self._foreign_ids:
             return True
-        used = (chosen for node in self.nodes for chosen in node.chosen_ids())
+        used = (chosen for node in self.nodes for chosen in chosen_ids(node))
         return any(other is not user and other_id == cob_id for other, other_id in used)
 
     def node_id_taken(self, node_id: int, node: Node) -> bool:
         if node_id == UNCONFIGURED:
             return False
-        if any(first + node_id in self._foreign_ids for first in _FIRST_IDS):
+        if any(first + node_id in self._foreign_ids for first in OF_NODE_ID):
             return True
         others = [other for other in self.nodes if other is not node]
-        used = {cob_id for other in others for _, cob_id in other.chosen_ids()} | set(
+        used = {cob_id for other in others for _, cob_id in chosen_ids(other)} | set(
             self._foreign_ids
         )
-        if node.future_ids(node_id) & used:
+        if any(cob_id in used for _, _, cob_id in default_ids(node.dictionary, node_id)):
             return True
         return any(node_id in (other.node_id, other.pending_node_id) for other in others)
+
+    def _after_all(self, now: int) -> None:
+        for node in self.nodes:
+            node.set_due()
+        self._after(now)
 
     def _after(self, now: int) -> None:
         while self._to_watchers:
@@ -271,13 +254,11 @@ class Nodes:
         if self._rerouted:
             self._rerouted = False
             self._watched = frozenset(
-                heartbeat.COB_ID + node_id
-                for node in self.nodes
-                for node_id in node.consumer.node_ids
+                HEARTBEAT + node_id for node in self.nodes for node_id in node.consumer.node_ids
             )
             self._routes = {}
             for node in self.nodes:
-                for cob_id, taker in node.routes():
+                for cob_id, taker in node.reception.routes():
                     self._routes.setdefault(cob_id, []).append(taker)
             self.receive_ids = frozenset(self._routes)
         self.due = min([node.due for node in self.nodes])

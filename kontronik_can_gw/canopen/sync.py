@@ -1,24 +1,51 @@
-"""SYNC, consumer side (CiA 301, 7.2.5; objects 1005h and 1019h)."""
+"""SYNC, consumer side (CiA 301, 7.2.5): objects 1005h COB-ID and 1019h counter overflow."""
+
+from collections.abc import Callable
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.cob_ids import SYNC_USER, restricted
+from kontronik_can_gw.canopen.dictionary import Dictionary
 
-PRODUCER_BIT, FRAME_BIT = 1 << 30, 1 << 29
-
-
-def check_cob_id(value: int, restricted: bool) -> None:
-    """A new 1005h. SdoAbort 06090030h for a producer (there is none), 29-bit ids, reserved bits and restricted ids."""
-    if value & (PRODUCER_BIT | FRAME_BIT) or value & 0x1FFFF800 or restricted:
-        raise SdoAbort(Abort.VALUE)
+_PRODUCER_BIT, _FRAME_BIT = 1 << 30, 1 << 29
 
 
-def check_overflow(value: int) -> None:
+class SyncConsumer:
+    """Which SYNC message a node follows. ``taken``: whether a COB-ID is in use by another service."""
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        taken: Callable[[int, object], bool],
+        rerouted: Callable[[int], bool],
+    ) -> None:
+        self._dictionary = dictionary
+        self._taken = taken
+        dictionary.bind(0x1005, check=self._check_cob_id, written=rerouted)
+        dictionary.bind(0x1019, check=_check_overflow)
+
+    @property
+    def cob_id(self) -> int:
+        """11 bits of 1005h."""
+        return self._dictionary.number(0x1005) & 0x7FF
+
+    def counter(self, data: bytes) -> int | None:
+        """The counter of a SYNC message, 0 where it has none.
+
+        None if its length is not what 1019h says: 1 byte with a counter, else none.
+        """
+        if len(data) != (1 if self._dictionary.number(0x1019) else 0):
+            return None
+        return data[0] if data else 0
+
+    def _check_cob_id(self, value: int) -> None:
+        """A new 1005h. SdoAbort 06090030h for a producer (there is none), 29-bit ids, reserved bits and restricted ids."""
+        if value & (_PRODUCER_BIT | _FRAME_BIT) or value & 0x1FFFF800 or restricted(value & 0x7FF):
+            raise SdoAbort(Abort.VALUE)
+        if self._taken(value & 0x7FF, SYNC_USER):
+            raise SdoAbort(Abort.INCOMPATIBLE)
+
+
+def _check_overflow(value: int) -> None:
     """A new 1019h: 0 (no counter) or 2..240, else SdoAbort 06090030h."""
     if value == 1 or value > 240:
         raise SdoAbort(Abort.VALUE)
-
-
-def counter(data: bytes, overflow: int) -> int | None:
-    """The counter of a SYNC message, 0 where it has none. None if its length is not what 1019h says: 1 byte with a counter, else none."""
-    if len(data) != (1 if overflow else 0):
-        return None
-    return data[0] if data else 0

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.eds import load as eds_of
-from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, decode, encode
 from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS

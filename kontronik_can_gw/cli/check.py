@@ -5,9 +5,12 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
+from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import Nodes
-from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Tpdo
+from kontronik_can_gw.canopen.pdo import Tpdo
+from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
+from kontronik_can_gw.canopen.traffic import bits_per_second, frames_per_second
 from kontronik_can_gw.cli.common import load_all, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config.assemble import Loaded
@@ -46,8 +49,8 @@ def main(args: argparse.Namespace) -> int:
         for line in node_table(nodes, loaded):
             show(line)
         show()
-        load += nodes.bits_per_second() / config.can.bitrate
-        frames += nodes.frames_per_second()
+        load += bits_per_second(nodes.nodes) / config.can.bitrate
+        frames += frames_per_second(nodes.nodes)
     if (folder := record_folder(config)) is not None:
         show(f"# captures: {in_words(config, folder)}")
     show(
@@ -63,9 +66,9 @@ def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
     for node, esc in zip(nodes.nodes, loaded.escs, strict=True):
         first = f"{esc.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else node.node_id}"
         if node.node_id == UNCONFIGURED:
-            rows.append((first, "7E5h", "LSS", "", f"serial number {node.identity[3]}"))
+            rows.append((first, "7E5h", "LSS", "", f"serial number {node.identity.identity[3]}"))
             continue
-        for cob_id, what in dict(node.cob_ids()).items():
+        for cob_id, what in dict(all_ids(node)).items():
             tpdo = next((t for t in node.tpdos if t.valid and t.cob_id == cob_id), None)
             objects = (
                 ""

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen import heartbeat, nmt, node
+from kontronik_can_gw.canopen import cob_ids, nmt
 from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
@@ -136,15 +136,15 @@ class Master:
         """Process a frame and react as a master."""
         data, node_id = bytes(message.data), self.node_id
         match message.arbitration_id - node_id:
-            case heartbeat.COB_ID:
+            case cob_ids.HEARTBEAT:
                 self.state = NmtState(data[0]).name.replace("_", "-")
                 if data[0] in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL):
-                    self._send(nmt.COB_ID, bytes((nmt.Command.START, node_id)))
+                    self._send(cob_ids.NMT, bytes((nmt.Command.START, node_id)))
             case 0x080:
                 code, bit = int.from_bytes(data[:2], "little"), data[3]
                 what = next((error.text for error in OperatingError if error == bit), "gateway")
                 self.emergency = f"{code:04X}h {what}" if code else "0000h no error any more"
-            case node.SDO_ANSWER:
+            case cob_ids.SDO_ANSWER:
                 known = data[0] == 0x4B
                 self.cell_voltage = (
                     f"{int.from_bytes(data[4:6], 'little') / 1000:.3f} V"
@@ -156,7 +156,7 @@ class Master:
                 self.counts[number] = self.counts.get(number, 0) + 1
         if seconds >= self._next_poll:
             self._next_poll = seconds + 1
-            self._send(node.SDO_REQUEST + node_id, bytes.fromhex("40 01 20 05 00 00 00 00"))
+            self._send(cob_ids.SDO_REQUEST + node_id, bytes.fromhex("40 01 20 05 00 00 00 00"))
 
     def line(self) -> str:
         """One line with everything that the master knows."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.canopen.traffic import bits_per_second
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import SHIPPED, Config, load
@@ -136,7 +137,7 @@ def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
         words.append(
             f"{len(nodes.nodes)} CANopen node{'s' * (number > 1)} of {config.eds_path.name}"
         )
-        load += nodes.bits_per_second() / config.can.bitrate
+        load += bits_per_second(nodes.nodes) / config.can.bitrate
     findings.ok("config", f"{config.file}: {', '.join(words)}")
     findings.ok(
         "config.bus_load", f"needs {load:.1%} of {config.can.bitrate // 1000} kbit/s at most"

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import SdoAbort
+from kontronik_can_gw.canopen.dcf import dcf
 from kontronik_can_gw.canopen.dictionary import Value
-from kontronik_can_gw.canopen.eds import dcf
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.canopen.check import without_objects
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import CanopenSetup
+from kontronik_can_gw.canopen.traffic import bits_per_second, cob_ids
 from kontronik_can_gw.config.keys import Config, EscConfig, examine
 from kontronik_can_gw.config.nodes import (
     load_of_stored,
@@ -127,7 +128,7 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
         with collecting(problems):
             plain = plain_setup(config)
             nodes = plain.nodes(plain.esc_settings(config.escs))
-            taken, bits = nodes.cob_ids(), nodes.bits_per_second()
+            taken, bits = cob_ids(nodes.nodes), bits_per_second(nodes.nodes)
             ignored += [f"{plain.eds.name}: {line}" for line in without_objects(nodes)]
         if plain is not None and not problems:
             kept = read_stored(config, store)
@@ -150,7 +151,7 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
         }
         canopen, given_way = with_stored(plain, kept.stored, config, escs, foreign)
         if canopen is not plain:
-            bits = canopen.nodes(escs).bits_per_second()
+            bits = bits_per_second(canopen.nodes(escs).nodes)
         warnings += [
             *given_way,
             *kept.warnings,

@@ -10,10 +10,12 @@ from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds
-from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds, without
+from kontronik_can_gw.canopen.cob_ids import all_ids
+from kontronik_can_gw.canopen.dcf import without
+from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
-from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.config.keys import Config, shipped
@@ -193,7 +195,7 @@ def _clashing_nodes(nodes: Nodes, foreign: Mapping[int, str]) -> list[int]:
     """Nodes with a COB-ID that another service, another node or a DBC message uses."""
     users: dict[int, list[tuple[int, str]]] = {}
     for number, node in enumerate(nodes.nodes):
-        for cob_id, what in node.cob_ids():
+        for cob_id, what in all_ids(node):
             users.setdefault(cob_id, []).append((number, what))
     found = {
         number

@@ -27,8 +27,10 @@ from typing import Any
 from script import MS, bytes_of, hexadecimal, ms
 from sdo_client import Refused, download, upload
 
-from kontronik_can_gw.canopen.eds import Eds, load, without
-from kontronik_can_gw.canopen.node import Node, NodeSettings
+from kontronik_can_gw.canopen.dcf import without
+from kontronik_can_gw.canopen.eds import Eds, load
+from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.config.keys import shipped
@@ -307,7 +309,7 @@ class Bench:
             case "listens", _:
                 return f"listens {' '.join(f'{cob_id:03X}' for cob_id in sorted(self.listened_to))}"
             case "rejected", [node, *_]:
-                keys = sorted(self.nodes[int(node) - 1].misfits)
+                keys = sorted(self.nodes[int(node) - 1].rejected)
                 return " ".join(
                     [
                         "rejected",

@@ -14,10 +14,12 @@ from eds_text import variable, with_object
 from packer_oracle import pascal, read
 
 from kontronik_can_gw.canopen import dbc as canopen_dbc
+from kontronik_can_gw.canopen import dbc_names
 from kontronik_can_gw.canopen import eds as reader
+from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import Eds
-from kontronik_can_gw.canopen.emergency import GatewayError
-from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
+from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli import main
@@ -129,7 +131,7 @@ class Bench:
 
     def of_message(self, can_id: int) -> int:
         nodes = enumerate(self.nodes.nodes)
-        return next(n for n, node in nodes if can_id in dict(node.cob_ids()))
+        return next(n for n, node in nodes if can_id in dict(all_ids(node)))
 
     def check(self, esc: EscTelemetry, prefix: str, values: Mapping[str, Any]) -> None:
         known = expected(esc)
@@ -568,7 +570,7 @@ def test_a_name_in_any_spelling_becomes_pascal_case() -> None:
         ("SyncStandBy", ("Sync_StandBy",)),
         ("X1", ("x1",)),
     ):
-        assert {canopen_dbc.pascal_case(name) for name in spellings} == {pascal_case}
+        assert {dbc_names.pascal_case(name) for name in spellings} == {pascal_case}
 
 
 # --- other readers -------------------------------------------------------------------------------------------------------

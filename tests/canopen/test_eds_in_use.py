@@ -7,9 +7,10 @@ from dialogue import Bench, changed, info, live, shipped_eds
 from eds_text import SHIPPED, with_key
 
 from kontronik_can_gw.canopen.check import check_eds, without_objects
+from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.dictionary import _IF_ABSENT, key
-from kontronik_can_gw.canopen.eds import load, without
-from kontronik_can_gw.canopen.node import NodeSettings
+from kontronik_can_gw.canopen.eds import load
+from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.config.keys import shipped

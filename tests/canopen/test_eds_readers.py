@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from eds_text import device_info
 
+from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.eds import Eds, Entry
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.eds_object import Entry
 
 SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
 PDO_NAMES = [
@@ -40,7 +43,7 @@ def dcf_text(shipped: Eds, node_id: int) -> str:
             assert isinstance(default, int)
             default += node_id
         values[entry.index, entry.sub] = default
-    return reader.dcf(shipped, node_id, 250_000, values, "left", "left.dcf")
+    return dcf.dcf(shipped, node_id, 250_000, values, "left", "left.dcf")
 
 
 # --- dcf-tools ------------------------------------------------------------------------------------------------------
@@ -100,11 +103,12 @@ def javascript() -> dict[str, Any]:
 
 @pytest.mark.extended
 def test_npm_canopen_reads_the_device(shipped: Eds, javascript: dict[str, Any]) -> None:
-    device = shipped.device
-    assert tuple(javascript["bitRates"]) == device.bit_rates
-    assert javascript["vendor"] == device.vendor_number
-    assert javascript["product"] == device.product_number
-    assert javascript["revision"] == device.revision_number
+    device = device_info(SHIPPED.read_text("ascii"))
+    rates = [key for key, value in device.items() if key.startswith("baudrate_") and value]
+    assert javascript["bitRates"] == [1000 * int(key.removeprefix("baudrate_")) for key in rates]
+    assert javascript["vendor"] == device["vendornumber"]
+    assert javascript["product"] == device["productnumber"]
+    assert javascript["revision"] == device["revisionnumber"]
     assert javascript["lss"] is True
     assert {int(index): name for index, name in javascript["names"].items()} == shipped.object_names
 

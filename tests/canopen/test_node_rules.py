@@ -7,8 +7,9 @@ from dialogue import NO_HEARTBEAT, OFF, QUIET, SPARE, Bench, default, live, ship
 from eds_text import SHIPPED, variable, with_object
 from script import MS
 
+from kontronik_can_gw.canopen.bound_values import message_plan
+from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import load
-from kontronik_can_gw.canopen.pdo import message_plan
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import parse
@@ -200,10 +201,10 @@ def test_nothing_a_master_stored_keeps_the_gateway_from_starting(
     ids: dict[int, str] = {m.can_id: m.name for m in loaded.layout.messages}
     nodes = loaded.canopen.nodes(loaded.escs, dict(ids)).nodes
     for node in nodes:
-        for cob_id, what in node.cob_ids():
+        for cob_id, what in all_ids(node):
             assert ids.setdefault(cob_id, what) == what
     # said at start, or by the node when it boots
-    assert loaded.warnings or any(node.misfits for node in nodes)
+    assert loaded.warnings or any(node.rejected for node in nodes)
 
 
 @pytest.mark.parametrize("clashing", [Stored(2), Stored(communication={0x101400: u32(0x82)})])

@@ -8,6 +8,7 @@ from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import GATEWAY, LINK
 from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.canopen.traffic import frames_per_second
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
@@ -76,7 +77,7 @@ def test_what_the_bus_has_to_carry_is_reckoned_with_the_pace_of_each_pdo() -> No
     def rate(*mapped: int, kind: int = 255, timer: int = 0) -> float:
         bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, timer, *mapped)}).start()
         assert bench.gateway.nodes is not None
-        return bench.gateway.nodes.frames_per_second()
+        return frames_per_second(bench.nodes)
 
     assert rate(0x20000210) == 100
     assert rate(CRC_ERRORS) == rate(SENT_FRAMES) == rate(LINK_STATUS) == 1

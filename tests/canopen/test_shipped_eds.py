@@ -11,9 +11,14 @@ from typing import Any
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
+from eds_text import SHIPPED as SHIPPED_TEXT
+from eds_text import device_info, lint, with_key
 
+from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.eds import RECORD, VAR, Eds, Entry
+from kontronik_can_gw.canopen.data_types import RECORD, VAR
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.config.keys import EscConfig
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, Row, rows
 
@@ -119,22 +124,14 @@ def test_it_is_accepted_and_keeps_its_bytes(shipped: Eds) -> None:
     )
 
 
-def test_device_info(shipped: Eds, entries: dict[tuple[int, int], Entry]) -> None:
-    device = shipped.device
-    assert device.bit_rates == (
-        10_000,
-        20_000,
-        50_000,
-        125_000,
-        250_000,
-        500_000,
-        800_000,
-        1_000_000,
-    )
-    assert (device.tx_pdos, device.rx_pdos, device.lss) == (6, 0, True)
-    assert device.vendor_number == entries[0x1018, 1].default == 0
-    assert device.product_number == entries[0x1018, 2].default
-    assert device.revision_number == entries[0x1018, 3].default
+def test_device_info(entries: dict[tuple[int, int], Entry]) -> None:
+    device = device_info(SHIPPED_TEXT)
+    for rate in (10, 20, 50, 125, 250, 500, 800, 1000):
+        assert device[f"baudrate_{rate}"] == 1
+    assert (device["nroftxpdo"], device["nrofrxpdo"], device["lss_supported"]) == (6, 0, 1)
+    assert device["vendornumber"] == entries[0x1018, 1].default == 0
+    assert device["productnumber"] == entries[0x1018, 2].default
+    assert device["revisionnumber"] == entries[0x1018, 3].default
     assert entries[0x1018, 4].default == 0
 
 
@@ -262,20 +259,44 @@ def test_the_canopen_library_reads_every_entry_as_we_do(shipped: Eds, node_id: i
     assert {index: dictionary[index].name for index in dictionary} == shipped.object_names
 
 
+def test_what_other_readers_go_by_agrees() -> None:
+    assert lint(SHIPPED_TEXT) == []
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "found"),
+    [
+        ("MandatoryObjects", "SupportedObjects", "2", "[MandatoryObjects] is not numbered 1 to 2"),
+        ("MandatoryObjects", "3", "0x1017", "[MandatoryObjects] has other objects"),
+        ("OptionalObjects", "1", "0x2000", "[OptionalObjects] has other objects"),
+        ("ManufacturerObjects", "2", "0x2009", "[ManufacturerObjects] has other objects"),
+        ("2100", "SubNumber", "0x8", "[2100] SubNumber"),
+        ("DeviceInfo", "NrOfTXPDO", "5", "[DeviceInfo] NrOfTXPDO"),
+        ("2102sub1", "PDOMapping", "1", "[2102sub1] PDOMapping"),
+        ("2010sub6", "PDOMapping", "1", "[2010sub6] PDOMapping"),
+    ],
+)
+def test_the_lint_would_have_said_so(section: str, key: str, value: str, found: str) -> None:
+    assert found in lint(with_key(SHIPPED_TEXT, section, key, value))
+
+
 def test_the_mirrors_can_be_dropped(shipped: Eds) -> None:
-    assert reader.without(DATA, ()) == DATA
+    assert dcf.without(DATA, ()) == DATA
     mirrors = (0x603F, 0x606C, 0x6079)
-    shorter = reader.without(DATA, mirrors)
+    shorter = dcf.without(DATA, mirrors)
     rest = reader.load(shorter, "short.eds")
     assert rest.entries == tuple(entry for entry in shipped.entries if entry.index not in mirrors)
-    assert rest.device == shipped.device
+    assert lint(shorter.decode()) == []
+    assert device_info(shorter.decode()) == device_info(SHIPPED_TEXT)
     assert shorter.isascii()
     assert shorter.count(b"\r\n") == shorter.count(b"\n")
 
 
 def test_dropping_a_pdo_counts_pdos_and_list_entries_anew(shipped: Eds) -> None:
-    rest = reader.load(reader.without(DATA, {0x1801, 0x1A01}), "short.eds")
-    assert rest.device.tx_pdos == 5
+    shorter = dcf.without(DATA, {0x1801, 0x1A01})
+    rest = reader.load(shorter, "short.eds")
+    assert device_info(shorter.decode())["nroftxpdo"] == 5
+    assert lint(shorter.decode()) == []
     assert set(shipped.object_names) - set(rest.object_names) == {0x1801, 0x1A01}
 
 
@@ -290,7 +311,7 @@ def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
         (0x2100, 1): 7,
         (0x6079, 0): 24420,
     }
-    text = reader.dcf(shipped, 5, 250_000, values, "left", "left.dcf")
+    text = dcf.dcf(shipped, 5, 250_000, values, "left", "left.dcf")
     assert text.count("\r\n") == text.count("\n")
     source = io.StringIO(text)
     source.name = "left.dcf"
@@ -310,7 +331,7 @@ def test_the_dcf_is_the_eds_with_values_and_reads_back(shipped: Eds) -> None:
 
 
 def test_the_dcf_keeps_every_line_of_the_eds_in_its_place(shipped: Eds) -> None:
-    text = reader.dcf(shipped, 5, 250_000, {(0x1017, 0): 500, (0x2100, 8): 9}, "left", "left.dcf")
+    text = dcf.dcf(shipped, 5, 250_000, {(0x1017, 0): 500, (0x2100, 8): 9}, "left", "left.dcf")
     lines = text.split("\r\n")
     start = lines.index("[DeviceComissioning]")
     del lines[start : lines.index("", start) + 1]

@@ -10,7 +10,7 @@ import canopen
 import pytest
 from command_line import refused, run
 
-from kontronik_can_gw.canopen.eds import without
+from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.config.keys import shipped

@@ -12,7 +12,7 @@ from canopen.objectdictionary import ODVariable
 from command_line import run
 from described import DBC, EDS, TWO_ESCS, configuration, described
 
-from kontronik_can_gw.canopen.emergency import GatewayError
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.desk.describe.facts import DATA_TYPES
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import cantools.database
 
-from kontronik_can_gw.canopen.eds import ARRAY, RECORD, Eds, load
-from kontronik_can_gw.canopen.emergency import GatewayError, code_of_bit
+from kontronik_can_gw.canopen.data_types import ARRAY, RECORD
+from kontronik_can_gw.canopen.eds import Eds, load
+from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import (
     CanConfig,

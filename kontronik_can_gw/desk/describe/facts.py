@@ -15,10 +15,13 @@ from typing import Any, Protocol
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.dbc import pascal_case
-from kontronik_can_gw.canopen.dictionary import Dictionary, codec
-from kontronik_can_gw.canopen.eds import ARRAY, DOMAIN, RECORD, VAR, Eds, Entry
-from kontronik_can_gw.canopen.emergency import GatewayError, code_of_bit, register_of
+from kontronik_can_gw.canopen.cob_ids import all_ids
+from kontronik_can_gw.canopen.data_types import ARRAY, DOMAIN, RECORD, VAR, codec
+from kontronik_can_gw.canopen.dbc_names import pascal_case
+from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit, register_of
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
@@ -569,7 +572,7 @@ def _named(line: str) -> set[int]:
 
 
 def _node(node: Node, esc: EscSettings) -> NodeFacts:
-    cob_ids = tuple(CobIdFacts(cob_id, use) for cob_id, use in sorted(dict(node.cob_ids()).items()))
+    cob_ids = tuple(CobIdFacts(cob_id, use) for cob_id, use in sorted(dict(all_ids(node)).items()))
     pdos = tuple(
         PdoFacts(
             number=tpdo.number + 1,

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from kontronik_can_gw.canopen.emergency import GatewayError
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.esc.values import CanState, GatewayState
 

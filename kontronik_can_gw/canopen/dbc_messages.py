@@ -1,0 +1,342 @@
+"""The messages that one CANopen node sends by itself, as rows of a DBC: transmit PDOs, heartbeat, emergencies.
+
+Rules: those of the shipped DBC, but PDOs know no Error code: what cannot be shown is NotAvailable (all bits set, signed:
+only the sign bit).
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from fractions import Fraction
+
+from kontronik_can_gw.canopen import emergency_codes
+from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.bound_values import Mapped, message_plan
+from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
+from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
+from kontronik_can_gw.canopen.dbc_rows import Message, Signal, number
+from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.nmt import NmtState
+from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.canopen.pdo import Tpdo
+from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    ErrorBit,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+)
+from kontronik_can_gw.esc.telemetry import MS, LinkState
+from kontronik_can_gw.esc.values import Group
+from kontronik_can_gw.signals.plan import SignalPlan
+
+_MAX_START_VALUE_BITS = 32
+"""That the range of GenSigStartValue holds."""
+_ASCII_UNITS = {"°C": "degC", "µs": "us"}
+_LINK_BITS, _REPLAY_BIT, _INFO_BIT = 6, 6, 7
+"""Of the link status 2020h:1."""
+_MIRRORS = 0x6000
+"""From here on objects show what others show too, under names of CiA 402."""
+
+_NOTES = {
+    "battery_current": "Negative while energy is fed back.",
+    "peak_current": "A held maximum that does not fall back when the motor stops.",
+    "bec_current": "Not supplied by a JIVEPro.",
+    "max_bec_current": "Not supplied by a JIVEPro.",
+    "throttle": "Zero and below brakes.",
+    "operating_state_raw": "A state that has no name in the telemetry sheet is called State with its number.",
+    "device_raw": "A device that has no name in the telemetry sheet is called Device with its number.",
+    "firmware": "Main version times 256, and the sub version.",
+    "data_age": "65534 stands for that or more, NotAvailable: none has come yet.",
+    "info_age": "65534 stands for that or more, NotAvailable: none has come yet.",
+}
+"""What a reader must know of a source beside its name and unit."""
+
+_REGISTER = {
+    emergency_codes.GENERIC: "Generic",
+    emergency_codes.CURRENT: "Current",
+    emergency_codes.VOLTAGE: "Voltage",
+    emergency_codes.TEMPERATURE: "Temperature",
+    emergency_codes.COMMUNICATION: "Communication",
+    emergency_codes.MANUFACTURER: "Manufacturer",
+}
+
+
+class NodeMessages:
+    """The messages of one node."""
+
+    def __init__(self, node: Node, prefix: str, message_names: Names, signal_names: Names) -> None:
+        self._node = node
+        self._title = f"CANopen node {node.node_id}"
+        self._message_prefix = prefix or "Esc"
+        self._prefix = prefix
+        self._message_names = message_names
+        self._signal_names = signal_names
+
+    def all(self) -> Iterator[Message]:
+        """PDOs by their number, heartbeat, emergency."""
+        for tpdo in self._node.tpdos:
+            if tpdo.valid and tpdo.mapped:
+                yield self._tpdo(tpdo)
+        yield self._heartbeat()
+        cob_id = self._node.emergencies.cob_id
+        if not cob_id >> 31:
+            yield self._emergency(cob_id & 0x7FF)
+
+    def _name(self, stem: str, end: str = "") -> str:
+        return self._signal_names.take(self._prefix, stem, end)
+
+    # --- heartbeat and emergency
+
+    def _heartbeat(self) -> Message:
+        period = self._node.dictionary.number(0x1017)
+        state = Signal(
+            self._name("NodeState"),
+            0,
+            8,
+            f"NMT state of {self._title}. BootUp is sent once, after each start and reset.",
+            high=NmtState.PRE_OPERATIONAL,
+            names={
+                NmtState.INITIALISING: "BootUp",
+                NmtState.STOPPED: "Stopped",
+                NmtState.OPERATIONAL: "Operational",
+                NmtState.PRE_OPERATIONAL: "PreOperational",
+            },
+        )
+        when = (
+            f"every {period} ms" if period else "off (1017h is 0), only the boot-up message is sent"
+        )
+        name = self._message_names.take(self._message_prefix, "Heartbeat")
+        cob_id = HEARTBEAT + self._node.node_id
+        comment = f"Heartbeat of {self._title}, {when}."
+        return Message(
+            cob_id, name, 1, comment, "Cyclic" if period else "Event", period, 0, [state]
+        )
+
+    def _emergency(self, cob_id: int) -> Message:
+        bits = {int(bit): pascal_case(bit.name) for bit in OperatingError}
+        sources = {bit: bits.get(bit, f"Bit{bit}") for bit in range(32)} | {0xFF: "Gateway"}
+        signals = [
+            Signal(
+                self._name("EmergencyCode"),
+                0,
+                16,
+                "Emergency code.",
+                high=max(emergency_names()),
+                names=emergency_names(),
+            ),
+            *(
+                Signal(
+                    self._name("ErrorRegister", what),
+                    16 + mask.bit_length() - 1,
+                    1,
+                    f"Error register 1001h at the time of the emergency, {what.lower()} error.",
+                )
+                for mask, what in _REGISTER.items()
+            ),
+            Signal(
+                self._name("EmergencySource"),
+                24,
+                8,
+                "Bit of the error word of the ESC that caused the emergency, or the gateway.",
+                high=0xFF,
+                start_value=0xFF,
+                names=sources,
+            ),
+            Signal(
+                self._name("EmergencyWord"),
+                32,
+                32,
+                "Error word of the ESC. Of an emergency of the gateway its detail. For TelemetryFault 1 telemetry lost, 2 CRC errors, "
+                "3 port gone, 4 other device than configured. For HeartbeatLost the node-ID.",
+                high=0xFFFFFFFF,
+            ),
+        ]
+        delay = self._node.dictionary.number(0x1015) // 10
+        name = self._message_names.take(self._message_prefix, "Emergency")
+        comment = f"Emergencies of {self._title}, sent when an error comes, again after a reset or outage, NoError when all are gone."
+        return Message(cob_id, name, 8, comment, "Event", 0, delay, signals)
+
+    # --- PDOs
+
+    def _tpdo(self, tpdo: Tpdo) -> Message:
+        plan = message_plan("", tpdo.cob_id, tpdo.mapped)
+        signals: list[Signal] = []
+        words: list[tuple[Mapped, SignalPlan, type[ErrorBit]]] = []
+        state_name = ""
+        for entry, place in zip(tpdo.mapped, plan.signals, strict=True):
+            if bits := _error_bits(entry, place):
+                words.append((entry, place, bits))
+                continue
+            made = self._object(entry, place)
+            if entry.bound is not None and entry.bound.source.name == "operating_state_raw":
+                state_name = state_name or made[0].name
+            signals += made
+        for entry, place, bits in words:
+            signals += self._flags(entry, place, bits, state_name)
+        name = self._message_names.take(self._message_prefix, f"Tpdo{tpdo.number + 1}")
+        comment = f"TPDO {tpdo.number + 1} of {self._title}. {_when(tpdo)}"
+        return Message(tpdo.cob_id, name, plan.length, comment, *_schedule(tpdo), signals)
+
+    def _object(self, entry: Mapped, place: SignalPlan) -> list[Signal]:
+        """The signals of one mapped object that is no error word."""
+        item, bound = entry.variable.entry, entry.bound
+        where = _where(item)
+        own_stem = _stem(item)
+        length, signed = place.length, place.signed
+        start = place.pieces[0].at
+        lowest, highest = (
+            (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        )
+        plain = Signal("", start, length, where, signed, place.is_float, low=lowest, high=highest)
+        if bound is None:
+            is_code = (item.index, item.sub, length, signed) == (at.ERROR_CODE, 0, 16, False)
+            names = emergency_names() if is_code else {}
+            return [replace(plain, name=self._name(own_stem), names=names)]
+        source = bound.source
+        if source.name == "link_status" and not signed:
+            return self._link(start, where)
+        names, stem = _table(source.name, source.names)
+        if item.index >= _MIRRORS:
+            stem = own_stem
+        unit = _ASCII_UNITS.get(source.unit, source.unit)
+        end = "Percent" if unit == "%" else ""
+        comment = " ".join(filter(None, (where, _NOTES.get(source.name))))
+        scaled = replace(
+            plain, name=self._name(stem.removesuffix(end), end), factor=1 / bound.steps, unit=unit
+        )
+        if source.rolls:
+            return [
+                replace(
+                    scaled,
+                    comment=f"{comment} Starts again at 0 after {number(highest / bound.steps)}.",
+                )
+            ]
+        not_available = lowest if signed else highest
+        lowest, highest = (lowest + 1, highest) if signed else (lowest, highest - 1)
+        names = {number: text for number, text in names.items() if lowest <= number <= highest}
+        return [
+            replace(
+                scaled,
+                comment=comment,
+                low=lowest,
+                high=max(names) if names else highest,
+                start_value=not_available if length <= _MAX_START_VALUE_BITS else 0,
+                names=names | {not_available: "NotAvailable"},
+            )
+        ]
+
+    def _link(self, start: int, where: str) -> list[Signal]:
+        states = {int(state): pascal_case(state.name) for state in LinkState}
+        state = "State of the telemetry line between ESC and gateway."
+        replay = "The values come from a recording, not from an ESC."
+        info = "The information of the ESC (its info frame) is fresh."
+        return [
+            Signal(
+                self._name("LinkState"),
+                start,
+                _LINK_BITS,
+                f"{where} {state}",
+                high=max(states),
+                names=states,
+            ),
+            Signal(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
+            Signal(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
+        ]
+
+    def _flags(
+        self, entry: Mapped, place: SignalPlan, bits: type[ErrorBit], state_name: str
+    ) -> list[Signal]:
+        then = f" and {state_name} is NotAvailable" if state_name else ""
+        lost = f"While the word is not available all its bits are set{then}."
+        where = _where(entry.variable.entry)
+        return [
+            Signal(
+                self._name(pascal_case(bit.name)),
+                place.pieces[0].at + bit,
+                1,
+                f"{where} Bit {int(bit)}, {bit.meaning}. {lost}",
+            )
+            for bit in bits
+            if bit < place.length
+        ]
+
+
+def _where(item: Entry) -> str:
+    return f"Object {item.index:04X}h:{item.sub:02X}, {item.name}."
+
+
+def _stem(item: Entry) -> str:
+    """A signal's name from an object's, which can be of any characters."""
+    stem = pascal_case(item.name)
+    return (
+        stem if re.fullmatch("[A-Z].*[a-z].*", stem) else f"Object{item.index:04X}Sub{item.sub:02X}"
+    )
+
+
+def _error_bits(entry: Mapped, place: SignalPlan) -> type[ErrorBit] | None:
+    """The bits of an error word that is shown unsigned; None for every other object."""
+    words: dict[str, type[ErrorBit]] = {
+        "operating_errors": OperatingError,
+        "selftest_errors": SelfTestError,
+    }
+    return None if entry.bound is None or place.signed else words.get(entry.bound.source.name)
+
+
+def _table(name: str, names: Mapping[int, str]) -> tuple[dict[int, str], str]:
+    """Value names and signal name of a source. An enumeration is closed: a number without a name gets one, because tools lose all
+    names by one sample that has none."""
+    if name == "operating_state_raw":
+        known = {int(state): pascal_case(state.text) for state in OperatingState}
+        return {
+            number: known.get(number, f"State{number}") for number in range(0x100)
+        }, "OperatingState"
+    if name == "device_raw":
+        known = {int(device): pascal_case(device.text) for device in Device}
+        return {number: known.get(number, f"Device{number}") for number in range(0x40)}, "Device"
+    return {int(number): pascal_case(text) for number, text in names.items()}, pascal_case(name)
+
+
+def _schedule(tpdo: Tpdo) -> tuple[str, int, int]:
+    """Send type, cycle and least distance in ms."""
+    if tpdo.type not in EVENT_TYPES:
+        return "None", 0, 0
+    delay = tpdo.inhibit_ns // MS
+    if tpdo.event_ns:
+        return (
+            "CyclicAndOnChange" if tpdo.on_change else "CyclicAndEvent",
+            tpdo.event_ns // MS,
+            delay,
+        )
+    return "OnChange" if tpdo.on_change else "Event", 0, delay
+
+
+def _when(tpdo: Tpdo) -> str:
+    """When a PDO is sent, in words."""
+    if tpdo.type not in EVENT_TYPES:
+        text = (
+            "Sent at a SYNC when there is news"
+            if tpdo.type == 0
+            else f"Sent at every SYNC number {tpdo.type}"
+        )
+    else:
+        text = "Sent when its status changes" if tpdo.on_change else "Sent when its values are new"
+        if tpdo.inhibit_ns:
+            text += f", no closer than {number(Fraction(tpdo.inhibit_ns, MS))} ms"
+        if tpdo.event_ns:
+            text += f", at the latest after {tpdo.event_ns // MS} ms"
+    live = any(
+        entry.bound is not None and entry.bound.source.group is Group.LIVE for entry in tpdo.mapped
+    )
+    link = any(
+        entry.bound is not None and entry.bound.source.name == "link_status"
+        for entry in tpdo.mapped
+    )
+    if live:
+        text += (
+            ". Goes on while the telemetry is lost"
+            if link
+            else ". Not sent while the telemetry is lost"
+        )
+    return f"{text}."

@@ -1,0 +1,131 @@
+"""Error codes of emergencies, and the register bits they set (CiA 301, 7.2.7.1 and 7.5.2.2; table 26).
+
+::
+
+    byte  0..1          2       3                                4..7
+    error code   1001h   ESC bit number, FFh: gateway   ESC's error word; gateway: byte 4 says which, see GatewayError
+"""
+
+from enum import Enum
+from typing import NamedTuple, Self
+
+from kontronik_can_gw.esc.kontronik.states import OperatingError, Severity
+
+GENERIC, CURRENT, VOLTAGE, TEMPERATURE, COMMUNICATION, MANUFACTURER = (
+    0x01,
+    0x02,
+    0x04,
+    0x08,
+    0x10,
+    0x80,
+)
+_REGISTER_OF_CLASS = {
+    0x2: CURRENT,
+    0x3: VOLTAGE,
+    0x4: TEMPERATURE,
+    0x8: COMMUNICATION,
+    0xF: MANUFACTURER,
+}
+FROM_GATEWAY = 0xFF
+
+_CODES = {
+    OperatingError.UNDERVOLTAGE: 0x3220,
+    OperatingError.OVERVOLTAGE: 0x3210,
+    OperatingError.OVERCURRENT_INTEGRAL_ERROR: 0x2350,
+    OperatingError.OVERCURRENT_INTEGRAL_WARNING: 0x2351,
+    OperatingError.POWER_STAGE_OVERTEMP_ERROR: 0x4210,
+    OperatingError.BEC_UNDERVOLTAGE: 0x5114,
+    OperatingError.BEC_OVERVOLTAGE: 0x5115,
+    OperatingError.BEC_OVERCURRENT: 0x2220,
+    OperatingError.BEC_OVERTEMPERATURE: 0x4410,
+    OperatingError.OPERATING_ERROR_FOUND: 0x1000,
+    OperatingError.SELFTEST_ERROR: 0x5000,
+    OperatingError.EEPROM_ERROR: 0x5530,
+    OperatingError.WATCHDOG_ERROR_TRIPPED: 0x6010,
+}
+_ERROR_BITS = sum(1 << bit for bit in OperatingError if bit.severity is Severity.ERROR)
+_WARNING_BITS = sum(1 << bit for bit in OperatingError if bit.severity is Severity.WARNING)
+_SUMMARIES = (
+    (1 << OperatingError.OPERATING_ERROR_FOUND, _ERROR_BITS),
+    (1 << OperatingError.OPERATING_WARNING_FOUND, _WARNING_BITS),
+)
+_SUMMARY_BITS = sum(bit for bit, _ in _SUMMARIES)
+
+
+class GatewayError(Enum):
+    """What the gateway itself finds. ``value``: error code, byte 4."""
+
+    meaning: str
+    remedy: str
+    """What a person should do."""
+
+    def __new__(cls, code: int, detail: int, meaning: str, remedy: str) -> Self:
+        member = object.__new__(cls)
+        member._value_ = code, detail
+        member.meaning = meaning
+        member.remedy = remedy
+        return member
+
+    # fmt: off
+    TELEMETRY_LOST = (0x7510, 1, "telemetry lost",
+        "Check that the ESC is switched on, its telemetry setting, and the cable to the gateway.")
+    CRC_RATE = (0x7510, 2, "telemetry degraded: many CRC errors or dropped bytes",
+        "Keep the telemetry cable short and away from the motor's wires. Check plugs and ground.")
+    PORT_GONE = (0x7510, 3, "serial port gone",
+        "Check the USB adapter and its plug. It is tried again for ever; kontronik-can-gw doctor says more.")
+    OTHER_DEVICE = (0x7510, 4, "another device than [esc].device says",
+        "Check which ESC is plugged in where, or correct device in the configuration.")
+    RECEIVE_OVERRUN = (0x8110, 0, "received CAN frames were lost",
+        "Let masters send less at once; look for somebody who floods the bus.")
+    CAN_PASSIVE = (0x8120, 0, "CAN controller error passive",
+        "Check bit rate, termination (120 ohm at both ends) and cables of the bus, and that another node is switched on.")
+    HEARTBEAT_LOST = (0x8130, 0, "a watched heartbeat stayed away; byte 4: the node-ID",
+        "Check that node, its supply and its bus cable, and the time in 1016h.")
+    BUS_OFF_LEFT = (0x8140, 0, "back from bus-off",
+        "Look for a short, a wrong bit rate or a bad cable on the bus.")
+    ID_COLLISION = (0x8150, 0, "somebody else sends with an id of this node: two nodes with one node-ID?",
+        "Give each node of the bus another node-ID, and each message another id.")
+    SYNC_LENGTH = (0x8240, 0, "SYNC of a wrong length",
+        "Let the master send SYNC as 1019h says: without data, or with one byte where it has a counter.")
+    PARAMETER_FILE = (0x6300, 0, "the parameter file could not be read: defaults",
+        "Let the master store its parameters anew, or restore the file. Check the disk.")
+    # fmt: on
+
+
+OF_COMMUNICATION = frozenset(
+    error.value[0] for error in (GatewayError.HEARTBEAT_LOST, GatewayError.SYNC_LENGTH)
+)
+
+
+class Condition(NamedTuple):
+    """Something that is wrong."""
+
+    code: int
+    source: int
+    """ESC bit number, FFh: gateway."""
+    detail: int
+    """Byte 4 of a gateway error; 0 for an ESC's bit, whose word is sent."""
+
+
+def code_of_bit(bit: int) -> int:
+    """The emergency code of an ESC's error bit: a standard one where there is one, else FF00h + bit."""
+    return _CODES.get(bit, 0xFF00 + bit)  # type: ignore[call-overload, no-any-return]
+
+
+def reported_bits(word: int, mask: int) -> int:
+    """The bits of an ESC's error word that get an emergency: those in the mask, a summary bit only where it is not explained by another."""
+    bits = word & mask
+    for summary, explained_by in _SUMMARIES:
+        if word & explained_by & ~_SUMMARY_BITS:
+            bits &= ~summary
+    return bits
+
+
+def register_of(code: int) -> int:
+    """The bits of 1001h that an error code sets: the generic one and that of its class."""
+    return GENERIC | _REGISTER_OF_CLASS.get(code >> 12, 0)
+
+
+def registered_bits(word: int, mask: int) -> int:
+    """The bits of an ESC's error word that set bits of 1001h: all errors, and the warnings in the mask."""
+    return word & (_ERROR_BITS & ~_SUMMARY_BITS) | reported_bits(word, mask)

@@ -1,0 +1,117 @@
+"""What a node does for its ESC: settings 2100h, status register 1002h, texts of 2010h, statistics 2102h, emergencies of ESC and link."""
+
+from collections.abc import Callable
+
+from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.emergency import Emergencies
+from kontronik_can_gw.canopen.emergency_codes import GatewayError
+from kontronik_can_gw.canopen.node_settings import esc_settings
+from kontronik_can_gw.esc.kontronik.states import Device, device_text
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
+from kontronik_can_gw.esc.values import GatewayState, GatewayStatus
+
+RESET = int.from_bytes(b"rset", "little")
+
+
+class EscObjects:
+    """``changed`` is called with other settings of the ESC, ``lost`` with the time when its telemetry is lost."""
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        esc: EscTelemetry,
+        gateway: GatewayStatus,
+        emergencies: Emergencies,
+        expected: Device | None,
+        changed: Callable[[EscSettings], None],
+        lost: Callable[[int], None],
+    ) -> None:
+        self._dictionary = dictionary
+        self._esc = esc
+        self._base = esc.settings
+        self._gateway = gateway
+        self._emergencies = emergencies
+        self._expected = expected
+        self._changed = changed
+        self._lost = lost
+        self._live = False  # for the edge of 1029h:2
+        dictionary.bind(0x1002, read=self._status_register)
+        dictionary.bind(at.INFO, 6, read=self._device_name)
+        dictionary.bind(at.INFO, 7, read=self._firmware)
+        for variable in dictionary.subs(at.SETTINGS):
+            variable.written = self._settings_written
+        dictionary.bind(at.RESET_STATISTICS, 1, check=_check_reset, written=self._reset_statistics)
+
+    def apply_settings(self, now: int) -> None:
+        """Take over 2100h."""
+        self._emergencies.mask = self._dictionary.number(at.SETTINGS, 6)
+        if self._esc.live is not None:
+            self._emergencies.set_word(self._esc.live.operating_errors, now, force=True)
+        settings = esc_settings(self._dictionary, self._base)
+        if settings != self._esc.settings:
+            self._changed(settings)
+
+    def on_event(self, events: int, now: int) -> None:
+        """Something of the ESC changed: bits of telemetry.Event."""
+        live = self._esc.live
+        if events & Event.LIVE and live is not None:
+            self._emergencies.set_word(live.operating_errors, now)
+        if events & (Event.LINK | Event.INFO) or self._live is (live is None):
+            self._follow_link(events, now)
+
+    def _follow_link(self, events: int, now: int) -> None:
+        esc, found = self._esc, self._emergencies
+        link = esc.link
+        if events & Event.LINK:
+            if link is LinkState.PORT_ERROR:
+                found.set(GatewayError.PORT_GONE, True, now)
+            found.set(GatewayError.TELEMETRY_LOST, link is LinkState.LOST, now)
+            found.set(GatewayError.CRC_RATE, link is LinkState.DEGRADED, now)
+            found.set(GatewayError.PORT_GONE, link is LinkState.PORT_ERROR, now)
+        if events & Event.INFO and esc.info is not None and self._expected is not None:
+            found.set(GatewayError.OTHER_DEVICE, esc.info.device != self._expected, now)
+        if self._live and esc.live is None and link in (LinkState.LOST, LinkState.PORT_ERROR):
+            self._lost(now)
+        self._live = esc.live is not None
+
+    # --- objects
+
+    def _status_register(self, _now: int) -> int:
+        """1002h: bits 7..0 link status as 2020h:1, 15..8 CAN state, 16 telemetry fresh, 17 information fresh."""
+        esc = self._esc
+        return (
+            int(esc.link)
+            | (self._gateway.state is GatewayState.REPLAY) << 6
+            | (esc.info is not None) << 7
+            | int(self._gateway.can_state) << 8
+            | (esc.live is not None) << 16
+            | (esc.info is not None) << 17
+        )
+
+    def _device_name(self, _now: int) -> bytes:
+        info = self._esc.last_info
+        if info is None:
+            raise SdoAbort(Abort.NO_DATA)
+        return (device_text(info.device) or f"device {info.device}").encode("ascii")
+
+    def _firmware(self, _now: int) -> bytes:
+        info = self._esc.last_info
+        if info is None:
+            raise SdoAbort(Abort.NO_DATA)
+        return info.firmware.encode("ascii")
+
+    def _settings_written(self, now: int) -> bool:
+        self.apply_settings(now)
+        return True
+
+    def _reset_statistics(self, _now: int) -> bool:
+        self._esc.reset_statistics()
+        return True
+
+
+def _check_reset(value: int) -> None:
+    """A new 2102h:1: the signature ``rset``."""
+    if value != RESET:
+        raise SdoAbort(Abort.TRANSFER)

@@ -1,0 +1,86 @@
+"""What the configuration says of a node; how it, the EDS and stored values make the dictionary and the ESC's settings (2100h)."""
+
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from kontronik_can_gw.canopen import objects as at
+from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.storage import APPLICATION, Stored
+from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.telemetry import MS, EscSettings
+
+_SELF_START_OFF = 4
+_MIN_TIMEOUT_MS, _MAX_TIMEOUT_MS = 20, 60_000  # whatever the limits of an EDS are
+
+
+@dataclass(frozen=True)
+class NodeSettings:
+    """What the configuration says of a node.
+
+    ``node_id``: 1..127, or 255 for a node that waits for LSS. ``vendor_id`` None: as the EDS says. ``segment_ns``: distance of the
+    segments of a block upload. ``device``: the device that is expected on the line, None for any.
+    """
+
+    node_id: int
+    serial: int = 0
+    vendor_id: int | None = None
+    self_start: bool = False
+    read_only: bool = False
+    bitrate: int = 500_000
+    segment_ns: int = 0
+    version: str = ""
+    device: Device | None = None
+
+
+def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
+    """The settings of 2100h; ``base`` where the EDS has no object for one."""
+    number = dictionary.number
+    gear = Fraction(
+        number(at.SETTINGS, 2, base.gear.numerator) or 1,
+        number(at.SETTINGS, 3, base.gear.denominator) or 1,
+    )
+    timeout_ms = number(at.SETTINGS, 4, base.timeout_ns // MS)
+    return replace(
+        base,
+        pole_pairs=max(1, number(at.SETTINGS, 1, base.pole_pairs)),
+        gear=gear,
+        timeout_ns=min(max(_MIN_TIMEOUT_MS, timeout_ms), _MAX_TIMEOUT_MS) * MS,
+        cell_count=number(at.SETTINGS, 7, base.cell_count),
+        crc_error_threshold=number(at.SETTINGS, 8, base.crc_error_threshold),
+    )
+
+
+def configured_settings(base: EscSettings) -> dict[int, int]:
+    """Sub-indices of 2100h that the configuration sets, and to what."""
+    standard = EscSettings()
+    listed = (
+        (1, base.pole_pairs, standard.pole_pairs),
+        (2, base.gear.numerator, 1),
+        (3, base.gear.denominator, 1),
+        (4, base.timeout_ns // MS, standard.timeout_ns // MS),
+        (7, base.cell_count, standard.cell_count),
+    )
+    return {sub: given for sub, given, default in listed if given != default}
+
+
+def make_dictionary(
+    eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored
+) -> Dictionary:
+    """The dictionary of a node before its first reset, the configuration's values as power-on values and the stored ones in place.
+
+    Where the configuration leaves a setting at its default, the EDS's default holds.
+    """
+    dictionary = Dictionary(eds)
+    power_on = {(at.SETTINGS, sub): given for sub, given in configured_settings(base).items()}
+    if settings.vendor_id is not None:
+        power_on[0x1018, 1] = settings.vendor_id
+    power_on[0x1018, 4] = settings.serial
+    for (index, sub), given in power_on.items():
+        if (variable := dictionary.get(index, sub)) is not None:
+            variable.power_on = given
+    if settings.self_start and (variable := dictionary.get(0x1F80)) is not None:
+        variable.power_on = int(variable.power_on) & ~_SELF_START_OFF
+    dictionary.read_only = settings.read_only
+    dictionary.reset(APPLICATION, settings.node_id, stored.application)
+    return dictionary
