@@ -17,7 +17,7 @@ from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
-from kontronik_can_gw.canopen.nmt import is_reset_of_all
+from kontronik_can_gw.canopen.nmt import NmtState, is_reset_of_all
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
 from kontronik_can_gw.canopen.reception import FrameTaker
@@ -25,6 +25,7 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import CanState, GatewayStatus
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.output import Output, Owner
 
 SettingsChanged = Callable[[int, EscSettings], None]
 
@@ -54,15 +55,12 @@ class CanopenSetup:
         """The nodes as they are after power-on, without a gateway around them: to see their COB-IDs and objects."""
         telemetry = [EscTelemetry(settings, 0) for settings in escs]
         nodes = Nodes(self, telemetry, GatewayStatus(), lambda _esc, _settings: None, foreign_ids)
-        nodes.start(0)
+        nodes.start(0, can_open=True)
         return nodes
 
 
-class Nodes:
+class Nodes(Output):
     """One node for each ESC.
-
-    Frames are appended to ``frames``, which ``take`` hands over, requests to store to ``saves`` as (ESC, parameters), which the owner
-    empties.
 
     ``foreign_ids``: 11-bit ids that the gateway sends otherwise; no PDO may be given one. ``settings_changed`` is called
     with the ESC's index and its new settings when a master writes 2100h.
@@ -76,14 +74,8 @@ class Nodes:
         settings_changed: SettingsChanged,
         foreign_ids: Mapping[int, str] | None = None,
     ) -> None:
-        self.frames: list[CanFrame] = []
-        self.saves: list[tuple[int, Stored]] = []
-        self.receive_ids: frozenset[int] = frozenset()
+        super().__init__()
         self.due = NEVER
-        self.misfits: list[tuple[int, int]] = []
-        """(ESC, index << 8 | sub-index) of stored values that did not hold at a reset; the owner empties it."""
-        self.state_changes = 0
-        """Grows with each change of a node's NMT state or node-ID."""
         self._settings_changed = settings_changed
         self._foreign_ids = foreign_ids or {}
         self._routes: dict[int, list[FrameTaker]] = {}
@@ -101,8 +93,12 @@ class Nodes:
 
     # --- what happens
 
-    def start(self, now: int) -> None:
-        """Power on."""
+    def start(self, now: int, can_open: bool) -> None:
+        """Power on; without a bus that can hear it the nodes boot when there is one."""
+        if can_open:
+            self._power_on(now)
+
+    def _power_on(self, now: int) -> None:
         self._started = True
         for node in self.nodes:
             node.power_on(now)
@@ -123,18 +119,18 @@ class Nodes:
             self.frames[begin:] = dict.fromkeys(self.frames[begin:])
         self._after(now)
 
-    def take(self) -> list[CanFrame]:
-        """The frames so far, oldest first; the list is handed over."""
-        frames, self.frames = self.frames, []
-        return frames
+    def next_deadline(self) -> int:
+        return self.due
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed."""
         self.nodes[esc].on_event(events, now)
         self._after(now)
 
-    def on_can_state(self, state: CanState, now: int) -> None:
-        """The CAN controller's state changed."""
+    def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
+        """The CAN controller's state changed, or it is down again before a frame was sent."""
+        if state is before and state is not CanState.DOWN:
+            return
         for node in self.nodes:
             node.can_faults.on_state(state, now)
         self._after_all(now)
@@ -142,7 +138,7 @@ class Nodes:
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost, or for the first time."""
         if not self._started:
-            self.start(now)
+            self._power_on(now)
             return
         for node in self.nodes:
             node.can_faults.frames_pass(now)
@@ -161,15 +157,20 @@ class Nodes:
             node.tpdos.repeat(now)
         self._after_all(now)
 
-    def collision(self, node_index: int, present: bool, now: int) -> None:
-        """Another device begins, or has ceased, to send with an id of this node."""
-        self.nodes[node_index].emergencies.set(GatewayError.ID_COLLISION, present, now)
+    def collision(self, esc: int, present: bool, now: int) -> None:
+        self.nodes[esc].emergencies.set(GatewayError.ID_COLLISION, present, now)
         self._after_all(now)
 
-    def own_ids(self) -> dict[int, tuple[int, str]]:
-        """COB-IDs that only our nodes send with: which node (0 ...), and what for."""
+    def node_states(self) -> list[tuple[int, NmtState, int]]:
+        return [
+            (node.claimed_node_id, node.state, sum(tpdo.sent for tpdo in node.tpdos))
+            for node in self.nodes
+        ]
+
+    def own_ids(self) -> dict[int, Owner]:
+        """COB-IDs that only our nodes send with."""
         return {
-            cob_id: (index, what)
+            cob_id: Owner(index, what)
             for index, node in enumerate(self.nodes)
             for cob_id, what in transmit_ids(node)
         }
@@ -216,7 +217,7 @@ class Nodes:
         self._rerouted = True
 
     def rejected(self, node: Node, keys: list[int]) -> None:
-        self.misfits += [(self.nodes.index(node), key) for key in keys]
+        self.rejected_parameters += [(self.nodes.index(node), key) for key in keys]
 
     def state_changed(self) -> None:
         self.state_changes += 1

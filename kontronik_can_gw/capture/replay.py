@@ -154,7 +154,7 @@ class Replay:
         frames = in_order(gateway.take_frames(), self._waiting)
         gateway.status.sent_frames += len(frames)
         gateway.take_link_changes()
-        gateway.take_misfits()
+        gateway.take_rejected_parameters()
         gateway.take_conflicts()
         self._taken = [TimedFrame(now, frame) for frame in frames]
 

@@ -1,11 +1,12 @@
 """Plans, packers and schedule put together: telemetry events and time in, CAN frames out."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from kontronik_can_gw.dbc.schedule import Schedule
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
-from kontronik_can_gw.esc.values import GatewayStatus, Group
-from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.esc.values import CanState, GatewayStatus, Group
+from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.output import NEVER, Output, Owner
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
@@ -93,7 +94,7 @@ class _Message:
         return bool(self.triggers & events)
 
 
-class DbcOutput:
+class DbcOutput(Output):
     """All messages of one layout. Frames are appended to ``frames``, which the owner empties.
 
     ``silent``: on loss of telemetry messages with values of a lost ESC stop instead of carrying NotAvailable.
@@ -107,7 +108,7 @@ class DbcOutput:
         now: int,
         silent: bool = False,
     ) -> None:
-        self.frames: list[CanFrame] = []
+        super().__init__()
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
@@ -131,7 +132,38 @@ class DbcOutput:
             if esc in m.plan.escs and m.follows(events, up)
         ]
 
-    def start(self, now: int) -> None:
+    def start(self, now: int, can_open: bool) -> None:  # noqa: ARG002
+        self._send_all(now)
+
+    def stop(self, now: int) -> None:
+        """The last word, without regard to the minimum distance of messages."""
+        for index, message in self._changed_of_gateway(now):
+            self._send(index, now)
+            while message.owed:
+                self._send(index, now)
+
+    def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
+        if state is before:
+            return
+        self.on_gateway_change(now)
+        if before is CanState.BUS_OFF and state is not CanState.DOWN:
+            self._send_all(now)  # what was handed over meanwhile never reached the bus
+
+    def can_returned(self, now: int) -> None:
+        self._send_all(now)
+
+    def make_anew(self, now: int) -> None:
+        self._send_all(now)
+
+    def own_ids(self) -> dict[int, Owner]:
+        return {
+            message.can_id | (EXTENDED if message.extended else 0): Owner(
+                None, f"message {message.plan.name}"
+            )
+            for message in self._messages
+        }
+
+    def _send_all(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
         for index, message in enumerate(self._messages):
             message.last.clear()
@@ -157,22 +189,22 @@ class DbcOutput:
             if message.is_free or request(index, now):
                 send(index, now)
 
-    def on_gateway_change(self, now: int, at_once: bool = False, each_second: bool = False) -> None:
-        """The gateway's own state changed: messages with its values that are sent by event or on change follow.
+    def on_gateway_change(self, now: int, each_second: bool = False) -> None:
+        """Messages with the gateway's own values that are sent by event or on change follow.
 
-        ``at_once``: without regard to their minimum distance, for the last word. ``each_second``: only its counters went on,
-        which is news for messages that have no cycle.
+        ``each_second``: only its counters went on, which is news for messages that have no cycle.
         """
+        for index, _ in self._changed_of_gateway(now, each_second):
+            self._request(index, now)
+
+    def _changed_of_gateway(
+        self, now: int, each_second: bool = False
+    ) -> Iterator[tuple[int, _Message]]:
         for index, message in self._of_gateway:
             if each_second and message.plan.cycle_ns:
                 continue
             if message.by_event or (message.on_change and self._note_changes(message, now)):
-                if at_once:
-                    self._send(index, now)
-                    while message.owed:
-                        self._send(index, now)
-                else:
-                    self._request(index, now)
+                yield index, message
 
     def advance(self, now: int) -> None:
         """Send what is due."""
@@ -185,17 +217,9 @@ class DbcOutput:
             if cyclic or message.by_event or message.owed or self._note_changes(message, now):
                 self._send(index, now)
 
-    def take(self) -> list[CanFrame]:
-        """The frames so far; the list is handed over."""
-        frames = self.frames
-        if not frames:
-            return []
-        self.frames = []
-        return frames
-
-    def next_deadline(self) -> int | None:
-        """When ``advance`` has something to do."""
-        return self._schedule.next_deadline()
+    def next_deadline(self) -> int:
+        due = self._schedule.next_deadline()
+        return NEVER if due is None else due
 
     def _request(self, index: int, now: int) -> None:
         if self._schedule.request(index, now):

@@ -13,7 +13,8 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Conflict, Gateway
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.id_conflicts import Conflict
 from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor

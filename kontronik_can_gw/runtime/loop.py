@@ -349,7 +349,7 @@ class Loop:
 
     def _report_nodes(self, now: int) -> None:
         self._node_changes = self.gateway.node_changes
-        for index, key in self.gateway.take_misfits():
+        for index, key in self.gateway.take_rejected_parameters():
             where = f"{key >> 8:04X}h:{key & 0xFF:02X}"
             log.warning(
                 "%s: the stored %s is passed over: it does not fit this EDS, or clashes",

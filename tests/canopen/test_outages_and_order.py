@@ -56,12 +56,12 @@ def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> No
         changes=QUIET,
         stored=[Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})],
     )
-    assert sorted(bench.gateway.take_misfits()) == [(0, 0x101700), (0, 0x210001)]
+    assert sorted(bench.gateway.take_rejected_parameters()) == [(0, 0x101700), (0, 0x210001)]
     for _ in range(3):
         bench.put(0, "82 01")
-        assert bench.gateway.take_misfits() == [(0, 0x101700)]
+        assert bench.gateway.take_rejected_parameters() == [(0, 0x101700)]
     bench.put(0, "81 01")
-    assert sorted(bench.gateway.take_misfits()) == [(0, 0x101700), (0, 0x210001)]
+    assert sorted(bench.gateway.take_rejected_parameters()) == [(0, 0x101700), (0, 0x210001)]
 
 
 def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:

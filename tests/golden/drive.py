@@ -149,7 +149,7 @@ class Drive:
             found.append(f"store {esc + 1} {json.dumps(content, sort_keys=True)}")
         found += [
             f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}"
-            for esc, key in gateway.take_misfits()
+            for esc, key in gateway.take_rejected_parameters()
         ]
         for conflict in gateway.take_conflicts():
             found.append(

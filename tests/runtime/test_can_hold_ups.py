@@ -65,7 +65,8 @@ class Bench:
 
     @property
     def state(self) -> NmtState:
-        return self.loop.gateway.node_states()[0][1]
+        state: NmtState = self.loop.gateway.node_states()[0][1]
+        return state
 
 
 @pytest.fixture
