@@ -36,7 +36,7 @@ _SHOWN = (
     *((at.INFO, sub) for sub in (6, 7)),
     *((at.NODE_ID, sub) for sub in (1, 3, 4)),
 )
-"""What the node itself shows: nobody can write it."""
+"""What the node itself shows: it cannot be written."""
 _SERVER = {1: SDO_REQUEST, 2: SDO_ANSWER}
 
 

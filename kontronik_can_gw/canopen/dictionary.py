@@ -16,8 +16,8 @@ Value = int | float | bytes
 Read = Callable[[int], Value]
 """``now`` to value. Raises SdoAbort where there is none."""
 
-_LONGEST_TEXT = 255
-_LONGEST_DOMAIN = 0x10000
+_MAX_TEXT = 255
+_MAX_DOMAIN = 0x10000
 
 
 def key(index: int, sub: int) -> int:
@@ -158,7 +158,7 @@ class Dictionary:
         return variable.encode(self.value(variable, now))
 
     def check_download(self, index: int, sub: int, size: int | None) -> None:
-        """Whether so many bytes may be written there, before any is moved."""
+        """Whether ``size`` bytes may be written there, before any is moved (CiA 301, 7.2.4.3.17: the abort code says why not)."""
         variable = self.find(index, sub)
         if self.read_only:
             raise SdoAbort(Abort.DEVICE_STATE)
@@ -172,7 +172,7 @@ class Dictionary:
         variable = self.find(index, sub)
         if variable.size is not None:
             return variable.size
-        return _LONGEST_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _LONGEST_TEXT
+        return _MAX_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _MAX_TEXT
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
         """Write. False where the confirmation comes later."""
@@ -234,7 +234,7 @@ class Dictionary:
 
 
 def _check_size(variable: Variable, size: int) -> None:
-    most = _LONGEST_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _LONGEST_TEXT
+    most = _MAX_DOMAIN if variable.entry.data_type == DOMAIN_TYPE else _MAX_TEXT
     least = 0
     if variable.size is not None:
         least = most = variable.size

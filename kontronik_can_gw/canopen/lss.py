@@ -12,7 +12,7 @@ Where independent stacks (CANopenNode, Lely) disagree, the stricter reading hold
   take part in a fastscan).
 - A fastscan begins with BitChecked = 80h (both stacks would also begin without), with LSSSub and LSSNext in 0..3.
 - A fastscan that has not come to its end is forgotten when the slave leaves the waiting state.
-- "Inquire node-ID" tells the active node-ID (Lely: the pending one while initialising).
+- "Inquire node-ID" answers with the active node-ID (Lely: the pending one while initialising).
 
 All agree, and so does the table of services by state in CiA 305: in configuration state a slave ignores "switch state selective", also that
 of another slave; only "switch state global" brings it back to waiting.

@@ -124,6 +124,8 @@ class _Run:
         from kontronik_can_gw.runtime.store import ParameterStore
 
         loaded = load_all(self._file, ParameterStore)
+        if loaded.canopen is not None:
+            gc.collect()  # the nodes that were built to be checked leave their memory to those that run
         config = loaded.config
         need_descriptors(2 * len(config.esc))
         wait = self._wait or config.run.wait_for_devices

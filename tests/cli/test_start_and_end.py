@@ -62,7 +62,7 @@ def folder(tmp_path: Path) -> Path:
         ("kontronik_can_gw.cli.check", ["check", "-c", "gateway.toml"]),
         ("kontronik_can_gw.config.keys", ["check", "-c", "gateway.toml"]),
         ("cantools.database", ["check", "-c", "gateway.toml"]),
-        ("canopen.objectdictionary.eds", ["eds"]),
+        ("kontronik_can_gw.canopen.eds", ["eds"]),
         ("kontronik_can_gw.cli.run", ["run", "-c", "gateway.toml"]),
     ],
 )
