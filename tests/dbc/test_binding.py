@@ -356,14 +356,14 @@ def test_a_value_that_equals_the_code_for_not_available_is_sent_as_error(code: i
 def test_each_page_has_its_own_constants_beside_those_of_every_frame() -> None:
     signals = [
         Sig("Page", 0, 8, mux="M"),
-        Sig("A", 8, 8, mux="m1"),
+        Sig("A", 8, 8, mux="m0"),
         Sig("B", 8, 8, mux="m6"),
         Sig("C", 20, 4),
         Sig("AliveCounter", 16, 4),
     ]
     layout = layout_of([Msg("M", 0x100, 3, signals)], {"A": 0x51, "B": 0x92, "C": 7})
     gateway = Gateway([EscSettings("esc1", 7)], layout, 0)
-    for page, constant in ((1, 0x51), (6, 0x92)):
+    for page, constant in ((0, 0x51), (6, 0x92)):
         bits = gateway.message_bits(0, 50 * MS, page)
         assert bits.to_bytes(3, "little") == bytes((page, constant, 0x70))
 
