@@ -310,6 +310,15 @@ def test_an_enumeration_in_a_float_keeps_its_table() -> None:
 
 
 @pytest.mark.parametrize(
+    ("maximum", "sent"), [("1", False), ("44.4", False), ("44.5", True), ("0", True)]
+)
+def test_a_float_beyond_its_limits_is_sent_as_nan(maximum: str, sent: bool) -> None:
+    signal = Sig("BatteryVoltage", 0, 32, signed=True, is_float=True, unit="V", maximum=maximum)
+    (number,) = struct.unpack("<f", (raw_of(signal) % (1 << 32)).to_bytes(4, "little"))
+    assert number == pytest.approx(44.42) if sent else number != number
+
+
+@pytest.mark.parametrize(
     "text", ["NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"]
 )
 def test_not_available_is_known_by_its_usual_names(text: str) -> None:

@@ -500,6 +500,7 @@ START = 'BA_DEF_ SG_ "GenSigStartValue" INT 0 1;\nBA_DEF_DEF_ "GenSigStartValue"
         (FLAG, 1, 1),
         (FLAG + START, None, 0),  # a default says nothing of this flag
         (FLAG + START + 'BA_ "GenSigStartValue" SG_ 256 Undervoltage 1;\n', None, 1),
+        (FLAG + START + 'BA_ "GenSigStartValue" SG_ 256 Undervoltage 2;\n', None, 0),
         (FLAG + START + 'BA_ "GenSigStartValue" SG_ 256 Undervoltage 1;\n', 0, 0),
         (FLAG + START + 'BA_ "GenSigStartValue" SG_ 256 Undervoltage 0;\n', 1, 1),
         (FLAG + 'VAL_ 256 Undervoltage 1 "NotAvailable" ;\n', None, 1),

@@ -74,7 +74,7 @@ def version(length: int = 8, **more: Any) -> Sig:
 
 
 REFUSED: list[tuple[list[Sig], list[str]]] = [
-    ([Sig("BattVoltage", 0, 16, unit="V")], ["my_car.dbc: Power.BattVoltage: no such source", "battery_voltage", "[dbc.bind]"]),
+    ([Sig("BattVoltage", 0, 16, unit="V")], ["my_car.dbc: Power.BattVoltage: no such source.", "battery_voltage", "[dbc.bind]"]),
     *(([volts(unit=u)], ["Power.BatteryVoltage", f"'{u}'", "mV", "kV"]) for u in ("A", "degC", "%", "furlong")),
     ([Sig("CellCount", 0, 8, unit="V")], ["Power.CellCount", "'V'", "no unit"]),
     ([VOLTAGE, Sig("BatteryCurrent", 15, 16, signed=True, unit="A")], ["Power.", "BatteryVoltage", "BatteryCurrent", "overlap"]),
