@@ -53,6 +53,30 @@ def test_all_pdos_that_a_uart_frame_causes_carry_that_frame() -> None:
     assert sent == [(0x81 + 0x100 * number, speed) for speed in speeds for number in numbers]
 
 
+def test_the_live_counter_begins_again_at_0_after_255() -> None:
+    maps_live_counter = tpdo(1, 254, 0, 0, 0x20200208)
+    bench = Bench(changes={**QUIET, **maps_live_counter}).start()
+    for number in range(1, 520):
+        bench.wait(10)
+        bench.uart(live(electrical_speed=number))
+        assert [frame.data for frame in bench.take()] == [bytes((number % 256,))]
+        assert bench.number(0x2020, 2) == number % 256
+
+
+@pytest.mark.parametrize(("threshold", "link_status"), [(3, 3), (4, 2)])
+def test_2100h_8_is_how_many_crc_errors_in_a_second_make_a_link_degraded(
+    threshold: int, link_status: int
+) -> None:
+    bench = Bench(changes=QUIET)
+    assert bench.write(0x2100, 8, threshold, size=2) is None
+    for number in range(150):
+        bench.wait(10)
+        bench.uart(live())
+        if number in (20, 40, 60):
+            bench.uart(live()[:-1] + b"\xff")
+    assert bench.number(0x2020, 1) == link_status
+
+
 def test_a_restricted_cob_id_is_refused_and_every_other_accepted() -> None:
     bench = Bench(changes={**QUIET, **SPARE})
     reserved = {

@@ -310,6 +310,15 @@ def test_an_enumeration_in_a_float_keeps_its_table() -> None:
 
 
 @pytest.mark.parametrize(
+    ("maximum", "sent"), [("1", False), ("44.4", False), ("44.5", True), ("0", True)]
+)
+def test_a_float_beyond_its_limits_is_sent_as_nan(maximum: str, sent: bool) -> None:
+    signal = Sig("BatteryVoltage", 0, 32, signed=True, is_float=True, unit="V", maximum=maximum)
+    (number,) = struct.unpack("<f", (raw_of(signal) % (1 << 32)).to_bytes(4, "little"))
+    assert number == pytest.approx(44.42) if sent else number != number
+
+
+@pytest.mark.parametrize(
     "text", ["NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"]
 )
 def test_not_available_is_known_by_its_usual_names(text: str) -> None:
@@ -341,6 +350,31 @@ def test_not_available_is_the_value_table_else_the_start_value_else_the_end_of_t
     signal: Sig, raw: int
 ) -> None:
     assert raw_of(signal) == raw
+
+
+@pytest.mark.parametrize("code", [0, 4442, 65534])
+def test_a_value_that_equals_the_code_for_not_available_is_sent_as_error(code: int) -> None:
+    signal = Sig("BatteryVoltage", 0, 16, unit="V", factor="0.01", texts={65535: "Error"})
+    signal.start_value = code
+    for number in (code, code - 1, code + 1):
+        if 0 <= number < 65535:
+            raw = raw_of(signal, live=LIVE._replace(battery_voltage=number))
+            assert raw == (65535 if number == code else number)
+
+
+def test_each_page_has_its_own_constants_beside_those_of_every_frame() -> None:
+    signals = [
+        Sig("Page", 0, 8, mux="M"),
+        Sig("A", 8, 8, mux="m0"),
+        Sig("B", 8, 8, mux="m6"),
+        Sig("C", 20, 4),
+        Sig("AliveCounter", 16, 4),
+    ]
+    layout = layout_of([Msg("M", 0x100, 3, signals)], {"A": 0x51, "B": 0x92, "C": 7})
+    gateway = Gateway([EscSettings("esc1", 7)], layout, 0)
+    for page, constant in ((0, 0x51), (6, 0x92)):
+        bits = gateway.message_bits(0, 50 * MS, page)
+        assert bits.to_bytes(3, "little") == bytes((page, constant, 0x70))
 
 
 # --- several ESCs in one message ----------------------------------------------------------------------------------------

@@ -316,6 +316,31 @@ def test_a_start_value_that_the_signal_cannot_hold_is_refused(value: str) -> Non
     assert "Motor_11.Motor_11X" in line and f"GenSigStartValue {value}" in line
 
 
+@pytest.mark.parametrize(
+    ("place", "fits", "beyond"),
+    [
+        ("0|8@1+", (0, 255), (-1, 256)),
+        ("0|8@1-", (-128, 127), (-129, 128)),
+        ("0|1@1-", (-1, 0), (-2, 1)),
+        ("7|12@0-", (-2048, 2047), (-2049, 2048)),
+    ],
+)
+def test_a_start_value_may_be_every_number_that_the_signal_holds(
+    place: str, fits: tuple[int, int], beyond: tuple[int, int]
+) -> None:
+    text = f'{MESSAGE} SG_ Foo : {place} (1,0) [0|0] "" Other\nBA_DEF_ SG_ "GenSigStartValue" INT 0 0;\n'
+    for value in fits:
+        own = f'BA_ "GenSigStartValue" SG_ 256 Foo {value};\n'
+        (plan,) = compiled(text + own, unbound="start_value").messages
+        gateway = Gateway([EscSettings("esc1", 7)], Layout("", "", ()), 0)
+        data = compile_pack(plan)(gateway.escs, gateway.status, 0, 0, 0).to_bytes(8, "little")
+        theirs = parse_database((HEAD + text).encode(), "my.dbc").messages[0]
+        assert theirs.decode_simple(data) == {"Foo": value}
+    for value in beyond:
+        own = f'BA_ "GenSigStartValue" SG_ 256 Foo {value};\n'
+        assert len(refused(text + own, unbound="start_value")) == 1
+
+
 def test_a_wrong_binding_is_refused_whatever_becomes_of_signals_without_one() -> None:
     (line,) = refused(
         ECU,
@@ -475,6 +500,7 @@ START = 'BA_DEF_ SG_ "GenSigStartValue" INT 0 1;\nBA_DEF_DEF_ "GenSigStartValue"
         (FLAG, 1, 1),
         (FLAG + START, None, 0),  # a default says nothing of this flag
         (FLAG + START + 'BA_ "GenSigStartValue" SG_ 256 Undervoltage 1;\n', None, 1),
+        (FLAG + START + 'BA_ "GenSigStartValue" SG_ 256 Undervoltage 2;\n', None, 0),
         (FLAG + START + 'BA_ "GenSigStartValue" SG_ 256 Undervoltage 1;\n', 0, 0),
         (FLAG + START + 'BA_ "GenSigStartValue" SG_ 256 Undervoltage 0;\n', 1, 1),
         (FLAG + 'VAL_ 256 Undervoltage 1 "NotAvailable" ;\n', None, 1),
@@ -500,6 +526,12 @@ def test_a_flag_without_a_code_is_0_without_telemetry_or_what_is_asked_for(
         assert pack(gateway.escs, gateway.status, 50 * MS, 0, 0) == value % (
             1 << plan.signals[0].length
         )
+
+
+PERCENT = ' SG_ Throttle : 32|32@1- (1,0) [0|100] "%" Other\nSIG_VALTYPE_ 256 Throttle : 1;\n'
+STATES = (
+    ' SG_ OperatingState : 8|8@1+ (1,0) [0|0] "" Other\nVAL_ 256 OperatingState 7 "MotorOff" ;\n'
+)
 
 
 def test_a_bit_that_cannot_hold_both_values_of_a_flag_is_refused() -> None:
@@ -529,6 +561,17 @@ def test_a_bit_that_cannot_hold_both_values_of_a_flag_is_refused() -> None:
             "Throttle",
         ),
         (' SG_ MessageAlive : 8|8@1+ (1,0) [0|0] "" Other\n', None),
+        (PERCENT + 'VAL_ 256 Throttle 101 "NotAvailable" ;\n', "Throttle"),
+        (PERCENT + 'VAL_ 256 Throttle -1 "NotAvailable" ;\n', "Throttle"),
+        # codes amid the values
+        (PERCENT + 'VAL_ 256 Throttle 100 "NotAvailable" ;\n', None),
+        (PERCENT + 'VAL_ 256 Throttle 0 "NotAvailable" ;\n', None),
+        (STATES, "OperatingState"),
+        (
+            STATES
+            + 'BA_DEF_ SG_ "GenSigStartValue" INT 0 0;\nBA_ "GenSigStartValue" SG_ 256 OperatingState 7;\n',
+            None,
+        ),
     ],
 )
 def test_check_names_the_signal_that_reports_the_loss_and_warns_where_there_is_none(

@@ -439,6 +439,8 @@ def test_names_of_more_than_32_characters_are_refused() -> None:
         words in line
         for words in ("abcdefg", "longer than 32", "LimitBatteryVoltageMinimum", "at most 6")
     )
+    both = refused(text, [EscSettings("abcdef"), EscSettings("ghijklm")])
+    assert "ghijklm" in both and "abcdef" not in both
 
 
 def test_two_messages_that_would_get_one_name_are_refused() -> None:

@@ -74,12 +74,13 @@ def version(length: int = 8, **more: Any) -> Sig:
 
 
 REFUSED: list[tuple[list[Sig], list[str]]] = [
-    ([Sig("BattVoltage", 0, 16, unit="V")], ["my_car.dbc: Power.BattVoltage: no such source", "battery_voltage", "[dbc.bind]"]),
+    ([Sig("BattVoltage", 0, 16, unit="V")], ["my_car.dbc: Power.BattVoltage: no such source.", "battery_voltage", "[dbc.bind]"]),
     *(([volts(unit=u)], ["Power.BatteryVoltage", f"'{u}'", "mV", "kV"]) for u in ("A", "degC", "%", "furlong")),
     ([Sig("CellCount", 0, 8, unit="V")], ["Power.CellCount", "'V'", "no unit"]),
     ([VOLTAGE, Sig("BatteryCurrent", 15, 16, signed=True, unit="A")], ["Power.", "BatteryVoltage", "BatteryCurrent", "overlap"]),
     *(([volts(*place)], ["Power.BatteryVoltage", "outside", "8 bytes"]) for place in (
         (56,), (63,), (56, 16, False), (64,), (300, 16, False))),
+    *(([volts(), Sig("BatteryCurrent", 0, n, signed=True, unit="A")], ["Power.BatteryCurrent", "outside"]) for n in (65, 80)),
     ([volts(factor="0")], ["Power.BatteryVoltage", "factor 0"]),
     *(([volts(**{k: v})], ["Power.BatteryVoltage", "finite"]) for k, v in (
         ("factor", "1e400"), ("offset", "-1e400"), ("maximum", "1e999"))),
@@ -158,6 +159,8 @@ def test_suggestions_go_without_prefix_and_without_likeness_there_is_none(tmp_pa
         "LeftBatteryVoltag: no such source",
         "battery_voltage",
     )
+    (line,) = mistakes(tmp_path, one(Sig("TestOvervoltag", 0, 1)))
+    assert "Did you mean test_overvoltage or " in line and line.partition("?")[0].count(" or ") == 2
     (line,) = mistakes(tmp_path, one(Sig("Qqq", 0, 16)))
     assert "Did you mean" not in line
     lines = mistakes(tmp_path, one(Sig("U", 0, 16)), DbcSettings({"U": "batery_voltage"}))

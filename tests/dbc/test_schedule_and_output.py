@@ -276,6 +276,18 @@ def test_frames_of_a_message_are_never_closer_than_its_minimum_distance() -> Non
         assert all(b - a >= 15 * MS for a, b in pairwise(times)), kind
 
 
+def test_what_has_to_wait_of_one_message_is_no_news_for_another() -> None:
+    """A change that is taken back before it may go is not sent, whatever else there is."""
+    kinds = ((CYCLIC, 10_000), (ON_CHANGE, 0), (ON_CHANGE, 0))
+    messages = [Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]) for n in range(3)]
+    bench = Bench([(m, *kind, 25) for m, kind in zip(messages, kinds, strict=True)])
+    for number in (1, 2, 1):
+        bench.until(bench.now + 10 * MS)
+        bench.live(volts(number))
+    bench.until(200 * MS)
+    assert [(when // MS, frame.can_id) for when, frame in bench.sent] == [(10, 0x101), (10, 0x102)]
+
+
 # --- on change ----------------------------------------------------------------------------------------------------------
 
 
@@ -446,7 +458,7 @@ def test_info_of_another_device_is_gone_with_the_telemetry() -> None:
 
 @pytest.mark.parametrize(
     ("length", "maximum", "modulus"),
-    [(4, "0", 16), (4, "14", 15), (8, "0", 256), (2, "0", 4), (3, "5", 6)],
+    [(4, "0", 16), (4, "14", 15), (8, "0", 256), (2, "0", 4), (2, "2", 3), (3, "5", 6)],
 )
 def test_the_alive_counter_goes_up_by_one_with_each_frame_and_wraps(
     length: int, maximum: str, modulus: int
@@ -524,6 +536,23 @@ def test_of_multiplexed_pages_sent_on_change_the_changed_one_goes() -> None:
     bench.until(bench.now + 10 * MS)
     bench.live(LIVE._replace(bec_temperature=99, throttle=1))
     assert bench.raws(8) == [9, 5]
+
+
+def test_a_cycle_adds_its_page_to_a_changed_one_that_had_to_wait() -> None:
+    signals = [
+        Sig("Page", 0, 8, mux="M"),
+        Sig("BatteryVoltage", 8, 16, mux="m1", factor="0.01"),
+        Sig("Throttle", 8, 16, signed=True, mux="m2"),
+    ]
+    bench = Bench([(Msg("EscPaged", 0x100, 8, signals), CYCLIC_AND_ON_CHANGE, 100, 30)])
+    for at, throttle in ((130, 0), (190, 5), (210, 6)):
+        bench.until(at * MS)
+        bench.live(volts(1)._replace(throttle=throttle))
+    bench.until(290 * MS)
+    sent = list(zip(bench.times(), bench.raws(8), bench.raws(16, 8), strict=True))
+    assert sent == [
+        (0, 1, 0xFFFF), (100, 2, 0x8000), (130, 1, 1), (160, 2, 0), (190, 2, 5), (220, 2, 6), (250, 1, 1),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("length", "modulus"), [(4, 15), (5, 15), (8, 15)])
@@ -658,6 +687,24 @@ def test_the_last_word_ignores_the_minimum_distance() -> None:
     bench.gateway.stop(2 * MS)
     bench.take()
     assert [tuple(frame.data[:2]) for _, frame in bench.sent] == [(2, 4)]
+
+
+def test_the_last_word_is_every_page_that_changed_without_regard_to_the_minimum_distance() -> None:
+    signals = [
+        Sig("Page", 0, 8, mux="M"),
+        Sig("GatewayState", 8, 8, mux="m1"),
+        Sig("CanState", 8, 8, mux="m2"),
+        Sig("EscCount", 8, 8, mux="m3"),
+    ]
+    bench = Bench([(Msg("Health", 0x300, 8, signals), ON_CHANGE, 0, 400)], start=True)
+    bench.until(1100 * MS)
+    bench.gateway.set_can_state(CanState.BUS_OFF, bench.now)
+    bench.now = 1150 * MS
+    bench.gateway.stop(bench.now)
+    bench.take()
+    sent = [(when // MS, frame.data[0], frame.data[1]) for when, frame in bench.sent]
+    assert sent[:3] == [(0, 1, 1), (400, 2, 0), (800, 3, 1)]
+    assert sorted(sent[3:]) == [(1150, 1, 2), (1150, 2, 4)]
 
 
 def test_messages_without_a_cycle_are_sent_once_at_the_start() -> None:

@@ -3,6 +3,7 @@
 import binascii
 import random
 import struct
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -235,6 +236,15 @@ def test_a_value_that_does_not_fit_is_refused_by_the_name_of_its_field(row: Form
                 ValueError, match=f"^{field.name}: {value} is outside {low}\\.\\.{high}$"
             ):
                 encode(data_type(**{field.name: value}), Layout(row.layout))
+
+
+@form_rows
+def test_a_value_that_is_no_whole_number_makes_no_frame(row: FormRow) -> None:
+    data_type: DataType = LiveData if row.kind == "live" else InfoData
+    for field in fields_of(row.kind):
+        wrong: Any = 1.5
+        with pytest.raises(struct.error):
+            encode(data_type(**{field.name: wrong}), Layout(row.layout))
 
 
 @form_rows

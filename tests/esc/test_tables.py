@@ -139,6 +139,12 @@ def test_an_error_bit_means_what_the_sheet_says(names: type[ErrorBit], bit: Bit)
         assert bit_of(names, bit.number).severity.value == bit.severity
 
 
+def test_every_error_bit_has_a_remedy_that_is_not_its_meaning() -> None:
+    for bit in (*OperatingError, *SelfTestError):
+        assert bit.remedy.endswith("."), bit
+        assert bit.remedy != bit.meaning
+
+
 def test_the_text_of_a_bit_is_unique_over_both_words() -> None:
     texts = [bit.text for names in (OperatingError, SelfTestError) for bit in names]
     assert len(set(texts)) == 24 + 19

@@ -74,6 +74,7 @@ def test_random_frames_of_random_layouts_read_as_cantools_reads_them(seed: int) 
                 for first, values in reader.read(key, bytes(data)) or ()
                 for n, value in enumerate(values)
             }
+            assert set(got) == {s.name for s in message.page_of(page) if s is not selector}
             raws = theirs.decode(bytes(data), decode_choices=False, scaling=False)
             assert isinstance(raws, dict)
             lost_flags = {name for name, value in got.items() if value is None}
