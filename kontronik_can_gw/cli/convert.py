@@ -45,6 +45,8 @@ does not. - is standard output, for text, and through a pipe for bin. Parquet ne
 where they are missing.
 
 Tables have a row at each telemetry frame, or at each group of CAN frames that belong together. Values hold while they are fresh.
+Columns are values by name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]): of captures and bytes all of them in full
+resolution, of CAN logs those that the DBC has.
 Time [s] counts from the recording's first row, with --frames from its first frame; Utc is there where the recording knows
 the time of day. What is not available is empty in CSV, null in JSON lines and Parquet, NaN or NotAvailable in MF4.
 Flags are 0 and 1.
@@ -234,14 +236,15 @@ def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Con
         LogConversion,
         TableConversion,
     )
-    from kontronik_can_gw.desk.recordings.tables import Choice
+    from kontronik_can_gw.desk.recordings.tables import Choice, fields_of_frames
 
     if form == BYTES:
         return BytesConversion(_esc(args, recording, needed=True) or 0)
     if form in LOGS:
         return LogConversion(LOGS[form], args.start, args.end)
     times = {"start_ns": args.start, "end_ns": args.end, "rate": args.rate}
-    choice = Choice.of(recording.reader.columns, args.signals, _esc(args, recording), **times)
+    fields = fields_of_frames(recording) if args.frames else recording.fields
+    choice = Choice.of(fields, args.signals, _esc(args, recording), **times)
     return TableConversion(form, choice, args.frames, args.units_line)
 
 

@@ -45,7 +45,7 @@ def main() -> None:
     with DumpInput(args.source, layout) as recording:
         conversion: Conversion = LogConversion(args.form)
         if args.form in TABLES:
-            conversion = TableConversion(args.form, Choice.of(recording.reader.columns))
+            conversion = TableConversion(args.form, Choice.of(recording.fields))
         cpu, wall = time.process_time(), time.perf_counter()
         with Output(args.target, args.form) as out:
             told = conversion(recording, out, lambda position: None)

@@ -100,8 +100,8 @@ class TableConversion:
                     reached(recording.position)
             reached(recording.position)
         out.is_whole = True
-        signals = len(self.choice.columns)
-        return f"{_many(count, 'row')} of {_many(signals, 'signal')}, up to {last_ns / 1e9:.3f} s"
+        columns = _many(len(self.choice.columns), "signal" if self.by_frame else "value")
+        return f"{_many(count, 'row')} of {columns}, up to {last_ns / 1e9:.3f} s"
 
 
 @dataclass(frozen=True)

@@ -30,14 +30,29 @@ from kontronik_can_gw.capture.replay import Replay, TimedFrame, follow_bytes
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc.compiler import DbcSettings
-from kontronik_can_gw.desk.recordings.can_logs import NAMES, SUFFIXES, CanLog, log_format
+from kontronik_can_gw.desk.recordings.can_logs import (
+    NAMES,
+    SUFFIXES,
+    UART_MAGIC,
+    CanLog,
+    log_format,
+)
+from kontronik_can_gw.desk.recordings.columns import Section, fields_of_values, sections
+from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.more_escs import more_escs
-from kontronik_can_gw.desk.recordings.samples import Sample, SampledGateway, samples_of_frames
+from kontronik_can_gw.desk.recordings.samples import (
+    FoundTelemetry,
+    Sample,
+    SampledGateway,
+    fields_of_log,
+    samples_of_bytes,
+    samples_of_frames,
+)
 from kontronik_can_gw.desk.recordings.spool import is_stream, spooled
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.kontronik.codec import Kind as FrameKind
-from kontronik_can_gw.esc.kontronik.deframer import Deframer
+from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import SignalReader
@@ -50,6 +65,8 @@ _LOOK_FOR_HEADER = 1 << 25
 _MAX_DAMAGE = 50
 _LATEST_NS = 1 << 62
 _MAX_WAITING = 1 << 16
+_UNDECIDED = len(UART_MAGIC) - 1
+"""Bytes at the end of a read that may begin a header."""
 _LONGEST_FRAME = 64
 _MAX_IDS = 4096
 
@@ -73,13 +90,17 @@ class Input(Protocol):
 
     @property
     def reader(self) -> SignalReader:
-        """Reads frames of ``bus``; its columns are those of the samples."""
+        """Reads frames of ``bus``."""
+
+    @property
+    def fields(self) -> Sequence[Field]:
+        """The columns of the samples: values by name."""
 
     def frames(self) -> Iterator[TimedFrame]:
         """The CAN frames that were sent (or would have been) and received."""
 
-    def samples(self) -> Iterator[Sample]:
-        """Rows of all values."""
+    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        """Rows of the values of ``chosen`` fields, in that order; None: of all."""
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         """The UART bytes of one ESC. UserError where the recording has none."""
@@ -114,6 +135,13 @@ class _Base:
     @cached_property
     def reader(self) -> SignalReader:
         return SignalReader(self.bus.layout)
+
+    @cached_property
+    def fields(self) -> Sequence[Field]:
+        return fields_of_values(self.bus.escs)
+
+    def _sections(self, chosen: Sequence[int] | None) -> list[Section]:
+        return sections(self.fields, range(len(self.fields)) if chosen is None else chosen)
 
     def close(self) -> None:
         pass
@@ -241,13 +269,18 @@ class CaptureInput(_Base):
         yield from replay.follow(self.entries())
         self._tell(replay)
 
-    def samples(self) -> Iterator[Sample]:
-        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, self._created_ns)
+    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        # who shows it tells names, pole pairs and gears
+        escs = [
+            replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
+            for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
+        ]
+        gateway = SampledGateway(self.setup, escs, self._sections(chosen), self._created_ns)
         replay = Replay(gateway, self.header.get("state"))
         for entry in self.entries():
             replay.play(entry)
-            yield from gateway.take_rows()
-        yield from gateway.finish()
+            yield from gateway.maker.take_rows()
+        yield from gateway.maker.finish()
         self._tell(replay)
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
@@ -444,12 +477,9 @@ class DumpInput(_Base):
     def frames(self) -> Iterator[TimedFrame]:
         yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self.chunks())
 
-    def samples(self) -> Iterator[Sample]:
-        gateway = SampledGateway(self.setup, self.bus.layout, self.reader, 0, frames_count=False)
-        for now, data in self.chunks():
-            gateway.play(now, data)
-            yield from gateway.take_rows()
-        yield from gateway.finish()
+    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        esc = FoundTelemetry(self.setup.escs[0], 0)
+        yield from samples_of_bytes(esc, self._found(esc), self._sections(chosen))
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         if esc:
@@ -474,7 +504,7 @@ class DumpInput(_Base):
         self.damage = []
         deframer = Deframer()
         waiting, at = bytearray(), 0
-        now, lives = 0, 0
+        now, clock = 0, _Clock(self._period_ns)
         for data in chain(self._read(), (None,)):
             if data is not None:
                 waiting += data
@@ -486,24 +516,58 @@ class DumpInput(_Base):
                     del waiting[:gone]
                     at += gone
             for frame in deframer.feed(data) if data is not None else deframer.flush():
-                if frame.kind is FrameKind.LIVE:
-                    now = lives * self._period_ns
-                    lives += 1
-                else:
-                    now = max(now, lives * self._period_ns - self._period_ns // 2)
+                now = clock.time_of(frame)
                 end = frame.offset + frame.form.length - at
                 yield now, bytes(waiting[:end])
                 del waiting[:end]
                 at += end
         if waiting:
             yield now, bytes(waiting)
-        counters = deframer.counters
+        self._tell(deframer.counters)
+
+    def _found(self, esc: FoundTelemetry) -> Iterator[tuple[int, Frame]]:
+        """Each frame and its time. ``esc`` is given the bytes up to the next header with it, so that its counters are of that time."""
+        self.damage = []
+        clock = _Clock(self._period_ns)
+        rest = b""
+        for data in chain(self._read(), (b"",)):
+            first, *others = (rest + data).split(UART_MAGIC)
+            pieces = [first, *(UART_MAGIC + other for other in others)]
+            if data:
+                rest = pieces[-1][-_UNDECIDED:]
+                pieces[-1] = pieces[-1][:-_UNDECIDED]
+            for piece in filter(None, pieces):
+                for frame in esc.find(piece):
+                    yield clock.time_of(frame), frame
+        for frame in esc.find(b""):
+            yield clock.time_of(frame), frame
+        self._tell(esc.counters)
+
+    def _tell(self, counters: Counters) -> None:
         if counters.dropped_bytes:
             self.damage.append(
                 f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
             )
-        if not lives:
+        if not counters.live:
             self.damage.append(counters.diagnosis() or "no live frame")
+
+
+class _Clock:
+    """The assumed times of frames: a live frame each period, an info frame half a period after it."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._now = self._lives = 0
+
+    def time_of(self, frame: Frame) -> int:
+        """The time of the next frame."""
+        next_live = self._lives * self._period_ns
+        if frame.kind is FrameKind.LIVE:
+            self._now = next_live
+            self._lives += 1
+        else:
+            self._now = max(self._now, next_live - self._period_ns // 2)
+        return self._now
 
 
 class CanLogInput(_Base):
@@ -539,8 +603,13 @@ class CanLogInput(_Base):
         if note := more_escs(self.bus, seen, others):
             self.notes.append(note)
 
-    def samples(self) -> Iterator[Sample]:
-        yield from samples_of_frames(self.frames(), self.reader)
+    @cached_property
+    def fields(self) -> Sequence[Field]:
+        return fields_of_log(self.reader, self.bus.escs)
+
+    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        columns = range(len(self.fields)) if chosen is None else chosen
+        yield from samples_of_frames(self.frames(), self.reader, columns)
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")

@@ -1,13 +1,16 @@
 """Tables as Parquet by pyarrow (an extra): typed columns, units and provenance in the metadata."""
 
 import json
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.desk.recordings.tables.fields import TIME, UTC, Field, Kind, Table
+from kontronik_can_gw.desk.recordings.columns import Values
+from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.signals.unpacker import Value
 
 ROWS = 16_384
 """Rows that gather as such."""
@@ -29,7 +32,7 @@ class ParquetTable:
         self._pa: Any = pa
         self._table = table
         # the same text may stand for several numbers
-        self._codes = [
+        self._codes: list[dict[Value, int]] = [
             {text: code for code, text in enumerate(dict.fromkeys(text for _, text in one.texts))}
             for one in table.fields
         ]
@@ -82,26 +85,42 @@ class ParquetTable:
         if not self._rows:
             return
         pa = self._pa
-        times, walls, values = zip(*self._rows, strict=True)
+        times, walls, rows = zip(*self._rows, strict=True)
         arrays = [pa.array([time_ns / SECOND_NS for time_ns in times], pa.float64())]
         if self._table.has_utc:
             in_range = [_in_range(wall_ns) for wall_ns in walls]
             arrays.append(pa.array(in_range, pa.int64()).cast(pa.timestamp("ns", tz="UTC")))
-        columns = zip(*values, strict=True)
-        for one, codes, column in zip(self._table.fields, self._codes, columns, strict=True):
-            if one.kind is Kind.TEXT:
-                indices = pa.array([codes.get(value) for value in column], pa.int32())
-                arrays.append(
-                    pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string()))
-                )
-            else:
-                arrays.append(pa.array(column, self._type(one)))
+        for part, values in zip(self._table.parts(), zip(*rows, strict=True), strict=True):
+            arrays += self._columns(part, values)
         self._rows = []
         batch = pa.RecordBatch.from_arrays(arrays, schema=self._schema)
         self._batches.append(batch)
         self._held += batch.num_rows
         if self._held >= GROUP:
             self._write_group()
+
+    def _columns(self, part: range, rows: Sequence[Values | None]) -> list[Any]:
+        """The columns of one part of all rows. Rows that have one object in common are made once and repeated."""
+        pa = self._pa
+        once = {id(values): values for values in rows}
+        repeated = len(once) * 2 < len(rows)
+        nothing = (None,) * len(part)
+        found = once.values() if repeated else rows
+        columns = zip(*(nothing if values is None else values for values in found), strict=True)
+        arrays = [self._array(index, column) for index, column in zip(part, columns, strict=True)]
+        if not repeated:
+            return arrays
+        at = {key: place for place, key in enumerate(once)}
+        places = pa.array([at[id(values)] for values in rows], pa.int32())
+        return [array.take(places) for array in arrays]
+
+    def _array(self, index: int, column: Sequence[Value]) -> Any:
+        pa, one = self._pa, self._table.fields[index]
+        if one.kind is not Kind.TEXT:
+            return pa.array(column, self._type(one))
+        codes = self._codes[index]
+        indices = pa.array([codes.get(value) for value in column], pa.int32())
+        return pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string()))
 
     def _write_group(self) -> None:
         if self._batches:

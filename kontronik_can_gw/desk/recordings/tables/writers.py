@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Protocol
 
-from kontronik_can_gw.desk.recordings.tables.fields import Table
+from kontronik_can_gw.desk.recordings.fields import Table
 from kontronik_can_gw.desk.recordings.tables.rows import Row
 from kontronik_can_gw.desk.recordings.tables.text import CsvTable, JsonTable
 
