@@ -24,7 +24,7 @@ DECIMALS = 6
 """Of a quotient by pole pairs, gear, cells or hours."""
 LEFT_OUT = frozenset({"sent_frames"})
 """What only the frames themselves tell: they are not made for a table."""
-_MAX_KNOWN = 1 << 14
+_MAX_KNOWN = 1 << 13
 _ORDER = {Group.LIVE: 0, Group.LINK: 1, Group.INFO: 2, Group.GATEWAY: 3}
 _DRIVE = EscSettings(pole_pairs=7, gear=Fraction(3))
 """A drive train of odd numbers: where it makes a difference, it is in a value."""
@@ -56,15 +56,19 @@ def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
 
 
 def _field(source: Source, prefix: str, esc: int | None) -> Field:
-    kind = Kind.WHOLE if source.per_unit == 1 and source.whole else Kind.FLOAT
-    if source.names:
-        kind = Kind.TEXT
-    elif source.bit is not None:
-        kind = Kind.FLAG
     texts = tuple(sorted(source.names.items()))
     name = prefix + source.name
     high = math.inf if source.high is None else float(source.high / source.per_unit)
-    return Field(name, source.unit, kind, "", texts, source.name, esc, high)
+    return Field(name, source.unit, _kind(source), "", texts, source.name, esc, high)
+
+
+def _kind(source: Source) -> Kind:
+    if source.names:
+        return Kind.TEXT
+    if source.bit is not None:
+        return Kind.FLAG
+    by_drive = _depends_on_drive(source.name)
+    return Kind.WHOLE if source.per_unit == 1 and source.whole and not by_drive else Kind.FLOAT
 
 
 # --- reading
@@ -114,12 +118,12 @@ class Known(dict[Any, Any]):
         return made
 
 
-def _scaling(source: Source) -> Callable[[Any], Value]:
-    """From steps to the value in its unit, or its text."""
+def _scaling(source: Source) -> Callable[[Any], Value] | None:
+    """From steps to the value in its unit, or its text; None where the value is the steps."""
     if source.names:
         return source.names.get
-    if source.per_unit == 1 and source.whole:
-        return int
+    if _kind(source) is Kind.WHOLE or source.bit is not None:
+        return None
     top, bottom = source.per_unit.denominator, source.per_unit.numerator
     if 10**DECIMALS % bottom == 0 and source.whole:
         return lambda steps: steps * top / bottom
@@ -143,7 +147,7 @@ def _words(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]
     """What gives values that stand in a frame's fields as they are."""
     words = [_word(_listed()[name]) for name in names]
     take = itemgetter(*words, words[0])  # one more: of a single word it would be no tuple
-    scales = [Known(_scaling(_listed()[name])) for name in names]
+    scales = [Known(_scaling(_listed()[name]) or int) for name in names]
     nothing: Values = (None,) * len(names)
     data_of = attrgetter(attribute)
 
@@ -173,24 +177,25 @@ def _flags(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]
 def _derived(names: Sequence[str]) -> Callable[[Any, int], Values]:
     """What gives values of an ESC that are computed, by its pole pairs and gear as they are then."""
     known: EscSettings | None = None
-    readers = [reader(name) for name in names]
-    scales: list[Callable[[Any], Value]] = []
+    readers: list[tuple[Callable[[EscTelemetry, int], Steps], Callable[[Any], Value] | None]] = []
 
     def read(esc: EscTelemetry, now: int) -> Values:
-        nonlocal known, scales
+        nonlocal known, readers
         if esc.settings is not known:
             known = esc.settings
             listed = sources(known)
-            scales = [_scaling(listed[name]) for name in names]
-        found = [read(esc, now) for read in readers]
-        both = zip(found, scales, strict=True)
-        return tuple([None if steps is None else scale(steps) for steps, scale in both])
+            readers = [(reader(name), _scaling(listed[name])) for name in names]
+        values: list[Value] = []
+        for read, scale in readers:
+            steps = read(esc, now)
+            values.append(steps if steps is None or scale is None else scale(steps))
+        return tuple(values)
 
     return read
 
 
 def _of_gateway(names: Sequence[str]) -> Callable[[Any, int], Values]:
-    readers = [(gateway_reader(name), _scaling(_listed()[name])) for name in names]
+    readers = [(gateway_reader(name), _scaling(_listed()[name]) or int) for name in names]
     return lambda status, now: tuple([scale(read(status, now)) for read, scale in readers])
 
 

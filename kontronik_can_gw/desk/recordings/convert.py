@@ -4,8 +4,10 @@ A conversion is called with the recording, the output and what is to be told of 
 words; None where the recording has nothing of it, and then nothing was written.
 """
 
+import gc
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Protocol, Self
@@ -90,7 +92,7 @@ class TableConversion:
         if table is None:
             return None
         count, last_ns = 0, 0
-        with open_table(out.open(), self.form, table, self.units_line) as writer:
+        with open_table(out.open(), self.form, table, self.units_line) as writer, _settled():
             write = writer.write
             for row in rows:
                 write(row)
@@ -191,6 +193,16 @@ class BytesConversion:
             return None
         out.is_whole = True
         return f"{_many(count, 'byte')} of {recording.bus.escs[self.esc].name}"
+
+
+@contextmanager
+def _settled() -> Iterator[None]:
+    """What is there by now is not looked at by the garbage collector: rows that are held would make it look often."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _many(count: int, what: str) -> str:

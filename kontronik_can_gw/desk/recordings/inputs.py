@@ -562,7 +562,7 @@ class _Clock:
     def time_of(self, frame: Frame) -> int:
         """The time of the next frame."""
         next_live = self._lives * self._period_ns
-        if frame.kind is FrameKind.LIVE:
+        if frame.form.kind is FrameKind.LIVE:
             self._now = next_live
             self._lives += 1
         else:

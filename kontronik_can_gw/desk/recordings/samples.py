@@ -94,15 +94,15 @@ class RowMaker:
         """Something changed with an ESC."""
         if not events & (Event.LIVE | Event.LINK | Event.INFO):
             return
-        state = self._escs[esc]
-        when = now
+        state, when, row_ns = self._escs[esc], now, self._row_ns
         if events & Event.LIVE and state.live is not None and state.live_ns is not None:
             when = min(now, state.live_ns)  # of its last byte on the wire
-        when = max(when, self._last_ns)  # rows do not go back
-        if self._row_ns is not None:
-            when = max(when, self._row_ns)
+        begun = self._last_ns if row_ns is None else row_ns
+        if when < begun:  # rows do not go back
+            when = begun
+        if row_ns is not None:
             again = events & Event.LIVE and esc in self._in_row
-            if again or when - self._row_ns > SAME_ROW_NS:
+            if again or when - row_ns > SAME_ROW_NS:
                 self._close_row()
         parts = self._parts
         changed = self._by_esc if events & (Event.LINK | Event.INFO) else self._with_live
@@ -170,7 +170,8 @@ def samples_of_bytes(
             status.escs_ok = int(esc.up)
             due = 0
         maker.follow(0, events, now)
-        yield from maker.take_rows()
+        if maker.rows:
+            yield from maker.take_rows()
     yield from maker.finish()
 
 

@@ -12,8 +12,9 @@ from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.signals.unpacker import Value
 
-ROWS = 16_384
+ROWS = 4096
 """Rows that gather as such."""
+_LOOK = 64
 GROUP = 1 << 16
 """Rows of a row group, whose columns stay in memory until it is full."""
 
@@ -101,18 +102,15 @@ class ParquetTable:
 
     def _columns(self, part: range, rows: Sequence[Values | None]) -> list[Any]:
         """The columns of one part of all rows. Rows that have one object in common are made once and repeated."""
-        pa = self._pa
-        once = {id(values): values for values in rows}
-        repeated = len(once) * 2 < len(rows)
+        once = rows if _differ(rows) else list({id(values): values for values in rows}.values())
         nothing = (None,) * len(part)
-        found = once.values() if repeated else rows
-        columns = zip(*(nothing if values is None else values for values in found), strict=True)
+        columns = zip(*(nothing if values is None else values for values in once), strict=True)
         arrays = [self._array(index, column) for index, column in zip(part, columns, strict=True)]
-        if not repeated:
+        if once is rows:
             return arrays
-        at = {key: place for place, key in enumerate(once)}
-        places = pa.array([at[id(values)] for values in rows], pa.int32())
-        return [array.take(places) for array in arrays]
+        places = {id(values): place for place, values in enumerate(once)}
+        repeated = self._pa.array([places[id(values)] for values in rows], self._pa.int32())
+        return [array.take(repeated) for array in arrays]
 
     def _array(self, index: int, column: Sequence[Value]) -> Any:
         pa, one = self._pa, self._table.fields[index]
@@ -133,6 +131,12 @@ class ParquetTable:
         if one.kind is Kind.TEXT:
             return pa.dictionary(pa.int32(), pa.string())
         return {Kind.FLAG: pa.int8(), Kind.WHOLE: pa.int64(), Kind.FLOAT: pa.float64()}[one.kind]
+
+
+def _differ(rows: Sequence[Values | None]) -> bool:
+    """True where few neighbours are one object, by the first rows."""
+    first = rows[:_LOOK]
+    return len({id(values) for values in first}) * 2 > len(first)
 
 
 def _in_range(wall_ns: int | None) -> int | None:

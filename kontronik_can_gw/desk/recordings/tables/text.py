@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from datetime import UTC as UTC_ZONE
 from datetime import datetime
-from operator import call
+from operator import getitem
 from typing import IO
 
 from kontronik_can_gw.desk.recordings.columns import Known, Values
@@ -76,31 +76,26 @@ def _number(value: float | None, nothing: str) -> str:
     return nothing if value is None or not math.isfinite(value) else str(value)
 
 
-def _remembered(field: Field, cell: Cell) -> Cell:
-    """Texts of floats are worth keeping; counters are new each time."""
-    return cell if field.kind is Kind.WHOLE else Known(cell).__getitem__
-
-
 class _Lines:
     """Lines of text, a row each. A part of a row that is the one of the row before is not put into words again."""
 
     def __init__(self, file: IO[bytes], table: Table, cell: Callable[[Field], Cell]) -> None:
         self._file = file
         self._utc = UtcText()
-        cells = [_remembered(one, cell(one)) for one in table.fields]
+        cells = [Known(cell(one)) for one in table.fields]
         self._cells = [[cells[index] for index in part] for part in table.parts()]
         self._parts: list[Values | None] = [None] * len(self._cells)
         self._texts = [""] * len(self._cells)
         self._lines: list[str] = []
         self._separator = ","
 
-    def _texts_of(self, parts: Sequence[Values | None]) -> list[str]:
+    def _in_words(self, parts: Sequence[Values | None]) -> list[str]:
         """The text of each part; of one of another frame the one that it had last."""
         known, texts = self._parts, self._texts
         for index, part in enumerate(parts):
             if part is not known[index] and part is not None:
                 known[index] = part
-                texts[index] = self._separator.join(map(call, self._cells[index], part))
+                texts[index] = self._separator.join(map(getitem, self._cells[index], part))
         return texts
 
     def _put(self, line: str) -> None:
@@ -131,7 +126,7 @@ class CsvTable(_Lines):
     def write(self, row: Row) -> None:
         """Add a row."""
         time_ns, wall_ns, parts = row
-        texts = self._texts_of(parts)
+        texts = self._in_words(parts)
         if None in parts:
             both = zip(parts, texts, self._nothing, strict=True)
             texts = [nothing if part is None else text for part, text, nothing in both]
@@ -153,7 +148,7 @@ class JsonTable(_Lines):
     def write(self, row: Row) -> None:
         """Add a row."""
         time_ns, wall_ns, parts = row
-        texts = self._texts_of(parts)
+        texts = self._in_words(parts)
         if None in parts:
             texts = [text for part, text in zip(parts, texts, strict=True) if part is not None]
         head = f'{{"{TIME}": {seconds_text(time_ns)}'
