@@ -11,8 +11,8 @@ from esc.sheet import LIVE_STRUCT
 from esc.streams import random_stream
 from recordings import convert, dump_bytes
 
-from kontronik_can_gw.desk.recordings import inputs
-from kontronik_can_gw.desk.recordings.inputs import DumpInput
+from kontronik_can_gw.desk.recordings import dump_input
+from kontronik_can_gw.desk.recordings.dump_input import DumpInput
 
 NAMES = ("electrical_speed", "battery_voltage", "battery_current")
 PERIOD_NS = 20_000_000
@@ -54,8 +54,8 @@ def test_rows_are_the_frames_that_brute_force_finds(
 ) -> None:
     """However the file is read: small reads put every limit of a read anywhere in a frame and in rubbish."""
     source = random.Random(f"{kind} {seed}")
-    monkeypatch.setattr(inputs, "CHUNK", source.choice([1, 7, 44, 100, 5000, inputs.CHUNK]))
-    monkeypatch.setattr(inputs, "_MAX_WAITING", source.choice([64, 300, inputs._MAX_WAITING]))
+    monkeypatch.setattr(dump_input, "CHUNK", source.choice([1, 7, 44, 100, 5000, 1 << 18]))
+    monkeypatch.setattr(dump_input, "MAX_WAITING", source.choice([64, 300, 1 << 16]))
     stream = STREAMS[kind](source)
     dump = recording(tmp_path, stream, live_rate=1e9 / PERIOD_NS)
     found = frames_of(stream)

@@ -90,10 +90,10 @@ def reader(name: str) -> Callable[[EscTelemetry, int], Steps]:
 
 
 @cache
-def gateway_reader(name: str) -> Callable[[GatewayStatus, int], Steps]:
+def gateway_reader(name: str) -> Callable[[GatewayStatus, int], int]:
     """What gives a value of the gateway in steps at a time."""
     text = f"lambda gateway, now: {_listed()[name].expression}"
-    made: Callable[[GatewayStatus, int], Steps] = eval(text)  # noqa: S307  text of values.py
+    made: Callable[[GatewayStatus, int], int] = eval(text)  # noqa: S307  text of values.py
     return made
 
 

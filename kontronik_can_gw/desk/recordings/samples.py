@@ -156,13 +156,17 @@ class FoundTelemetry(EscTelemetry):
 
 
 def samples_of_bytes(
-    esc: FoundTelemetry, found: Iterable[tuple[int, Frame]], sections: Sequence[Section]
+    esc: FoundTelemetry,
+    found: Iterable[tuple[int, bytes, Frame | None]],
+    sections: Sequence[Section],
 ) -> Iterator[Sample]:
-    """The rows of one ESC's frames (time, frame); a gateway runs from the first one on."""
+    """The rows of one ESC's frames (time, bytes, frame); a gateway runs from the first one on."""
     status = GatewayStatus(GatewayState.RUNNING, esc_count=1)
     maker = RowMaker([esc], status, sections, 0)
     due = 0
-    for now, frame in found:
+    for now, _, frame in found:
+        if frame is None:
+            continue
         while due < now and (due := esc.next_deadline()) < now:
             maker.follow(0, esc.advance(due), due)
         events = esc.take(frame, now)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import chain, groupby
 from operator import itemgetter
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.columns import Values
@@ -17,6 +17,7 @@ from kontronik_can_gw.desk.recordings.fields import (
     field_of_signal,
     frame_fields,
 )
+from kontronik_can_gw.desk.recordings.recording import Input
 from kontronik_can_gw.desk.recordings.samples import Sample
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import EXTENDED
@@ -39,21 +40,7 @@ class Row(NamedTuple):
     parts: tuple[Values | None, ...]
 
 
-class Recording(Protocol):
-    """What rows need of an Input."""
-
-    provenance: dict[str, str]
-
-    @property
-    def reader(self) -> SignalReader: ...
-    @property
-    def fields(self) -> Sequence[Field]: ...
-    def frames(self) -> Iterator[TimedFrame]: ...
-    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]: ...
-    def wall_ns(self, time_ns: int) -> int | None: ...
-
-
-def fields_of_frames(recording: Recording) -> list[Field]:
+def fields_of_frames(recording: Input) -> list[Field]:
     """The fields of a table of CAN frames: the signals of the DBC."""
     return distinct([field_of_signal(column) for column in recording.reader.columns])
 
@@ -122,7 +109,7 @@ class Rows:
     ``table`` describes them; None where the recording has nothing.
     """
 
-    def __init__(self, recording: Recording, choice: Choice, by_frame: bool = False) -> None:
+    def __init__(self, recording: Input, choice: Choice, by_frame: bool = False) -> None:
         self._recording = recording
         self._choice = choice
         every = fields_of_frames(recording) if by_frame else recording.fields
