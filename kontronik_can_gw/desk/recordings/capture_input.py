@@ -78,7 +78,7 @@ class CaptureInput(Input):
         gateway = self.setup.gateway(self.sent_layout, self._created_ns)
         replay = Replay(gateway, self.header.get("state"), marked)
         yield from replay.follow(self.entries())
-        self._tell(replay)
+        self._add_losses(replay)
 
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
         # who shows it tells names, pole pairs and gears
@@ -92,7 +92,7 @@ class CaptureInput(Input):
             replay.play(entry)
             yield from gateway.maker.take_rows()
         yield from gateway.maker.finish()
-        self._tell(replay)
+        self._add_losses(replay)
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         for entry in self.entries():
@@ -119,7 +119,7 @@ class CaptureInput(Input):
         return channel if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII) else "can0"
 
     def entries(self) -> Iterator[Entry]:
-        """All entries of all parts. What is damaged is passed over, and told in ``damage``."""
+        """All entries of all parts. What is damaged is left out, and reported in ``damage``."""
         self.position = 0
         self.damage = list(self._headerless)
         self._offsets = []
@@ -132,7 +132,7 @@ class CaptureInput(Input):
                     impossible += 1
                     continue
                 if entry.kind == Kind.CLOCK:
-                    # it stands behind what was written by the clock before
+                    # it stands after what was written by the clock before
                     self._offsets.append(
                         (entry.time_ns + 1, read_number(entry.data) - entry.time_ns)
                     )
@@ -185,12 +185,10 @@ class CaptureInput(Input):
         expected, ended = 0, False
         for found in self._blocks(path):
             if isinstance(found, Damage):
-                self._tell_damage(
-                    f"{path.name}: {found.length} bytes at {found.offset} are damaged"
-                )
+                self._add_damage(f"{path.name}: {found.length} bytes at {found.offset} are damaged")
                 continue
             if found.number > expected:
-                self._tell_damage(
+                self._add_damage(
                     f"{path.name}: {found.number - expected} blocks in front of byte {found.offset} are missing"
                 )
             expected, ended = found.number + 1, found.kind == b"E"
@@ -203,13 +201,13 @@ class CaptureInput(Input):
                 elif found.kind == b"H":
                     self._check_part(read_json(found.payload), path, part)
             except ValueError as error:
-                self._tell_damage(f"{path.name}: the block at {found.offset} {error}")
+                self._add_damage(f"{path.name}: the block at {found.offset} {error}")
         if not ended:
-            self._tell_damage(
+            self._add_damage(
                 f"{path.name}: was not closed: up to the last second before its end may be missing"
             )
 
-    def _tell_damage(self, text: str) -> None:
+    def _add_damage(self, text: str) -> None:
         if len(self.damage) < _MAX_DAMAGE:
             self.damage.append(text)
         elif len(self.damage) == _MAX_DAMAGE:
@@ -234,7 +232,7 @@ class CaptureInput(Input):
                 f"{path.name}: {missing} parts of the run in front of it are not given"
             )
 
-    def _tell(self, replay: Replay) -> None:
+    def _add_losses(self, replay: Replay) -> None:
         if replay.lost:
             self.damage.append(
                 f"{replay.lost} entries could not be recorded: the disk was too slow or full"
@@ -254,7 +252,7 @@ class CaptureInput(Input):
         words["DBC"] = self.setup.dbc[0] if self.setup.dbc else ""
         for index, (esc, port) in enumerate(zip(self.setup.escs, self.setup.ports, strict=False)):
             device = self._devices[index] if index < len(self._devices) else None
-            told = "device not known"
+            known = "device not known"
             if isinstance(device, dict):
-                told = f"{device.get('device')} {device.get('variant')}, firmware {device.get('firmware')}, {device.get('layout')} layout"
-            words[esc.name] = f"{told}, at {port}"
+                known = f"{device.get('device')} {device.get('variant')}, firmware {device.get('firmware')}, {device.get('layout')} layout"
+            words[esc.name] = f"{known}, at {port}"

@@ -1,10 +1,12 @@
-"""A recording to a table, a log of CAN frames or plain bytes: the work of ``convert``, without its talk.
+"""A recording to a table, a log of CAN frames or plain bytes: the work of ``convert``, without its messages.
 
-A conversion is called with the recording, the output and what is to be told of the bytes read so far. It returns what it wrote, in
+A conversion is called with the recording, the output and what to call with the bytes read so far. It returns what it wrote, in
 words; None where the recording has nothing of it, and then nothing was written.
 """
 
 import gc
+import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +25,19 @@ TABLES = ("csv", "jsonl", "parquet", "mf4")
 LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
 BYTES = "bin"
 FORMATS = (*TABLES, *LOGS, BYTES)
+SUFFIXES = {
+    ".csv": "csv",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".mf4": "mf4",
+    ".log": "candump",
+    ".candump": "candump",
+    ".asc": "asc",
+    ".blf": "blf",
+    ".trc": "trc",
+    ".bin": BYTES,
+}
 ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """What may go to standard output: it is text, and is written from its beginning to its end."""
 STREAMS = (*ON_SCREEN, BYTES)
@@ -148,15 +163,15 @@ class LogConversion:
             raise
         out.is_whole = True
         lasted = last.time_ns - origin_ns
-        told = f"{_many(count - sum(writer.left_out.values()), 'CAN frame')}, up to {lasted / 1e9:.3f} s"
+        summary = f"{_many(count - sum(writer.left_out.values()), 'CAN frame')}, up to {lasted / 1e9:.3f} s"
         for what, number in writer.left_out.items():
-            told += f"; {number} {what} left out, which {self.format} does not know"
+            summary += f"; {number} {what} left out, which {self.format} does not know"
         moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - lasted
         if abs(moved) > _CLOCK_SET_NS:
-            told += (
+            summary += (
                 f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
             )
-        return told
+        return summary
 
     def _cut(self, frames: "Iterator[TimedFrame]", origin_ns: int) -> "Iterator[TimedFrame]":
         from kontronik_can_gw.desk.recordings.tables import DISORDER_NS
@@ -207,3 +222,10 @@ def _settled() -> Iterator[None]:
 
 def _many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def reason(error: OSError) -> str:
+    """Why nothing could be written, in the system's words; pyarrow says its own, with the number in it."""
+    if number := re.search(r"\[errno (\d+)\]", str(error)):
+        return os.strerror(int(number[1]))
+    return error.strerror or (str(error).strip().splitlines() or ["no reason given"])[0]

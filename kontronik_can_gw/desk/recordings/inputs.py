@@ -30,7 +30,7 @@ from kontronik_can_gw.errors import RunError, UserError
 
 __all__ = ["LIVE_RATE", "CanLogInput", "CaptureInput", "DumpInput", "Input", "open_input"]
 
-_LOOK = 1 << 16
+_HEAD = 1 << 16
 _MAX_IDS = 4096
 
 
@@ -40,11 +40,11 @@ def open_input(
     live_rate: float = LIVE_RATE,
     reached: Callable[[int], None] | None = None,
 ) -> Input:
-    """Open a recording. UserError for what is none, RunError for what cannot be read.
+    """Open a recording. UserError for other files, RunError for what cannot be read.
 
     ``path``: a file; a folder of captures, or the beginning of the names of one run's, for all parts of that run; a pipe, or ``-`` for
-    standard input, which is read to its end first (``reached`` is told how far that is). ``layout``: of CAN logs and plain bytes, the
-    shipped one of one ESC if None; for a capture it replaces the recorded one.
+    standard input, which is read to its end first (``reached`` is called with the bytes so far). ``layout``: of CAN logs and plain
+    bytes, the shipped one of one ESC if None; for a capture it replaces the recorded one.
     """
     if is_stream(path):
         path = spooled(path, reached)
@@ -53,7 +53,7 @@ def open_input(
         return CaptureInput(parts, layout)
     try:
         with path.open("rb") as file:
-            head = file.read(_LOOK)
+            head = file.read(_HEAD)
     except OSError as error:
         raise RunError(f"{path}: cannot be opened: {error.strerror}.") from None
     if not head:
@@ -69,7 +69,7 @@ def open_input(
             f"{path}: is no {NAMES[called]}, whatever its name says, and no other recording"
         )
     raise UserError(
-        f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_LOOK // 1024} kB"
+        f"{path}: is no capture, no CAN log (candump, ASC, BLF, TRC, MF4), and has no telemetry of an ESC in its first {_HEAD // 1024} kB"
     )
 
 

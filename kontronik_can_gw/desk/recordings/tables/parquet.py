@@ -14,7 +14,7 @@ from kontronik_can_gw.signals.unpacker import Value
 
 ROWS = 4096
 """Rows that gather as such."""
-_LOOK = 64
+_FIRST = 64
 GROUP = 1 << 16
 """Rows of a row group, whose columns stay in memory until it is full."""
 
@@ -135,7 +135,7 @@ class ParquetTable:
 
 def _differ(rows: Sequence[Values | None]) -> bool:
     """True where few neighbours are one object, by the first rows."""
-    first = rows[:_LOOK]
+    first = rows[:_FIRST]
     return len({id(values) for values in first}) * 2 > len(first)
 
 

@@ -1,4 +1,4 @@
-"""The formats of tables behind one surface."""
+"""The formats of tables, all with the same methods."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
