@@ -74,9 +74,8 @@ class Gateway:
 
     def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
         """A data frame of another device with one of ``receive_ids``, read at ``now``; it came ``at``."""
-        if not frame.remote:
-            self._conflicts.receive(frame.key, now)
-            self.status.id_conflicts = self._conflicts.count
+        if not frame.remote and self._conflicts.receive(frame.key, now):
+            self.status.id_conflicts += 1
         takers = [output for output in self._outputs if output.receive_ids]
         if takers:
             self._expire(now)

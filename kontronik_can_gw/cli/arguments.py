@@ -38,6 +38,38 @@ def number_from(low: float, high: float, what: str = "number of seconds") -> Cal
     return read
 
 
+def seconds_ns(text: str) -> int:
+    """A type for argparse: seconds as ns."""
+    from decimal import Decimal, InvalidOperation
+
+    try:
+        number = Decimal(text)
+        if number.is_finite() and 0 <= number < 10**9:
+            return int(number * 10**9)
+    except InvalidOperation:
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds")
+
+
+def rate(text: str) -> float:
+    """A type for argparse: a rate in Hz."""
+    try:
+        found = float(text)
+    except ValueError:
+        found = 0.0
+    if not 0.001 <= found <= 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r} is no rate between 0.001 and 1000000")
+    return found
+
+
+def names(text: str) -> list[str]:
+    """A type for argparse: names with commas between."""
+    found = [name.strip() for name in text.split(",") if name.strip()]
+    if not found:
+        raise argparse.ArgumentTypeError("give names of signals, with commas between")
+    return found
+
+
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
     """UserError with the replacement where a command line has a removed option."""
     options = words[: words.index("--")] if "--" in words else words

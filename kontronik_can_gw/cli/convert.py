@@ -5,12 +5,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.cli.arguments import names, rate, seconds_ns
 from kontronik_can_gw.desk.recordings.convert import (
     BYTES,
     FORMATS,
     LOGS,
     ON_SCREEN,
     STREAMS,
+    SUFFIXES,
     TABLES,
 )
 
@@ -21,19 +23,6 @@ if TYPE_CHECKING:
     from kontronik_can_gw.desk.recordings.inputs import Input
     from kontronik_can_gw.desk.recordings.layouts import BusLayout
 
-SUFFIXES = {
-    ".csv": "csv",
-    ".jsonl": "jsonl",
-    ".ndjson": "jsonl",
-    ".parquet": "parquet",
-    ".mf4": "mf4",
-    ".log": "candump",
-    ".candump": "candump",
-    ".asc": "asc",
-    ".blf": "blf",
-    ".trc": "trc",
-    ".bin": BYTES,
-}
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
 BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
@@ -45,6 +34,8 @@ does not. - is standard output, for text, and through a pipe for bin. Parquet ne
 where they are missing.
 
 Tables have a row at each telemetry frame, or at each group of CAN frames that belong together. Values hold while they are fresh.
+Columns are values by name (battery_voltage [V]; of several ESCs esc1.battery_voltage [V]): of captures and bytes all of them in full
+resolution, of CAN logs those that the DBC has.
 Time [s] counts from the recording's first row, with --frames from its first frame; Utc is there where the recording knows
 the time of day. What is not available is empty in CSV, null in JSON lines and Parquet, NaN or NotAvailable in MF4.
 Flags are 0 and 1.
@@ -76,30 +67,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--from",
         dest="start",
         metavar="S",
-        type=_seconds,
-        help="from so many seconds after the start",
+        type=seconds_ns,
+        help="from this time after the start, in seconds",
     )
     part.add_argument(
         "--until",
         dest="end",
         metavar="S",
-        type=_seconds,
-        help="up to so many seconds after the start",
+        type=seconds_ns,
+        help="up to this time after the start, in seconds",
     )
     part.add_argument("--esc", metavar="NAME", help="only the signals (or bytes) of this ESC")
     table = parser.add_argument_group("tables")
     table.add_argument(
         "--signals",
         metavar="A,B*",
-        type=_names,
+        type=names,
         default=[],
         help="only these signals, in this order; * and ? stand for others",
     )
     table.add_argument(
         "--rate",
         metavar="HZ",
-        type=_rate,
-        help="at most so many rows a second, the newest of each period",
+        type=rate,
+        help="rows a second at most, the newest of each period",
     )
     table.add_argument(
         "--frames", action="store_true", help="a row for each CAN frame, with its own signals only"
@@ -110,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--live-rate",
         metavar="HZ",
-        type=_rate,
+        type=rate,
         default=None,
         help="live frames a second of plain UART bytes, which have no time (default 100)",
     )
@@ -163,7 +154,7 @@ def _convert(args: argparse.Namespace, form: str) -> None:
 
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.desk.recordings.convert import Output
+    from kontronik_can_gw.desk.recordings.convert import Output, reason
     from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput
     from kontronik_can_gw.errors import RunError, UserError
 
@@ -183,14 +174,14 @@ def _convert(args: argparse.Namespace, form: str) -> None:
                 ) as progress,
                 Output(None if args.output == "-" else target, form) as out,
             ):
-                told = conversion(recording, out, progress.reach)
+                summary = conversion(recording, out, progress.reach)
         except BrokenPipeError:
             raise
         except OSError as error:
             where = "standard output" if args.output == "-" else str(target)
-            raise RunError(f"{where}: cannot be written: {_reason(error)}.") from None
+            raise RunError(f"{where}: cannot be written: {reason(error)}.") from None
         damage = [line for line in recording.damage if line not in recording.notes]
-        if told is None:
+        if summary is None:
             raise RunError(*_nothing(args, recording, damage))
         notes = recording.notes if form in TABLES else []
         if not args.quiet:
@@ -200,9 +191,9 @@ def _convert(args: argparse.Namespace, form: str) -> None:
                 and isinstance(recording, CanLogInput)
                 and recording.others
             ):
-                told += f", {recording.others} other frames passed over"
+                summary += f", {recording.others} other frames passed over"
             _say(
-                f"{'standard output' if args.output == '-' else args.output}: {told}, in {time.monotonic() - begun:.1f} s"
+                f"{'standard output' if args.output == '-' else args.output}: {summary}, in {time.monotonic() - begun:.1f} s"
             )
             if recording.times_assumed and form != BYTES:
                 _say(
@@ -234,14 +225,15 @@ def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Con
         LogConversion,
         TableConversion,
     )
-    from kontronik_can_gw.desk.recordings.tables import Choice
+    from kontronik_can_gw.desk.recordings.tables import Choice, fields_of_frames
 
     if form == BYTES:
         return BytesConversion(_esc(args, recording, needed=True) or 0)
     if form in LOGS:
         return LogConversion(LOGS[form], args.start, args.end)
     times = {"start_ns": args.start, "end_ns": args.end, "rate": args.rate}
-    choice = Choice.of(recording.reader.columns, args.signals, _esc(args, recording), **times)
+    fields = fields_of_frames(recording) if args.frames else recording.fields
+    choice = Choice.of(fields, args.signals, _esc(args, recording), **times)
     return TableConversion(form, choice, args.frames, args.units_line)
 
 
@@ -336,14 +328,14 @@ def _nothing(args: argparse.Namespace, recording: "Input", damage: list[str]) ->
     """Why there is nothing to convert."""
     from kontronik_can_gw.desk.recordings.inputs import CanLogInput
 
-    told = [f"{args.input}: damaged: {line}" for line in damage]
+    lines = [f"{args.input}: damaged: {line}" for line in damage]
     if args.start is not None or args.end is not None:
-        return [*told, f"{args.input}: nothing in it is between --from and --until"]
+        return [*lines, f"{args.input}: nothing in it is between --from and --until"]
     file = recording.bus.layout.file
     if isinstance(recording, CanLogInput) and not recording.others:
-        return [*told, f"{args.input}: nothing in it can be converted: it has no CAN frame."]
+        return [*lines, f"{args.input}: nothing in it can be converted: it has no CAN frame."]
     return [
-        *told,
+        *lines,
         f"{args.input}: nothing in it can be converted: no frame of {file}. Give the right DBC by --dbc or -c.",
     ]
 
@@ -352,43 +344,3 @@ def _say(text: str) -> None:
     from kontronik_can_gw.cli import say
 
     say(text, "convert")
-
-
-def _reason(error: OSError) -> str:
-    """In the system's words; pyarrow says its own, with the number in it."""
-    import os
-    import re
-
-    if number := re.search(r"\[errno (\d+)\]", str(error)):
-        return os.strerror(int(number[1]))
-    return error.strerror or (str(error).strip().splitlines() or ["no reason given"])[0]
-
-
-def _seconds(text: str) -> int:
-    """Seconds as ns."""
-    from decimal import Decimal, InvalidOperation
-
-    try:
-        number = Decimal(text)
-        if number.is_finite() and 0 <= number < 10**9:
-            return int(number * 10**9)
-    except InvalidOperation:
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds")
-
-
-def _rate(text: str) -> float:
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0.001 <= rate <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r} is no rate between 0.001 and 1000000")
-    return rate
-
-
-def _names(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    if not names:
-        raise argparse.ArgumentTypeError("give names of signals, with commas between")
-    return names

@@ -85,7 +85,8 @@ def main(args: argparse.Namespace) -> int:
     _check_target(source, args.output, force=args.force)
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     with open_input(source, layout) as recording:
-        analysis = Analysis(recording.bus, args.points, (args.start, args.end))
+        window = (args.start, args.end)
+        analysis = Analysis(recording.bus, args.points, window, recording.fields)
         if not analysis.has_anything:
             raise UserError(
                 f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
@@ -149,8 +150,8 @@ def _read(recording: "Input", analysis: "Analysis", name: str, data_on_screen: b
     take = analysis.take
     try:
         with Progress(name, recording.size or None, data_on_screen) as progress:
-            for count, (time_ns, values) in enumerate(recording.samples()):
-                if not take(time_ns, values):
+            for count, sample in enumerate(recording.samples()):
+                if not take(sample.time_ns, sample.values):
                     break
                 if not count & 1023:
                     progress.reach(recording.position)

@@ -1,6 +1,8 @@
 """One conversion in a process of its own: prints its CPU and wall time, its peak memory and what was said of it, as JSON.
 
-    python convert_driver.py FORM IN OUT [--dbc FILE]
+    python convert_driver.py FORM IN OUT [--dbc FILE] [--live]
+
+``--live``: of a table only the sixteen values of a live frame.
 
 The libraries are loaded before the clock starts.
 """
@@ -21,6 +23,7 @@ from kontronik_can_gw.desk.recordings.convert import (
 from kontronik_can_gw.desk.recordings.inputs import DumpInput
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.desk.recordings.tables import Choice
+from kontronik_can_gw.esc.kontronik.fields import LiveData
 
 
 def peak_mb() -> float:
@@ -36,6 +39,7 @@ def main() -> None:
     parser.add_argument("source", type=Path)
     parser.add_argument("target", type=Path)
     parser.add_argument("--dbc", type=Path)
+    parser.add_argument("--live", action="store_true")
     args = parser.parse_args()
     if args.form == "parquet":
         import pyarrow.parquet  # type: ignore[import-untyped]
@@ -45,7 +49,8 @@ def main() -> None:
     with DumpInput(args.source, layout) as recording:
         conversion: Conversion = LogConversion(args.form)
         if args.form in TABLES:
-            conversion = TableConversion(args.form, Choice.of(recording.reader.columns))
+            names = LiveData._fields if args.live else ()
+            conversion = TableConversion(args.form, Choice.of(recording.fields, names))
         cpu, wall = time.process_time(), time.perf_counter()
         with Output(args.target, args.form) as out:
             told = conversion(recording, out, lambda position: None)

@@ -171,12 +171,12 @@ def candump(context: Context) -> list[Figure]:
 
 
 def tables(context: Context) -> list[Figure]:
-    """Rows a CPU second, with the sixteen live values and with all signals of the shipped DBC."""
+    """Rows a CPU second, with the sixteen values of a live frame and with all values."""
     figures = []
     source = recording(context, 0.5 if context.quick else 2)
     lives = of_obvious(context, source)[1]
     for form in ("csv", "jsonl", "parquet"):
-        for what, options in (("16 live values", ("--dbc", FIVE)), ("all signals", ())):
+        for what, options in (("16 live values", ("--live",)), ("all values", ())):
             run = best(context, form, source, *options)
             if run.count != lives:
                 raise NotEqual(f"{form}: {run.count} rows of {lives} live frames")
@@ -188,7 +188,7 @@ def tables(context: Context) -> list[Figure]:
 
 # --- growth and damage --------------------------------------------------------------------------------------------------
 
-_FORMS = {"candump": (), "parquet": ("--dbc", FIVE), "csv": ("--dbc", FIVE)}
+_FORMS = {"candump": (), "parquet": ("--live",), "csv": ("--live",)}
 
 
 def growth(context: Context) -> list[Figure]:

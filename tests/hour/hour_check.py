@@ -153,17 +153,18 @@ def check_rows(
 
 
 def _texts(values: Sequence[Any], numbers: Mapping[str, int]) -> Floats:
-    codes = {text: float(number) for text, number in numbers.items()}
+    """``numbers``: by text, folded: tables spell texts as the sheet does, and the DBC as names."""
+    codes = {text.casefold(): float(number) for text, number in numbers.items()}
     return np.array(
-        [np.nan if v is None or v != v else codes.get(v, _UNKNOWN_TEXT) for v in values]
+        [np.nan if v is None or v != v else codes.get(v.casefold(), _UNKNOWN_TEXT) for v in values]
     )
 
 
 def _split(header: str, truth: Truth) -> str:
-    """The signal's name; the unit in the header must be the DBC's."""
+    """The value's name; the unit in the header must be its own."""
     name, _, unit = header.partition(" [")
-    if unit.rstrip("]") != truth.units[name]:
-        raise AssertionError(f"{header}: the unit of {name} is {truth.units[name]!r}")
+    if unit.rstrip("]") != truth.value_units[name]:
+        raise AssertionError(f"{header}: the unit of {name} is {truth.value_units[name]!r}")
     return name
 
 
@@ -178,7 +179,7 @@ def _column(values: Any, name: str, truth: Truth) -> Floats:
         return np.asarray(values, dtype=np.float64)
     if values.isna().all():
         return np.full(len(values), np.nan)
-    return _texts(list(values), truth.texts[name])
+    return _texts(list(values), truth.value_texts[name])
 
 
 def _wall(frame: Any) -> Times | None:
@@ -243,7 +244,7 @@ def parquet_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
                 continue
             name = _split(head, truth)
             if hasattr(column, "dictionary"):
-                codes = _texts(column.dictionary.to_pylist(), truth.texts[name])
+                codes = _texts(column.dictionary.to_pylist(), truth.value_texts[name])
                 at = column.indices.cast("float64").to_numpy(zero_copy_only=False)
                 values[name] = np.where(
                     np.isnan(at), np.nan, codes[np.nan_to_num(at).astype(np.int64)]
@@ -266,14 +267,16 @@ def mf4_chunks(path: Path, truth: Truth) -> Iterator[Chunk]:
                 continue
             assert len(places) == 1, f"{name} is there {len(places)} times"
             signal = mdf.get(name)
-            if signal.unit != truth.units[name]:
-                raise AssertionError(f"{name}: unit {signal.unit!r}, must be {truth.units[name]!r}")
+            if signal.unit != truth.value_units[name]:
+                raise AssertionError(
+                    f"{name}: unit {signal.unit!r}, must be {truth.value_units[name]!r}"
+                )
             times = signal.timestamps
             if signal.samples.dtype.kind in "SUO":
                 kinds, at = np.unique(signal.samples, return_inverse=True)
                 words = [kind.decode() if isinstance(kind, bytes) else str(kind) for kind in kinds]
                 values[name] = _texts(
-                    [None if w == "NotAvailable" else w for w in words], truth.texts[name]
+                    [None if w == "NotAvailable" else w for w in words], truth.value_texts[name]
                 )[at]
             else:
                 values[name] = signal.samples.astype(np.float64)
@@ -424,7 +427,7 @@ def check_table_of_log(path: Path, truth: Truth, frames: Frames, decoded: Decode
                 values = np.where(fresh, table[name][np.maximum(at, 0)], np.nan)
                 # cantools multiplies by 0.01 where the table holds the float nearest to the decimal
                 values = np.where(np.isnan(values), values, np.round(values, 6))
-                expected[name] = Expected(values, values)
+                expected[truth.value_name(name)] = Expected(values, values)
     return check_rows(path, csv_chunks(path, truth), row_ns, expected, row_ns, 1500, 1500)
 
 
@@ -540,12 +543,7 @@ def check_last(truth: Truth, decoded: Decoded, path: Path) -> Verdict:
     for prefix, esc in zip(truth.prefixes, told["escs"], strict=True):
         values = esc["values"]
         for name, wanted in expected.items():
-            key = "".join(
-                f"_{c.lower()}" if c.isupper() else c for c in name.removeprefix(prefix)
-            ).lstrip("_")
-            key = {"throttle_percent": "throttle", "output_opening_percent": "output_opening"}.get(
-                key, key
-            )
+            key = truth.value_name(name).rpartition(".")[2]
             if not name.startswith(prefix) or key not in values or key == "data_age":  # it goes on
                 continue
             value = values[key]
@@ -570,10 +568,10 @@ def check_report(truth: Truth, path: Path) -> Verdict:
     wanted = [f"{len(truth.row_ns)} rows"]
     if len(truth.escs) == 1:
         wanted += [
-            f"<b>{np.nanmax(rows['BatteryPower'].low):.0f} W</b>",
-            f"<b>{np.nanmax(rows['BatteryCurrent'].low):.1f} A</b>",
-            f"<b>{np.nanmin(rows['BatteryVoltage'].low):.2f} V</b>",
-            f"<b>{np.nanmax(rows['PowerStageTemperature'].low):.0f} °C</b>",
+            f"<b>{np.nanmax(rows['battery_power'].low):.0f} W</b>",
+            f"<b>{np.nanmax(rows['battery_current'].low):.1f} A</b>",
+            f"<b>{np.nanmin(rows['battery_voltage'].low):.2f} V</b>",
+            f"<b>{np.nanmax(rows['power_stage_temperature'].low):.0f} °C</b>",
         ]
     for words in wanted:
         verdict.values += 1

@@ -96,8 +96,16 @@ SELFTEST_ERRORS = (
     ),
     *("TestEepromChecksum", "TestEepromSize", "TestEepromVersion"),
 )
+LENGTHS = {"live": (40, 38), "info": (44, 41)}
+"""Bytes of a frame in V4 and legacy layout."""
 ALIVE = "Alive"
 """How alive counters are called at their end."""
+ONLY_IN_ROWS = (
+    *("operating_errors", "selftest_errors", "motor_run_time", "live_frames", "info_frames"),
+    *("received_bytes", "suspect_frames"),
+)
+"""Values that no signal of the DBC holds."""
+ONLY_IN_ROWS_OF_GATEWAY = ("received_frames", "bus_off_count", "dropped_frames", "id_conflicts")
 NEVER_SEEN, OK, LOST, PORT_ERROR = 0, 2, 4, 5
 RUNNING, STOPPING = 1, 2
 
@@ -182,6 +190,17 @@ class EscTruth:
             energies.append(total)
         return energies
 
+    def _turning(self) -> list[int]:
+        """How long the motor had turned up to each live frame, in ns, by the frames before."""
+        speeds, times = self.live["electrical_speed"].tolist(), self.live_ns.tolist()
+        lost = set(np.searchsorted(self.live_ns, self.lost_ns).tolist())
+        total, found = 0, [0]
+        for index in range(1, len(times)):
+            if index not in lost and speeds[index - 1]:
+                total += times[index] - times[index - 1]
+            found.append(total)
+        return found
+
     def _links(self) -> None:
         returns = self.live_ns[
             np.searchsorted(self.live_ns, self.lost_ns[self.lost_ns < self.live_ns[-1]])
@@ -237,16 +256,24 @@ class EscTruth:
         for bit, name in enumerate(OPERATING_ERRORS):
             found[name] = _one(np.where(fresh, errors >> bit & 1, np.nan))
         speed, pole_pairs = self.live["electrical_speed"][at], self.meant.pole_pairs
-        live("MotorSpeed", _rounded(speed, pole_pairs))
         gear = GEAR * pole_pairs
-        live("OutputSpeed", _rounded(speed * gear.denominator, gear.numerator))
         power = self.live["battery_voltage"][at] * self.live["battery_current"][at]
-        live("BatteryPower", _rounded(power, 5000) * 5)
-        self._infos(times, fresh, at, found)
+        if told_ns is None:
+            live("MotorSpeed", _rounded(speed, pole_pairs))
+            live("OutputSpeed", _rounded(speed * gear.denominator, gear.numerator))
+            live("BatteryPower", _rounded(power, 5000) * 5)
+        else:
+            live("MotorSpeed", np.round(speed / pole_pairs, 6))
+            live("OutputSpeed", np.round(speed * gear.denominator / gear.numerator, 6))
+            live("BatteryPower", power / 1000)
+            live("OperatingErrors", errors)
+        self._infos(times, fresh, at, found, told_ns is not None)
         self._link(times, told, told_ns is not None, newest, at, found)
         return found
 
-    def _infos(self, times: Times, fresh: Any, at: Any, found: dict[str, Expected]) -> None:
+    def _infos(
+        self, times: Times, fresh: Any, at: Any, found: dict[str, Expected], rows: bool
+    ) -> None:
         newest = np.searchsorted(self.info_ns, times, "right") - 1
         info = np.maximum(newest, 0)
         forgotten = np.searchsorted(self.forgotten_ns, times, "right")
@@ -271,8 +298,12 @@ class EscTruth:
             found[name] = _one(
                 np.where(known, self.info["selftest_errors"][info] >> bit & 1, np.nan)
             )
-        cells = _rounded(self.live["battery_voltage"][at] * 10, CELLS)
-        found["MeanCellVoltage"] = _one(np.where(fresh & known, cells / 1000, np.nan))
+        if rows:
+            put("SelftestErrors", self.info["selftest_errors"][info])
+            cells = np.round(self.live["battery_voltage"][at] / CELLS / 100, 6)
+        else:
+            cells = _rounded(self.live["battery_voltage"][at] * 10, CELLS) / 1000
+        found["MeanCellVoltage"] = _one(np.where(fresh & known, cells, np.nan))
 
     def _link(
         self,
@@ -288,6 +319,10 @@ class EscTruth:
             [(2 * e + int(step)) // (2 * int(step)) for e in self.energy], dtype=np.int64
         )
         found["EnergyUsed"] = _one(np.where(newest >= 0, tenths[at] / 10, 0.0))
+        if rows:
+            energy = np.array([round(e / (3_600_000 * SECOND), 6) for e in self.energy])
+            found["EnergyUsed"] = _one(np.where(newest >= 0, energy[at], 0.0))
+            self._counted(times, newest, at, found)
         found["Losses"] = _one(np.searchsorted(self.timed_out_ns, times, "right"))
         found["Layout"] = _one(np.where(newest >= 0, 1 + self.legacy[at], 0))
         found["LinkState"] = _one(self.links[np.searchsorted(self.link_ns, times, "right") - 1])
@@ -301,6 +336,20 @@ class EscTruth:
             found["FrameRate"] = Expected(np.fmin(behind, now), np.fmax(behind, now))
         for name in ("CrcErrors", "DroppedBytes"):
             found[name] = _one(np.zeros(len(times)))
+
+    def _counted(self, times: Times, newest: Any, at: Any, found: dict[str, Expected]) -> None:
+        """What only rows hold: counters, and how long the motor has turned."""
+        infos = np.searchsorted(self.info_ns, times, "right")
+        found["LiveFrames"] = _one(newest + 1)
+        found["InfoFrames"] = _one(infos)
+        found["SuspectFrames"] = _one(np.zeros(len(times)))
+        lives = np.cumsum(np.where(self.legacy == 1, LENGTHS["live"][1], LENGTHS["live"][0]))
+        of_info = self.legacy[np.maximum(np.searchsorted(self.live_ns, self.info_ns) - 1, 0)]
+        info_bytes = np.cumsum(np.where(of_info == 1, LENGTHS["info"][1], LENGTHS["info"][0]))
+        received = np.where(newest >= 0, lives[at], 0)
+        found["ReceivedBytes"] = _one(received + np.append(0, info_bytes)[infos])
+        turning = np.array(self._turning(), dtype=np.int64)
+        found["MotorRunTime"] = _one(np.where(newest >= 0, np.round(turning[at] / SECOND, 6), 0.0))
 
 
 class Truth:
@@ -322,7 +371,28 @@ class Truth:
         self.units = {
             s.name: s.unit or "" for message in self.database.messages for s in message.signals
         }
+        self.value_texts = {
+            self.value_name(name): {text.casefold(): number for text, number in texts.items()}
+            for name, texts in self.texts.items()
+        }
+        signs = {"degC": "°C", "us": "µs"}
+        self.value_units = {
+            self.value_name(name): signs.get(unit, unit) for name, unit in self.units.items()
+        }
+        for prefix in (self.value_name(one) for one in self.prefixes):
+            self.value_units |= dict.fromkeys(
+                (f"{prefix}{name}" for name in ONLY_IN_ROWS if name != "motor_run_time"), ""
+            )
+            self.value_units[f"{prefix}motor_run_time"] = "s"
+        self.value_units |= dict.fromkeys(ONLY_IN_ROWS_OF_GATEWAY, "")
         self._row_times()
+
+    def value_name(self, name: str) -> str:
+        """How a table calls a signal: by the value that it holds."""
+        prefix = next((one for one in self.prefixes if one and name.startswith(one)), "")
+        text = name.removeprefix(prefix).removesuffix("Percent")
+        words = "".join(f"_{c.lower()}" if c.isupper() else c for c in text).lstrip("_")
+        return f"{prefix.lower()}.{words}" if prefix else words
 
     def _row_times(self) -> None:
         """A row begins with a live frame, or a loss; what other ESCs say within 5 ms belongs to it, until one speaks again.
@@ -362,7 +432,7 @@ class Truth:
         """Of each ESC when something was read, and what time it was given."""
 
     def rows(self) -> dict[str, Expected]:
-        """The table: a row at each of ``row_ns``."""
+        """The table: values by name, a row at each of ``row_ns``."""
         until = self._until_ns
         found: dict[str, Expected] = {}
         for prefix, esc, told in zip(self.prefixes, self.escs, self._told, strict=True):
@@ -371,7 +441,12 @@ class Truth:
                 for end in (expected.low, expected.high):
                     end[until < told[0, 0]] = np.nan  # nothing was ever heard of it
                 found[prefix + name] = expected
-        return found | self.gateway(until, LATE_NS)
+        found |= self.gateway(until, LATE_NS)
+        del found["SentFrames"]
+        found["Uptime"].low[:] = np.maximum(until - LATE_NS - START, 0) // MS / 1000
+        found["Uptime"].high[:] = np.maximum(until - START, 0) // MS / 1000
+        none = dict.fromkeys(ONLY_IN_ROWS_OF_GATEWAY, _one(np.zeros(len(until))))
+        return {self.value_name(name): expected for name, expected in found.items()} | none
 
     def gateway(self, times: Times, late_ns: int) -> dict[str, Expected]:
         """The gateway's own values, read at most so long before."""

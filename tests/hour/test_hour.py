@@ -51,17 +51,17 @@ def test_the_minute_has_everything_in_it(minute: Minute) -> None:
     rows = truth.rows()
     assert 5000 < minute.truth.recording.telemetry_frames < 6000
     assert len(truth.escs[0].timed_out_ns) == 3
-    assert set(rows["LinkState"].low) == {2, 4, 5}
-    assert set(rows["Layout"].low) == {1, 2}
-    assert {1.0, 3.0} < set(rows["Device"].low)
-    assert np.isnan(rows["BecCurrent"].low).sum() > 1000
-    assert 200 < np.nansum(rows["Undervoltage"].low) < 400
-    assert np.nansum(rows["TestEepromVersion"].low) > 300
-    assert np.nanmax(rows["ElectricalSpeed"].low) > 20_000
-    assert np.nanmin(rows["BatteryCurrent"].low) < -5
-    assert set(rows["CanState"].high) == {1, 2}
-    assert np.nanmax(rows["EnergyUsed"].low) > 5
-    assert np.isnan(rows["BatteryVoltage"].low).sum() == 4  # a row for each loss
+    assert set(rows["link_state"].low) == {2, 4, 5}
+    assert set(rows["layout"].low) == {1, 2}
+    assert {1.0, 3.0} < set(rows["device"].low)
+    assert np.isnan(rows["bec_current"].low).sum() > 1000
+    assert 200 < np.nansum(rows["undervoltage"].low) < 400
+    assert np.nansum(rows["test_eeprom_version"].low) > 300
+    assert np.nanmax(rows["electrical_speed"].low) > 20_000
+    assert np.nanmin(rows["battery_current"].low) < -5
+    assert set(rows["can_state"].high) == {1, 2}
+    assert np.nanmax(rows["energy_used"].low) > 5
+    assert np.isnan(rows["battery_voltage"].low).sum() == 4  # a row for each loss
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -85,21 +85,21 @@ def test_nothing_is_left_out(minute: Minute) -> None:
 
 
 def _changed_value(lines: list[str]) -> None:
-    at = lines[0].split(",").index("BatteryVoltage [V]")
+    at = lines[0].split(",").index("battery_voltage [V]")
     row = next(n for n, line in enumerate(lines) if n >= 3000 and line.split(",")[at])
-    _edit(lines, row, "BatteryVoltage [V]", lambda text: f"{float(text) + 0.01:.2f}")
+    _edit(lines, row, "battery_voltage [V]", lambda text: f"{float(text) + 0.01:.2f}")
 
 
 def _old_value_in_a_gap(lines: list[str]) -> None:
-    at = lines[0].split(",").index("BatteryVoltage [V]")
+    at = lines[0].split(",").index("battery_voltage [V]")
     gap = next(n for n, line in enumerate(lines) if not line.split(",")[at])
-    _edit(lines, gap, "BatteryVoltage [V]", lambda _: lines[gap - 1].split(",")[at])
+    _edit(lines, gap, "battery_voltage [V]", lambda _: lines[gap - 1].split(",")[at])
 
 
 def _bec_current_of_a_jivepro(lines: list[str]) -> None:
-    at = lines[0].split(",").index("Device")
-    row = next(n for n, line in enumerate(lines) if line.split(",")[at] == "JivePro")
-    _edit(lines, row, "BecCurrent [A]", lambda _: "0.0")
+    at = lines[0].split(",").index("device")
+    row = next(n for n, line in enumerate(lines) if line.split(",")[at] == "JIVEPro")
+    _edit(lines, row, "bec_current [A]", lambda _: "0.0")
 
 
 def _edit(lines: list[str], row: int, head: str, change: Callable[[str], str]) -> None:
@@ -120,7 +120,7 @@ TABLE_FAULTS: dict[str, Callable[[list[str]], object]] = {
         lines, 3000, "Time [s]", lambda text: f"{float(text) + 0.000005:.6f}"
     ),
     "clock": lambda lines: _edit(lines, 3000, "Utc", lambda _: lines[2000].split(",")[1]),
-    "text": lambda lines: _edit(lines, 3000, "OperatingState", lambda _: "StandBy"),
+    "text": lambda lines: _edit(lines, 3000, "operating_state", lambda _: "StandBy"),
     "value of a JIVEPro": _bec_current_of_a_jivepro,
     "column": _without_last_column,
 }
@@ -149,9 +149,9 @@ def test_a_wrong_unit_is_found_out(minute: Minute, tmp_path: Path) -> None:
     path.write_text(
         (minute.folder / "hour.csv")
         .read_text()
-        .replace("BatteryVoltage [V]", "BatteryVoltage [mV]", 1)
+        .replace("battery_voltage [V]", "battery_voltage [mV]", 1)
     )
-    with pytest.raises(AssertionError, match="the unit of BatteryVoltage"):
+    with pytest.raises(AssertionError, match="the unit of battery_voltage"):
         check_table(minute.truth, path)
 
 
@@ -159,9 +159,9 @@ def test_a_mutilated_file_of_each_other_format_is_found_out(minute: Minute, tmp_
     from asammdf import MDF
     from pyarrow import compute, parquet  # type: ignore[import-untyped]
 
-    _mutilated(minute.folder / "hour.jsonl", lambda lines: _add(lines, 3000, "PwmInput"), tmp_path)
+    _mutilated(minute.folder / "hour.jsonl", lambda lines: _add(lines, 3000, "pwm_input"), tmp_path)
     found = parquet.read_table(minute.folder / "hour.parquet")
-    place = found.schema.names.index("MotorCurrent [A]")
+    place = found.schema.names.index("motor_current [A]")
     other = compute.add(found.column(place), 0.1)
     parquet.write_table(
         found.set_column(place, found.schema.field(place), other), tmp_path / "bad.parquet"

@@ -32,9 +32,12 @@ OPTIONS = (EscOptions(faults=FAULTS), EscOptions(device=Device.JIVEPRO, max_curr
 
 
 def analysed(
-    bus: BusLayout, rows: list[Row], points: int = 2000, **more: tuple[float | None, float | None]
+    bus: BusLayout,
+    rows: list[Row],
+    points: int = 2000,
+    window: tuple[float | None, float | None] = (None, None),
 ) -> Flight:
-    analysis = Analysis(bus, points, **more)
+    analysis = Analysis(bus, points, window)
     for time_ns, values in rows:
         if not analysis.take(time_ns, values):
             break

@@ -1,11 +1,15 @@
-"""A recording to a table, a log of CAN frames or plain bytes: the work of ``convert``, without its talk.
+"""A recording to a table, a log of CAN frames or plain bytes: the work of ``convert``, without its messages.
 
-A conversion is called with the recording, the output and what is to be told of the bytes read so far. It returns what it wrote, in
+A conversion is called with the recording, the output and what to call with the bytes read so far. It returns what it wrote, in
 words; None where the recording has nothing of it, and then nothing was written.
 """
 
+import gc
+import os
+import re
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Protocol, Self
@@ -21,6 +25,19 @@ TABLES = ("csv", "jsonl", "parquet", "mf4")
 LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
 BYTES = "bin"
 FORMATS = (*TABLES, *LOGS, BYTES)
+SUFFIXES = {
+    ".csv": "csv",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".mf4": "mf4",
+    ".log": "candump",
+    ".candump": "candump",
+    ".asc": "asc",
+    ".blf": "blf",
+    ".trc": "trc",
+    ".bin": BYTES,
+}
 ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """What may go to standard output: it is text, and is written from its beginning to its end."""
 STREAMS = (*ON_SCREEN, BYTES)
@@ -90,7 +107,7 @@ class TableConversion:
         if table is None:
             return None
         count, last_ns = 0, 0
-        with open_table(out.open(), self.form, table, self.units_line) as writer:
+        with open_table(out.open(), self.form, table, self.units_line) as writer, _settled():
             write = writer.write
             for row in rows:
                 write(row)
@@ -100,8 +117,8 @@ class TableConversion:
                     reached(recording.position)
             reached(recording.position)
         out.is_whole = True
-        signals = len(self.choice.columns)
-        return f"{_many(count, 'row')} of {_many(signals, 'signal')}, up to {last_ns / 1e9:.3f} s"
+        columns = _many(len(self.choice.columns), "signal" if self.by_frame else "value")
+        return f"{_many(count, 'row')} of {columns}, up to {last_ns / 1e9:.3f} s"
 
 
 @dataclass(frozen=True)
@@ -146,15 +163,15 @@ class LogConversion:
             raise
         out.is_whole = True
         lasted = last.time_ns - origin_ns
-        told = f"{_many(count - sum(writer.left_out.values()), 'CAN frame')}, up to {lasted / 1e9:.3f} s"
+        summary = f"{_many(count - sum(writer.left_out.values()), 'CAN frame')}, up to {lasted / 1e9:.3f} s"
         for what, number in writer.left_out.items():
-            told += f"; {number} {what} left out, which {self.format} does not know"
+            summary += f"; {number} {what} left out, which {self.format} does not know"
         moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - lasted
         if abs(moved) > _CLOCK_SET_NS:
-            told += (
+            summary += (
                 f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
             )
-        return told
+        return summary
 
     def _cut(self, frames: "Iterator[TimedFrame]", origin_ns: int) -> "Iterator[TimedFrame]":
         from kontronik_can_gw.desk.recordings.tables import DISORDER_NS
@@ -193,5 +210,22 @@ class BytesConversion:
         return f"{_many(count, 'byte')} of {recording.bus.escs[self.esc].name}"
 
 
+@contextmanager
+def _settled() -> Iterator[None]:
+    """What is there by now is not looked at by the garbage collector: rows that are held would make it look often."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
 def _many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def reason(error: OSError) -> str:
+    """Why nothing could be written, in the system's words; pyarrow says its own, with the number in it."""
+    if number := re.search(r"\[errno (\d+)\]", str(error)):
+        return os.strerror(int(number[1]))
+    return error.strerror or (str(error).strip().splitlines() or ["no reason given"])[0]

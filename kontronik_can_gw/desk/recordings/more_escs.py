@@ -13,7 +13,7 @@ MAX_ESCS = 8
 
 
 def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
-    """What the person is to be told, in a line; empty where there is nothing.
+    """A hint for the person, in a line; empty where there is none.
 
     ``ours``: ids of the layout that came (29 bits with EXTENDED), ``others``: how often each other one came.
     """
@@ -22,7 +22,7 @@ def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
     found, frames = 1, 0
     for count in range(2, MAX_ESCS + 1):
         by_esc: list[set[int]] = []
-        with suppress(UserError):  # so many do not fit
+        with suppress(UserError):  # that many do not fit
             by_esc = _ids(bus, count)
         here = [ids & (others.keys() | ours) for ids in by_esc]
         # half of the messages: some come rarely, or are switched off
@@ -43,7 +43,7 @@ def more_escs(bus: BusLayout, ours: set[int], others: Mapping[int, int]) -> str:
 
 
 def _ids(bus: BusLayout, count: int) -> list[set[int]]:
-    """The ids of each of so many ESCs, as ``dbc`` gives them."""
+    """The ids of each of ``count`` ESCs, as ``dbc`` gives them."""
     from kontronik_can_gw.dbc.expand import esc_prefix, expand
 
     escs = [EscSettings(f"esc{number}") for number in range(1, count + 1)]

@@ -45,7 +45,7 @@ def is_stream(path: Path) -> bool:
 
 
 def spooled(path: Path, reached: Callable[[int], None] | None = None) -> Path:
-    """All that comes of a stream, as a file; ``reached`` is told how many bytes there are. UserError for a device, RunError."""
+    """All that comes of a stream, as a file; ``reached`` is called with the bytes so far. UserError for a device, RunError."""
     shown = "standard input" if str(path) == STREAM else str(path)
     file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  as long as its path
     count = 0

@@ -1,17 +1,18 @@
 """Analyses a recording: rows of values in; numbers, events and points to draw out. Pure, one pass, bounded memory.
 
-Every value is found by its source (``SignalReader.column_of``) and converted to the source's unit, so any DBC works. Values that the DBC
-does not have are left out and named in ``missing``. A value holds until the next row; between rows further apart than the time-out there
-is a gap. Times are ns of the recording's clock.
+Every value is found by its name, so any recording and any DBC will do. What they do not have is left out and named in ``missing``. A value
+holds until the next row; two rows further apart than the time-out have a gap between them. Times are ns of the recording's clock.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from enum import IntEnum
 from operator import itemgetter
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.desk.recordings.fields import Field, column_of
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.samples import fields_of_log
 from kontronik_can_gw.desk.report.decimate import Decimator, Number, Points
 from kontronik_can_gw.desk.report.flight import (
     Event,
@@ -35,9 +36,8 @@ from kontronik_can_gw.esc.kontronik.states import (
     state_text,
 )
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
-from kontronik_can_gw.esc.values import VALUES, GatewayState
-from kontronik_can_gw.signals import units
-from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
+from kontronik_can_gw.esc.values import GatewayState
+from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 CHUNK = 4096
 """Rows that are processed together."""
@@ -48,15 +48,20 @@ MAX_SEGMENTS = 4000
 
 
 class Analysis:
-    """Takes the rows of a recording. ``window``: seconds after the first row, (from, to); None: no limit."""
+    """Takes the rows of a recording.
+
+    ``window``: seconds after the first row, (from, to); None: no limit. ``fields``: of the rows; those of a CAN log if None.
+    """
 
     def __init__(
         self,
         bus: BusLayout,
         points: int = 20_000,
         window: tuple[float | None, float | None] = (None, None),
+        fields: Sequence[Field] | None = None,
     ) -> None:
-        self._reader = SignalReader(bus.layout)
+        if fields is None:
+            fields = fields_of_log(SignalReader(bus.layout), bus.escs)
         self._names = [settings.name for settings in bus.escs]
         low, high = window
         self._from_ns = None if low is None else round(low * SECOND)
@@ -69,11 +74,11 @@ class Analysis:
         self._times: list[int] = []
         self._pending: list[tuple[Value, ...]] = []
         self._picked: list[int] = []
-        self._gateway_state = self._reader.column_of("gateway_state")
+        self._gateway_state = column_of(fields, "gateway_state", None)
         self._replayed = False
         self._events = _Events()
         self._escs = [
-            _Esc(index, settings, self._reader, self._pick, self._events)
+            _Esc(index, settings, fields, self._pick, self._events)
             for index, settings in enumerate(bus.escs)
         ]
         if self._gateway_state is not None:
@@ -237,22 +242,6 @@ class _Events:
         )
 
 
-class _Input(NamedTuple):
-    """Column of a source in a chunk, and its conversion to the source's unit."""
-
-    at: int
-    slope: float
-    shift: float
-    column: Column
-
-    def read(self, columns: Sequence[tuple[Value, ...]]) -> Sequence[Number]:
-        values: Sequence[Number] = columns[self.at]  # type: ignore[assignment]  # no text: the source is a number
-        if self.slope == 1 and self.shift == 0:
-            return values
-        slope, shift = self.slope, self.shift
-        return [None if value is None else round((value - shift) / slope, 9) for value in values]
-
-
 _NUMBERS = ("consumed_charge", "energy_used", "losses", "crc_errors", "dropped_bytes", "cell_count")
 _FACTS = (
     "device",
@@ -290,7 +279,7 @@ class _Esc:
         self,
         index: int,
         settings: EscSettings,
-        reader: SignalReader,
+        fields: Sequence[Field],
         pick: Callable[[int], int],
         events: _Events,
     ) -> None:
@@ -299,20 +288,20 @@ class _Esc:
         self.facts = Facts()
         self.missing: list[str] = []
         self._events = events
-        self._inputs: dict[str, _Input] = {}
+        self._inputs: dict[str, int] = {}
+        self._counters: dict[str, Counter] = {}
 
         def bind(source: str) -> int | None:
-            found = reader.column_of(source, index)
+            found = column_of(fields, source, index)
             return None if found is None else pick(found)
 
         for source in dict.fromkeys((*(q.source for plot in PLOTS for q in plot.lines), *_NUMBERS)):
-            if (at := bind(source)) is None:
+            found = column_of(fields, source, index)
+            if found is None:
                 continue
-            found = reader.column_of(source, index)
-            assert found is not None
-            column = reader.columns[found]
-            factors = units.conversion(VALUES[source].unit, column.unit) or (1, 0)
-            self._inputs[source] = _Input(at, float(factors[0]), float(factors[1]), column)
+            self._inputs[source] = pick(found)
+            if source in _NUMBERS[:5]:
+                self._counters[source] = Counter(fields[found].high)
         self._facts_at = {source: at for source in _FACTS if (at := bind(source)) is not None}
         states = [
             (at, source)
@@ -322,11 +311,11 @@ class _Esc:
         self._state_at = states[0][0] if states else None
         self._state_numbers: dict[Value, int] = {}
         if states and states[0][1] == "operating_state":
-            found = reader.column_of("operating_state", index)
+            found = column_of(fields, "operating_state", index)
             assert found is not None
             named = {normalize(state.text): int(state) for state in OperatingState}
             self._state_numbers = {
-                text: named.get(normalize(text), -1) for _, text in reader.columns[found].texts
+                text: named.get(normalize(text), -1) for _, text in fields[found].texts
             }
         self._live_at = next((at for source in _LIVE if (at := bind(source)) is not None), None)
         self._flags: list[tuple[int, ErrorBit, Value, Event | None]] = []
@@ -371,11 +360,6 @@ class _Esc:
         if not self._flags and not self._words:
             self.missing.append("Errors")
         self._ledger = Ledger(self.summary)
-        self._counters = {
-            source: Counter(self._inputs[source].column)
-            for source in _NUMBERS[:5]
-            if source in self._inputs
-        }
         self.segments: list[Segment] = []
         self._shortest_ns = 0
         self._state: tuple[int, int] | None = None  # number, since
@@ -392,7 +376,11 @@ class _Esc:
         self, times: tuple[int, ...], columns: Sequence[tuple[Value, ...]]
     ) -> list[Sequence[Number]]:
         """Take a chunk of rows; return the columns to draw."""
-        numbers = {source: found.read(columns) for source, found in self._inputs.items()}
+        # no texts: these values are numbers
+        numbers: dict[str, Sequence[Number]] = {
+            source: columns[at]  # type: ignore[misc]
+            for source, at in self._inputs.items()
+        }
         if "cell_count" in numbers:
             known = next((value for value in reversed(numbers["cell_count"]) if value), None)
             self._cells = known or self._cells

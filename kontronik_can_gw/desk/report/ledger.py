@@ -7,7 +7,7 @@ from kontronik_can_gw.desk.report.decimate import Number
 from kontronik_can_gw.desk.report.fit import ResistanceFit
 from kontronik_can_gw.desk.report.flight import Extreme, Summary
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.signals.unpacker import Column, Value
+from kontronik_can_gw.signals.unpacker import Value
 
 HOUR_NS = 3600 * SECOND
 REST_CURRENT = 1.0
@@ -19,10 +19,10 @@ REST_NS = 2 * SECOND
 
 
 class Counter:
-    """Total increase of a counter, across resets and overflows."""
+    """Total increase of a counter, across resets and overflows at ``top``."""
 
-    def __init__(self, column: Column) -> None:
-        self._top = column.high
+    def __init__(self, top: float) -> None:
+        self._top = top
         self._last: Number = None
         self.total = 0.0
         self.resets = 0

@@ -4,9 +4,10 @@ from kontronik_can_gw.desk.recordings.can_logs.log import (
     FORMATS,
     NAMES,
     SUFFIXES,
+    UART_MAGIC,
     CanLog,
     log_format,
 )
 from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
 
-__all__ = ["FORMATS", "NAMES", "SUFFIXES", "CanLog", "CanLogWriter", "log_format"]
+__all__ = ["FORMATS", "NAMES", "SUFFIXES", "UART_MAGIC", "CanLog", "CanLogWriter", "log_format"]

@@ -1,4 +1,4 @@
-"""Reader of Vector BLF files. A damaged container or object is passed over, up to the next one that can be read.
+"""Reader of Vector BLF files. A damaged container or object is left out, up to the next one that can be read.
 
 A BLF file is a header ``LOGG`` and containers ``LOBJ``, each with zlib-compressed objects ``LOBJ``, which may go on in the next container.
 No specification is public; the structures are those of python-can (and of Tobias Lorenz' vector_blf).
@@ -33,7 +33,7 @@ _FD_MESSAGE_64 = struct.Struct("<BBBBLLLLLLLHBBL")
 _CAN_MESSAGE, _CAN_ERROR, _LOG_CONTAINER, _CAN_ERROR_EXT = 1, 2, 10, 73
 _CAN_MESSAGE2, _CAN_FD_MESSAGE, _CAN_FD_MESSAGE_64 = 86, 100, 101
 _FRAMES = (_CAN_MESSAGE, _CAN_MESSAGE2, _CAN_FD_MESSAGE, _CAN_FD_MESSAGE_64)
-_LEAST = {
+_MIN_SIZES = {
     _CAN_MESSAGE: _MESSAGE.size,
     _CAN_MESSAGE2: _MESSAGE.size,
     _CAN_FD_MESSAGE: _FD_MESSAGE.size,
@@ -86,7 +86,7 @@ class BlfReader:
             self._damage.notes.append("the last frame is cut off")
 
     def _containers(self) -> Iterator[tuple[int, int, bytes]]:
-        """Offset, end and content of each container that can be read, in order; what lies between is told as damage."""
+        """Offset, end and content of each container that can be read, in order; what lies between is reported as damage."""
         file, damage = self._file, self._damage
         file.seek(0, 2)
         end = file.tell()
@@ -225,7 +225,7 @@ class BlfReader:
         flags, _, _, stamp = _OBJECT.unpack_from(data, start + _BASE.size)
         time_ns = stamp * 10_000 if flags == 1 else stamp
         at = start + _BASE.size + _OBJECT.size + (8 if version == 2 else 0)
-        if start + size < at + _LEAST.get(kind, 0):
+        if start + size < at + _MIN_SIZES.get(kind, 0):
             raise struct.error
         if kind in (_CAN_MESSAGE, _CAN_MESSAGE2):
             channel, bits, length, can_id, content = _MESSAGE.unpack_from(data, at)

@@ -13,12 +13,10 @@ from kontronik_can_gw.desk.recordings.can_logs.text import (
     CANDUMP_LINE,
     CANDUMP_SCREEN_LINE,
     LONGEST_LINE,
-    TRC_HEAD,
-    TRC_LINE,
     AscReader,
     CandumpReader,
-    TrcReader,
 )
+from kontronik_can_gw.desk.recordings.can_logs.trc import TRC_HEAD, TRC_LINE, TrcReader
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 

@@ -31,7 +31,7 @@ class Reader(Protocol):
 
 
 def is_possible(can_id: int, extended: bool, size: int, fd: bool) -> bool:
-    """True where a frame with this id and so many bytes exists on a CAN bus."""
+    """True where a frame with this id and number of bytes exists on a CAN bus."""
     return can_id <= (0x1FFFFFFF if extended else 0x7FF) and (
         size in FD_LENGTHS if fd else size <= 8
     )

@@ -5,11 +5,13 @@ share one channel group and one time, of a table of CAN frames those of each mes
 """
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.desk.recordings.can_logs.mf4 import asammdf_module, quiet, save_mf4, set_start
-from kontronik_can_gw.desk.recordings.tables.fields import Field, Kind, Table
+from kontronik_can_gw.desk.recordings.columns import Values
+from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table
 from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
 from kontronik_can_gw.signals.unpacker import Value
 
@@ -24,6 +26,7 @@ class Mf4Table:
         module = asammdf_module()
         self._path = path
         self._provenance = table.provenance
+        self._nothing: list[Values] = [(None,) * len(part) for part in table.parts()]
         with quiet():
             self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
             set_start(self._mdf, table.start_wall_ns or 0)
@@ -43,7 +46,12 @@ class Mf4Table:
 
     def write(self, row: Row) -> None:
         """Add a row."""
-        (self._groups[row.values[1]] if self._groups else self._group).write(row)
+        values = list(
+            chain.from_iterable(
+                self._nothing[i] if p is None else p for i, p in enumerate(row.parts)
+            )
+        )
+        (self._groups[values[1]] if self._groups else self._group).write(row.time_ns, values)
 
     def close(self) -> None:
         """Write the file."""
@@ -67,7 +75,8 @@ class _Group:
 
         self._np = np
         self._mdf = mdf
-        self._rows: list[Row] = []
+        self._times: list[int] = []
+        self._rows: list[Sequence[Value]] = []
         self._last = -(1 << 62)
         self._codes: list[tuple[int, str, dict[Value, int]]] = []
         """Of each field its index, type and the codes of its texts."""
@@ -102,12 +111,11 @@ class _Group:
             )
         self._number = mdf.append(signals, acq_name=name, comment=name, common_timebase=True)
 
-    def write(self, row: Row) -> None:
+    def write(self, time_ns: int, values: Sequence[Value]) -> None:
         """Add a row; what is earlier than its predecessor gets that one's time, for a master channel only rises."""
-        if row.time_ns < self._last:
-            row = row._replace(time_ns=self._last)
-        self._last = row.time_ns
-        self._rows.append(row)
+        self._last = max(self._last, time_ns)
+        self._times.append(self._last)
+        self._rows.append(values)
         if len(self._rows) >= ROWS:
             self.flush()
 
@@ -116,12 +124,13 @@ class _Group:
         np = self._np
         if not self._rows:
             return
-        columns = list(zip(*(row.values for row in self._rows), strict=True))
-        times = np.array([row.time_ns for row in self._rows], dtype=np.int64) / SECOND_NS
+        columns = list(zip(*self._rows, strict=True))
+        times = np.array(self._times, dtype=np.int64) / SECOND_NS
         arrays = [(times, None)]
         for index, kind, codes in self._codes:
             column = [codes[value] for value in columns[index]] if codes else columns[index]
             arrays.append((np.array(column, dtype=kind), None))
         self._rows.clear()
+        self._times.clear()
         with quiet():
             self._mdf.extend(self._number, arrays)

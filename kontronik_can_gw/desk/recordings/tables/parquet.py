@@ -1,16 +1,20 @@
 """Tables as Parquet by pyarrow (an extra): typed columns, units and provenance in the metadata."""
 
 import json
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.desk.recordings.tables.fields import TIME, UTC, Field, Kind, Table
+from kontronik_can_gw.desk.recordings.columns import Values
+from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.signals.unpacker import Value
 
-ROWS = 16_384
+ROWS = 4096
 """Rows that gather as such."""
+_FIRST = 64
 GROUP = 1 << 16
 """Rows of a row group, whose columns stay in memory until it is full."""
 
@@ -29,7 +33,7 @@ class ParquetTable:
         self._pa: Any = pa
         self._table = table
         # the same text may stand for several numbers
-        self._codes = [
+        self._codes: list[dict[Value, int]] = [
             {text: code for code, text in enumerate(dict.fromkeys(text for _, text in one.texts))}
             for one in table.fields
         ]
@@ -82,26 +86,39 @@ class ParquetTable:
         if not self._rows:
             return
         pa = self._pa
-        times, walls, values = zip(*self._rows, strict=True)
+        times, walls, rows = zip(*self._rows, strict=True)
         arrays = [pa.array([time_ns / SECOND_NS for time_ns in times], pa.float64())]
         if self._table.has_utc:
             in_range = [_in_range(wall_ns) for wall_ns in walls]
             arrays.append(pa.array(in_range, pa.int64()).cast(pa.timestamp("ns", tz="UTC")))
-        columns = zip(*values, strict=True)
-        for one, codes, column in zip(self._table.fields, self._codes, columns, strict=True):
-            if one.kind is Kind.TEXT:
-                indices = pa.array([codes.get(value) for value in column], pa.int32())
-                arrays.append(
-                    pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string()))
-                )
-            else:
-                arrays.append(pa.array(column, self._type(one)))
+        for part, values in zip(self._table.parts(), zip(*rows, strict=True), strict=True):
+            arrays += self._columns(part, values)
         self._rows = []
         batch = pa.RecordBatch.from_arrays(arrays, schema=self._schema)
         self._batches.append(batch)
         self._held += batch.num_rows
         if self._held >= GROUP:
             self._write_group()
+
+    def _columns(self, part: range, rows: Sequence[Values | None]) -> list[Any]:
+        """The columns of one part of all rows. Rows that have one object in common are made once and repeated."""
+        once = rows if _differ(rows) else list({id(values): values for values in rows}.values())
+        nothing = (None,) * len(part)
+        columns = zip(*(nothing if values is None else values for values in once), strict=True)
+        arrays = [self._array(index, column) for index, column in zip(part, columns, strict=True)]
+        if once is rows:
+            return arrays
+        places = {id(values): place for place, values in enumerate(once)}
+        repeated = self._pa.array([places[id(values)] for values in rows], self._pa.int32())
+        return [array.take(repeated) for array in arrays]
+
+    def _array(self, index: int, column: Sequence[Value]) -> Any:
+        pa, one = self._pa, self._table.fields[index]
+        if one.kind is not Kind.TEXT:
+            return pa.array(column, self._type(one))
+        codes = self._codes[index]
+        indices = pa.array([codes.get(value) for value in column], pa.int32())
+        return pa.DictionaryArray.from_arrays(indices, pa.array(list(codes), pa.string()))
 
     def _write_group(self) -> None:
         if self._batches:
@@ -114,6 +131,12 @@ class ParquetTable:
         if one.kind is Kind.TEXT:
             return pa.dictionary(pa.int32(), pa.string())
         return {Kind.FLAG: pa.int8(), Kind.WHOLE: pa.int64(), Kind.FLOAT: pa.float64()}[one.kind]
+
+
+def _differ(rows: Sequence[Values | None]) -> bool:
+    """True where few neighbours are one object, by the first rows."""
+    first = rows[:_FIRST]
+    return len({id(values) for values in first}) * 2 > len(first)
 
 
 def _in_range(wall_ns: int | None) -> int | None:

@@ -1,19 +1,27 @@
 """Rows of a table out of a recording: which columns, from when to when, how many a second."""
 
 import fnmatch
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from itertools import chain
+from itertools import chain, groupby
 from operator import itemgetter
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.columns import Values
+from kontronik_can_gw.desk.recordings.fields import (
+    Field,
+    Table,
+    distinct,
+    field_of_signal,
+    frame_fields,
+)
+from kontronik_can_gw.desk.recordings.recording import Input
 from kontronik_can_gw.desk.recordings.samples import Sample
-from kontronik_can_gw.desk.recordings.tables.fields import Table, fields_of, frame_fields
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
+from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 SECOND_NS = 1_000_000_000
 DISORDER_NS = SECOND_NS
@@ -22,23 +30,19 @@ T = TypeVar("T")
 
 
 class Row(NamedTuple):
-    """A row. ``time_ns``: since the recording's start. ``wall_ns``: Unix time, None where unknown."""
+    """A row. ``time_ns``: since the recording's start. ``wall_ns``: Unix time, None where unknown.
+
+    ``parts``: values of neighbouring fields. A part that has not changed is the object that it was; None: it is of another frame.
+    """
 
     time_ns: int
     wall_ns: int | None
-    values: tuple[Value, ...]
+    parts: tuple[Values | None, ...]
 
 
-class Recording(Protocol):
-    """What rows need of an Input."""
-
-    provenance: dict[str, str]
-
-    @property
-    def reader(self) -> SignalReader: ...
-    def frames(self) -> Iterator[TimedFrame]: ...
-    def samples(self) -> Iterator[Sample]: ...
-    def wall_ns(self, time_ns: int) -> int | None: ...
+def fields_of_frames(recording: Input) -> list[Field]:
+    """The fields of a table of CAN frames: the signals of the DBC."""
+    return distinct([field_of_signal(column) for column in recording.reader.columns])
 
 
 @dataclass(frozen=True)
@@ -53,36 +57,44 @@ class Choice:
     @classmethod
     def of(
         cls,
-        columns: Sequence[Column],
+        fields: Sequence[Field],
         names: Sequence[str] = (),
         esc: int | None = None,
         **times: Any,
     ) -> "Choice":
-        """The columns whose signal has one of these names (with * and ?), of one ESC. UserError for a name that fits none."""
+        """The fields with one of these names (with * and ?), of one ESC. UserError for a name that fits none.
+
+        Case and underscores do not matter, and with several ESCs a name may be that of a value alone.
+        """
         chosen: list[int] = []
         problems = []
+        known = [{_plain(one.name), _plain(one.name.rpartition(".")[2])} for one in fields]
         for name in names:
+            wanted = _plain(name)
             found = [
-                i
-                for i, c in enumerate(columns)
-                if fnmatch.fnmatchcase(c.name.lower(), name.lower())
+                index
+                for index, called in enumerate(known)
+                if any(fnmatch.fnmatchcase(one, wanted) for one in called)
             ]
             if not found:
-                close = get_close_matches(name, [c.name for c in columns], 1, 0.5)
-                problems.append(
-                    f"--signals {name}: no such signal."
-                    + (f" Did you mean {close[0]}?" if close else "")
-                )
-            chosen += [i for i in found if i not in chosen]
+                shown = {_plain(one.name): one.name for one in reversed(fields)}
+                close = get_close_matches(wanted, shown, 1, 0.5)
+                more = f" Did you mean {shown[close[0]]}?" if close else ""
+                problems.append(f"--signals {name}: no such signal.{more}")
+            chosen += [index for index in found if index not in chosen]
         if problems:
             raise UserError(*problems)
         if not names:
-            chosen = list(range(len(columns)))
+            chosen = list(range(len(fields)))
         if esc is not None:
-            chosen = [i for i in chosen if columns[i].esc == esc]
+            chosen = [index for index in chosen if fields[index].esc == esc]
         if not chosen:
             raise UserError("no signal is left: --esc and --signals leave out each other's")
         return cls(chosen, **times)
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "")
 
 
 def first_of(items: Iterator[T]) -> tuple[T | None, Iterator[T]]:
@@ -97,59 +109,75 @@ class Rows:
     ``table`` describes them; None where the recording has nothing.
     """
 
-    def __init__(self, recording: Recording, choice: Choice, by_frame: bool = False) -> None:
+    def __init__(self, recording: Input, choice: Choice, by_frame: bool = False) -> None:
         self._recording = recording
         self._choice = choice
-        self._names = _frame_names(recording.reader, choice)
-        columns = recording.reader.columns
-        fields = fields_of([columns[index] for index in choice.columns])
+        every = fields_of_frames(recording) if by_frame else recording.fields
+        fields = [every[index] for index in choice.columns]
         items: Iterator[Row]
         self.table: Table | None = None
         self._rows: Iterator[Row] = iter(())
         if by_frame:
+            names = _frame_names(recording.reader, choice)
             first_frame, frames = first_of(recording.frames())
             origin_ns = None if first_frame is None else first_frame.time_ns
-            items = self._of_frames(frames, origin_ns or 0)
-            fields = [*frame_fields(self._names.values()), *fields]
+            runs = self._runs()
+            items = self._of_frames(frames, origin_ns or 0, names, runs)
+            widths = [2, *(len(columns) for _, columns in runs)]
+            fields = [*frame_fields(names.values()), *fields]
         else:
-            first, samples = first_of(recording.samples())
+            first, samples = first_of(recording.samples(choice.columns))
             origin_ns = None if first is None else first.time_ns
             items = self._of_samples(samples, origin_ns or 0)
+            widths = [] if first is None else list(map(len, first.parts))
         if origin_ns is None:
             return
         if choice.start_ns is not None or choice.end_ns is not None:
             items = _cut(items, choice.start_ns, choice.end_ns)
         if choice.rate is not None:
-            items = thinned(items, choice.rate, (lambda row: row.values[1]) if by_frame else None)
+            items = thinned(items, choice.rate, (lambda row: row.parts[0]) if by_frame else None)
         first_row, self._rows = first_of(items)
         if first_row is None:
             return
         wall_ns = recording.wall_ns(origin_ns)
-        self.table = Table(fields, wall_ns is not None, by_frame, wall_ns, recording.provenance)
+        has_utc, provenance = wall_ns is not None, recording.provenance
+        self.table = Table(fields, has_utc, by_frame, wall_ns, provenance, widths)
 
     def __iter__(self) -> Iterator[Row]:
         return self._rows
 
     def _of_samples(self, samples: Iterator[Sample], origin_ns: int) -> Iterator[Row]:
-        pick = _picker(self._choice.columns)
         wall_ns = self._recording.wall_ns
-        for time_ns, values in samples:
-            yield Row(time_ns - origin_ns, wall_ns(time_ns), pick(values))
+        for time_ns, parts in samples:
+            yield Row(time_ns - origin_ns, wall_ns(time_ns), parts)
 
-    def _of_frames(self, frames: Iterator[TimedFrame], origin_ns: int) -> Iterator[Row]:
-        reader, names = self._recording.reader, self._names
-        pick = _picker(self._choice.columns)
-        wall_ns = self._recording.wall_ns
+    def _runs(self) -> list[tuple[int, list[int]]]:
+        """Neighbouring columns of one message, and its id."""
+        columns = self._recording.reader.columns
+        runs = groupby(self._choice.columns, lambda index: columns[index].key)
+        return [(key, list(indices)) for key, indices in runs]
+
+    def _of_frames(
+        self,
+        frames: Iterator[TimedFrame],
+        origin_ns: int,
+        names: Mapping[int, tuple[str, str]],
+        runs: Sequence[tuple[int, Sequence[int]]],
+    ) -> Iterator[Row]:
+        reader, wall_ns = self._recording.reader, self._recording.wall_ns
+        picks = [(key, _picker(indices)) for key, indices in runs]
         count = len(reader.columns)
         for time_ns, frame, _ in frames:
-            head = names.get(frame.key)
-            if head is None or (chunks := reader.read(frame.key, frame.data)) is None:
+            key = frame.key
+            head = names.get(key)
+            if head is None or (chunks := reader.read(key, frame.data)) is None:
                 # shorter than its message
                 continue
             values: list[Value] = [None] * count
             for first, new in chunks:
                 values[first : first + len(new)] = new
-            yield Row(time_ns - origin_ns, wall_ns(time_ns), head + pick(values))
+            parts = [pick(values) if of == key else None for of, pick in picks]
+            yield Row(time_ns - origin_ns, wall_ns(time_ns), (head, *parts))
 
 
 def _frame_names(reader: SignalReader, choice: Choice) -> dict[int, tuple[str, str]]:
@@ -158,10 +186,8 @@ def _frame_names(reader: SignalReader, choice: Choice) -> dict[int, tuple[str, s
     for index in choice.columns:
         column = reader.columns[index]
         can_id = column.key & ~EXTENDED
-        found[column.key] = (
-            f"{can_id:08X}" if column.key & EXTENDED else f"{can_id:03X}",
-            column.message,
-        )
+        name = f"{can_id:08X}" if column.key & EXTENDED else f"{can_id:03X}"
+        found[column.key] = name, column.message
     return found
 
 
@@ -193,7 +219,7 @@ def thinned(
     yield from sorted(held.values(), key=lambda one: one.time_ns)
 
 
-def _picker(columns: Sequence[int]) -> Callable[[Sequence[Value]], tuple[Value, ...]]:
+def _picker(columns: Sequence[int]) -> Callable[[Sequence[Value]], Values]:
     if len(columns) == 1:
         only = columns[0]
         return lambda values: (values[only],)

@@ -1,17 +1,22 @@
-"""Tables as text: CSV and JSON lines. The function that makes a row's line is generated from the fields."""
+"""Tables as text: CSV and JSON lines. Each column keeps the texts of the values that it had."""
 
 import json
 import math
 from collections.abc import Callable, Sequence
 from datetime import UTC as UTC_ZONE
 from datetime import datetime
+from operator import getitem
 from typing import IO
 
-from kontronik_can_gw.desk.recordings.tables.fields import TIME, UTC, Field, Kind, Table
+from kontronik_can_gw.desk.recordings.columns import Known, Values
+from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
 from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
 from kontronik_can_gw.signals.unpacker import Value
 
-_Line = Callable[[str, str, Sequence[Value]], str]
+_LINES = 256
+"""Lines that gather before they are written."""
+Cell = Callable[[Value], str]
+"""What gives the text of a value."""
 
 
 def seconds_text(time_ns: int) -> str:
@@ -46,97 +51,109 @@ def csv_text(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text
 
 
-class CsvTable:
+def _csv_cell(field: Field) -> Cell:
+    if field.kind is Kind.WHOLE:
+        return lambda value: "" if value is None else str(value)
+    return lambda value: csv_text(value) if isinstance(value, str) else _number(value, "")
+
+
+def _json_cell(field: Field) -> Cell:
+    key = f"{json.dumps(field.name)}: "
+    if field.kind is Kind.WHOLE:
+        return lambda value: f"{key}null" if value is None else f"{key}{value}"
+    return lambda value: (
+        key
+        + (
+            json.dumps(value, ensure_ascii=False)
+            if isinstance(value, str)
+            else _number(value, "null")
+        )
+    )
+
+
+def _number(value: float | None, nothing: str) -> str:
+    """A float signal may be infinite, which JSON does not know."""
+    return nothing if value is None or not math.isfinite(value) else str(value)
+
+
+class _Lines:
+    """Lines of text, a row each. A part of a row that is the one of the row before is not put into words again."""
+
+    def __init__(self, file: IO[bytes], table: Table, cell: Callable[[Field], Cell]) -> None:
+        self._file = file
+        self._utc = UtcText()
+        cells = [Known(cell(one)) for one in table.fields]
+        self._cells = [[cells[index] for index in part] for part in table.parts()]
+        self._parts: list[Values | None] = [None] * len(self._cells)
+        self._texts = [""] * len(self._cells)
+        self._lines: list[str] = []
+        self._separator = ","
+
+    def _in_words(self, parts: Sequence[Values | None]) -> list[str]:
+        """The text of each part; of one of another frame the one that it had last."""
+        known, texts = self._parts, self._texts
+        for index, part in enumerate(parts):
+            if part is not known[index] and part is not None:
+                known[index] = part
+                texts[index] = self._separator.join(map(getitem, self._cells[index], part))
+        return texts
+
+    def _put(self, line: str) -> None:
+        self._lines.append(line)
+        if len(self._lines) >= _LINES:
+            self.close()
+
+    def close(self) -> None:
+        """Write what has gathered."""
+        self._file.write("".join(self._lines).encode())
+        self._lines.clear()
+
+    def discard(self) -> None:
+        """Nothing is held but text."""
+
+
+class CsvTable(_Lines):
     """RFC 4180 without its carriage returns: a header of names with units, comma, decimal point, UTF-8; empty where not available."""
 
     def __init__(self, file: IO[bytes], table: Table) -> None:
-        self._write = file.write
-        self._utc = UtcText()
-        self._line = _compiled(table.fields, "csv", table.has_utc)
-        heads = [
-            f"{TIME} [s]",
-            *([UTC] if table.has_utc else []),
-            *(one.header for one in table.fields),
-        ]
-        file.write((",".join(map(csv_text, heads)) + "\n").encode())
+        super().__init__(file, table, _csv_cell)
+        self._has_utc = table.has_utc
+        self._nothing = ["," * (len(part) - 1) for part in table.parts()]
+        heads = [f"{TIME} [s]", *([UTC] if table.has_utc else [])]
+        heads += [one.header for one in table.fields]
+        self._put(",".join(map(csv_text, heads)) + "\n")
 
     def write(self, row: Row) -> None:
         """Add a row."""
-        time_ns, wall_ns, values = row
-        self._write(self._line(seconds_text(time_ns), self._utc(wall_ns), values).encode())
+        time_ns, wall_ns, parts = row
+        texts = self._in_words(parts)
+        if None in parts:
+            both = zip(parts, texts, self._nothing, strict=True)
+            texts = [nothing if part is None else text for part, text, nothing in both]
+        utc = f",{self._utc(wall_ns)}" if self._has_utc else ""
+        self._put(f"{seconds_text(time_ns)}{utc},{','.join(texts)}\n")
 
-    def close(self) -> None:
-        """Nothing is held back."""
 
-    def discard(self) -> None:
-        """Nothing is held."""
-
-
-class JsonTable:
-    """One object a line, keys are the names of the signals; null where not available. ``units``: a first line with the units."""
+class JsonTable(_Lines):
+    """One object a line, keys are the names of the fields; null where not available. ``units``: a first line with the units."""
 
     def __init__(self, file: IO[bytes], table: Table, units: bool = False) -> None:
-        self._write = file.write
-        self._utc = UtcText()
-        self._by_message: dict[Value, _Line] = {}
-        fields = table.fields
-        if table.by_frame:
-            for message in dict.fromkeys(one.message for one in fields[2:]):
-                indices = [0, 1, *table.indices(message)]
-                self._by_message[message] = _compiled(fields, "json", table.has_utc, indices)
-        else:
-            self._line = _compiled(fields, "json", table.has_utc)
+        super().__init__(file, table, _json_cell)
+        self._separator = ", "
+        self._has_utc = table.has_utc
         if units:
-            known = {TIME: "s"} | {one.name: one.unit for one in fields if one.unit}
-            file.write((json.dumps({"units": known}, ensure_ascii=False) + "\n").encode())
+            known = {TIME: "s"} | {one.name: one.unit for one in table.fields if one.unit}
+            self._put(json.dumps({"units": known}, ensure_ascii=False) + "\n")
 
     def write(self, row: Row) -> None:
         """Add a row."""
-        time_ns, wall_ns, values = row
-        line = self._by_message[values[1]] if self._by_message else self._line
-        self._write(line(seconds_text(time_ns), self._utc(wall_ns), values).encode())
-
-    def close(self) -> None:
-        """Nothing is held back."""
-
-    def discard(self) -> None:
-        """Nothing is held."""
-
-
-def _compiled(
-    fields: Sequence[Field], form: str, has_utc: bool, only: Sequence[int] | None = None
-) -> _Line:
-    """A function from time, UTC and values to a line."""
-    is_csv = form == "csv"
-    nothing = "" if is_csv else "null"
-    names: dict[str, object] = {"finite": _finite}
-    parts = ["{t}"] if is_csv else [f'{{{{"{TIME}": {{t}}']
-    if has_utc:
-        # where a single row has no Unix time, as in front of a damaged one
-        parts.append("{u}" if is_csv else f'"{UTC}": {{w}}')
-    for index in range(len(fields)) if only is None else only:
-        one = fields[index]
-        if one.kind is Kind.TEXT:
-            quote = csv_text if is_csv else lambda text: json.dumps(text, ensure_ascii=False)
-            names[f"q{index}"] = {None: nothing} | {text: quote(text) for _, text in one.texts}
-            value = f"q{index}[v{index}]"
-        elif one.kind is Kind.FLOAT:
-            # a float signal may be infinite, which JSON does not know
-            value = f"finite(v{index}, n)"
-        else:
-            value = f"n if v{index} is None else v{index}"
-        key = "" if is_csv else json.dumps(one.name).replace("{", "{{").replace("}", "}}") + ": "
-        parts.append(f"{key}{{{value}}}")
-    names["n"] = nothing
-    text = (",".join(parts) if is_csv else ", ".join(parts) + "}}") + "\\n"
-    unpacked = ", ".join(f"v{index}" for index in range(len(fields)))
-    lines = ["def line(t, u, values):", f"    {unpacked}, = values"]
-    if has_utc and not is_csv:
-        lines.append("    w = f'\"{u}\"' if u else 'null'")
-    lines.append(f"    return f'''{text}'''")
-    exec(compile("\n".join(lines), "<row of a table>", "exec"), names)  # noqa: S102  text made here, from checked fields
-    return names["line"]  # type: ignore[return-value]
-
-
-def _finite(value: float | None, nothing: str) -> float | str:
-    return nothing if value is None or not math.isfinite(value) else value
+        time_ns, wall_ns, parts = row
+        texts = self._in_words(parts)
+        if None in parts:
+            texts = [text for part, text in zip(parts, texts, strict=True) if part is not None]
+        head = f'{{"{TIME}": {seconds_text(time_ns)}'
+        if self._has_utc:
+            # a single row may have no Unix time, as before a damaged one
+            utc = self._utc(wall_ns)
+            head = f'{head}, "{UTC}": "{utc}"' if utc else f'{head}, "{UTC}": null'
+        self._put(f"{head}, {', '.join(texts)}}}\n")

@@ -1,11 +1,11 @@
-"""The formats of tables behind one surface."""
+"""The formats of tables, all with the same methods."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Protocol
 
-from kontronik_can_gw.desk.recordings.tables.fields import Table
+from kontronik_can_gw.desk.recordings.fields import Table
 from kontronik_can_gw.desk.recordings.tables.rows import Row
 from kontronik_can_gw.desk.recordings.tables.text import CsvTable, JsonTable
 

@@ -1,0 +1,180 @@
+"""The columns of a table of telemetry: every value of values.py by its name and in its unit, of each ESC and of the gateway.
+
+``sections`` divides chosen columns into neighbours that are read together: fields of a frame all at once, flags by
+their word, the others one by one. A value that is not fresh is None.
+"""
+
+import math
+from collections.abc import Callable, Hashable, Sequence
+from itertools import groupby
+from operator import attrgetter, getitem, itemgetter
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.desk.recordings.fields import Field, Kind
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.esc.values import VALUES, Divisor, GatewayStatus, Group, physical, steps
+from kontronik_can_gw.esc.values import Kind as How
+from kontronik_can_gw.esc.values import Value as EscValue
+from kontronik_can_gw.signals.unpacker import Value
+
+Values = tuple[Value, ...]
+LEFT_OUT = frozenset({"sent_frames"})
+"""Only the frames themselves show it: they are not made for a table."""
+_MAX_KNOWN = 1 << 13
+_ORDER = {Group.LIVE: 0, Group.LINK: 1, Group.INFO: 2, Group.GATEWAY: 3}
+_LISTED = sorted(
+    (value for value in VALUES.values() if value.name not in LEFT_OUT),
+    key=lambda value: _ORDER[value.group],
+)
+
+
+def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
+    """A field for each value, of all ESCs and then of the gateway; with several ESCs named ``esc1.battery_voltage``."""
+    found = []
+    for index, esc in enumerate(escs):
+        prefix = f"{esc.name}." if len(escs) > 1 else ""
+        listed = (value for value in _LISTED if value.group is not Group.GATEWAY)
+        found += [_field(value, prefix, index) for value in listed]
+    listed = (value for value in _LISTED if value.group is Group.GATEWAY)
+    return found + [_field(value, "", None) for value in listed]
+
+
+def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
+    texts = tuple(sorted(value.names.items()))
+    high = math.inf if value.high is None else value.high / value.per_unit
+    return Field(prefix + value.name, value.unit, _kind(value), "", texts, value.name, esc, high)
+
+
+def _kind(value: EscValue) -> Kind:
+    if value.names:
+        return Kind.TEXT
+    if value.bit is not None:
+        return Kind.FLAG
+    return Kind.WHOLE if value.per_unit == 1 and value.divisor is Divisor.ONE else Kind.FLOAT
+
+
+# --- reading
+
+
+def _word(value: EscValue) -> int | None:
+    """Where in its frame's fields a value or flag stands as it is; None for one that is derived."""
+    if value.not_on or value.divisor is not Divisor.ONE:
+        return None
+    if value.kind is How.WIRE or value.bit is not None:
+        return value.words[0]
+    return None
+
+
+class Known(dict[Any, Any]):
+    """Results of a function by argument; it is emptied when it is full."""
+
+    def __init__(self, make: Callable[[Any], Any]) -> None:
+        self._make = make
+
+    def __missing__(self, key: Any) -> Any:
+        if len(self) >= _MAX_KNOWN:
+            self.clear()
+        made = self[key] = self._make(key)
+        return made
+
+
+def _scaling(value: EscValue) -> Callable[[Any], Value]:
+    """From steps to the value in its unit, or its text; of values without a divisor."""
+    if value.names:
+        return value.names.get
+    per_unit = value.per_unit
+    return int if per_unit == 1 else lambda steps: steps / per_unit
+
+
+class Section(NamedTuple):
+    """Neighbouring columns that are read together.
+
+    ``group``: what they change with; ``esc``: whose they are, None for the gateway. ``read`` is given an EscTelemetry, or
+    the GatewayStatus, and the time.
+    """
+
+    group: Group
+    esc: int | None
+    nothing: Values
+    read: Callable[[Any, int], Values]
+
+
+def _words(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]:
+    """What gives values that stand in a frame's fields as they are."""
+    words = [_word(VALUES[name]) for name in names]
+    take = itemgetter(*words, words[0])  # one more: of a single word it would be no tuple
+    scales = [Known(_scaling(VALUES[name])) for name in names]
+    nothing: Values = (None,) * len(names)
+    data_of = attrgetter(attribute)
+
+    def read(esc: EscTelemetry, _: int) -> Values:
+        data = data_of(esc)
+        return nothing if data is None else tuple(map(getitem, scales, take(data)))
+
+    return read
+
+
+def _flags(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]:
+    """What gives the bits of one word of a frame."""
+    word = _word(VALUES[names[0]])
+    assert word is not None
+    bits = [VALUES[name].bit or 0 for name in names]
+    known = Known(lambda found: tuple([found >> bit & 1 for bit in bits]))
+    nothing: Values = (None,) * len(names)
+    data_of = attrgetter(attribute)
+
+    def read(esc: EscTelemetry, _: int) -> Values:
+        data = data_of(esc)
+        return nothing if data is None else known[data[word]]
+
+    return read
+
+
+def _derived(names: Sequence[str]) -> Callable[[Any, int], Values]:
+    """What gives values of an ESC that are computed, by its pole pairs and gear as they are then."""
+    listed = [VALUES[name] for name in names]
+    gateway = GatewayStatus()
+
+    def read(esc: EscTelemetry, now: int) -> Values:
+        values: list[Value] = []
+        for value in listed:
+            found = steps(value, esc, gateway, now)
+            if value.names:
+                values.append(None if found is None else value.names.get(found))
+            else:
+                values.append(physical(value, esc, found))
+        return tuple(values)
+
+    return read
+
+
+def _of_gateway(names: Sequence[str]) -> Callable[[Any, int], Values]:
+    readers: list[tuple[Any, Callable[[Any], Value]]] = [
+        (VALUES[name].read, _scaling(VALUES[name])) for name in names
+    ]
+    return lambda status, now: tuple([scale(read(None, status, now)) for read, scale in readers])
+
+
+def sections(fields: Sequence[Field], chosen: Sequence[int]) -> list[Section]:
+    """The sections of chosen fields, in their order."""
+    found = []
+    for _, neighbours in groupby((fields[index] for index in chosen), _together):
+        together = list(neighbours)
+        names = [one.source for one in together]
+        source, esc = VALUES[names[0]], together[0].esc
+        if esc is None:
+            read = _of_gateway(names)
+        elif _word(source) is None:
+            read = _derived(names)
+        else:
+            make = _words if source.bit is None else _flags
+            read = make(names, source.group.value)
+        found.append(Section(source.group, esc, (None,) * len(names), read))
+    return found
+
+
+def _together(field: Field) -> Hashable:
+    """The same for columns that are read together."""
+    source = VALUES[field.source]
+    word = _word(source)
+    return field.esc, source.group, None if word is None else word if source.bit is not None else -1

@@ -1,0 +1,131 @@
+"""The UART bytes of one ESC, which have no times: their live frames are taken to come at a fixed rate."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+from kontronik_can_gw.capture.replay import TimedFrame, follow_bytes
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.dbc.compiler import DbcSettings
+from kontronik_can_gw.desk.recordings.can_logs import UART_MAGIC
+from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
+from kontronik_can_gw.desk.recordings.samples import FoundTelemetry, Sample, samples_of_bytes
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.kontronik.codec import Kind
+from kontronik_can_gw.esc.kontronik.deframer import Counters, Frame
+from kontronik_can_gw.esc.telemetry import SECOND
+
+LIVE_RATE = 100.0
+"""Live frames a second that plain bytes are taken to have come at."""
+MAX_WAITING = 1 << 16
+"""Bytes without a frame that are held."""
+_LONGEST_FRAME = 64
+_UNDECIDED = len(UART_MAGIC) - 1
+"""Bytes at the end of a read that may begin a header."""
+Found = tuple[int, bytes, Frame | None]
+"""Bytes up to the end of a frame, its time, and the frame; without a frame at the time of the one before."""
+
+
+class DumpInput(Input):
+    """The bytes of one ESC, without times."""
+
+    def __init__(
+        self, path: Path, layout: BusLayout | None = None, live_rate: float = LIVE_RATE
+    ) -> None:
+        layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+        if len(layout.escs) != 1:
+            raise UserError(
+                f"{path}: holds the bytes of one ESC, {layout.layout.file} describes {len(layout.escs)}"
+            )
+        super().__init__(str(path), layout, path.stat().st_size)
+        self.times_assumed = True
+        self._path = path
+        self._period_ns = max(1, round(SECOND / live_rate))
+        esc = replace(
+            layout.escs[0], timeout_ns=max(layout.escs[0].timeout_ns, 3 * self._period_ns)
+        )
+        self.setup = CaptureSetup((esc,), (str(path),), None, DbcSettings(), False, False, None)
+        self.provenance["times"] = f"assumed: {live_rate:g} live frames a second"
+        if layout.config is None:
+            self.provenance["motor"] = (
+                "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
+            )
+
+    def frames(self) -> Iterator[TimedFrame]:
+        yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self.chunks())
+
+    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        esc = FoundTelemetry(self.setup.escs[0], 0)
+        yield from samples_of_bytes(esc, self._found(esc), self._sections(chosen))
+
+    def chunks(self) -> Iterator[tuple[int, bytes]]:
+        """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period after it."""
+        for time_ns, data, _ in self._found(FoundTelemetry(self.setup.escs[0], 0)):
+            if data:
+                yield time_ns, data
+
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        if esc:
+            raise UserError(f"{self.name}: holds the bytes of one ESC")
+        yield from self._read()
+
+    def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
+        return None
+
+    def _read(self) -> Iterator[bytes]:
+        self.position = 0
+        try:
+            with self._path.open("rb") as file:
+                while data := file.read(CHUNK):
+                    self.position += len(data)
+                    yield data
+        except OSError as error:
+            raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
+
+    def _found(self, esc: FoundTelemetry) -> Iterator[Found]:
+        """The frames that ``esc`` finds. It is given the bytes up to the next header with each, so that its counters are of that time."""
+        self.damage = []
+        waiting, at, now, lives = bytearray(), 0, 0, 0
+        for piece in chain(self._pieces(), (b"",)):
+            waiting += piece
+            for frame in esc.find(piece):
+                if frame.form.kind is Kind.LIVE:
+                    now = lives * self._period_ns
+                    lives += 1
+                else:
+                    now = max(now, lives * self._period_ns - self._period_ns // 2)
+                end = frame.offset + frame.form.length - at
+                yield now, bytes(waiting[:end]), frame
+                del waiting[:end]
+                at += end
+            if len(waiting) > MAX_WAITING:
+                # no frame for long: what can belong to none any more goes
+                gone = len(waiting) - _LONGEST_FRAME
+                yield now, bytes(waiting[:gone]), None
+                del waiting[:gone]
+                at += gone
+        yield now, bytes(waiting), None
+        self._count(esc.counters)
+
+    def _pieces(self) -> Iterator[bytes]:
+        """The bytes of the file, each header at the beginning of a piece."""
+        rest = b""
+        for data in self._read():
+            first, *others = (rest + data).split(UART_MAGIC)
+            pieces = [first, *(UART_MAGIC + other for other in others)]
+            rest = pieces[-1][-_UNDECIDED:]
+            pieces[-1] = pieces[-1][:-_UNDECIDED]
+            yield from filter(None, pieces)
+        if rest:
+            yield rest
+
+    def _count(self, counters: Counters) -> None:
+        if counters.dropped_bytes:
+            self.damage.append(
+                f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
+            )
+        if not counters.live:
+            self.damage.append(counters.diagnosis() or "no live frame")

@@ -1,0 +1,107 @@
+"""What a table has: its fields beside the time, and what is known of where it came from."""
+
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from itertools import accumulate
+
+from kontronik_can_gw.signals.unpacker import Column
+
+TIME = "Time"
+UTC = "Utc"
+ID, MESSAGE = "Id", "Message"
+_OWN = (TIME, UTC, ID, MESSAGE)
+
+
+class Kind(Enum):
+    """What a field's values are. All may be missing."""
+
+    FLAG = "flag"
+    WHOLE = "whole"
+    FLOAT = "float"
+    TEXT = "text"
+
+
+@dataclass(frozen=True)
+class Field:
+    """A column of a table. ``texts``: number and text of each value that a text can have."""
+
+    name: str
+    unit: str
+    kind: Kind
+    message: str = ""
+    """Of a value that came in a CAN frame."""
+    texts: tuple[tuple[int, str], ...] = ()
+    source: str = ""
+    """A name of values.py."""
+    esc: int | None = None
+    """Index of the ESC; None for the gateway's own."""
+    high: float = math.inf
+    """The greatest value, at which a counter begins again."""
+
+    @property
+    def header(self) -> str:
+        """Name with unit: ``battery_voltage [V]``."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+def field_of_signal(column: Column) -> Field:
+    """The field of a DBC's signal."""
+    kind = Kind.WHOLE if column.is_whole else Kind.FLOAT
+    if column.texts:
+        kind = Kind.TEXT
+    elif column.is_flag:
+        kind = Kind.FLAG
+    name, unit, message = column.name, column.unit, column.message
+    return Field(name, unit, kind, message, column.texts, column.source, column.esc, column.high)
+
+
+def distinct(fields: Sequence[Field]) -> list[Field]:
+    """The fields; names that several have, or that a table itself uses, with the message in front: ``Message.Name``."""
+    counts = Counter(one.name for one in fields)
+    return [
+        replace(one, name=f"{one.message}.{one.name}")
+        if counts[one.name] > 1 or one.name in _OWN
+        else one
+        for one in fields
+    ]
+
+
+def frame_fields(names: Collection[tuple[str, str]]) -> tuple[Field, Field]:
+    """``Id`` and ``Message`` of a table of CAN frames. ``names``: each id and its message."""
+    ids = tuple(enumerate(dict.fromkeys(name for name, _ in names)))
+    messages = tuple(enumerate(dict.fromkeys(message for _, message in names)))
+    return Field(ID, "", Kind.TEXT, "", ids), Field(MESSAGE, "", Kind.TEXT, "", messages)
+
+
+def column_of(fields: Sequence[Field], source: str, esc: int | None) -> int | None:
+    """Index of the first field with a value of values.py; None where there is none."""
+    found = (i for i, one in enumerate(fields) if one.source == source and one.esc == esc)
+    return next(found, None)
+
+
+@dataclass(frozen=True)
+class Table:
+    """The frame of a table. ``has_utc``: its rows have Unix times. ``by_frame``: its first fields are Id and Message."""
+
+    fields: Sequence[Field]
+    has_utc: bool
+    by_frame: bool = False
+    start_wall_ns: int | None = None
+    """Unix time in ns of time 0."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    widths: Sequence[int] = ()
+    """How many neighbouring fields each part of a row has; none: all are one part."""
+
+    def parts(self) -> list[range]:
+        """The fields of each part of a row."""
+        widths = self.widths or (len(self.fields),)
+        return [
+            range(end - width, end) for width, end in zip(widths, accumulate(widths), strict=True)
+        ]
+
+    def indices(self, message: str) -> list[int]:
+        """The fields of one message."""
+        return [index for index, one in enumerate(self.fields) if one.message == message]

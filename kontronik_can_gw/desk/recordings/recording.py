@@ -1,0 +1,77 @@
+"""What every recording is: CAN frames in order of time, and rows of values by name."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.recordings.columns import Section, fields_of_values, sections
+from kontronik_can_gw.desk.recordings.fields import Field
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.samples import Sample
+from kontronik_can_gw.signals.unpacker import SignalReader
+
+CHUNK = 1 << 18
+
+
+class Input(ABC):
+    """A recording. Each of ``frames``, ``samples``, ``esc_bytes`` reads it from its beginning.
+
+    ``position``: bytes read so far, of ``size``. ``damage`` (what was not intact) and ``notes`` (what the person should know of how
+    it was read) have a line each and are complete when it was read to the end.
+    """
+
+    last_path: Path | None = None
+    """Of captures: the last part."""
+
+    def __init__(self, name: str, bus: BusLayout, size: int) -> None:
+        self.name = name
+        self.bus = bus
+        self.size = size
+        self.position = 0
+        self.provenance: dict[str, str] = {}
+        """What is known of where it came from, in words."""
+        self.damage: list[str] = []
+        self.notes: list[str] = []
+        self.times_assumed = False
+        """True where the recording has no times."""
+
+    @cached_property
+    def reader(self) -> SignalReader:
+        """Reads frames of ``bus``."""
+        return SignalReader(self.bus.layout)
+
+    @cached_property
+    def fields(self) -> Sequence[Field]:
+        """The columns of the samples: values by name."""
+        return fields_of_values(self.bus.escs)
+
+    @abstractmethod
+    def frames(self) -> Iterator[TimedFrame]:
+        """The CAN frames that were sent (or would have been) and received."""
+
+    @abstractmethod
+    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+        """Rows of the values of ``chosen`` fields, in that order; None: of all."""
+
+    @abstractmethod
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:
+        """The UART bytes of one ESC. UserError where the recording has none."""
+
+    @abstractmethod
+    def wall_ns(self, time_ns: int) -> int | None:
+        """Unix time, where it is known."""
+
+    def close(self) -> None:  # noqa: B027  only some have any
+        """Close the files."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _sections(self, chosen: Sequence[int] | None) -> list[Section]:
+        return sections(self.fields, range(len(self.fields)) if chosen is None else chosen)

@@ -1,0 +1,100 @@
+"""The seam of an output: what turns events of the ESCs and time into CAN frames, and takes frames from the bus.
+
+The gateway holds its outputs in a tuple and treats all alike. An output overrides what concerns it; everything else does nothing. ``now``
+is integer nanoseconds of one monotonic clock.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.esc.values import CanState
+from kontronik_can_gw.frames import CanFrame
+
+NEVER = 1 << 62
+"""Later than every deadline, ns."""
+NO_IDS: frozenset[int] = frozenset()
+
+
+class Owner(NamedTuple):
+    """What sends with an id: ``esc`` is the ESC whose node it is, None: the gateway."""
+
+    esc: int | None
+    what: str
+
+
+class Output:
+    """One way onto the bus. Frames are appended to ``frames``, which ``take`` hands over."""
+
+    def __init__(self) -> None:
+        self.frames: list[CanFrame] = []
+        self.receive_ids: frozenset[int] = NO_IDS
+        """The ids (29-bit ones with EXTENDED) that ``receive`` is to be given; the same object until they or ``own_ids`` change."""
+        self.saves: list[tuple[int, Any]] = []
+        """(ESC, parameters) to store; the owner empties it and answers each by ``saved``, in this order."""
+        self.rejected_parameters: list[tuple[int, int]] = []
+        """(ESC, index << 8 | sub-index) of stored values that were rejected at a reset; the owner empties it."""
+        self.state_changes = 0
+        """Grows with each change of a node's state or node-ID."""
+
+    def own_ids(self) -> Mapping[int, Owner]:
+        """The ids that only this output sends with, and what for."""
+        return {}
+
+    def node_states(self) -> list[tuple[int, Any, int]]:
+        """Of each ESC's node: node-ID, state, frames with measurements so far. Empty without nodes."""
+        return []
+
+    def next_deadline(self) -> int:
+        """When ``advance`` is to be called at the latest."""
+        return NEVER
+
+    def take(self) -> list[CanFrame]:
+        """The frames so far, oldest first; the list is handed over."""
+        if not self.frames:
+            return []
+        frames, self.frames = self.frames, []
+        return frames
+
+    # --- what happens
+
+    def start(self, now: int, can_open: bool) -> None:
+        """The gateway runs. ``can_open``: there is a bus that can hear it."""
+
+    def stop(self, now: int) -> None:
+        """The gateway is about to end."""
+
+    def on_event(self, esc: int, events: int, now: int) -> None:
+        """Something of an ESC changed: bits of telemetry.Event."""
+
+    def on_gateway_change(self, now: int, each_second: bool = False) -> None:
+        """The gateway's own state changed; ``each_second``: only its counters."""
+
+    def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
+        """The CAN controller's state, as the runtime knows it; DOWN may be followed by DOWN."""
+
+    def can_returned(self, now: int) -> None:
+        """Frames can be sent again after some were lost, or for the first time."""
+
+    def held_up(self, now: int) -> None:
+        """The process was held up until ``now``."""
+
+    def make_anew(self, now: int) -> None:
+        """Measurements that waited to be sent were dropped."""
+
+    def advance(self, now: int) -> None:
+        """Let time pass."""
+
+    def receive(self, frame: CanFrame, now: int, at: int) -> None:
+        """A frame from the bus, which came ``at``; it may be none of ``receive_ids``."""
+
+    def collision(self, esc: int, present: bool, now: int) -> None:
+        """Another device begins, or has ceased, to send with an id of this ESC's node."""
+
+    def overrun(self, now: int) -> None:
+        """The CAN controller lost received frames."""
+
+    def saved(self, esc: int, error: str | None, now: int) -> None:
+        """The oldest of ``saves`` of this ESC is on disk, or could not be stored and why."""
+
+    def parameters_damaged(self, esc: int, now: int) -> None:
+        """What was stored for an ESC could not be read."""
