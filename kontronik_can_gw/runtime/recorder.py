@@ -10,7 +10,6 @@ import contextlib
 import errno
 import fcntl
 import os
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -30,7 +29,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.states import device_text
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.threads import start_beside_the_loop
+from kontronik_can_gw.runtime.worker import Worker
 
 CAPACITY = 50_000
 """Entries that may wait to be written: about two minutes of one ESC, 15 seconds of eight."""
@@ -110,8 +109,9 @@ class Recorder:
         self._state_ns = 0
         self._devices: list[Any] = []
         self._told_devices: list[Any] = []
-        self._ending = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._worker: Worker[None] = Worker(
+            "recorder", self._work, wait=self._wait, ended=self._end
+        )
         self._busy_since: int | None = None
         self._told_slow = False
         self._file: _Part | None = None
@@ -138,10 +138,8 @@ class Recorder:
                 raise RunError(
                     f"captures: {folder}: {error.strerror}. Give another folder (record.directory, --record)."
                 ) from None
-        thread = threading.Thread(target=self._run_thread, name="recorder", daemon=True)
-        if not start_beside_the_loop(thread):
+        if not self._worker.start():
             raise RunError("captures: the system gives no thread to write them")
-        self._thread = thread
 
     def put(
         self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None
@@ -181,23 +179,14 @@ class Recorder:
 
     def close(self) -> None:
         """Write what waits and end the thread; a disk that does not answer is waited for 0.35 s and no longer."""
-        self._ending.set()
-        if self._thread is not None:
-            self._thread.join(_CLOSE_S)
-            self._thread = None
+        self._worker.stop(_CLOSE_S)
 
     # --- the thread's side
 
-    def _run_thread(self) -> None:
-        while not self._ending.wait(PERIOD_S):
-            self._work()
-        self._work()
-        try:
-            self._end_part()
-        except Exception as error:  # whatever it is, the gateway is ending
-            self._fail(error, self._clock(), [])
+    def _wait(self) -> None:
+        self._worker.pause(PERIOD_S)
 
-    def _work(self) -> None:
+    def _work(self, _items: list[None]) -> None:
         """Write what has come."""
         entries = self._entries
         self._busy_since = self._clock()
@@ -211,6 +200,12 @@ class Recorder:
             if not entries or self._file is None:
                 break
         self._busy_since = None
+
+    def _end(self) -> None:
+        try:
+            self._end_part()
+        except Exception as error:  # whatever it is, the gateway is ending
+            self._fail(error, self._clock(), [])
 
     def _write(self, items: list[Item], now: int) -> None:
         if not self._may_write(now):

@@ -527,7 +527,7 @@ def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(
     held = threading.Event()
     with virtual() as (port, other):
         other.send(message(1))
-        monkeypatch.setattr("kontronik_can_gw.runtime.bus_reader._LONGEST_END_S", 0.01)
+        monkeypatch.setattr("kontronik_can_gw.runtime.bus_reader._MAX_END_S", 0.01)
         waiting = threading.Event()
 
         def holding(timeout: float | None) -> can.Message:
