@@ -12,7 +12,9 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, fault_of, socketcan_error
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
+from kontronik_can_gw.runtime.open_can import open_can
+from kontronik_can_gw.runtime.socketcan_port import fault_of, socketcan_error
 
 RETRY_S = 0.5
 """Between two looks at an interface that does not work, and at whether one that works is still up."""
@@ -65,7 +67,7 @@ class BusListener:
             self._port = None
 
     def _open(self) -> None:
-        port = CanPort(self._config)
+        port = open_can(self._config)
         try:
             port.set_receive_ids(self._keys)
         except BaseException:

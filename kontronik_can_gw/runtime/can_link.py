@@ -14,13 +14,15 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Conflict, Gateway
-from kontronik_can_gw.runtime.can_port import CanPort, socketcan_error
+from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
+from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.snapshot import CanFacts, name_in_words
+from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.transmit_queue import Sent, TransmitQueue
 
 LONGEST_RETRY_NS = SECOND // 2
@@ -179,7 +181,7 @@ class CanLink:
     def _open(self, now: int) -> None:
         self._refuse_escs_as_channel()
         try:
-            port = CanPort(self.config)
+            port = open_can(self.config)
         except OSError as error:  # it went away a moment ago
             raise RunError(
                 f"CAN interface {self.config.channel}: {error.strerror or error}."
@@ -432,7 +434,7 @@ class CanLink:
         assert self.port is not None
         self._busy_since = self._busy_since or now
         if now - self._busy_since > LASTING_BUSY_NS:
-            if not self.port.tells_busy_from_gone:
+            if not self.port.reports_full:
                 return Sent.GONE
             self._stall(now)
         self._busy_until = now + BUSY_RETRY_NS

@@ -16,9 +16,9 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import can_link as can_side
 from kontronik_can_gw.runtime.can_link import CanLink
-from kontronik_can_gw.runtime.can_port import socketcan_error
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.transmit_queue import Sent
 
 ACTIVE = LinkFacts(True, True, "can", CanState.ERROR_ACTIVE, 500_000, 100, (0, 0))
@@ -121,7 +121,7 @@ class Bench:
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
     made = Kernel()
-    monkeypatch.setattr(can_side, "CanPort", Port)
+    monkeypatch.setattr(can_side, "open_can", Port)
     monkeypatch.setattr(can_side, "link_monitor", lambda _name: made)
     monkeypatch.setattr(Port, "there", True)
     return made
@@ -269,7 +269,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
         raise socketcan_error(bench.can.config, 100)
 
     with monkeypatch.context() as patch:
-        patch.setattr(can_side, "CanPort", is_down)
+        patch.setattr(can_side, "open_can", is_down)
         bench.turn(5000)
     assert (bench.can.is_open, bench.gateway.status.can_state) == (False, CanState.DOWN)
     kernel.facts = ACTIVE
@@ -350,7 +350,7 @@ def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
-    monkeypatch.setattr(Port, "tells_busy_from_gone", False)
+    monkeypatch.setattr(Port, "reports_full", False)
     bench.start()
     port, before = bench.port, bench.can.port
     for n in range(3000):
