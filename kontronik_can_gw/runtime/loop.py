@@ -40,7 +40,7 @@ from kontronik_can_gw.runtime.systemd import Notifier
 log = logging.getLogger("kontronik_can_gw")
 
 MIN_HELD_UP_NS = 20 * MS
-"""A loop that comes round this much too late at least, and by ``can_link.longest_turn``, was held up."""
+"""A loop that comes round this much too late at least, and by ``Transmitter.max_turn_ns``, was held up."""
 _LOOKS_PER_TIMEOUT = 8
 """The ports are looked at so often within the shortest telemetry time-out at least: by how much of it a value may go early."""
 STATUS_NS = SECOND
@@ -155,14 +155,14 @@ class Loop:
         ready = self._poller.wait(pause)
         now = self._poller.now
         late = now - last - pause
-        if late > MIN_HELD_UP_NS and late > can.longest_turn_ns:
+        if late > MIN_HELD_UP_NS and late > can.transmitter.max_turn_ns:
             self._follow_hold_up(late, now)
         elif not ready and now < due:  # only looked
             self._now = now
             return
         for handler, events in ready:
             handler(now, events)
-        if self._lost or not can.rests(now):
+        if self._lost or not can.is_idle(now):
             now = self._reopen(now)
         self._now = now
         if gateway.nodes is not None:
@@ -221,7 +221,7 @@ class Loop:
         for esc in self._lost:
             due = min(due, esc.due)
         can_due = self.can.due
-        return due if can_due is None or due < can_due else can_due
+        return min(can_due, due)
 
     def _others(self, esc: EscPort) -> tuple[Identity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)
@@ -234,18 +234,15 @@ class Loop:
         """What was measured before is old; commands and answers are not (how old bytes are, ``since`` tells)."""
         text = f"the process was suspended for {late / SECOND:.1f} s: measurements that waited to be sent are dropped and made anew"
         self.conditions.event("suspended", text, now)
-        self.gateway.held_up(now, self.can.drop_measurements())
+        self.gateway.held_up(now, self.can.transmitter.drop_measurements())
 
     def _reopen(self, now: int) -> int:
         """Open what is due. Returns the time: it may have taken long on a slow machine."""
         for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
             esc.reopen(now, self._others(esc))
         self.can.reopen(now)
-        self.can.ask_if_due(now)
-        if self._lost or not self.can.is_open or self.can.just_opened:
-            self.can.just_opened = False
-            now = max(now, self._clock())
-        return now
+        self.can.controller.ask_if_due(now)
+        return max(now, self._clock())
 
     # --- parameters
 

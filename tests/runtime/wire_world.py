@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime import can_link as can_side
+from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT
 from kontronik_can_gw.runtime.loop import Loop
@@ -300,7 +300,7 @@ def loop_in(
         return world.bus
 
     by_path = {wire.path: wire for wire in world.wires}
-    patch.setattr(can_side, "open_can", open_bus)
+    patch.setattr(can_link, "open_can", open_bus)
     patch.setattr(esc_input, "SerialPort", by_path.__getitem__)
     gateway = Gateway(escs, layout or layout_of(escs), world.now, canopen=canopen)
     config = CanConfig(interface="virtual", channel="world")
