@@ -10,17 +10,16 @@ import selectors
 import time
 from collections.abc import Callable
 
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.esc.values import CanState
-from kontronik_can_gw.gateway import Conflict, Gateway
+from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_controller import CanController
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.id_locks import IdLocks
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
-from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
 from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
@@ -56,8 +55,7 @@ class CanLink:
         self._esc_at = esc_at
         self._clock = clock
         self._retry = Retry(MAX_RETRY_NS)
-        self._locks = Locks(report=lambda text: conditions.say(logging.WARNING, text))
-        self._locked: list[str] = []
+        self._own_ids = IdLocks(config, gateway, conditions)
         self._receive_ids: frozenset[int] | None = None
         """What the open port was asked to receive."""
         self._is_proven = False
@@ -70,10 +68,14 @@ class CanLink:
 
     @property
     def due(self) -> int:
-        """When ``reopen``, the controller's ``ask_if_due`` or ``transmit`` has something to do."""
-        due = min(self.transmitter.due, self.controller.due)
-        retry = self._retry.due
-        return due if retry is None else min(due, retry)
+        """When ``reopen``, ``transmit`` or, in bus-off, the controller's ``ask_if_due`` has something to do.
+
+        Otherwise the controller is asked when the loop comes round: it need not be woken for that.
+        """
+        due, retry = self.transmitter.due, self._retry.due
+        if self.controller.is_off and self.controller.due < due:
+            due = self.controller.due
+        return due if retry is None or due < retry else retry
 
     def is_idle(self, now: int) -> bool:
         """True where neither ``reopen`` nor the controller's ``ask_if_due`` has something to do."""
@@ -114,7 +116,7 @@ class CanLink:
 
         Where another gateway has one of our node-IDs or sends our messages it is a RunError in any case.
         """
-        self._lock(at_start=True)
+        self._own_ids.lock(at_start=True)
         try:
             self._open(now)
         except RunError as error:
@@ -136,7 +138,7 @@ class CanLink:
     def close(self) -> None:
         """Close everything."""
         self._close_port()
-        self._locks.close()
+        self._own_ids.close()
         if (fd := self.controller.fileno()) is not None:
             self._selector.unregister(fd)
             self.controller.close()
@@ -165,29 +167,6 @@ class CanLink:
             self._conditions.say(
                 logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open"
             )
-
-    def _lock(self, at_start: bool = False) -> None:
-        """Have what only one gateway may have on this interface."""
-        if self.config.interface == "virtual":  # is in this process only
-            return
-        channel = self.config.channel
-        names = [
-            node_lock(channel, node_id)
-            for node_id in self._gateway.node_ids
-            if node_id != UNCONFIGURED
-        ]
-        if (first := self._gateway.first_message_id) is not None:
-            names.append(messages_lock(channel, first))
-        if names == self._locked:
-            return
-        self._locked = names
-        all_taken = self._locks.hold(names)
-        if all_taken:
-            self._locked = []  # to be tried again
-        for taken in all_taken:
-            if at_start:
-                raise in_use(taken)
-            self._conditions.say(logging.ERROR, str(in_use(taken)))
 
     def _refuse_escs_as_channel(self) -> None:
         """Whatever its name is now: what leads to an ESC must not be opened as a CAN interface, which would send to it."""
@@ -252,7 +231,7 @@ class CanLink:
         self.port.set_receive_ids(ids)
         if not had_fd and (fd := self.port.fileno()) is not None:
             self._selector.register(fd, selectors.EVENT_READ, self.serve)
-        self._lock()
+        self._own_ids.lock()
 
     def serve(self, now: int, events: int = selectors.EVENT_READ) -> None:
         """The port is readable, or can be sent to again."""
@@ -328,28 +307,3 @@ class CanLink:
             self._lost(Sent.GONE, now)
         else:
             self.controller.follow(port, now)
-
-    def follow_conflicts(self, now: int) -> None:
-        """Others that send with our ids: log when it begins and when it is over."""
-        for conflict in self._gateway.take_conflicts():
-            _log_conflict(self._conditions, self.config.channel, conflict, now)
-
-
-def _log_conflict(conditions: FaultLog, channel: str, conflict: Conflict, now: int) -> None:
-    bits = "29-bit id" if conflict.is_extended else "id"
-    which = f"CAN {channel}: {bits} {conflict.can_id:X}h"
-    if conflict.over:
-        conditions.end(
-            which, f"{which}: nobody else sends with it", now, f"; {conflict.count} frames"
-        )
-        return
-    remedy = (
-        "Two nodes with one node-ID?"
-        if conflict.node is not None
-        else "Change one, as by dbc.base_id."
-    )
-    conditions.begin(
-        which,
-        f"{which}: somebody else sends with it too; here it is {conflict.whose}. {remedy}",
-        now,
-    )

@@ -65,11 +65,12 @@ class EscPort:
         self._undrained_ns: int | None = None
         """The last read left something, which came after this."""
         self._retry = Retry(LONGEST_RETRY_NS)
+        self.report_due = 0
+        """When ``report`` has something to do."""
         self._diagnosis_due = 0
         self._diagnosed: set[str] = set()
         self._counted: dict[str, int] = {}
         self._count_due = 0
-        self._settings_due = 0
         self._served = True
         self._seen_waiting = False
         self._lost_counters = (0, 0)
@@ -233,16 +234,15 @@ class EscPort:
 
     def report(self, now: int) -> None:
         """Count line errors once a second, look at the port's settings twice; say why nothing comes."""
+        self.report_due = now + SETTINGS_NS
         if self.port is None:
             return
         if now >= self._count_due:
             self._count_due = now + SECOND
             self._count(self.port.line_errors())
-        if now >= self._settings_due:
-            self._settings_due = now + SETTINGS_NS
-            if not self.port.settings_hold():
-                text = f"{self.name}: another program changed the settings of {self.port.path}: set to 115200 8E1 again"
-                self._conditions.event(f"{self.name}: settings", text, now)
+        if not self.port.settings_hold():
+            text = f"{self.name}: another program changed the settings of {self.port.path}: set to 115200 8E1 again"
+            self._conditions.event(f"{self.name}: settings", text, now)
         if self._diagnosis_due and now >= self._diagnosis_due:
             self._diagnosis_due = now + DIAGNOSIS_NS
             diagnosis = self._gateway.escs[self._index].diagnosis()
