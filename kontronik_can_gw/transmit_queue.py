@@ -81,7 +81,7 @@ class TransmitQueue:
 
     def remove(self, frames: Sequence[CanFrame], count: int) -> None:
         """Forget the first ``count`` of ``frames``, which ``in_order`` gave: they were sent. The next one stays first of its kind."""
-        if count and self._queue and len(frames) > 1:
+        if self._queue and count and len(frames) > 1:
             self._queue_has_turn = not frames[count - 1].queued
         if count == len(frames):
             self._slots.clear()

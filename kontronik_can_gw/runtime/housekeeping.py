@@ -21,13 +21,15 @@ from kontronik_can_gw.runtime.systemd import Notifier
 log = logging.getLogger("kontronik_can_gw")
 
 PERIOD_NS = 250 * MS
-"""How often there is a round. The loop is not woken for it: it wakes more often anyhow."""
+"""How often there is a round. The loop is woken for one only when it is late by as much: mostly it comes round before."""
 STATUS_NS = SECOND
 """The service manager is given a line at most this often."""
 
 
 class Housekeeping:
-    """``due``: when ``run`` has something to do. ``status_ns``: how often a line about everything is logged, 0: never."""
+    """``due``: when ``run`` has something to do; ``wake_due``: when the loop is to be woken for it.
+
+    ``status_ns``: how often a line about everything is logged, 0: never."""
 
     def __init__(
         self,
@@ -43,7 +45,7 @@ class Housekeeping:
         program: ProgramFacts,
         status_ns: int,
     ) -> None:
-        self.due = 0
+        self.due = self.wake_due = 0
         self._gateway = gateway
         self._escs = escs
         self._can = can
@@ -75,6 +77,7 @@ class Housekeeping:
         self._notify(now)
         if self._alive_due is not None:
             self.due = min(self.due, max(now, self._alive_due))
+        self.wake_due = self.due + PERIOD_NS
 
     def publish(self, now: int) -> None:
         """Hand the statistics' thread a document, if it is time."""

@@ -19,7 +19,7 @@ from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.housekeeping import PERIOD_NS, Housekeeping
+from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.poller import Handler, Poller
 from kontronik_can_gw.runtime.recorder import Recorder
@@ -32,7 +32,10 @@ from kontronik_can_gw.runtime.systemd import Notifier
 MIN_HELD_UP_NS = 20 * MS
 """A loop that comes round this much too late at least, and by ``Transmitter.max_turn_ns``, was held up."""
 _WAKES_PER_TIMEOUT = 4
-"""The loop wakes at least this often within the shortest telemetry time-out: by how much of it a value may go early."""
+"""The loop wakes at least this often within the shortest telemetry time-out: by how much of it a value may go early.
+
+A millisecond sooner, for a wait is rounded up to one.
+"""
 _LAST_SAVE_S = 0.2
 
 
@@ -135,13 +138,14 @@ class Loop:
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
         last, due = self._now, self._next_deadline()
-        pause = min(due, last + self._max_pause_ns()) - self._clock()
+        wake = last + self.gateway.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
+        pause = min(wake, due) - self._clock()
         if pause < 0:
             pause = 0
         ready = self._poller.wait(pause)
         now = self._poller.now
         late = now - last - pause
-        if late > MIN_HELD_UP_NS and late > self.can.transmitter.max_turn_ns:
+        if late > MIN_HELD_UP_NS and late > self.can.transmitter.max_turn_ns():
             self._follow_hold_up(late, now)
             now = self._serve(ready, now)
         elif ready or now >= due:  # otherwise it is known that nothing has come until now
@@ -212,11 +216,6 @@ class Loop:
             due = min(due, esc.due)
         can_due = self.can.due
         return min(can_due, due)
-
-    def _max_pause_ns(self) -> int:
-        """In whole milliseconds, for a wait is rounded up to one."""
-        limit = min(self.gateway.shortest_timeout_ns // _WAKES_PER_TIMEOUT, PERIOD_NS)
-        return limit // MS * MS
 
     def _others(self, esc: EscPort) -> tuple[Identity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)

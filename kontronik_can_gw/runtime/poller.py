@@ -6,7 +6,6 @@ terminal whether bytes are still on their way to it inside the kernel.
 """
 
 import contextlib
-import math
 import select
 import selectors
 import time
@@ -67,7 +66,7 @@ class Poller:
         Returns handlers of what there is, with what.
         """
         if pause_ns > 0:
-            self._poll.poll(math.ceil(pause_ns / MS))
+            self._poll.poll(-(-pause_ns // MS))
         self.before, self.now = self.now, self._clock()
         happened = self._poll.poll(0)
         watched = self._watched

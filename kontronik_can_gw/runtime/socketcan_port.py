@@ -140,7 +140,7 @@ class SocketCanPort(CanPort):
     def _send_each(
         self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
     ) -> tuple[int, Sent]:
-        send, count = self._socket.send, 0
+        send, pack, count = self._socket.send, _CLASSIC.pack, 0
         for can_id, data, extended, fd, _, remote, _ in frames:
             if clock() > latest:
                 return count, Sent.LATE
@@ -151,7 +151,7 @@ class SocketCanPort(CanPort):
             if fd:
                 packed = _FD.pack(can_id, len(data), _FD_BRS, data)
             else:
-                packed = _CLASSIC.pack(can_id, len(data), data)
+                packed = pack(can_id, len(data), data)
             try:
                 send(packed)
             except OSError as error:

@@ -41,10 +41,10 @@ class Transmitter:
         self._clock = clock
         self._busy_since: int | None = None
 
-    @property
     def max_turn_ns(self) -> int:
         """A frame that is to go out this long after its turn began is old by then."""
-        return min(MAX_LATE_NS, self._gateway.shortest_timeout_ns)
+        limit = self._gateway.shortest_timeout_ns
+        return min(MAX_LATE_NS, limit)
 
     def put(self, frames: Sequence[CanFrame]) -> None:
         """Let frames wait to be sent."""
@@ -56,24 +56,24 @@ class Transmitter:
 
         None where nothing waits or is to be tried, and where frames became late meanwhile: the next turn drops those.
         """
-        if now < self.due < NEVER:
-            return None
-        self.due = NEVER
-        queue, status = self.queue, self._status
-        if not queue:
+        if self.due != NEVER:
+            if now < self.due:
+                return None
+            self.due = NEVER
+        frames = self.queue.in_order()
+        if not frames:
             if not self.is_stalled:
                 self._busy_since = None
             return None
-        frames = queue.in_order()
-        count, answer = port.send_all(frames, self._clock, now + self.max_turn_ns)
-        queue.remove(frames, count)
-        status.sent_frames += count
+        count, answer = port.send_all(frames, self._clock, now + self.max_turn_ns())
+        self.queue.remove(frames, count)
+        self._status.sent_frames += count
         if count:
             self._busy_since = None
         if answer is Sent.LATE:
             return None
         if answer is not _OK:
-            status.send_failures += 1
+            self._status.send_failures += 1
             if answer is Sent.BUSY or answer is Sent.FULL:
                 answer = self._busy(port, answer, now)
             if answer is Sent.DOWN or answer is Sent.GONE:
