@@ -14,16 +14,14 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import (
-    Identity,
     NoPort,
     PortLost,
     SerialPort,
     device_of,
-    find_adapter,
-    identity_at,
     is_mini_uart,
 )
 from kontronik_can_gw.runtime.snapshot import PortFacts
+from kontronik_can_gw.runtime.usb_adapters import Identity, find_adapter, identity_at
 
 LONGEST_RETRY_NS = SECOND
 DIAGNOSIS_NS = 3 * SECOND

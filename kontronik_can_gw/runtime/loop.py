@@ -23,11 +23,11 @@ from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.poller import Handler, Poller
 from kontronik_can_gw.runtime.recorder import Recorder
-from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.snapshot import ProgramFacts
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.runtime.systemd import Notifier
+from kontronik_can_gw.runtime.usb_adapters import Identity
 
 MIN_HELD_UP_NS = 20 * MS
 """A loop that comes round this much too late at least, and by ``Transmitter.max_turn_ns``, was held up."""

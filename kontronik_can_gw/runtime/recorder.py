@@ -6,9 +6,6 @@ recorded when there is room again. Each half second what has come is one block, 
 Whatever goes wrong with the disk is told once, tried again each five seconds, and never ends the gateway nor the recorder.
 """
 
-import contextlib
-import errno
-import fcntl
 import os
 import time
 from collections import deque
@@ -20,8 +17,6 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.capture.format import (
     SUFFIX,
     Kind,
-    block,
-    data_payload,
     json_payload,
     number_data,
 )
@@ -29,6 +24,8 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.states import device_text
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.capture_folder import make_folder, remove_oldest
+from kontronik_can_gw.runtime.capture_part import CapturePart, Item
 from kontronik_can_gw.runtime.worker import Worker
 
 CAPACITY = 50_000
@@ -44,12 +41,6 @@ _STATE_NS = 2 * SECOND
 _STEP_NS = MS
 _SLOW_NS = 5 * SECOND
 _MB = 1_000_000
-
-_LOGS_OF_0_5_0 = (".log", ".asc", ".blf", ".trc")
-"""Logs of CAN frames beside captures, which 0.5.0 wrote: they are removed as captures are."""
-
-Item = tuple[int, int, int, bytes, int, int | None]
-"""(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
 
 
 class Report(NamedTuple):
@@ -114,7 +105,7 @@ class Recorder:
         )
         self._busy_since: int | None = None
         self._told_slow = False
-        self._file: _Part | None = None
+        self._file: CapturePart | None = None
         self._run = os.urandom(8).hex()
         self._stamp = ""
         self._part = 0
@@ -132,7 +123,7 @@ class Recorder:
         """Begin to write. RunError where the folder cannot be used, unless ``wait``: then it is tried again and again."""
         folder = self.settings.folder
         try:
-            _make_folder(folder)
+            make_folder(folder)
         except OSError as error:
             if not wait:
                 raise RunError(
@@ -233,7 +224,7 @@ class Recorder:
         if is_large or is_old:
             self._end_part()
 
-    def _remark(self, file: "_Part", items: list[Item], now: int) -> None:
+    def _remark(self, file: "CapturePart", items: list[Item], now: int) -> None:
         """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
         last = items[-1][0]
         if (lost := self._overflowed + self._unwritten - file.lost) > 0:
@@ -250,9 +241,9 @@ class Recorder:
         if self._file is None and now < self._retry_ns:
             return False
         if now >= self._space_ns:
-            _make_folder(self.settings.folder)
+            make_folder(self.settings.folder)
             self._space_ns = now + _LOOK_AT_SPACE_NS
-            self._remove_oldest()
+            remove_oldest(self.settings.folder, self.settings.keep_bytes)
             found = os.statvfs(self.settings.folder)
             free = found.f_bavail * found.f_frsize
             self._full = free < self.settings.least_free_bytes
@@ -302,9 +293,9 @@ class Recorder:
             "devices": self._told_devices,
         }
         base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{part:05d}"
-        self._file = _Part(base.with_name(base.name + SUFFIX), json_payload(header), now)
+        self._file = CapturePart(base.with_name(base.name + SUFFIX), json_payload(header), now)
         self._file.lost = self._recorded_losses
-        self._remove_oldest()
+        remove_oldest(self.settings.folder, self.settings.keep_bytes)
 
     def _end_part(self) -> None:
         file, self._file = self._file, None
@@ -312,34 +303,6 @@ class Recorder:
             self._recorded_losses = file.lost
             self.facts.file = ""
             self.facts.bytes += file.close()
-
-    def _remove_oldest(self) -> None:
-        """Keep the folder within its bound; what is being written, by whomever, stays."""
-        if not self.settings.keep_bytes:
-            return
-        found: list[tuple[int, str, int, Path]] = []
-        for path in self.settings.folder.iterdir():
-            with contextlib.suppress(FileNotFoundError):  # another gateway has removed it
-                if is_ours(path.name) and not path.is_symlink() and path.is_file():
-                    status = path.stat()
-                    found.append((status.st_mtime_ns, path.name, status.st_size, path))
-        total = sum(size for _, _, size, _ in found)
-        for _, _, size, path in sorted(found):
-            if total <= self.settings.keep_bytes:
-                return
-            if not _is_being_written(path):
-                with contextlib.suppress(OSError):
-                    path.unlink()
-                    total -= size
-
-
-def is_ours(name: str) -> bool:
-    """True for the name of a capture, or of a log beside one."""
-    stem, _, suffix = name.partition(".")
-    stamp, _, rest = stem.partition("-")
-    run, _, part = rest.partition("-")
-    made = len(stamp) == 16 and stamp.endswith("Z") and len(run) == 6 and part.isdecimal()
-    return made and f".{suffix}" in (SUFFIX, *_LOGS_OF_0_5_0)
 
 
 def state_of(gateway: Gateway) -> dict[str, Any]:
@@ -367,100 +330,3 @@ def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
         }
         for esc in gateway.escs
     ]
-
-
-class _Part:
-    """One file of a capture, locked while it is written."""
-
-    def __init__(self, path: Path, header: bytes, now: int) -> None:
-        self.path = path
-        self.begun = now
-        self.size = 0
-        self.lost = 0
-        self._number = 0
-        self._new = 0
-        self._header: bytes | None = header
-        self._fd = os.open(
-            self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640
-        )
-        try:
-            with contextlib.suppress(OSError):  # a file system without locks
-                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self.write(b"H", header)
-            _sync_folder(path.parent)
-        except BaseException:  # nothing is in there yet
-            os.close(self._fd)
-            with contextlib.suppress(OSError):
-                self.path.unlink()
-            raise
-
-    def write(self, kind: bytes, payload: bytes) -> None:
-        """Append a block."""
-        data = memoryview(block(kind, self._number, payload))
-        self._number += 1
-        self.size += len(data)
-        self._new += len(data)
-        while data:
-            data = data[os.write(self._fd, data) :]
-
-    def take(self, items: list[Item]) -> None:
-        """Append what came."""
-        self.write(b"D", data_payload(items))
-        if self._header is not None:
-            # once more, elsewhere: without it nothing can be made of the rest
-            self.write(b"H", self._header)
-            self._header = None
-
-    def sync(self) -> int:
-        """Force to the disk what was written; how many bytes since the last call. OSError where somebody removed a file."""
-        if os.fstat(self._fd).st_nlink == 0:
-            raise OSError(errno.ENOENT, "what was being written was removed")
-        if self._new:
-            os.fdatasync(self._fd)
-        new, self._new = self._new, 0
-        return new
-
-    def close(self) -> int:
-        """Close in good order; how many bytes since the last ``sync``."""
-        try:
-            self.write(b"E", b"")
-            os.fdatasync(self._fd)
-        finally:
-            os.close(self._fd)
-        return self._new
-
-    def abandon(self) -> None:
-        """Close without writing any more."""
-        with contextlib.suppress(OSError):
-            os.close(self._fd)
-
-
-def _make_folder(folder: Path) -> None:
-    folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(1, "may not be written to")
-
-
-def _is_being_written(path: Path) -> bool:
-    """True for a capture that a recorder has open, here or in another process, and for the log beside it."""
-    try:
-        fd = os.open(path.with_suffix(SUFFIX), os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except OSError:  # a log whose capture has gone
-        return False
-    try:
-        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(fd)
-    return False
-
-
-def _sync_folder(folder: Path) -> None:
-    """So that the file's name survives a loss of power too."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        with contextlib.suppress(OSError):  # a file system that cannot
-            os.fsync(fd)
-    finally:
-        os.close(fd)

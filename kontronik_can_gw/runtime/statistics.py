@@ -25,7 +25,7 @@ from kontronik_can_gw.runtime.snapshot import STALE_NS, Document, with_rates
 from kontronik_can_gw.runtime.worker import Worker
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.prometheus import MetricsServer
+    from kontronik_can_gw.runtime.metrics_server import MetricsServer
 
 PERIOD_NS = SECOND
 _CLOSE_S = 0.2
@@ -195,7 +195,7 @@ class Statistics:
 
 
 def _server_at(address: tuple[str, int]) -> "MetricsServer":
-    from kontronik_can_gw.runtime.prometheus import MetricsServer
+    from kontronik_can_gw.runtime.metrics_server import MetricsServer
 
     return MetricsServer(address)
 

@@ -16,8 +16,9 @@ from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import InfoData
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime import recorder
-from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder, RecordSettings, is_ours
+from kontronik_can_gw.runtime import capture_part, recorder
+from kontronik_can_gw.runtime.capture_folder import is_ours
+from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder, RecordSettings
 
 HEADER = made(1)[0].header()
 
@@ -396,7 +397,7 @@ def test_a_mistake_in_what_writes_ends_nothing(
 
     it = begun(tmp_path, clock=lambda: now)
     with monkeypatch.context() as patch:
-        patch.setattr(recorder, "data_payload", fail)
+        patch.setattr(capture_part, "data_payload", fail)
         put(it, entries(2))
         until(lambda: it.facts.problem != "" and not it._entries)
     assert "a mistake of ours" in it.reports(0)[0].text

@@ -26,8 +26,8 @@ from kontronik_can_gw.runtime import esc_port as esc_input
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler
-from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.systemd import Notifier
+from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
 
