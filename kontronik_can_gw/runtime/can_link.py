@@ -23,7 +23,6 @@ from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
-from kontronik_can_gw.runtime.snapshot import CanFacts
 from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.transmitter import Transmitter
 from kontronik_can_gw.transmit_queue import Sent
@@ -51,7 +50,7 @@ class CanLink:
         self._gateway = gateway
         self._selector = selector
         self._conditions = conditions
-        self._condition = f"CAN {config.channel}: interface"
+        self.condition = f"CAN {config.channel}: interface"
         self._esc_at = esc_at
         self._clock = clock
         self._retry = Retry(MAX_RETRY_NS)
@@ -84,32 +83,6 @@ class CanLink:
     @property
     def is_open(self) -> bool:
         return self.port is not None
-
-    @property
-    def complaint(self) -> str:
-        """What is wrong with the bus; empty while frames are sent."""
-        for name in (self._condition, self.transmitter.condition, self.controller.condition):
-            if reason := self._conditions.reason(name):
-                return reason
-        return ""
-
-    def facts_for_statistics(self) -> CanFacts:
-        """What the statistics show of the interface."""
-        known = self.controller.facts or LinkFacts(exists=False)
-        config = self.config
-        bitrate = known.bitrate or (config.bitrate if config.interface != "socketcan" else None)
-        return CanFacts(
-            config.interface,
-            config.channel,
-            bitrate,
-            self.is_open,
-            self.complaint,
-            self.transmitter.is_stalled,
-            known.restart_ms,
-            known.error_counters,
-        )
-
-    # --- life
 
     def open(self, now: int, wait: bool) -> None:
         """Open the interface. RunError where that fails, unless ``wait``: then it is tried again.
@@ -162,7 +135,7 @@ class CanLink:
         self.follow_ids()
         self._gateway.can_opened(now)
         self.controller.refresh(now)  # older reports, as that it was down, are past
-        if not self._conditions.is_on(self._condition):
+        if not self._conditions.is_on(self.condition):
             # otherwise it is said when a frame is sent
             self._conditions.say(
                 logging.INFO, f"CAN {self.config.interface} {self.config.channel} is open"
@@ -189,7 +162,7 @@ class CanLink:
         self._retry.failed(now)
         self.transmitter.clear()
         self._gateway.set_can_state(CanState.DOWN, now)
-        self._conditions.begin(self._condition, f"{reason} Trying again.", now)
+        self._conditions.begin(self.condition, f"{reason} Trying again.", now)
 
     def _lost(self, answer: Sent, now: int) -> None:
         """The interface is down or gone: to be opened anew."""
@@ -293,7 +266,7 @@ class CanLink:
         self._is_proven = True
         self._retry.succeeded()
         self._conditions.end(
-            self._condition, f"CAN {self.config.channel}: frames are sent again", now
+            self.condition, f"CAN {self.config.channel}: frames are sent again", now
         )
 
     def _follow_reception(self, now: int) -> None:

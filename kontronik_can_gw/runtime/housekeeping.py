@@ -12,9 +12,16 @@ from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.conflict_log import log_conflicts
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.recorder import Recorder
-from kontronik_can_gw.runtime.snapshot import ProgramFacts, name_in_words, process_facts, snapshot
+from kontronik_can_gw.runtime.snapshot import (
+    CanFacts,
+    ProgramFacts,
+    name_in_words,
+    process_facts,
+    snapshot,
+)
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
 
@@ -90,7 +97,7 @@ class Housekeeping:
                 program=self._program,
                 process=process_facts(),
                 ports=[esc.facts() for esc in self._escs],
-                can=self._can.facts_for_statistics(),
+                can=_can_facts(self._can, self._conditions),
                 store=self._saver.facts(),
                 log_lines=list(self._conditions.recent),
                 recorder=None if self._recorder is None else self._recorder.facts,
@@ -180,3 +187,19 @@ class Housekeeping:
                     f"node {node_id} {name_in_words(state.name)} {rates[1 + number]:.0f} PDOs/s"
                 )
         log.info("%s", "; ".join(words))
+
+
+def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:
+    """What the statistics show of the interface."""
+    config, known = can.config, can.controller.facts or LinkFacts(exists=False)
+    faults = (can.condition, can.transmitter.condition, can.controller.condition)
+    return CanFacts(
+        config.interface,
+        config.channel,
+        known.bitrate or (config.bitrate if config.interface != "socketcan" else None),
+        can.is_open,
+        next(filter(None, map(conditions.reason, faults)), ""),
+        can.transmitter.is_stalled,
+        known.restart_ms,
+        known.error_counters,
+    )

@@ -171,7 +171,7 @@ class Loop:
             self._housekeeping.report_nodes(now)
         if changes := gateway.take_link_changes():
             for index in dict.fromkeys(changes):
-                self.escs[index].follow_link(now)
+                self.escs[index].log.follow_link(now)
         return now
 
     def end(self) -> None:

@@ -264,9 +264,9 @@ def test_a_diagnosis_is_said_once_and_names_the_drivers_counts(
     assert "parity errors)" in said[0]
     bench.port().reads = [LIVE]
     esc.serve(21 * SECOND)
-    esc.follow_link(21 * SECOND)
+    esc.log.follow_link(21 * SECOND)
     assert caplog.messages[-1] == "left: telemetry ok (V4)"
-    assert esc.complaint == ""
+    assert esc.log.complaint == ""
 
 
 def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(bench: Bench) -> None:
