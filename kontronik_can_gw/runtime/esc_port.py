@@ -31,7 +31,7 @@ SETTINGS_NS = SECOND // 2
 class EscPort:
     """One ESC's port. ``reopened``: how often it came back; ``line_errors``: since the start, by kind.
 
-    While the port is lost it is in ``lost``, so that nobody need look at each.
+    While the port is lost it is in ``lost``, so that the others need not be checked.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
 
 MIN_HELD_UP_NS = 20 * MS
-"""A loop that comes round this much too late at least, and by ``Transmitter.max_turn_ns``, was held up."""
+"""A turn that is later than this, and than ``Transmitter.max_turn_ns``, was held up."""
 _WAKES_PER_TIMEOUT = 4
 """The loop wakes at least this often within the shortest telemetry time-out: by how much of it a value may go early.
 
@@ -101,7 +101,7 @@ class Loop:
     def open(self) -> None:
         """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
         now = self._clock()
-        self.conditions.hold()  # what was opened is said when all is: an error at start is the only line
+        self.conditions.hold()  # what was opened is logged when all is: an error at start is the only line
         try:
             # ports first, and locked: so that nothing else, a CAN adapter's driver included, opens them
             for esc in self.escs:
@@ -114,7 +114,7 @@ class Loop:
             self.close()
             raise
         if self.can.port is not None:
-            self.can.port.discard()  # a node that has not booted yet hears nothing
+            self.can.port.discard()  # a node that has not booted yet receives nothing
         self.conditions.release()
         self._housekeeping.publish(now)  # the first time takes the longest
 
@@ -128,7 +128,7 @@ class Loop:
             self.end()
 
     def begin(self) -> None:
-        """The gateway starts: what is said once."""
+        """Start the gateway."""
         now = self._now = self._clock()
         self.gateway.start(now, self.can.is_open)
         self.can.follow_ids()  # before the boot-up message: a master may ask as soon as it sees it
@@ -225,7 +225,7 @@ class Loop:
         return next((esc.name for esc in self.escs if esc.is_at(path)), None)
 
     def _follow_hold_up(self, late: int, now: int) -> None:
-        """What was measured before is old; commands and answers are not (how old bytes are, ``since`` tells)."""
+        """What was measured before is old; commands and answers are not (how old bytes are, ``since`` says)."""
         text = f"the process was suspended for {late / SECOND:.1f} s: measurements that waited to be sent are dropped and made anew"
         self.conditions.event("suspended", text, now)
         self.gateway.held_up(now, self.can.transmitter.drop_measurements())

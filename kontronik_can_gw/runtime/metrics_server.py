@@ -23,7 +23,7 @@ CONNECTIONS = 8
 REQUEST_LIMIT = 4096
 TIME_LIMIT_NS = 2 * SECOND
 _PER_SECOND = 50
-"""Connections accepted in a second: whoever asks without end must not take the processor from the loop."""
+"""Connections accepted in a second: a client that asks without end must not take the processor from the loop."""
 _REQUEST = re.compile(rb"([A-Z]{1,16}) (/[!-~]*) HTTP/1\.[01]")
 _LOOPBACK = re.compile(r"(localhost|127(\.[0-9]{1,3}){3}|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 _REASONS = {
@@ -254,5 +254,5 @@ class MetricsServer:
             return 503, f"the gateway does not answer since {age // SECOND} s\n"
         if self._text[0] is not document:
             self._text = (document, metrics(document))
-        text = f"# HELP {_AGE} Age of what is told here.\n# TYPE {_AGE} gauge\n"
+        text = f"# HELP {_AGE} Age of these statistics.\n# TYPE {_AGE} gauge\n"
         return 200, f"{self._text[1]}{text}{_AGE} {age / SECOND:.3f}\n"

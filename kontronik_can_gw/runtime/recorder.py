@@ -3,7 +3,7 @@
 What may touch what: ``put``, ``note`` and ``reports`` are called by the loop's thread and never wait; only ``_work`` and
 what it calls touch the disk. Entries go from one to the other by a deque with a bound: what finds no room is counted, and the count is
 recorded when there is room again. Each half second what has come is one block, forced to the disk: a loss of power costs that and no more.
-Whatever goes wrong with the disk is told once, tried again each five seconds, and never ends the gateway nor the recorder.
+A fault of the disk is reported once, tried again each five seconds, and never ends the gateway nor the recorder.
 """
 
 import os
@@ -35,7 +35,7 @@ _AT_ONCE = 5000
 """Entries taken together, so that other threads have their turn between."""
 _CLOSE_S = 0.35
 _RETRY_NS = 5 * SECOND
-_LOOK_AT_SPACE_NS = 5 * SECOND
+_CHECK_SPACE_NS = 5 * SECOND
 _CLOCK_NS = 10 * SECOND
 _STATE_NS = 2 * SECOND
 _STEP_NS = MS
@@ -60,7 +60,7 @@ class RecordSettings:
     part_ns: int = 3600 * SECOND
     keep_bytes: int = 0
     """The oldest captures of the folder are removed when all together are larger."""
-    least_free_bytes: int = 100 * _MB
+    min_free_bytes: int = 100 * _MB
     """With less than this free nothing is written."""
 
 
@@ -88,23 +88,23 @@ class Recorder:
         self.header: Mapping[str, Any] = {}
         """What is known of gateway and ESCs, set before ``start``; a part's own numbers are added."""
         self.words = str(settings.folder)
-        """What is said of it when it begins."""
+        """What is logged when it begins."""
         self._clock = clock
         self._entries: deque[Item] = deque()
         self._overflowed = 0
         """Entries that found no room: the loop's count."""
         self._unwritten = 0
         """Entries that could not be written: the thread's count."""
-        self._told_overflow = 0
+        self._reported_overflow = 0
         self._reports: deque[Report] = deque()
         self._state_ns = 0
         self._devices: list[Any] = []
-        self._told_devices: list[Any] = []
+        self._recorded_devices: list[Any] = []
         self._worker: Worker[None] = Worker(
             "recorder", self._work, wait=self._wait, ended=self._end
         )
         self._busy_since: int | None = None
-        self._told_slow = False
+        self._reported_slow = False
         self._file: CapturePart | None = None
         self._run = os.urandom(8).hex()
         self._stamp = ""
@@ -153,17 +153,17 @@ class Recorder:
         taken: list[Report] = []
         while self._reports:
             taken.append(self._reports.popleft())
-        if self._overflowed >= max(1, 2 * self._told_overflow):
-            self._told_overflow = self._overflowed
+        if self._overflowed >= max(1, 2 * self._reported_overflow):
+            self._reported_overflow = self._overflowed
             text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
             taken.append(Report("losses", True, text))
         since, folder = self._busy_since, self.settings.folder
-        if since is not None and now - since > _SLOW_NS and not self._told_slow:
-            self._told_slow = True
+        if since is not None and now - since > _SLOW_NS and not self._reported_slow:
+            self._reported_slow = True
             text = f"captures: {folder}: the disk does not answer; the gateway is not held up."
             taken.append(Report("disk", True, text))
-        elif since is None and self._told_slow:
-            self._told_slow = False
+        elif since is None and self._reported_slow:
+            self._reported_slow = False
             taken.append(Report("disk", False, f"captures: {folder}: the disk answers again"))
         self.facts.lost = self._overflowed + self._unwritten
         return taken
@@ -206,9 +206,9 @@ class Recorder:
             self._begin_part(items[0][0] if items else now)
         file = self._file
         assert file is not None
-        if self._devices != self._told_devices:
-            self._told_devices = self._devices
-            file.write(b"I", json_payload({"devices": self._told_devices}))
+        if self._devices != self._recorded_devices:
+            self._recorded_devices = self._devices
+            file.write(b"I", json_payload({"devices": self._recorded_devices}))
         if items:
             self._remark(file, items, now)
             file.take(items)
@@ -242,16 +242,16 @@ class Recorder:
             return False
         if now >= self._space_ns:
             make_folder(self.settings.folder)
-            self._space_ns = now + _LOOK_AT_SPACE_NS
+            self._space_ns = now + _CHECK_SPACE_NS
             remove_oldest(self.settings.folder, self.settings.keep_bytes)
             found = os.statvfs(self.settings.folder)
             free = found.f_bavail * found.f_frsize
-            self._full = free < self.settings.least_free_bytes
+            self._full = free < self.settings.min_free_bytes
             if self._full:
                 self._end_part()
-                least = self.settings.least_free_bytes // _MB
+                minimum = self.settings.min_free_bytes // _MB
                 self._say_failed(
-                    f"{self.settings.folder}: less than {least} MB are free: nothing is recorded"
+                    f"{self.settings.folder}: less than {minimum} MB are free: nothing is recorded"
                 )
         return not self._full
 
@@ -284,13 +284,13 @@ class Recorder:
         if not self._stamp:
             self._stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(wall // SECOND))
         part, self._part = self._part, self._part + 1  # a name is tried once
-        self._told_devices = self._devices
+        self._recorded_devices = self._devices
         header = dict(self.header) | {
             "run": self._run,
             "part": part,
             "monotonic_ns": since,
             "wall_ns": wall,
-            "devices": self._told_devices,
+            "devices": self._recorded_devices,
         }
         base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{part:05d}"
         self._file = CapturePart(base.with_name(base.name + SUFFIX), json_payload(header), now)
@@ -318,7 +318,7 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
 
 
 def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
-    """What each ESC's last info frame told of the device now on its line; None where none has come."""
+    """What each ESC's last info frame says of the device now on its line; None where none has come."""
     return [
         None
         if esc.last_info is None

@@ -136,7 +136,7 @@ class SerialPort:
             return False
 
     def identity(self) -> Identity | None:
-        """Of the USB adapter behind the port; None for another kind of port."""
+        """Of the USB adapter that the port belongs to; None for another kind of port."""
         return identity_at(self._real_path)
 
     def discard(self) -> None:
@@ -172,7 +172,7 @@ def _in_use(path: str, users: str) -> RunError:
 
 
 def device_of(path: str) -> int | None:
-    """The device number behind a path (slcan's ``path@baud`` too); None where there is none."""
+    """The device number that a path leads to (slcan's ``path@baud`` too); None where it leads to none."""
     try:
         status = Path(path.partition("@")[0]).stat()
     except (OSError, ValueError):
@@ -258,16 +258,16 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
 
 
 _seen_users: set[Path] = set()
-_next_look: dict[str, float] = {}
-_LOOK_PAUSE_S = 10.0
+_next_search: dict[str, float] = {}
+_SEARCH_PAUSE_S = 10.0
 
 
 def _users_now_and_then(path: str) -> str:
     """Who has the port open; looked for at first and then no more than every ten seconds, because it takes a while on a slow machine."""
     now = time.monotonic()
-    if now < _next_look.get(path, 0.0) and not _seen_users:
+    if now < _next_search.get(path, 0.0) and not _seen_users:
         return ""
-    _next_look[path] = now + _LOOK_PAUSE_S
+    _next_search[path] = now + _SEARCH_PAUSE_S
     return _users(path)
 
 

@@ -216,7 +216,7 @@ class _StatusFile:
         return f"statistics file {self._path}"
 
     def write(self, data: bytes) -> Report | None:
-        """Replace the file; what there is to tell of it. It is not forced to the disk: after a loss of power nobody wants it."""
+        """Replace the file; returns what there is to report. It is not forced to the disk: after a loss of power nobody wants it."""
         try:
             self._replace(data)
         except OSError as error:

@@ -41,7 +41,7 @@ class ParameterStore:
     def lock(self, name: str) -> str | None:
         """Keep other gateways from a node's file until ``close``: RunError where one has it.
 
-        Where no lock can be made nothing can be saved either: the reason, to be told.
+        Where no lock can be made nothing can be saved either: returns the reason.
         """
         path = self._path(name)
         try:
