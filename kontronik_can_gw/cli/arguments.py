@@ -38,8 +38,11 @@ def number_from(low: float, high: float, what: str = "number of seconds") -> Cal
     return read
 
 
-def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
-    """UserError with what to type instead, where a command line has an option that was removed."""
+def refuse_removed_options(command: str | None, words: Sequence[str], rejected: str = "") -> None:
+    """UserError with what to type instead, where a command line has an option that was removed.
+
+    ``rejected``: what argparse says of the command line: the beginning of a removed option that is named in it counts too.
+    """
     options = words[: words.index("--")] if "--" in words else words
     parts = [
         part
@@ -47,6 +50,8 @@ def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
         for part in (word.split("=", 1) if word.startswith("--") else [word])
     ]
     for part, value in pairwise([*parts, ""]):
-        for option in (part, f"{part} {value}"):
-            if advice := REMOVED_OPTIONS.get((command or "", option)):
+        for (of, option), advice in REMOVED_OPTIONS.items():
+            name, _, choice = option.partition(" ")
+            is_short = len(part) > 2 and name.startswith(part) and (choice or part) in rejected
+            if of == command and (part == name or is_short) and choice in ("", value):
                 raise UserError(f"{option}: was removed. {advice}")
