@@ -165,7 +165,8 @@ class Worker(Generic[Item]):
     def _run(self) -> None:
         is_last = False
         while not is_last:
-            self._wait()
+            if not self._ending.is_set():  # whose wake may be read already, with the last items
+                self._wait()
             is_last = self._ending.is_set()  # asked first: what was put before the end is done
             try:
                 self._work(self._items.take())

@@ -61,6 +61,26 @@ def test_what_was_put_before_the_end_is_done_in_order_and_nothing_after_it() -> 
     assert worker.stop(PATIENCE)
 
 
+def test_an_end_whose_wake_is_read_with_the_last_items_is_not_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[int] = []
+    worker: Worker[int] = Worker("test", done.extend)
+    take = worker._items.take
+
+    def ended_just_before() -> list[int]:
+        worker.end()
+        return take()
+
+    monkeypatch.setattr(worker._items, "take", ended_just_before)
+    worker.put(1)
+    assert worker.start()
+    assert worker._thread is not None
+    worker._thread.join(PATIENCE)
+    assert not worker._thread.is_alive()
+    assert done == [1]
+
+
 def test_a_worker_that_was_never_started_ends_at_once() -> None:
     worker: Worker[int] = Worker("test", lambda _items: None)
     assert worker.stop(0)
