@@ -1,7 +1,7 @@
 """What waits to be sent: a slot for each CAN id (and multiplexer page), where the newest value wins, and a queue that keeps its order."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import Enum
 from operator import attrgetter
 
@@ -46,44 +46,29 @@ class TransmitQueue:
     def __len__(self) -> int:
         return len(self._slots) + len(self._queue)
 
-    def put_all(self, frames: Sequence[CanFrame]) -> None:
-        """Let frames wait: behind the queued ones, or in place of an older one of the id."""
+    def put_all(self, frames: Sequence[CanFrame]) -> int:
+        """Let frames wait: after the queued ones, or in place of an older one of the id. Returns how many were lost by it."""
+        dropped = 0
         if any(map(_is_queued, frames)):
             room = QUEUE_LENGTH - len(self._queue)
             queued = [frame for frame in frames if frame.queued]
             self._queue += queued[:room]
-            self.dropped += len(queued[room:])
+            dropped = len(queued[room:])
+            self.dropped += dropped
             frames = [frame for frame in frames if not frame.queued]
         slots = self._slots
         count = len(slots) + len(frames)
         slots.update(zip(map(_slot_of, frames), frames, strict=True))
-        self.replaced += count - len(slots)
+        replaced = count - len(slots)
+        self.replaced += replaced
+        return replaced + dropped
 
-    def put(self, frame: CanFrame) -> None:
-        """Let one frame wait."""
-        self.put_all((frame,))
+    def put(self, frame: CanFrame) -> int:
+        """Let one frame wait. Returns how many were lost by it."""
+        return self.put_all((frame,))
 
-    def flush(self, send: Callable[[Sequence[CanFrame]], tuple[int, Sent]]) -> tuple[int, Sent]:
-        """Let ``send`` have what waits; it says how many frames went, and why not more. Returns its answer.
-
-        A frame that was not taken stays the first of its line.
-        """
-        frames = self._in_order()
-        count, answer = send(frames)
-        if count and self._queue and len(frames) > 1:
-            self._queue_has_turn = not frames[count - 1].queued
-        if count == len(frames):
-            self._slots.clear()
-            self._queue.clear()
-            return count, answer
-        for frame in frames[:count]:
-            if frame.queued:
-                self._queue.popleft()
-            else:
-                del self._slots[_slot_of(frame)]
-        return count, answer
-
-    def _in_order(self) -> list[CanFrame]:
+    def in_order(self) -> list[CanFrame]:
+        """All that wait, in the order in which they are to be sent."""
         slots = list(self._slots.values())
         if not self._queue:
             return slots
@@ -93,6 +78,26 @@ class TransmitQueue:
         by_turns = [frame for pair in zip(first, second, strict=False) for frame in pair]
         both = len(by_turns) // 2
         return by_turns + first[both:] + second[both:]
+
+    def remove(self, frames: Sequence[CanFrame], count: int) -> None:
+        """Forget the first ``count`` of ``frames``, which ``in_order`` gave: they were sent. The next one stays first of its kind."""
+        if self._queue and count and len(frames) > 1:
+            self._queue_has_turn = not frames[count - 1].queued
+        if count == len(frames):
+            self._slots.clear()
+            self._queue.clear()
+            return
+        for frame in frames[:count]:
+            if frame.queued:
+                self._queue.popleft()
+            else:
+                del self._slots[_slot_of(frame)]
+
+    def take_all(self) -> list[CanFrame]:
+        """All that wait, in order; nothing waits any more."""
+        frames = self.in_order()
+        self.remove(frames, len(frames))
+        return frames
 
     def drop_measurements(self) -> bool:
         """Drop what waits in slots; True where something did."""

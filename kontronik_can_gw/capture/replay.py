@@ -4,7 +4,7 @@ The core is that of a live run and gets the recorded times, so frames and times 
 entry is missing. Nothing here waits or sends.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture.format import (
@@ -19,7 +19,7 @@ from kontronik_can_gw.capture.format import (
 from kontronik_can_gw.esc.values import CanState, GatewayState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.transmit_queue import Sent, TransmitQueue
+from kontronik_can_gw.transmit_queue import TransmitQueue
 
 
 class TimedFrame(NamedTuple):
@@ -173,14 +173,7 @@ class Replay:
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
     """The frames of one turn in the order in which the interface gets them. ``waiting``: the queue, the same for each turn."""
     waiting.put_all(frames)
-    sent: list[CanFrame] = []
-
-    def take(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
-        sent.extend(frames)
-        return len(frames), Sent.OK
-
-    waiting.flush(take)
-    return sent
+    return waiting.take_all()
 
 
 def follow_bytes(gateway: Gateway, chunks: Iterable[tuple[int, bytes]]) -> Iterator[TimedFrame]:

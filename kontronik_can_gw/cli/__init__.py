@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from typing import NoReturn
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.cli.arguments import refuse_removed_options
@@ -75,7 +76,11 @@ def _main(words: list[str], command: str | None) -> int:
     _prepare_streams()
     need_descriptors()
     refuse_removed_options(command, words)
-    args = make_parser([] if command is None else [command]).parse_args(words)
+    try:
+        args = make_parser([] if command is None else [command]).parse_args(words)
+    except _UsageError as error:
+        refuse_removed_options(command, words, error.message)
+        argparse.ArgumentParser.error(error.parser, error.message)
     with _interruptible():
         code: int = args.main(args)
     if sys.stdout is not None:  # None where it was closed, as by `>&-`
@@ -128,9 +133,21 @@ def _too_few_files(needed: int = _DESCRIPTORS) -> RunError:
     )
 
 
+class _UsageError(Exception):
+    def __init__(self, parser: argparse.ArgumentParser, message: str) -> None:
+        super().__init__(message)
+        self.parser = parser
+        self.message = message
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise _UsageError(self, message)
+
+
 def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """The parser of the program. Only commands in ``complete`` get their options; a run needs only those of one command."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="kontronik-can-gw",
         description="Gateway from KONTRONIK ESC telemetry (UART) to CAN, described by a DBC.",
         epilog="kontronik-can-gw COMMAND --help describes a command.",

@@ -70,8 +70,11 @@ def names(text: str) -> list[str]:
     return found
 
 
-def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
-    """UserError with the replacement where a command line has a removed option."""
+def refuse_removed_options(command: str | None, words: Sequence[str], rejected: str = "") -> None:
+    """UserError with the replacement where a command line has a removed option.
+
+    ``rejected``: argparse's message about the command line: the beginning of a removed option that is named in it counts too.
+    """
     options = words[: words.index("--")] if "--" in words else words
     parts = [
         part
@@ -79,6 +82,8 @@ def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
         for part in (word.split("=", 1) if word.startswith("--") else [word])
     ]
     for part, value in pairwise([*parts, ""]):
-        for option in (part, f"{part} {value}"):
-            if advice := REMOVED_OPTIONS.get((command or "", option)):
+        for (of, option), advice in REMOVED_OPTIONS.items():
+            name, _, choice = option.partition(" ")
+            is_short = len(part) > 2 and name.startswith(part) and (choice or part) in rejected
+            if of == command and (part == name or is_short) and choice in ("", value):
                 raise UserError(f"{option}: was removed. {advice}")

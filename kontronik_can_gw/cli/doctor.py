@@ -19,7 +19,7 @@ from kontronik_can_gw.config.nodes import parameter_folder
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity, count, document
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
-from kontronik_can_gw.runtime.can_port import check_interface
+from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.runtime.store import parameter_file
 
 if TYPE_CHECKING:

@@ -291,7 +291,7 @@ def _source(args: argparse.Namespace, bus: "BusLayout | None") -> _Source:
         if getattr(args, name) is not None
     }
     can = replace(can, **given)
-    from kontronik_can_gw.runtime.can_port import check_interface
+    from kontronik_can_gw.runtime.open_can import check_interface
 
     check_interface(can)
     return _Bus(bus, can)

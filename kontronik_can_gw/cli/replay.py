@@ -187,8 +187,8 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     from kontronik_can_gw.config.keys import CanConfig
     from kontronik_can_gw.desk.recordings.inputs import CaptureInput
     from kontronik_can_gw.desk.recordings.marking import Marker
-    from kontronik_can_gw.runtime.can_port import CanPort, check_interface
     from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
+    from kontronik_can_gw.runtime.open_can import check_interface, open_can
     from kontronik_can_gw.signals.unpacker import SignalReader
 
     config = recording.bus.config.can if args.config and recording.bus.config else None
@@ -218,7 +218,7 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
         ]
         for taken in locks.hold(names):
             raise in_use(taken)
-    port = CanPort(can)
+    port = open_can(can)
     count = 0
     try:
         # the core marks the frames of a capture itself; those of a log are changed one by one

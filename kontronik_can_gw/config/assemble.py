@@ -25,7 +25,7 @@ from kontronik_can_gw.dbc.prepare import check_load, prepare
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.runtime.can_port import check_interface
+from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.signals.plan import Layout
 

@@ -1,4 +1,4 @@
-"""A participant of the CAN bus that only listens, for those who look on: it never sends, claims nothing, and comes back by itself.
+"""A participant of the CAN bus that only listens: it never sends, claims nothing, and comes back by itself.
 
 It has an interface of its own beside whatever else uses it (a gateway, for one), with receive filters for the ids that were asked for.
 """
@@ -12,10 +12,12 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort, fault_of, socketcan_error
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
+from kontronik_can_gw.runtime.open_can import open_can
+from kontronik_can_gw.runtime.socketcan_port import fault_of, socketcan_error
 
 RETRY_S = 0.5
-"""Between two looks at an interface that does not work, and at whether one that works is still up."""
+"""How often an interface that does not work is tried again, and one that works is checked."""
 _MAX_AT_ONCE = 4096
 _BUS_OFF = (
     "CAN interface {name}: is bus-off: look at bit rate, wiring and termination. "
@@ -27,18 +29,18 @@ class BusListener:
     """An open interface, received from only.
 
     ``keys``: ids, with EXTENDED for 29 bits. Raises RunError where the interface cannot be opened now, UserError where python-can does
-    not know it; later troubles only show in ``problem``. ``fileno`` does not exist: what stands behind changes with each opening.
+    not know it; later troubles only show in ``problem``. There is no ``fileno``: the descriptor changes with each opening.
     """
 
     def __init__(self, config: CanConfig, keys: frozenset[int]) -> None:
         self.problem = ""
         """One line with the remedy while the interface does not work; empty while it does."""
         self.lost_frames = 0
-        """How often frames were lost because they came faster than they were taken."""
+        """How often frames were lost because they came faster than they were read."""
         self._config = config
         self._keys = keys
         self._port: CanPort | None = None
-        self._look_at = 0.0
+        self._check_at = 0.0
         # what python-can says of an interface that went away is said by ``problem``, with the remedy
         logging.getLogger("can").addHandler(logging.NullHandler())
         self._open()
@@ -48,15 +50,15 @@ class BusListener:
         end = time.monotonic() + timeout_s
         while True:
             now = time.monotonic()
-            if now >= self._look_at:
-                self._look_at = now + RETRY_S
-                self._look()
+            if now >= self._check_at:
+                self._check_at = now + RETRY_S
+                self._check()
             if frames := self._take():
                 return frames
             now = time.monotonic()
             if now >= end:
                 return []
-            self._wait(min(end, max(now, self._look_at)) - now)
+            self._wait(min(end, max(now, self._check_at)) - now)
 
     def close(self) -> None:
         """May be called again."""
@@ -65,7 +67,7 @@ class BusListener:
             self._port = None
 
     def _open(self) -> None:
-        port = CanPort(self._config)
+        port = open_can(self._config)
         try:
             port.set_receive_ids(self._keys)
         except BaseException:
@@ -74,7 +76,7 @@ class BusListener:
         self._port = port
         self.problem = ""
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         """Whether the interface works; open it anew where it is gone."""
         config = self._config
         fault = fault_of(config.channel) if config.interface == "socketcan" else 0

@@ -1,4 +1,4 @@
-"""One ESC's serial port as the loop has it: opened, read, lost, found again, and talked about."""
+"""One ESC's serial port as the loop has it: opened, read, lost, found again."""
 
 import logging
 import selectors
@@ -7,26 +7,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik.states import device_text
-from kontronik_can_gw.esc.telemetry import NS_PER_BYTE, SECOND, LinkState
+from kontronik_can_gw.esc.telemetry import NS_PER_BYTE, SECOND
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.esc_log import EscLog
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Registry
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.serial_port import (
-    Identity,
     NoPort,
     PortLost,
     SerialPort,
     device_of,
-    find_adapter,
-    identity_at,
     is_mini_uart,
 )
 from kontronik_can_gw.runtime.snapshot import PortFacts
+from kontronik_can_gw.runtime.usb_adapters import Identity, find_adapter, identity_at
 
-LONGEST_RETRY_NS = SECOND
-DIAGNOSIS_NS = 3 * SECOND
+MAX_RETRY_NS = SECOND
 SETTINGS_NS = SECOND // 2
 """While another program has echo on, what the ESC sends goes back to it."""
 
@@ -34,7 +31,7 @@ SETTINGS_NS = SECOND // 2
 class EscPort:
     """One ESC's port. ``reopened``: how often it came back; ``line_errors``: since the start, by kind.
 
-    While the port is lost it is in ``lost``, so that nobody need look at each.
+    While the port is lost it is in ``lost``, so that the others need not be checked.
     """
 
     def __init__(
@@ -64,29 +61,20 @@ class EscPort:
         """The port was empty then."""
         self._undrained_ns: int | None = None
         """The last read left something, which came after this."""
-        self._retry = Retry(LONGEST_RETRY_NS)
-        self._diagnosis_due = 0
-        self._diagnosed: set[str] = set()
+        self._retry = Retry(MAX_RETRY_NS)
+        self.log = EscLog(index, gateway, conditions)
+        self.report_due = 0
+        """When ``report`` has something to do."""
         self._counted: dict[str, int] = {}
         self._count_due = 0
-        self._settings_due = 0
         self._served = True
         self._seen_waiting = False
-        self._lost_counters = (0, 0)
         self._lost_since: int | None = None
         self._proven = False
 
     @property
     def name(self) -> str:
         return self._gateway.escs[self._index].settings.name
-
-    @property
-    def complaint(self) -> str:
-        """Why there is no telemetry, as far as it is known; empty while there is."""
-        for name in (self._port_condition, self._link_condition, self._diagnosis_condition):
-            if reason := self._conditions.reason(name):
-                return reason
-        return ""
 
     def facts(self) -> PortFacts:
         """For the statistics."""
@@ -97,7 +85,7 @@ class EscPort:
             self.name,
             path,
             is_open,
-            self.complaint,
+            self.log.complaint,
             again,
             dict(self.line_errors),
             self._lost_since,
@@ -125,14 +113,14 @@ class EscPort:
         self._lost_since = None
         self._proven = False
         self._lost.discard(self)
-        self._diagnosis_due = now + DIAGNOSIS_NS
+        self.log.await_telemetry(now)
         self._counted = port.line_errors()
         self._served, self._seen_waiting = True, False
         self._selector.register(port.fileno(), selectors.EVENT_READ, self.serve)
         self._gateway.port_opened(self._index, now)
         said = f"{self.name}: {port.path} is open"
-        if self._conditions.is_on(self._port_condition):
-            self._conditions.end(self._port_condition, said, now)
+        if self._conditions.is_on(self.log.port_condition):
+            self._conditions.end(self.log.port_condition, said, now)
         else:
             self._conditions.say(logging.INFO, said)
         if is_mini_uart(port.path):
@@ -196,63 +184,18 @@ class EscPort:
         self._served, self._seen_waiting = False, waiting
         return stuck
 
-    def follow_link(self, now: int) -> None:
-        """The link's state, layout or device changed: say so."""
-        esc, told, name = self._gateway.escs[self._index], self._conditions, self.name
-        self._diagnosis_due = now + DIAGNOSIS_NS
-        if esc.link in (LinkState.LOST, LinkState.PORT_ERROR):
-            self._lost_counters = (esc.counters.crc_errors, esc.counters.dropped_bytes)
-            quiet = esc.link is LinkState.PORT_ERROR  # which is said by itself
-            text = f"{name}: telemetry lost; its values are marked as not available"
-            told.begin(self._link_condition, text, now, quiet=quiet, since=esc.live_ns)
-            told.forget(self._quality_condition)
-        if esc.link not in (LinkState.OK, LinkState.DEGRADED):
-            return
-        self._diagnosed.clear()
-        told.forget(self._diagnosis_condition)
-        layout = ("unknown layout", "V4", "legacy")[esc.layout]
-        device = device_text(esc.info.device) if esc.info else None
-        said = (
-            f"{name}: telemetry {esc.link.name.lower()} ({layout}{f', {device}' if device else ''})"
-        )
-        if told.is_on(self._link_condition):
-            crc_errors = esc.counters.crc_errors - self._lost_counters[0]
-            dropped = esc.counters.dropped_bytes - self._lost_counters[1]
-            told.end(
-                self._link_condition,
-                said,
-                now,
-                f"; {crc_errors} CRC errors, {dropped} bytes dropped meanwhile",
-            )
-        elif esc.link is LinkState.DEGRADED:
-            told.begin(self._quality_condition, f"{said}: many CRC errors or dropped bytes", now)
-        elif told.is_on(self._quality_condition):
-            told.end(self._quality_condition, said, now)
-        else:
-            told.say(logging.INFO, said)
-
     def report(self, now: int) -> None:
         """Count line errors once a second, look at the port's settings twice; say why nothing comes."""
+        self.report_due = now + SETTINGS_NS
         if self.port is None:
             return
         if now >= self._count_due:
             self._count_due = now + SECOND
             self._count(self.port.line_errors())
-        if now >= self._settings_due:
-            self._settings_due = now + SETTINGS_NS
-            if not self.port.settings_hold():
-                text = f"{self.name}: another program changed the settings of {self.port.path}: set to 115200 8E1 again"
-                self._conditions.event(f"{self.name}: settings", text, now)
-        if self._diagnosis_due and now >= self._diagnosis_due:
-            self._diagnosis_due = now + DIAGNOSIS_NS
-            diagnosis = self._gateway.escs[self._index].diagnosis()
-            if diagnosis and diagnosis not in self._diagnosed:
-                self._diagnosed.add(diagnosis)
-                self._conditions.begin(
-                    self._diagnosis_condition,
-                    f"{self.name}: no telemetry: {diagnosis}{self._line_error_words()}",
-                    now,
-                )
+        if not self.port.settings_hold():
+            text = f"{self.name}: another program changed the settings of {self.port.path}: set to 115200 8E1 again"
+            self._conditions.event(f"{self.name}: settings", text, now)
+        self.log.diagnose(self.line_errors, now)
 
     def _count(self, counts: dict[str, int]) -> None:
         for kind, count in counts.items():
@@ -263,21 +206,13 @@ class EscPort:
                 self._gateway.escs[self._index].line_errors += new
         self._counted = counts
 
-    def _line_error_words(self) -> str:
-        counts = [
-            f"{count} {kind} errors"
-            for kind, count in self.line_errors.items()
-            if count and kind != "break"
-        ]
-        return f" (the driver counts {', '.join(counts)})" if counts else ""
-
     def _failed(self, reason: str, now: int, quiet: bool = False) -> None:
         self.due = self._retry.failed(now)
         self._lost.add(self)
         self._lost_since = self._lost_since or now
         self._gateway.port_lost(self._index, now)
         self._conditions.begin(
-            self._port_condition, f"{self.name}: {reason} Trying again.", now, quiet=quiet
+            self.log.port_condition, f"{self.name}: {reason} Trying again.", now, quiet=quiet
         )
 
     def _path_now(self, others: tuple[Identity | None, ...]) -> str:
@@ -298,19 +233,3 @@ class EscPort:
                 f"{self.path}: is another ESC's adapter now. Name ports by /dev/serial/by-id or by-path."
             )
         return self.path
-
-    @property
-    def _port_condition(self) -> str:
-        return f"{self.name}: port"
-
-    @property
-    def _link_condition(self) -> str:
-        return f"{self.name}: telemetry"
-
-    @property
-    def _quality_condition(self) -> str:
-        return f"{self.name}: line quality"
-
-    @property
-    def _diagnosis_condition(self) -> str:
-        return f"{self.name}: diagnosis"

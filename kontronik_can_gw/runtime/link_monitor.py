@@ -1,4 +1,4 @@
-"""What the kernel tells of one network interface by rtnetlink: whether it is there, up, and how its CAN controller is.
+"""What the kernel reports of one network interface by rtnetlink: whether it is there, up, and how its CAN controller is.
 
 Nothing is changed by it and no privilege is needed. Source of the numbers: linux/rtnetlink.h, if_link.h, can/netlink.h.
 """
@@ -21,7 +21,7 @@ _NEW_LINK, _DELETED_LINK, _GET_LINK, _ERROR = 16, 17, 18, 2
 _REQUEST = 1
 _UP = 0x1
 _RUNS = 0x40 | 0x10000
-"""IFF_RUNNING, which the kernel may tell a second late, and IFF_LOWER_UP: the controller is on."""
+"""IFF_RUNNING, which the kernel may report a second late, and IFF_LOWER_UP: the controller is on."""
 _NAME, _LINK_INFO, _INFO_KIND, _INFO_DATA = 3, 18, 1, 2
 _BIT_TIMING, _STATE, _RESTART_MS, _ERROR_COUNTERS = 1, 4, 6, 8
 _TYPE_MASK = 0x3FFF
@@ -32,7 +32,7 @@ _STATES = (CanState.ERROR_ACTIVE, CanState.ERROR_WARNING, CanState.ERROR_PASSIVE
 class LinkFacts(NamedTuple):
     """An interface as the kernel knows it. ``state`` is None where there is no controller (vcan) or it does not run.
 
-    ``bitrate`` in bit/s, ``restart_ms`` 0: a controller in bus-off stays there; None where the driver does not tell.
+    ``bitrate`` in bit/s, ``restart_ms`` 0: a controller in bus-off stays there; None where the driver does not report it.
     """
 
     exists: bool
@@ -48,7 +48,7 @@ class LinkFacts(NamedTuple):
 
 
 class LinkMonitor:
-    """Hears of every change of one interface; asks for what is not told by itself. OSError where the system has no rtnetlink."""
+    """Receives every change of one interface; asks for what is not reported unasked. OSError where the system has no rtnetlink."""
 
     def __init__(self, name: str) -> None:
         self._name = name.encode()
@@ -65,7 +65,7 @@ class LinkMonitor:
         return self._socket.fileno()
 
     def ask(self) -> None:
-        """Let the kernel tell how the interface is now: ``take`` gives the answer, at once."""
+        """Let the kernel report how the interface is now: ``take`` gives the answer, at once."""
         name = _attribute(_NAME, self._name + b"\0")
         body = _INTERFACE.pack(0, 0, 0, 0, 0) + name
         with contextlib.suppress(OSError):
@@ -74,7 +74,7 @@ class LinkMonitor:
             )
 
     def take(self) -> list[LinkFacts]:
-        """What was told of the interface since the last call, oldest first."""
+        """What was reported of the interface since the last call, oldest first."""
         found: list[LinkFacts] = []
         while True:
             try:
@@ -84,7 +84,7 @@ class LinkMonitor:
             except OSError as error:
                 if error.errno != errno.ENOBUFS:
                     return found
-                self.ask()  # more was told than we took: what counts is how it is now
+                self.ask()  # more was reported than we read: what counts is how it is now
                 continue
             for kind, body in _messages(data):
                 facts = self._facts(kind, body)

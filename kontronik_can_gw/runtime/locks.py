@@ -24,7 +24,7 @@ SYSTEM_FOLDER = Path("/run/kontronik-can-gw/lock")
 PREFIX = ""
 """Before the names of all locks, for tests that run side by side."""
 _NAME = "kontronik-can-gw"
-_LONGEST_NAME = 200
+_MAX_NAME = 200
 _TRIES = 100
 _OPEN = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
 
@@ -65,7 +65,7 @@ def network_namespace() -> int:
 def file_name(name: str, namespace: int) -> str:
     """The file that stands for a lock."""
     text = (PREFIX + name).replace("%", "%25").replace("/", "%2F")
-    if len(os.fsencode(text)) > _LONGEST_NAME:
+    if len(os.fsencode(text)) > _MAX_NAME:
         from hashlib import sha256  # which loads OpenSSL: 4 MB
 
         channel, what, number = (PREFIX + name).rsplit("/", 2)

@@ -1,12 +1,11 @@
 """Waiting for many descriptors at once: poll(2) with a handler for each.
 
-What there is, and what was not there at a known time, is found by a look of its own after each wait: a process that was stopped while it
-waited hears that nothing has come once the wait's time is over (PEP 475). And by poll, not epoll, which does not ask a
-terminal whether bytes are still on their way to it inside the kernel.
+What is ready, and what was not at a known time, is asked for once more after each wait: a process that was stopped while it waited is
+answered that nothing has come once the wait's time is over (PEP 475). And by poll, not epoll, which does not ask a terminal whether
+bytes are still on their way to it inside the kernel.
 """
 
 import contextlib
-import math
 import select
 import selectors
 import time
@@ -40,7 +39,7 @@ class Registry(Protocol):
 class Poller:
     """A poll object. A descriptor that hung up counts as readable, and as writable where that is watched.
 
-    ``now``: the time of the last look, ``before``: of the one before it. What was not there then has come since.
+    ``now``: when was last asked what is ready, ``before``: the time before that. What was not ready then has come since.
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
@@ -62,12 +61,12 @@ class Poller:
             self._poll.unregister(fileobj)
 
     def wait(self, pause_ns: int) -> list[tuple[Handler, int]]:
-        """Wait until something happens, ``pause_ns`` is over (rounded up to a millisecond), or a signal comes; then look.
+        """Wait until something happens, ``pause_ns`` is over (rounded up to a millisecond), or a signal comes; then ask what is ready.
 
         Returns handlers of what there is, with what.
         """
         if pause_ns > 0:
-            self._poll.poll(math.ceil(pause_ns / MS))
+            self._poll.poll(-(-pause_ns // MS))
         self.before, self.now = self.now, self._clock()
         happened = self._poll.poll(0)
         watched = self._watched

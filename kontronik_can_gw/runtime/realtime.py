@@ -17,8 +17,10 @@ _LOCK_CURRENT, _LOCK_FUTURE, _LOCK_ON_FAULT = 1, 2, 4
 """Of mlockall(2): what is used, as it comes to be used."""
 
 
-_begun: list[int] = []
-"""The priority that was taken here, if any: what others gave this process (chrt) is left as it is."""
+class _Taken:
+    """What was taken here: what others gave this process (chrt) is left as it is."""
+
+    priority: int | None = None
 
 
 def begin(priority: int) -> None:
@@ -33,7 +35,7 @@ def begin(priority: int) -> None:
         raise RunError(
             f"run.realtime_priority = {priority}: {error.strerror or error}. Leave it out."
         ) from None
-    _begun.append(priority)
+    _Taken.priority = priority
     for thread in threading.enumerate():
         if thread is not threading.current_thread():
             follow(thread)
@@ -42,11 +44,11 @@ def begin(priority: int) -> None:
 
 def follow(thread: threading.Thread) -> None:
     """Give a thread beside the loop its priority: that of the loop less one; nothing where it has none."""
-    if not _begun or thread.native_id is None:
+    if _Taken.priority is None or thread.native_id is None:
         return
-    priority = max(1, _begun[0] - 1)
+    param = os.sched_param(max(1, _Taken.priority - 1))
     with contextlib.suppress(OSError):  # it has ended by now
-        os.sched_setscheduler(thread.native_id, os.SCHED_FIFO, os.sched_param(priority))
+        os.sched_setscheduler(thread.native_id, os.SCHED_FIFO, param)
 
 
 def _how(priority: int) -> str:

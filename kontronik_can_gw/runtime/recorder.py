@@ -3,14 +3,10 @@
 What may touch what: ``put``, ``note`` and ``reports`` are called by the loop's thread and never wait; only ``_work`` and
 what it calls touch the disk. Entries go from one to the other by a deque with a bound: what finds no room is counted, and the count is
 recorded when there is room again. Each half second what has come is one block, forced to the disk: a loss of power costs that and no more.
-Whatever goes wrong with the disk is told once, tried again each five seconds, and never ends the gateway nor the recorder.
+A fault of the disk is reported once, tried again each five seconds, and never ends the gateway nor the recorder.
 """
 
-import contextlib
-import errno
-import fcntl
 import os
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -21,8 +17,6 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.capture.format import (
     SUFFIX,
     Kind,
-    block,
-    data_payload,
     json_payload,
     number_data,
 )
@@ -30,7 +24,9 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.states import device_text
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime.threads import start_beside_the_loop
+from kontronik_can_gw.runtime.capture_folder import make_folder, remove_oldest
+from kontronik_can_gw.runtime.capture_part import CapturePart, Item
+from kontronik_can_gw.runtime.worker import Worker
 
 CAPACITY = 50_000
 """Entries that may wait to be written: about two minutes of one ESC, 15 seconds of eight."""
@@ -39,18 +35,12 @@ _AT_ONCE = 5000
 """Entries taken together, so that other threads have their turn between."""
 _CLOSE_S = 0.35
 _RETRY_NS = 5 * SECOND
-_LOOK_AT_SPACE_NS = 5 * SECOND
+_CHECK_SPACE_NS = 5 * SECOND
 _CLOCK_NS = 10 * SECOND
 _STATE_NS = 2 * SECOND
 _STEP_NS = MS
 _SLOW_NS = 5 * SECOND
 _MB = 1_000_000
-
-_LOGS_OF_0_5_0 = (".log", ".asc", ".blf", ".trc")
-"""Logs of CAN frames beside captures, which 0.5.0 wrote: they are removed as captures are."""
-
-Item = tuple[int, int, int, bytes, int, int | None]
-"""(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
 
 
 class Report(NamedTuple):
@@ -70,7 +60,7 @@ class RecordSettings:
     part_ns: int = 3600 * SECOND
     keep_bytes: int = 0
     """The oldest captures of the folder are removed when all together are larger."""
-    least_free_bytes: int = 100 * _MB
+    min_free_bytes: int = 100 * _MB
     """With less than this free nothing is written."""
 
 
@@ -98,23 +88,24 @@ class Recorder:
         self.header: Mapping[str, Any] = {}
         """What is known of gateway and ESCs, set before ``start``; a part's own numbers are added."""
         self.words = str(settings.folder)
-        """What is said of it when it begins."""
+        """What is logged when it begins."""
         self._clock = clock
         self._entries: deque[Item] = deque()
         self._overflowed = 0
         """Entries that found no room: the loop's count."""
         self._unwritten = 0
         """Entries that could not be written: the thread's count."""
-        self._told_overflow = 0
+        self._reported_overflow = 0
         self._reports: deque[Report] = deque()
         self._state_ns = 0
         self._devices: list[Any] = []
-        self._told_devices: list[Any] = []
-        self._ending = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._recorded_devices: list[Any] = []
+        self._worker: Worker[None] = Worker(
+            "recorder", self._work, wait=self._wait, ended=self._end
+        )
         self._busy_since: int | None = None
-        self._told_slow = False
-        self._file: _Part | None = None
+        self._reported_slow = False
+        self._file: CapturePart | None = None
         self._run = os.urandom(8).hex()
         self._stamp = ""
         self._part = 0
@@ -132,16 +123,14 @@ class Recorder:
         """Begin to write. RunError where the folder cannot be used, unless ``wait``: then it is tried again and again."""
         folder = self.settings.folder
         try:
-            _make_folder(folder)
+            make_folder(folder)
         except OSError as error:
             if not wait:
                 raise RunError(
                     f"captures: {folder}: {error.strerror}. Give another folder (record.directory, --record)."
                 ) from None
-        thread = threading.Thread(target=self._run_thread, name="recorder", daemon=True)
-        if not start_beside_the_loop(thread):
+        if not self._worker.start():
             raise RunError("captures: the system gives no thread to write them")
-        self._thread = thread
 
     def put(
         self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None
@@ -164,40 +153,31 @@ class Recorder:
         taken: list[Report] = []
         while self._reports:
             taken.append(self._reports.popleft())
-        if self._overflowed >= max(1, 2 * self._told_overflow):
-            self._told_overflow = self._overflowed
+        if self._overflowed >= max(1, 2 * self._reported_overflow):
+            self._reported_overflow = self._overflowed
             text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
             taken.append(Report("losses", True, text))
         since, folder = self._busy_since, self.settings.folder
-        if since is not None and now - since > _SLOW_NS and not self._told_slow:
-            self._told_slow = True
+        if since is not None and now - since > _SLOW_NS and not self._reported_slow:
+            self._reported_slow = True
             text = f"captures: {folder}: the disk does not answer; the gateway is not held up."
             taken.append(Report("disk", True, text))
-        elif since is None and self._told_slow:
-            self._told_slow = False
+        elif since is None and self._reported_slow:
+            self._reported_slow = False
             taken.append(Report("disk", False, f"captures: {folder}: the disk answers again"))
         self.facts.lost = self._overflowed + self._unwritten
         return taken
 
     def close(self) -> None:
         """Write what waits and end the thread; a disk that does not answer is waited for 0.35 s and no longer."""
-        self._ending.set()
-        if self._thread is not None:
-            self._thread.join(_CLOSE_S)
-            self._thread = None
+        self._worker.stop(_CLOSE_S)
 
     # --- the thread's side
 
-    def _run_thread(self) -> None:
-        while not self._ending.wait(PERIOD_S):
-            self._work()
-        self._work()
-        try:
-            self._end_part()
-        except Exception as error:  # whatever it is, the gateway is ending
-            self._fail(error, self._clock(), [])
+    def _wait(self) -> None:
+        self._worker.pause(PERIOD_S)
 
-    def _work(self) -> None:
+    def _work(self, _items: list[None]) -> None:
         """Write what has come."""
         entries = self._entries
         self._busy_since = self._clock()
@@ -212,6 +192,12 @@ class Recorder:
                 break
         self._busy_since = None
 
+    def _end(self) -> None:
+        try:
+            self._end_part()
+        except Exception as error:  # whatever it is, the gateway is ending
+            self._fail(error, self._clock(), [])
+
     def _write(self, items: list[Item], now: int) -> None:
         if not self._may_write(now):
             self._lose(items)
@@ -220,9 +206,9 @@ class Recorder:
             self._begin_part(items[0][0] if items else now)
         file = self._file
         assert file is not None
-        if self._devices != self._told_devices:
-            self._told_devices = self._devices
-            file.write(b"I", json_payload({"devices": self._told_devices}))
+        if self._devices != self._recorded_devices:
+            self._recorded_devices = self._devices
+            file.write(b"I", json_payload({"devices": self._recorded_devices}))
         if items:
             self._remark(file, items, now)
             file.take(items)
@@ -238,7 +224,7 @@ class Recorder:
         if is_large or is_old:
             self._end_part()
 
-    def _remark(self, file: "_Part", items: list[Item], now: int) -> None:
+    def _remark(self, file: "CapturePart", items: list[Item], now: int) -> None:
         """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
         last = items[-1][0]
         if (lost := self._overflowed + self._unwritten - file.lost) > 0:
@@ -255,17 +241,17 @@ class Recorder:
         if self._file is None and now < self._retry_ns:
             return False
         if now >= self._space_ns:
-            _make_folder(self.settings.folder)
-            self._space_ns = now + _LOOK_AT_SPACE_NS
-            self._remove_oldest()
+            make_folder(self.settings.folder)
+            self._space_ns = now + _CHECK_SPACE_NS
+            remove_oldest(self.settings.folder, self.settings.keep_bytes)
             found = os.statvfs(self.settings.folder)
             free = found.f_bavail * found.f_frsize
-            self._full = free < self.settings.least_free_bytes
+            self._full = free < self.settings.min_free_bytes
             if self._full:
                 self._end_part()
-                least = self.settings.least_free_bytes // _MB
+                minimum = self.settings.min_free_bytes // _MB
                 self._say_failed(
-                    f"{self.settings.folder}: less than {least} MB are free: nothing is recorded"
+                    f"{self.settings.folder}: less than {minimum} MB are free: nothing is recorded"
                 )
         return not self._full
 
@@ -298,18 +284,18 @@ class Recorder:
         if not self._stamp:
             self._stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(wall // SECOND))
         part, self._part = self._part, self._part + 1  # a name is tried once
-        self._told_devices = self._devices
+        self._recorded_devices = self._devices
         header = dict(self.header) | {
             "run": self._run,
             "part": part,
             "monotonic_ns": since,
             "wall_ns": wall,
-            "devices": self._told_devices,
+            "devices": self._recorded_devices,
         }
         base = self.settings.folder / f"{self._stamp}-{self._run[:6]}-{part:05d}"
-        self._file = _Part(base.with_name(base.name + SUFFIX), json_payload(header), now)
+        self._file = CapturePart(base.with_name(base.name + SUFFIX), json_payload(header), now)
         self._file.lost = self._recorded_losses
-        self._remove_oldest()
+        remove_oldest(self.settings.folder, self.settings.keep_bytes)
 
     def _end_part(self) -> None:
         file, self._file = self._file, None
@@ -317,34 +303,6 @@ class Recorder:
             self._recorded_losses = file.lost
             self.facts.file = ""
             self.facts.bytes += file.close()
-
-    def _remove_oldest(self) -> None:
-        """Keep the folder within its bound; what is being written, by whomever, stays."""
-        if not self.settings.keep_bytes:
-            return
-        found: list[tuple[int, str, int, Path]] = []
-        for path in self.settings.folder.iterdir():
-            with contextlib.suppress(FileNotFoundError):  # another gateway has removed it
-                if is_ours(path.name) and not path.is_symlink() and path.is_file():
-                    status = path.stat()
-                    found.append((status.st_mtime_ns, path.name, status.st_size, path))
-        total = sum(size for _, _, size, _ in found)
-        for _, _, size, path in sorted(found):
-            if total <= self.settings.keep_bytes:
-                return
-            if not _is_being_written(path):
-                with contextlib.suppress(OSError):
-                    path.unlink()
-                    total -= size
-
-
-def is_ours(name: str) -> bool:
-    """True for the name of a capture, or of a log beside one."""
-    stem, _, suffix = name.partition(".")
-    stamp, _, rest = stem.partition("-")
-    run, _, part = rest.partition("-")
-    made = len(stamp) == 16 and stamp.endswith("Z") and len(run) == 6 and part.isdecimal()
-    return made and f".{suffix}" in (SUFFIX, *_LOGS_OF_0_5_0)
 
 
 def state_of(gateway: Gateway) -> dict[str, Any]:
@@ -360,7 +318,7 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
 
 
 def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
-    """What each ESC's last info frame told of the device now on its line; None where none has come."""
+    """What each ESC's last info frame says of the device now on its line; None where none has come."""
     return [
         None
         if esc.last_info is None
@@ -372,100 +330,3 @@ def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
         }
         for esc in gateway.escs
     ]
-
-
-class _Part:
-    """One file of a capture, locked while it is written."""
-
-    def __init__(self, path: Path, header: bytes, now: int) -> None:
-        self.path = path
-        self.begun = now
-        self.size = 0
-        self.lost = 0
-        self._number = 0
-        self._new = 0
-        self._header: bytes | None = header
-        self._fd = os.open(
-            self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640
-        )
-        try:
-            with contextlib.suppress(OSError):  # a file system without locks
-                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self.write(b"H", header)
-            _sync_folder(path.parent)
-        except BaseException:  # nothing is in there yet
-            os.close(self._fd)
-            with contextlib.suppress(OSError):
-                self.path.unlink()
-            raise
-
-    def write(self, kind: bytes, payload: bytes) -> None:
-        """Append a block."""
-        data = memoryview(block(kind, self._number, payload))
-        self._number += 1
-        self.size += len(data)
-        self._new += len(data)
-        while data:
-            data = data[os.write(self._fd, data) :]
-
-    def take(self, items: list[Item]) -> None:
-        """Append what came."""
-        self.write(b"D", data_payload(items))
-        if self._header is not None:
-            # once more, elsewhere: without it nothing can be made of the rest
-            self.write(b"H", self._header)
-            self._header = None
-
-    def sync(self) -> int:
-        """Force to the disk what was written; how many bytes since the last call. OSError where somebody removed a file."""
-        if os.fstat(self._fd).st_nlink == 0:
-            raise OSError(errno.ENOENT, "what was being written was removed")
-        if self._new:
-            os.fdatasync(self._fd)
-        new, self._new = self._new, 0
-        return new
-
-    def close(self) -> int:
-        """Close in good order; how many bytes since the last ``sync``."""
-        try:
-            self.write(b"E", b"")
-            os.fdatasync(self._fd)
-        finally:
-            os.close(self._fd)
-        return self._new
-
-    def abandon(self) -> None:
-        """Close without writing any more."""
-        with contextlib.suppress(OSError):
-            os.close(self._fd)
-
-
-def _make_folder(folder: Path) -> None:
-    folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(1, "may not be written to")
-
-
-def _is_being_written(path: Path) -> bool:
-    """True for a capture that a recorder has open, here or in another process, and for the log beside it."""
-    try:
-        fd = os.open(path.with_suffix(SUFFIX), os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except OSError:  # a log whose capture has gone
-        return False
-    try:
-        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(fd)
-    return False
-
-
-def _sync_folder(folder: Path) -> None:
-    """So that the file's name survives a loss of power too."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        with contextlib.suppress(OSError):  # a file system that cannot
-            os.fsync(fd)
-    finally:
-        os.close(fd)

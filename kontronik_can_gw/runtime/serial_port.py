@@ -12,13 +12,12 @@ import os
 import struct
 import termios
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import serial
 
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.runtime.usb_adapters import Identity, identity_at
 
 BAUD_RATE = 115_200
 READ_SIZE = 4096
@@ -43,15 +42,6 @@ class PortLost(Exception):
 
 class NoPort(RunError):
     """There is no such port."""
-
-
-class Identity(NamedTuple):
-    """What tells a USB adapter from others, whatever its number is: vendor, product, serial number, or place where it has none."""
-
-    vendor: int
-    product: int
-    serial: str
-    place: str
 
 
 class SerialPort:
@@ -146,8 +136,8 @@ class SerialPort:
             return False
 
     def identity(self) -> Identity | None:
-        """Of the USB adapter behind the port; None for another kind of port."""
-        return next((found for device, found in _adapters() if device == self._real_path), None)
+        """Of the USB adapter that the port belongs to; None for another kind of port."""
+        return identity_at(self._real_path)
 
     def discard(self) -> None:
         """Throw away what waits to be read."""
@@ -170,43 +160,6 @@ def is_mini_uart(path: str, root: Path = Path("/")) -> bool:
     return False
 
 
-def identity_at(path: str) -> Identity | None:
-    """Of the USB adapter that a path leads to now."""
-    real = os.path.realpath(path.partition("@")[0])
-    return next((found for device, found in _adapters() if os.path.realpath(device) == real), None)
-
-
-def find_adapter(identity: Identity) -> str | None:
-    """The path of the adapter now, as /dev/ttyUSB1; None while it is not plugged in, or if two are alike."""
-    found = [device for device, other in _adapters() if other == identity]
-    return found[0] if len(found) == 1 else None
-
-
-def _adapters(root: Path = Path("/")) -> Iterator[tuple[str, Identity]]:
-    """USB adapters that are plugged in: path and identity. The loop waits for this, so it reads no more than is needed."""
-    names = []
-    with contextlib.suppress(OSError):
-        listed = os.listdir(root / "sys/class/tty")  # noqa: PTH208
-        names = [name for name in listed if name.startswith(("ttyUSB", "ttyACM"))]
-    for name in names:
-        with contextlib.suppress(OSError, ValueError):  # one is being unplugged
-            folder = Path(os.path.realpath(root / "sys/class/tty" / name / "device"))
-            interface = ""
-            while not (folder / "idVendor").exists() and folder.name:
-                interface = folder.name if ":" in folder.name else interface  # as 1-1.2:1.0
-                folder = folder.parent
-            if not folder.name:
-                continue
-            vendor, product = (
-                int((folder / file).read_text(), 16) for file in ("idVendor", "idProduct")
-            )
-            file = folder / "serial"
-            serial_number = file.read_text().strip() if file.exists() else ""
-            # an adapter with several ports has one serial number for all
-            place = interface.partition(":")[2] if serial_number else interface
-            yield f"/dev/{name}", Identity(vendor, product, serial_number, place)
-
-
 def _in_use(path: str, users: str) -> RunError:
     who = f": {users}" if users else " (another gateway? a getty?)"
     name = Path(os.path.realpath(path)).name
@@ -219,7 +172,7 @@ def _in_use(path: str, users: str) -> RunError:
 
 
 def device_of(path: str) -> int | None:
-    """The device number behind a path (slcan's ``path@baud`` too); None where there is none."""
+    """The device number that a path leads to (slcan's ``path@baud`` too); None where it leads to none."""
     try:
         status = Path(path.partition("@")[0]).stat()
     except (OSError, ValueError):
@@ -305,16 +258,16 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
 
 
 _seen_users: set[Path] = set()
-_next_look: dict[str, float] = {}
-_LOOK_PAUSE_S = 10.0
+_next_search: dict[str, float] = {}
+_SEARCH_PAUSE_S = 10.0
 
 
 def _users_now_and_then(path: str) -> str:
     """Who has the port open; looked for at first and then no more than every ten seconds, because it takes a while on a slow machine."""
     now = time.monotonic()
-    if now < _next_look.get(path, 0.0) and not _seen_users:
+    if now < _next_search.get(path, 0.0) and not _seen_users:
         return ""
-    _next_look[path] = now + _LOOK_PAUSE_S
+    _next_search[path] = now + _SEARCH_PAUSE_S
     return _users(path)
 
 

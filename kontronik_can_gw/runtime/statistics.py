@@ -1,9 +1,9 @@
 """The gateway's document of itself (snapshot.py), once a second: to a file that is replaced, and for Prometheus.
 
-What may touch what: everything is called by the loop's thread; only ``_work`` and what it calls run in the worker. The newest document,
-the reports and the marks of a write in progress go from one to the other by single assignments and a deque: no lock, so that no disk and
-no reader of the statistics, be it slow or hostile, holds the loop up. The worker writes and answers in turn: a disk that does not answer
-holds up Prometheus too, nothing else.
+What may touch what: everything is called by the loop's thread; only ``_wait``, ``_work``, ``_fail``, ``_end`` and what they call run in the
+worker's. The newest document, the reports and the mark of a write in progress go from one to the other by single assignments and a deque,
+so that no disk and no reader of the statistics, be it slow or hostile, holds the loop up. The worker writes and answers in turn: a disk
+that does not answer holds up Prometheus too, nothing else.
 """
 
 import contextlib
@@ -12,7 +12,6 @@ import json
 import os
 import selectors
 import stat
-import threading
 import time
 from collections import deque
 from itertools import count
@@ -23,10 +22,10 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.snapshot import STALE_NS, Document, with_rates
-from kontronik_can_gw.runtime.threads import start_beside_the_loop
+from kontronik_can_gw.runtime.worker import Worker
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.prometheus import MetricsServer
+    from kontronik_can_gw.runtime.metrics_server import MetricsServer
 
 PERIOD_NS = SECOND
 _CLOSE_S = 0.2
@@ -62,13 +61,17 @@ class Statistics:
                 f"statistics.file {file}: another gateway writes it. Give this one its own."
             )
         self._newest: Document | None = None
+        self._written: Document | None = None
+        """The last document; of the worker's thread."""
+        self._failed = False
         self._reports: deque[Report] = deque()
         self._writing_since: int | None = None
-        self._told_slow = False
-        self._closed = False
-        self._thread: threading.Thread | None = None
+        self._reported_slow = False
         self._due: int | None = None
-        self._wake = -1
+        self._selector: selectors.BaseSelector | None = None
+        self._ready: list[object] = []
+        """What of the server has something to read or to send."""
+        self._worker: Worker[None] | None = None
         if self._file is not None or self._server is not None:
             try:
                 self._start()
@@ -94,11 +97,11 @@ class Statistics:
 
     def publish(self, document: Document) -> None:
         """Let this be the newest document; never blocks. It is not to be changed any more."""
-        if self._thread is None or self._closed:
+        if self._worker is None or self._worker.is_ending:
             return
         self._due = document["monotonic_ns"] + PERIOD_NS
         self._newest = document
-        os.eventfd_write(self._wake, 1)
+        self._worker.put(None)  # without room it is awake already
 
     def reports(self, now: int) -> list[Report]:
         """Take what went wrong, or is right again, since the last call."""
@@ -106,78 +109,77 @@ class Statistics:
         while self._reports:
             taken.append(self._reports.popleft())
         since = self._writing_since
-        if since is not None and now - since > STALE_NS and not self._told_slow:
-            self._told_slow = True
+        if since is not None and now - since > STALE_NS and not self._reported_slow:
+            self._reported_slow = True
             taken.append(
                 Report(True, f"{self._file}: the disk does not answer; the gateway is not held up.")
             )
-        elif since is None and self._told_slow:
-            self._told_slow = False
+        elif since is None and self._reported_slow:
+            self._reported_slow = False
             taken.append(Report(False, f"{self._file}: the disk answers again"))
         return taken
 
     def close(self) -> None:
         """Remove the file and end the thread; a disk that does not answer is waited for 0.2 s and no longer."""
-        if self._thread is None or self._closed:
+        if self._worker is None:
             return
-        self._closed = True
         self._locks.close()
-        os.eventfd_write(self._wake, 1)
-        self._thread.join(_CLOSE_S)
+        self._worker.stop(_CLOSE_S)
         if self._server is not None:
             self._server.stop_listening()
-        if not self._thread.is_alive():
-            os.close(self._wake)
-            self._wake = -1
 
     def _start(self) -> None:
-        selector = selectors.DefaultSelector()
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        selector.register(self._wake, selectors.EVENT_READ)
-        thread = threading.Thread(
-            target=self._run, args=(selector,), name="statistics", daemon=True
+        worker: Worker[None] = Worker(
+            "statistics",
+            self._work,
+            failed=self._fail,
+            wait=self._wait,
+            ended=self._end,
+            capacity=1,
         )
-        if not start_beside_the_loop(thread):
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(worker.fileno(), selectors.EVENT_READ)
+        if self._server is not None:
+            self._server.listen(self._selector)
+        if not worker.start():
             raise RuntimeError("no thread can be started")
-        self._thread = thread
+        self._worker = worker
 
-    def _run(self, selector: selectors.BaseSelector) -> None:
-        try:
-            self._work(selector)
-        except Exception as error:  # a mistake of ours in here must not go unsaid
-            self._reports.append(Report(True, f"the statistics have ended: {error!r}"))
+    def _wait(self) -> None:
+        assert self._selector is not None
+        pause = None if self._server is None else self._server.pause_s(time.monotonic_ns())
+        self._ready = [key.fileobj for key, _ in self._selector.select(pause)]
 
-    def _work(self, selector: selectors.BaseSelector) -> None:
-        file, server = self._file, self._server
-        done: Document | None = None
-        if file is not None:
-            file.tidy()
-        with selector:
-            if server is not None:
-                server.listen(selector)
-            while not self._closed:
-                now = time.monotonic_ns()
-                ready = selector.select(None if server is None else server.pause_s(now))
-                now = time.monotonic_ns()
-                for key, _ in ready:
-                    if key.fd == self._wake:
-                        with contextlib.suppress(BlockingIOError):
-                            os.eventfd_read(self._wake)
-                    elif server is not None:
-                        server.serve(key.fileobj, now)
-                if server is not None:
-                    server.advance(now)
-                document = self._newest
-                if document is not done and document is not None:
-                    if server is not None:
-                        server.document = document
-                    if file is not None and not self._closed:
-                        self._write(file, with_rates(document, done))
-                    done = document
-            if server is not None:
-                server.close()
-        if file is not None:
-            file.remove()
+    def _work(self, _items: list[None]) -> None:
+        """Answer who asks, and write the newest document."""
+        if self._server is not None:
+            now = time.monotonic_ns()
+            for ready in self._ready:
+                self._server.serve(ready, now)
+            self._server.advance(now)
+        document, before = self._newest, self._written
+        if document is not None and document is not before:
+            self._written = document
+            if self._server is not None:
+                self._server.document = document
+            if self._file is not None and self._worker is not None and not self._worker.is_ending:
+                self._write(self._file, with_rates(document, before))
+        if self._failed:
+            self._failed = False
+            self._reports.append(Report(False, "the statistics work again"))
+
+    def _fail(self, error: Exception) -> None:
+        """A mistake of ours in here must not go unsaid."""
+        self._failed = True
+        self._reports.append(Report(True, f"the statistics fail: {error!r}. Trying again."))
+
+    def _end(self) -> None:
+        if self._server is not None:
+            self._server.close()
+        if self._selector is not None:
+            self._selector.close()
+        if self._file is not None:
+            self._file.remove()
 
     def _write(self, file: "_StatusFile", document: Document) -> None:
         data = (
@@ -193,7 +195,7 @@ class Statistics:
 
 
 def _server_at(address: tuple[str, int]) -> "MetricsServer":
-    from kontronik_can_gw.runtime.prometheus import MetricsServer
+    from kontronik_can_gw.runtime.metrics_server import MetricsServer
 
     return MetricsServer(address)
 
@@ -214,7 +216,7 @@ class _StatusFile:
         return f"statistics file {self._path}"
 
     def write(self, data: bytes) -> Report | None:
-        """Replace the file; what there is to tell of it. It is not forced to the disk: after a loss of power nobody wants it."""
+        """Replace the file; returns what there is to report. It is not forced to the disk: after a loss of power nobody wants it."""
         try:
             self._replace(data)
         except OSError as error:
@@ -249,6 +251,8 @@ class _StatusFile:
                 self._path.unlink()
 
     def _replace(self, data: bytes) -> None:
+        if self._ours is None:
+            self.tidy()
         with contextlib.suppress(FileNotFoundError):
             if not stat.S_ISREG(self._path.lstat().st_mode):
                 # /dev/null would be gone, for everybody

@@ -1,8 +1,8 @@
 """The parameter files of all nodes in one folder: read at start, written by a thread of its own.
 
-What may touch what: everything is called by the loop's thread; only ``_work`` and what it calls run in the worker. They share the queue,
-the results and the event under one lock that is never held during I/O, so no disk, be it full, read-only or slow, holds the loop up; and
-the names of unusable files, to which the loop's thread adds only before the first saving of that name.
+What may touch what: everything is called by the loop's thread; only ``_write_all`` and what it calls run in the worker's. Savings and
+results are handed over without waiting, so no disk, be it full, read-only or slow, holds the loop up. Both know the names of unusable
+files, to which the loop's thread adds only before the first saving of that name.
 
 A file is replaced, never changed: temporary file in the same folder, write, fsync, rename, fsync of the folder. After a loss of power at
 any instant the old content is there or the new one; once a saving is reported as on disk, it is the new one. After a failed saving it is
@@ -12,14 +12,12 @@ the old one (the new one, if only the last step failed).
 import contextlib
 import os
 import re
-import threading
-from collections import deque
 from pathlib import Path
 
 from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.locks import Taken, lock_file
-from kontronik_can_gw.runtime.threads import start_beside_the_loop
+from kontronik_can_gw.runtime.worker import Handover, Worker
 
 CAPACITY = 32
 """Savings that may wait for the disk."""
@@ -32,12 +30,10 @@ class ParameterStore:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._lock = threading.Condition()
-        self._waiting: deque[tuple[str, bytes]] = deque()
-        self._results: list[tuple[str, str | None]] = []
-        self._thread: threading.Thread | None = None
-        self._closed = False
-        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._worker: Worker[tuple[str, bytes]] = Worker(
+            "parameter-store", self._write_all, capacity=CAPACITY
+        )
+        self._results: Handover[tuple[str, str | None]] = Handover()
         # Names whose file could not be used and is still in its place: it is moved aside before a new one takes that.
         self._unusable: set[str] = set()
         self._lock_files: list[int] = []
@@ -45,7 +41,7 @@ class ParameterStore:
     def lock(self, name: str) -> str | None:
         """Keep other gateways from a node's file until ``close``: RunError where one has it.
 
-        Where no lock can be made nothing can be saved either: the reason, to be told.
+        Where no lock can be made nothing can be saved either: returns the reason.
         """
         path = self._path(name)
         try:
@@ -91,45 +87,27 @@ class ParameterStore:
         False: not accepted, because too many savings wait or the store is closed; no result follows. ValueError for a name that is none.
         """
         self._path(name)
-        with self._lock:
-            if self._closed or len(self._waiting) >= CAPACITY or not self._started():
-                return False
-            self._waiting.append((name, data))
-            self._lock.notify()
-        return True
+        return self._worker.start() and self._worker.put((name, data))
 
     def fileno(self) -> int:
         """Give a descriptor that is readable while results wait; -1 after ``close``."""
-        return self._event
+        return self._results.fileno()
 
     def results(self) -> list[tuple[str, str | None]]:
         """Take the results since the last call: the name, and None if the content is on disk, else the reason."""
-        with self._lock:
-            if self._event >= 0:
-                with contextlib.suppress(BlockingIOError):
-                    os.eventfd_read(self._event)
-            taken, self._results = self._results, []
-        return taken
+        return self._results.take()
 
     def close(self, timeout: float) -> bool:
         """Take no more, and wait for what is queued, at most ``timeout`` seconds. False: that was not enough.
 
         ``results`` may be called once more after it.
         """
-        with self._lock:
-            self._closed = True
-            self._lock.notify()
-            thread = self._thread
-        if thread is not None:
-            thread.join(timeout)
-        with self._lock:
-            if self._event >= 0:
-                os.close(self._event)
-                self._event = -1
+        has_ended = self._worker.stop(timeout)
+        self._results.close()
         for lock in self._lock_files:
             os.close(lock)
         self._lock_files = []
-        return thread is None or not thread.is_alive()
+        return has_ended
 
     def _path(self, name: str) -> Path:
         if _NAME.fullmatch(name) is None:
@@ -138,28 +116,13 @@ class ParameterStore:
             )
         return parameter_file(self._folder, name)
 
-    def _started(self) -> bool:
-        """Start the worker if it does not run yet. False: the system gives no thread."""
-        if self._thread is not None:
-            return True
-        thread = threading.Thread(target=self._work, name="parameter-store", daemon=True)
-        if not start_beside_the_loop(thread):
-            return False
-        self._thread = thread
-        return True
-
-    def _work(self) -> None:
-        while True:
-            with self._lock:
-                self._lock.wait_for(lambda: self._waiting or self._closed)
-                if not self._waiting:
-                    return
-                name, data = self._waiting.popleft()
-            problem = self._write(name, data)
-            with self._lock:
-                self._results.append((name, problem))
-                if self._event >= 0:
-                    os.eventfd_write(self._event, 1)
+    def _write_all(self, savings: list[tuple[str, bytes]]) -> None:
+        for name, data in savings:
+            try:
+                problem = self._write(name, data)
+            except Exception as error:  # a mistake of ours: the saving has its result all the same
+                problem = repr(error)
+            self._results.put((name, problem))
 
     def _write(self, name: str, data: bytes) -> str | None:
         path = self._path(name)

@@ -1,4 +1,4 @@
-"""What systemd and its journal are told: sd_notify's protocol and the priorities of log lines, without a library.
+"""What is reported to systemd and its journal: sd_notify's protocol and the priorities of log lines, without a library.
 
 Nothing here raises and nothing blocks: a supervisor that does not listen must not disturb the gateway.
 """
@@ -31,7 +31,7 @@ class Notifier:
         )
         self._watchdog_ns = _watchdog_ns(environment)
         self._socket: socket.socket | None = None
-        self._owed: dict[str, str] = {}
+        self._pending: dict[str, str] = {}
         self._status = ""
 
     @property
@@ -46,22 +46,22 @@ class Notifier:
 
     def ready(self, status: str = "") -> None:
         """The gateway has started."""
-        self._tell({"READY": "1"} | self._news(status))
+        self._send({"READY": "1"} | self._news(status))
 
     def status(self, text: str) -> None:
-        """Tell a line for people, if it is another one than before."""
+        """Send a line for people, if it is another one than before."""
         if news := self._news(text):
-            self._tell(news)
+            self._send(news)
 
     def stopping(self, status: str = "") -> None:
         """About to end."""
         self._forget("READY")
-        self._tell({"STOPPING": "1"} | self._news(status))
+        self._send({"STOPPING": "1"} | self._news(status))
 
     def watchdog(self) -> None:
-        """Tell that all is well; nothing where nobody watches."""
+        """Send a sign of life; nothing where nobody watches."""
         if self.watchdog_ns is not None:
-            self._tell({"WATCHDOG": "1"})
+            self._send({"WATCHDOG": "1"})
             self._forget("WATCHDOG")
 
     def close(self) -> None:
@@ -82,22 +82,22 @@ class Notifier:
 
     def _forget(self, *names: str) -> None:
         for name in names:
-            self._owed.pop(name, None)
+            self._pending.pop(name, None)
 
-    def _tell(self, what: dict[str, str]) -> None:
+    def _send(self, what: dict[str, str]) -> None:
         if not self._address:
             return
-        self._owed |= what
-        message = "".join(f"{name}={value}\n" for name, value in self._owed.items())
+        self._pending |= what
+        message = "".join(f"{name}={value}\n" for name, value in self._pending.items())
         try:
             if self._socket is None:
                 self._socket = socket.socket(
                     socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
                 )
             self._socket.sendto(message.encode(errors="replace"), self._address)
-        except (OSError, ValueError):  # full, or nobody there: it is told next time
+        except (OSError, ValueError):  # full, or nobody there: it goes with the next call
             return
-        self._owed.clear()
+        self._pending.clear()
 
 
 def _watchdog_ns(environment: Mapping[str, str]) -> int | None:
@@ -135,12 +135,12 @@ class JournalFormatter(logging.Formatter):
 
 def priority(level: int) -> int:
     """Syslog's priority for a level of ``logging``: 2 critical, 3 error, 4 warning, 5 notice, 6 information, 7 debug."""
-    for least, number in (
+    for minimum, number in (
         (logging.CRITICAL, 2),
         (logging.ERROR, 3),
         (logging.WARNING, 4),
         (logging.INFO + 1, 5),
     ):
-        if level >= least:
+        if level >= minimum:
             return number
     return 6 if level >= logging.INFO else 7

@@ -1,7 +1,5 @@
 """What goes on a bus by itself: after an outage, from link and gateway counters, in which order; and which ids are a node's own."""
 
-from collections.abc import Sequence
-
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
@@ -12,7 +10,7 @@ from kontronik_can_gw.canopen.traffic import frames_per_second
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.transmit_queue import Sent, TransmitQueue
+from kontronik_can_gw.transmit_queue import TransmitQueue
 
 LINK_STATUS = LINK << 16 | 0x0108
 CRC_ERRORS = LINK << 16 | 0x0720
@@ -21,15 +19,9 @@ SENT_FRAMES = GATEWAY << 16 | 0x0320
 
 def put_out(frames: list[CanFrame]) -> list[CanFrame]:
     """As they leave a gateway whose interface was busy until now."""
-    waiting, sent = TransmitQueue(), list[CanFrame]()
+    waiting = TransmitQueue()
     waiting.put_all(frames)
-
-    def send(frames: Sequence[CanFrame]) -> tuple[int, Sent]:
-        sent.extend(frames)
-        return len(frames), Sent.OK
-
-    waiting.flush(send)
-    return sent
+    return waiting.take_all()
 
 
 def test_of_what_a_node_answers_nothing_is_overtaken() -> None:

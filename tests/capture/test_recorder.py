@@ -16,8 +16,9 @@ from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import InfoData
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime import recorder
-from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder, RecordSettings, is_ours
+from kontronik_can_gw.runtime import capture_part, recorder
+from kontronik_can_gw.runtime.capture_folder import is_ours
+from kontronik_can_gw.runtime.recorder import CAPACITY, Recorder, RecordSettings
 
 HEADER = made(1)[0].header()
 
@@ -29,7 +30,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def begun(folder: Path, clock: Callable[[], int] = time.monotonic_ns, **more: object) -> Recorder:
-    made_with = {"folder": folder, "least_free_bytes": 0} | more
+    made_with = {"folder": folder, "min_free_bytes": 0} | more
     found = Recorder(RecordSettings(**made_with), clock)  # type: ignore[arg-type]
     found.header = HEADER
     found.start()
@@ -130,7 +131,7 @@ def test_the_header_shows_where_it_comes_from(tmp_path: Path) -> None:
     )
     bench.gateway.escs[0].layout = 1
     it.note(bench.gateway, 1)
-    until(lambda: it._told_devices == it._devices)
+    until(lambda: it._recorded_devices == it._devices)
     it.close()
     with open_input(tmp_path) as found:
         assert isinstance(found, CaptureInput)
@@ -155,7 +156,7 @@ def test_room_again_and_it_goes_on_and_the_loss_is_reported(
         return os.statvfs_result(values)
 
     monkeypatch.setattr(os, "statvfs", statvfs)
-    it = begun(tmp_path, clock=lambda: now, least_free_bytes=1000 * real.f_frsize)
+    it = begun(tmp_path, clock=lambda: now, min_free_bytes=1000 * real.f_frsize)
     put(it, entries(10))
     until(lambda: it.facts.problem != "" and not it._entries)
     free = 2000 * real.f_frsize
@@ -372,7 +373,7 @@ def test_a_folder_that_is_not_there_yet_is_waited_for_where_devices_are(tmp_path
     now = 10 * SECOND
     place = tmp_path / "place"
     place.write_text("")
-    it = Recorder(RecordSettings(place / "captures", least_free_bytes=0), lambda: now)
+    it = Recorder(RecordSettings(place / "captures", min_free_bytes=0), lambda: now)
     it.header = HEADER
     it.start(wait=True)
     put(it, entries(3))
@@ -396,7 +397,7 @@ def test_a_mistake_in_what_writes_ends_nothing(
 
     it = begun(tmp_path, clock=lambda: now)
     with monkeypatch.context() as patch:
-        patch.setattr(recorder, "data_payload", fail)
+        patch.setattr(capture_part, "data_payload", fail)
         put(it, entries(2))
         until(lambda: it.facts.problem != "" and not it._entries)
     assert "a mistake of ours" in it.reports(0)[0].text
@@ -447,7 +448,7 @@ def test_a_header_that_is_damaged_is_there_once_more(tmp_path: Path) -> None:
 
 def test_all_parts_of_a_run_together_replay_as_the_run(tmp_path: Path) -> None:
     bench = Bench(*made(2, canopen=True)).live(4, 12)
-    it = Recorder(RecordSettings(tmp_path, least_free_bytes=0, part_bytes=60_000))
+    it = Recorder(RecordSettings(tmp_path, min_free_bytes=0, part_bytes=60_000))
     it.header = bench.setup.header() | {"created_ns": START, "state": {}}
     it.start()
     for at in range(0, len(bench.entries), 1000):

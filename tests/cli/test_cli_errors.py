@@ -64,6 +64,17 @@ def test_a_removed_option_is_one_line_with_what_to_type_instead(
     assert "unrecognized arguments: --tape" in refused(2, "schema", "--tape")
 
 
+@pytest.mark.parametrize("given", ["--ta x", "--tap=x", "--form=wax", "--forma wax"])
+def test_a_removed_option_is_known_by_its_beginning_as_argparse_knows_the_others(
+    given: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--tape"), "Type -o x.")
+    monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--format wax"), "Type -o x.")
+    option = "--tape" if "--ta" in given else "--format wax"
+    assert refused(2, "describe", *given.split()) == f"{option}: was removed. Type -o x."
+    assert "unrecognized arguments: --other" in refused(2, "describe", "--other", "--", "--ta")
+
+
 def test_a_file_may_have_the_name_of_a_removed_option(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(REMOVED_OPTIONS, ("decode", "--tape"), "Type -o x.")
     assert "No such file" in refused(1, "decode", "--", "--tape")

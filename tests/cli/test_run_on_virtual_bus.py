@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -21,15 +20,16 @@ import pytest
 from cantools.database.can import Database
 
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import CanConfig, parse
+from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime import can_port
 from kontronik_can_gw.runtime.can_port import CanPort
+from kontronik_can_gw.runtime.driver_port import DriverPort
 from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.transmit_queue import Sent
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -227,10 +227,9 @@ class FakeSocket:
 
 
 @pytest.fixture
-def socket_port(monkeypatch: pytest.MonkeyPatch) -> tuple[CanPort, FakeSocket]:
+def socket_port() -> tuple[CanPort, FakeSocket]:
     fake = FakeSocket()
-    monkeypatch.setattr(can_port, "_open", lambda _: SimpleNamespace(socket=fake))
-    return CanPort(CanConfig()), fake
+    return SocketCanPort(fake, lambda: None), fake  # type: ignore[arg-type]
 
 
 def test_frames_go_out_as_the_kernel_wants_them_and_nothing_waits(
@@ -323,14 +322,13 @@ def test_a_flood_of_error_frames_does_not_hold_the_loop(
     port.close()
 
 
-def test_another_interfaces_refusal_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_interfaces_refusal_is_busy() -> None:
     class Refusing:
         def send(self, _message: can.Message, timeout: float) -> None:
             assert timeout == 0
             raise can.CanOperationError("full")
 
-    monkeypatch.setattr(can_port, "_open", lambda _: Refusing())
-    port = CanPort(CanConfig(interface="pcan"))
+    port = DriverPort(Refusing())  # type: ignore[arg-type]
     assert port.fileno() is None
     assert port.send(CanFrame(1, b"")) is Sent.BUSY
     port.receive()

@@ -320,7 +320,7 @@ class EscTruth:
         )
         found["EnergyUsed"] = _one(np.where(newest >= 0, tenths[at] / 10, 0.0))
         if rows:
-            energy = np.array([round(e / (3_600_000 * SECOND), 6) for e in self.energy])
+            energy = np.array([round(e // SECOND / 3_600_000, 6) for e in self.energy])
             found["EnergyUsed"] = _one(np.where(newest >= 0, energy[at], 0.0))
             self._counted(times, newest, at, found)
         found["Losses"] = _one(np.searchsorted(self.timed_out_ns, times, "right"))

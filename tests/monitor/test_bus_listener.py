@@ -9,7 +9,7 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime import bus_listener, can_port
+from kontronik_can_gw.runtime import bus_listener, socketcan_port
 from kontronik_can_gw.runtime.bus_listener import BusListener
 
 FRAME = CanFrame(0x123, b"\x01\x02")
@@ -23,7 +23,7 @@ class FakePort:
 
     def __init__(self, config: CanConfig) -> None:
         if FakePort.fault:
-            raise can_port.socketcan_error(config, FakePort.fault)
+            raise socketcan_port.socketcan_error(config, FakePort.fault)
         self.inbox: list[CanFrame] = []
         self.gone = self.closed = False
         self.state = CanState.UNKNOWN
@@ -48,7 +48,7 @@ class FakePort:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     FakePort.opened, FakePort.fault = [], 0
     made = Clock()
-    monkeypatch.setattr(bus_listener, "CanPort", FakePort)
+    monkeypatch.setattr(bus_listener, "open_can", FakePort)
     monkeypatch.setattr(bus_listener, "fault_of", lambda _name: FakePort.fault)
     monkeypatch.setattr(bus_listener, "time", made)
     return made
@@ -65,7 +65,7 @@ def test_it_is_tried_at_most_each_half_second(
         raise RunError("CAN pcan PCAN_USBBUS1: cannot be opened: no")
 
     FakePort.opened[0].gone = True
-    monkeypatch.setattr(bus_listener, "CanPort", refuse)
+    monkeypatch.setattr(bus_listener, "open_can", refuse)
     for _ in range(100):
         assert listener.receive(0.05) == []
     assert listener.problem == "CAN pcan PCAN_USBBUS1: cannot be opened: no"

@@ -67,7 +67,7 @@ def gateway(channel: str, store: Path, node_id: int) -> Iterator[None]:
         feeder.start()
         runner.start()
         # it has come round: a node that waits for LSS does not say when it listens
-        until(lambda: loop._look_due > 0)
+        until(lambda: loop._housekeeping.due > 0)
         try:
             yield
         finally:

@@ -234,8 +234,8 @@ def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench
         bus.came(REQUEST, bytes((0x40, n, 0x99, 0, 0, 0, 0, 0)))
     bench.speed_until(50 * MS)
     old = len(bench.wire.frames)
-    assert len(bench.loop.can.mailboxes) > 5
-    bench.loop.can.mailboxes.put(CanFrame(0x123, b"old"))
+    assert len(bench.loop.can.transmitter.queue) > 5
+    bench.loop.can.transmitter.queue.put(CanFrame(0x123, b"old"))
     bus.take()
     bus.answer = Sent.OK
     bench.world.now += HELD_UP_NS

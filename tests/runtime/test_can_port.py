@@ -25,10 +25,13 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime import can_port
+from kontronik_can_gw.runtime import socketcan_port
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
+from kontronik_can_gw.runtime.driver_port import DriverPort
 from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.runtime.open_can import open_can
+from kontronik_can_gw.runtime.socketcan_port import SocketCanPort
 from kontronik_can_gw.transmit_queue import Sent
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
@@ -94,10 +97,9 @@ def frames_of(port: CanPort) -> list[CanFrame]:
 
 
 @pytest.fixture
-def socket_port(monkeypatch: pytest.MonkeyPatch) -> tuple[CanPort, FakeSocket]:
+def socket_port() -> tuple[CanPort, FakeSocket]:
     fake = FakeSocket()
-    monkeypatch.setattr(can_port, "_open", lambda _: SimpleNamespace(socket=fake))
-    return CanPort(CanConfig()), fake
+    return SocketCanPort(fake, lambda: None), fake  # type: ignore[arg-type]
 
 
 def packet(can_id: int, data: bytes = b"") -> bytes:
@@ -131,7 +133,7 @@ def test_any_set_of_ids_fits_into_the_kernels_filters(
     short_ids: set[int], long_ids: set[int]
 ) -> None:
     ids = short_ids | {each | EXTENDED for each in long_ids}
-    filters = can_port._kernel_filters(frozenset(ids))
+    filters = socketcan_port.kernel_filters(frozenset(ids))
     assert len(filters) <= 512
     assert all(mask & (EXTENDED | REMOTE) == EXTENDED | REMOTE for _, mask in filters)
     by_mask: dict[int, set[int]] = {}
@@ -285,7 +287,7 @@ def test_the_kernels_time_of_a_frame_is_told_on_the_monotonic_clock(
     clock = SimpleNamespace(
         time_ns=lambda: 1_700_000_000_500_000_000, monotonic_ns=lambda: 42 * SECOND
     )
-    monkeypatch.setattr(can_port, "time", clock)
+    monkeypatch.setattr(socketcan_port, "time", clock)
     port, fake = socket_port
     port.set_receive_ids({1})
     fake.inbox, fake.ancillary = [packet(1)], ancillary
@@ -330,12 +332,11 @@ class DatagramSocket(socket.socket):
             super().setsockopt(level, *rest)
 
 
-def test_the_kernel_holds_six_frames_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_kernel_holds_six_frames_at_most() -> None:
     """What waits there cannot be overtaken by newer values."""
     ours, others = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with others, DatagramSocket(fileno=ours.detach()) as mine:
-        monkeypatch.setattr(can_port, "_open", lambda _: SimpleNamespace(socket=mine))
-        port = CanPort(CanConfig())
+        port = SocketCanPort(mine, mine.close)
         answers = [port.send(CanFrame(n, bytes(8))) for n in range(30)]
     taken = answers.index(Sent.FULL)
     assert 1 <= taken <= 6
@@ -350,10 +351,11 @@ def readers() -> list[threading.Thread]:
 
 
 @contextmanager
-def virtual() -> Iterator[tuple[CanPort, can.BusABC]]:
+def virtual() -> Iterator[tuple[DriverPort, can.BusABC]]:
     """A port on a bus of its own, and another participant."""
     channel = f"reception-{os.getpid()}-{next(_numbers)}"
-    port = CanPort(CanConfig("virtual", channel))
+    port = open_can(CanConfig("virtual", channel))
+    assert isinstance(port, DriverPort)
     try:
         with can.Bus(interface="virtual", channel=channel) as other:
             yield port, other
@@ -388,7 +390,7 @@ def test_without_ids_there_is_no_thread_and_nothing_to_wait_for() -> None:
         port.set_receive_ids(frozenset())
         other.send(message(0x601))
         assert (port.fileno(), port.receive(), readers()) == (None, [], [])
-        assert not port.tells_busy_from_gone
+        assert not port.reports_full
 
 
 def test_one_thread_brings_the_wanted_frames_in_order() -> None:
@@ -396,7 +398,7 @@ def test_one_thread_brings_the_wanted_frames_in_order() -> None:
         port.set_receive_ids({0x601})
         port.set_receive_ids({0x601, 0x602})
         assert len(readers()) == 1
-        assert not port.tells_busy_from_gone, "a descriptor to wait on says nothing of sending"
+        assert not port.reports_full, "a descriptor to wait on says nothing of sending"
         for n in range(100):
             other.send(message(0x123, b"foreign"))
             other.send(message(0x601, is_extended_id=True))
@@ -448,7 +450,7 @@ def test_what_waits_can_be_thrown_away() -> None:
 def test_own_frames_do_not_come_back_even_where_the_driver_is_told_to_return_them() -> None:
     channel = f"own-{os.getpid()}"
     config = CanConfig("virtual", channel, options={"receive_own_messages": True})
-    port = CanPort(config)
+    port = open_can(config)
     try:
         with can.Bus(interface="virtual", channel=channel) as other:
             port.set_receive_ids({0x581})
@@ -527,7 +529,7 @@ def test_a_thread_that_a_driver_holds_is_left_behind_without_effect(
     held = threading.Event()
     with virtual() as (port, other):
         other.send(message(1))
-        monkeypatch.setattr("kontronik_can_gw.runtime.bus_reader._LONGEST_END_S", 0.01)
+        monkeypatch.setattr("kontronik_can_gw.runtime.bus_reader._MAX_END_S", 0.01)
         waiting = threading.Event()
 
         def holding(timeout: float | None) -> can.Message:
@@ -580,7 +582,7 @@ def test_the_loop_answers_what_the_thread_brings_and_opens_an_adapter_anew_when_
 
         loop.open()
         first = loop.can.port
-        assert first is not None
+        assert isinstance(first, DriverPort)
         thread = threading.Thread(target=loop.run)
         thread.start()
         try:

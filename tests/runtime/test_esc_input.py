@@ -18,11 +18,12 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import esc_port as esc_input
-from kontronik_can_gw.runtime import serial_port
+from kontronik_can_gw.runtime import serial_port, usb_adapters
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.poller import Poller
-from kontronik_can_gw.runtime.serial_port import Identity, PortLost, is_mini_uart
+from kontronik_can_gw.runtime.serial_port import PortLost, is_mini_uart
+from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
 
 LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2", "1.0")
@@ -113,7 +114,7 @@ def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
     Port.there = ports
     monkeypatch.setattr(esc_input, "SerialPort", Port)
     monkeypatch.setattr(
-        serial_port, "_adapters", lambda: [(p, i) for p, i in ports.items() if i is not None]
+        usb_adapters, "adapters", lambda: [(p, i) for p, i in ports.items() if i is not None]
     )
     return ports
 
@@ -263,9 +264,9 @@ def test_a_diagnosis_is_said_once_and_names_the_drivers_counts(
     assert "parity errors)" in said[0]
     bench.port().reads = [LIVE]
     esc.serve(21 * SECOND)
-    esc.follow_link(21 * SECOND)
+    esc.log.follow_link(21 * SECOND)
     assert caplog.messages[-1] == "left: telemetry ok (V4)"
-    assert esc.complaint == ""
+    assert esc.log.complaint == ""
 
 
 def test_a_port_whose_bytes_nobody_reads_is_stuck_and_a_silent_one_is_not(bench: Bench) -> None:
@@ -298,7 +299,7 @@ def test_a_usb_adapter_is_known_by_vendor_product_serial_number_and_interface(
     plug("ttyUSB1", "1-1.2", "")
     (tmp_path / "sys/class/tty/ttyS0").mkdir()
     (tmp_path / "sys/class/tty/ttyACM9").mkdir()  # being unplugged
-    assert dict(serial_port._adapters(tmp_path)) == {
+    assert dict(usb_adapters.adapters(tmp_path)) == {
         "/dev/ttyUSB0": Identity(0x403, 0x6001, "A1", "1.0"),
         "/dev/ttyUSB1": Identity(0x403, 0x6001, "", "1-1.2:1.0"),
     }
@@ -330,7 +331,8 @@ def test_settings_are_looked_at_twice_a_second(
     for now in range(0, 3 * SECOND, 100 * MS):
         bench.port().hold = now != 1500 * MS
         before = bench.port().looks
-        bench.escs[0].report(now)
+        if now >= bench.escs[0].report_due:
+            bench.escs[0].report(now)
         if bench.port().looks > before:
             looks.append(now // MS)
     assert looks == [0, 500, 1000, 1500, 2000, 2500]

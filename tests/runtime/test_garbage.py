@@ -137,9 +137,7 @@ def test_recording_leaves_no_garbage(tmp_path: Path) -> None:
     recorder = Recorder(RecordSettings(tmp_path / "captures"))
     gateway = RecordedGateway(recorder.put, setup.escs, setup.layout, 0, False, setup.canopen)
     recorder.start()
-    recorder._ending.set()
-    assert recorder._thread is not None
-    recorder._thread.join()
+    assert recorder._worker.stop(60)
 
     def note(turn: int, now: int) -> None:
         if turn % 10 == 0:
@@ -151,7 +149,7 @@ def test_recording_leaves_no_garbage(tmp_path: Path) -> None:
         drive(gateway, START, note)
         with collector_off():
             drive(gateway, STEADY, note)
-            recorder._work()  # what the thread does each half second; it has ended
+            recorder._work([])  # what the thread does each half second; it has ended
             assert garbage() == []
     finally:
         recorder.close()

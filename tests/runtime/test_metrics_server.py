@@ -17,7 +17,7 @@ from statistics_bench import Bench
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime.prometheus import (
+from kontronik_can_gw.runtime.metrics_server import (
     CONNECTIONS,
     REQUEST_LIMIT,
     TIME_LIMIT_NS,

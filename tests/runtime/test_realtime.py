@@ -14,7 +14,7 @@ from kontronik_can_gw.cli import main
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime import realtime
-from kontronik_can_gw.runtime.threads import start_beside_the_loop
+from kontronik_can_gw.runtime.worker import start_beside_the_loop
 
 
 class Scheduler:
@@ -46,7 +46,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Scheduler:
     monkeypatch.setattr(os, "sched_getscheduler", scheduler.policy)
     monkeypatch.setattr(os, "sched_getparam", scheduler.param)
     monkeypatch.setattr(realtime, "_lock_memory", lambda: None)
-    monkeypatch.setattr(realtime, "_begun", [])
+    monkeypatch.setattr(realtime._Taken, "priority", None)
     return scheduler
 
 

@@ -21,13 +21,13 @@ from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime import can_link as can_side
+from kontronik_can_gw.runtime import can_link
 from kontronik_can_gw.runtime import esc_port as esc_input
-from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, one_by_one
+from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler
-from kontronik_can_gw.runtime.serial_port import Identity
 from kontronik_can_gw.runtime.systemd import Notifier
+from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
 
@@ -147,7 +147,7 @@ class Wire:
 class Bus:
     """A CAN interface: ``sent`` with times, ``inbox`` with the times at which frames came."""
 
-    tells_busy_from_gone = True
+    reports_full = True
     gone = False
 
     def __init__(self, world: "World") -> None:
@@ -202,7 +202,12 @@ class Bus:
     def send_all(
         self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
     ) -> tuple[int, Sent]:
-        return one_by_one(self.send, frames, clock, latest)
+        for count, frame in enumerate(frames):
+            if clock() > latest:
+                return count, Sent.LATE
+            if (answer := self.send(frame)) is not Sent.OK:
+                return count, answer
+        return len(frames), Sent.OK
 
     def close(self) -> None:
         pass
@@ -295,7 +300,7 @@ def loop_in(
         return world.bus
 
     by_path = {wire.path: wire for wire in world.wires}
-    patch.setattr(can_side, "CanPort", open_bus)
+    patch.setattr(can_link, "open_can", open_bus)
     patch.setattr(esc_input, "SerialPort", by_path.__getitem__)
     gateway = Gateway(escs, layout or layout_of(escs), world.now, canopen=canopen)
     config = CanConfig(interface="virtual", channel="world")

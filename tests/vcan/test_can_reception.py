@@ -23,6 +23,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
 
@@ -68,7 +69,7 @@ class Peer:
 def port_on(
     interface: str, ids: Sequence[int], fd: bool = False, own: bool = False
 ) -> Iterator[CanPort]:
-    port = CanPort(CanConfig("socketcan", interface, fd=fd, options={"receive_own_messages": own}))
+    port = open_can(CanConfig("socketcan", interface, fd=fd, options={"receive_own_messages": own}))
     try:
         port.set_receive_ids(frozenset(ids))
         yield port

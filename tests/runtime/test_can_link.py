@@ -14,11 +14,11 @@ from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.runtime import can_link as can_side
+from kontronik_can_gw.runtime import can_controller, can_link
 from kontronik_can_gw.runtime.can_link import CanLink
-from kontronik_can_gw.runtime.can_port import socketcan_error
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.socketcan_port import socketcan_error
 from kontronik_can_gw.transmit_queue import Sent
 
 ACTIVE = LinkFacts(True, True, "can", CanState.ERROR_ACTIVE, 500_000, 100, (0, 0))
@@ -103,12 +103,11 @@ class Bench:
             self.clock = self.now
             self.can.hear(self.now)
             self.can.reopen(self.now)
-            self.can.ask_if_due(self.now)
+            self.can.controller.ask_if_due(self.now)
             self.gateway.advance(self.now)
             self.can.follow_ids()
             self.can.transmit(self.now)
-            due = self.can.due
-            assert due is None or due > self.now or self.can.port is None
+            assert self.can.due > self.now or self.can.port is None
 
     def error_frame(self, state: CanState) -> None:
         self.port.note_state(state)
@@ -121,8 +120,8 @@ class Bench:
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
     made = Kernel()
-    monkeypatch.setattr(can_side, "CanPort", Port)
-    monkeypatch.setattr(can_side, "link_monitor", lambda _name: made)
+    monkeypatch.setattr(can_link, "open_can", Port)
+    monkeypatch.setattr(can_controller, "link_monitor", lambda _name: made)
     monkeypatch.setattr(Port, "there", True)
     return made
 
@@ -269,7 +268,7 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
         raise socketcan_error(bench.can.config, 100)
 
     with monkeypatch.context() as patch:
-        patch.setattr(can_side, "CanPort", is_down)
+        patch.setattr(can_link, "open_can", is_down)
         bench.turn(5000)
     assert (bench.can.is_open, bench.gateway.status.can_state) == (False, CanState.DOWN)
     kernel.facts = ACTIVE
@@ -308,15 +307,15 @@ def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
     bench.turn(100)
     bench.take()
     bench.port.answer = Sent.BUSY
-    bench.can.mailboxes.put(CanFrame(0x100, b"held"))
+    bench.can.transmitter.queue.put(CanFrame(0x100, b"held"))
     bench.can.transmit(bench.now)
     bench.can._is_proven = False
-    bench.can.clear()
+    bench.can.transmitter.clear()
     later = bench.now + SECOND
     bench.gateway.take_frames()
     bench.can.transmit(later)
     assert not bench.can._is_proven
-    assert bench.can._busy_since is None
+    assert bench.can.transmitter._busy_since is None
 
 
 def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
@@ -332,7 +331,7 @@ def test_a_bus_that_stood_still_gets_what_is_true_now_and_no_backlog(
     bench.take()
     bench.port.answer = Sent.BUSY
     bench.turn(5000)
-    assert len(bench.can.mailboxes) < 50
+    assert len(bench.can.transmitter.queue) < 50
     assert bench.gateway.status.dropped_frames > 4, "a heartbeat a second"
     bench.port.answer = Sent.OK
     bench.turn(50)
@@ -350,17 +349,17 @@ def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
-    monkeypatch.setattr(Port, "tells_busy_from_gone", False)
+    monkeypatch.setattr(Port, "reports_full", False)
     bench.start()
     port, before = bench.port, bench.can.port
     for n in range(3000):
         port.answer = Sent.OK if n % 3 else Sent.BUSY
         for can_id in range(10):
-            bench.can.mailboxes.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
+            bench.can.transmitter.queue.put(CanFrame(0x100 + can_id, bytes((n & 255,))))
         bench.turn()
     assert bench.can.port is before
     port.answer = Sent.BUSY
-    bench.can.mailboxes.put(CanFrame(0x100, b""))
+    bench.can.transmitter.queue.put(CanFrame(0x100, b""))
     bench.turn(2000)
     assert bench.can.port is not before
 
@@ -393,7 +392,7 @@ def test_answers_that_an_interface_that_is_down_does_not_take_are_dropped_and_co
     bench.can.transmit(bench.now)
     assert bench.gateway.status.can_state is CanState.DOWN
     assert bench.gateway.status.dropped_frames >= before + 3
-    assert len(bench.can.mailboxes) == 0
+    assert len(bench.can.transmitter.queue) == 0
     bench.can.serve(bench.now)  # closed in this round
 
 

@@ -1,0 +1,79 @@
+"""One file of a capture while it is written."""
+
+import contextlib
+import errno
+import fcntl
+import os
+from pathlib import Path
+
+from kontronik_can_gw.capture.format import block, data_payload
+from kontronik_can_gw.runtime.capture_folder import sync_folder
+
+Item = tuple[int, int, int, bytes, int, int | None]
+"""(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
+
+
+class CapturePart:
+    """One file of a capture, locked while it is written."""
+
+    def __init__(self, path: Path, header: bytes, now: int) -> None:
+        self.path = path
+        self.begun = now
+        self.size = 0
+        self.lost = 0
+        self._number = 0
+        self._new = 0
+        self._header: bytes | None = header
+        self._fd = os.open(
+            self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640
+        )
+        try:
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self.write(b"H", header)
+            sync_folder(path.parent)
+        except BaseException:  # nothing is in there yet
+            os.close(self._fd)
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+            raise
+
+    def write(self, kind: bytes, payload: bytes) -> None:
+        """Append a block."""
+        data = memoryview(block(kind, self._number, payload))
+        self._number += 1
+        self.size += len(data)
+        self._new += len(data)
+        while data:
+            data = data[os.write(self._fd, data) :]
+
+    def take(self, items: list[Item]) -> None:
+        """Append what came."""
+        self.write(b"D", data_payload(items))
+        if self._header is not None:
+            # once more, elsewhere: without it nothing can be made of the rest
+            self.write(b"H", self._header)
+            self._header = None
+
+    def sync(self) -> int:
+        """Force to the disk what was written; how many bytes since the last call. OSError where somebody removed a file."""
+        if os.fstat(self._fd).st_nlink == 0:
+            raise OSError(errno.ENOENT, "what was being written was removed")
+        if self._new:
+            os.fdatasync(self._fd)
+        new, self._new = self._new, 0
+        return new
+
+    def close(self) -> int:
+        """Close in good order; how many bytes since the last ``sync``."""
+        try:
+            self.write(b"E", b"")
+            os.fdatasync(self._fd)
+        finally:
+            os.close(self._fd)
+        return self._new
+
+    def abandon(self) -> None:
+        """Close without writing any more."""
+        with contextlib.suppress(OSError):
+            os.close(self._fd)

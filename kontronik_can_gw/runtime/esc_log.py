@@ -1,0 +1,95 @@
+"""What is logged of one ESC: telemetry lost and found, the quality of its line, why nothing comes."""
+
+import logging
+from collections.abc import Mapping
+
+from kontronik_can_gw.esc.kontronik.states import device_text
+from kontronik_can_gw.esc.telemetry import SECOND, LinkState
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.fault_log import FaultLog
+
+DIAGNOSIS_NS = 3 * SECOND
+"""Without telemetry for this long, the reason is looked for."""
+
+
+class EscLog:
+    """The conditions of one ESC in the fault log. ``port_condition`` is the name of what is wrong with its port."""
+
+    def __init__(self, index: int, gateway: Gateway, conditions: FaultLog) -> None:
+        self._esc = gateway.escs[index]
+        self._conditions = conditions
+        name = self._esc.settings.name
+        self.port_condition = f"{name}: port"
+        self._link_condition = f"{name}: telemetry"
+        self._quality_condition = f"{name}: line quality"
+        self._diagnosis_condition = f"{name}: diagnosis"
+        self._diagnosis_due = 0
+        self._diagnosed: set[str] = set()
+        self._lost_counters = (0, 0)
+
+    @property
+    def complaint(self) -> str:
+        """Why there is no telemetry, as far as it is known; empty while there is."""
+        for name in (self.port_condition, self._link_condition, self._diagnosis_condition):
+            if reason := self._conditions.reason(name):
+                return reason
+        return ""
+
+    def await_telemetry(self, now: int) -> None:
+        """Telemetry may come from now on: a diagnosis is not due yet."""
+        self._diagnosis_due = now + DIAGNOSIS_NS
+
+    def follow_link(self, now: int) -> None:
+        """The link's state, layout or device changed: say so."""
+        esc, conditions, name = self._esc, self._conditions, self._esc.settings.name
+        self.await_telemetry(now)
+        if esc.link in (LinkState.LOST, LinkState.PORT_ERROR):
+            self._lost_counters = (esc.counters.crc_errors, esc.counters.dropped_bytes)
+            quiet = esc.link is LinkState.PORT_ERROR  # which is said by itself
+            text = f"{name}: telemetry lost; its values are marked as not available"
+            conditions.begin(self._link_condition, text, now, quiet=quiet, since=esc.live_ns)
+            conditions.forget(self._quality_condition)
+        if esc.link not in (LinkState.OK, LinkState.DEGRADED):
+            return
+        self._diagnosed.clear()
+        conditions.forget(self._diagnosis_condition)
+        layout = ("unknown layout", "V4", "legacy")[esc.layout]
+        device = device_text(esc.info.device) if esc.info else None
+        said = (
+            f"{name}: telemetry {esc.link.name.lower()} ({layout}{f', {device}' if device else ''})"
+        )
+        if conditions.is_on(self._link_condition):
+            crc_errors = esc.counters.crc_errors - self._lost_counters[0]
+            dropped = esc.counters.dropped_bytes - self._lost_counters[1]
+            conditions.end(
+                self._link_condition,
+                said,
+                now,
+                f"; {crc_errors} CRC errors, {dropped} bytes dropped meanwhile",
+            )
+        elif esc.link is LinkState.DEGRADED:
+            conditions.begin(
+                self._quality_condition, f"{said}: many CRC errors or dropped bytes", now
+            )
+        elif conditions.is_on(self._quality_condition):
+            conditions.end(self._quality_condition, said, now)
+        else:
+            conditions.say(logging.INFO, said)
+
+    def diagnose(self, line_errors: Mapping[str, int], now: int) -> None:
+        """Log why nothing comes, each reason once."""
+        if not self._diagnosis_due or now < self._diagnosis_due:
+            return
+        self._diagnosis_due = now + DIAGNOSIS_NS
+        diagnosis = self._esc.diagnosis()
+        if diagnosis and diagnosis not in self._diagnosed:
+            self._diagnosed.add(diagnosis)
+            text = f"{self._esc.settings.name}: no telemetry: {diagnosis}{_in_words(line_errors)}"
+            self._conditions.begin(self._diagnosis_condition, text, now)
+
+
+def _in_words(line_errors: Mapping[str, int]) -> str:
+    counts = [
+        f"{count} {kind} errors" for kind, count in line_errors.items() if count and kind != "break"
+    ]
+    return f" (the driver counts {', '.join(counts)})" if counts else ""

@@ -1,0 +1,205 @@
+"""What the loop does now and then, not with each frame: line errors, sums of the log, captures' reports, statistics, signs of life."""
+
+import logging
+import time
+from collections.abc import Sequence
+
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.canopen.nmt import NmtState
+from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.can_link import CanLink
+from kontronik_can_gw.runtime.conflict_log import log_conflicts
+from kontronik_can_gw.runtime.esc_port import EscPort
+from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
+from kontronik_can_gw.runtime.recorder import Recorder
+from kontronik_can_gw.runtime.snapshot import (
+    CanFacts,
+    ProgramFacts,
+    name_in_words,
+    process_facts,
+    snapshot,
+)
+from kontronik_can_gw.runtime.statistics import Statistics
+from kontronik_can_gw.runtime.systemd import Notifier
+
+log = logging.getLogger("kontronik_can_gw")
+
+PERIOD_NS = 250 * MS
+"""How often there is a round. The loop is woken for one only when it is late by as much: mostly it comes round before."""
+STATUS_NS = SECOND
+"""The service manager is given a line at most this often."""
+
+
+class Housekeeping:
+    """``due``: when ``run`` has something to do; ``wake_due``: when the loop is to be woken for it.
+
+    ``status_ns``: how often a line about everything is logged, 0: never."""
+
+    def __init__(
+        self,
+        gateway: Gateway,
+        escs: Sequence[EscPort],
+        can: CanLink,
+        conditions: FaultLog,
+        saver: ParameterSaver,
+        *,
+        notifier: Notifier,
+        statistics: Statistics,
+        recorder: Recorder | None,
+        program: ProgramFacts,
+        status_ns: int,
+    ) -> None:
+        self.due = self.wake_due = 0
+        self._gateway = gateway
+        self._escs = escs
+        self._can = can
+        self._conditions = conditions
+        self._saver = saver
+        self._notifier = notifier
+        self._statistics = statistics
+        self._recorder = recorder
+        self._program = program
+        self._status_ns = status_ns
+        self._status_due = 0 if status_ns else None
+        self._last_counts: tuple[int, list[int]] = (0, [])
+        self._alive_due = 0 if notifier.watchdog_ns is not None else None
+        self._notify_due = 0
+        self._node_states: list[tuple[int, NmtState]] = []
+
+    def run(self, now: int) -> None:
+        """One round."""
+        self.due = now + PERIOD_NS
+        for esc in self._escs:
+            if now >= esc.report_due:
+                esc.report(now)
+        log_conflicts(self._gateway, self._conditions, self._can.config.channel, now)
+        self._conditions.advance(now)
+        if self._status_due is not None and now >= self._status_due:
+            self._log_status(now)
+        self.follow_recorder(now)
+        self.publish(now)
+        self._notify(now)
+        if self._alive_due is not None:
+            self.due = min(self.due, max(now, self._alive_due))
+        self.wake_due = self.due + PERIOD_NS
+
+    def publish(self, now: int) -> None:
+        """Hand the statistics' thread a document, if it is time."""
+        statistics = self._statistics
+        if statistics.wanted(now):
+            document = snapshot(
+                self._gateway,
+                now=now,
+                wall=time.time(),
+                program=self._program,
+                process=process_facts(),
+                ports=[esc.facts() for esc in self._escs],
+                can=_can_facts(self._can, self._conditions),
+                store=self._saver.facts(),
+                log_lines=list(self._conditions.recent),
+                recorder=None if self._recorder is None else self._recorder.facts,
+            )
+            statistics.publish(document)
+        for begins, text in statistics.reports(now):
+            if begins:
+                self._conditions.begin("statistics", text, now)
+            else:
+                self._conditions.end("statistics", text, now)
+
+    def follow_recorder(self, now: int) -> None:
+        """Give the recorder what a replay needs to know, and log what it reports."""
+        if self._recorder is None:
+            return
+        self._recorder.note(self._gateway, now)
+        for name, begins, text in self._recorder.reports(now):
+            if name == "losses":
+                self._conditions.event("captures: losses", text, now)
+            elif begins:
+                self._conditions.begin(f"captures: {name}", text, now)
+            else:
+                self._conditions.end(f"captures: {name}", text, now)
+
+    def report_nodes(self, now: int) -> None:
+        """Log which nodes have another state or node-ID, and stored values that were rejected."""
+        for index, key in self._gateway.take_rejected_parameters():
+            log.warning(
+                "%s: the stored %04Xh:%02X is passed over: it does not fit this EDS, or clashes",
+                self._escs[index].name,
+                key >> 8,
+                key & 0xFF,
+            )
+        states = [(node_id, state) for node_id, state, _ in self._gateway.node_states()]
+        before, self._node_states = self._node_states, states
+        for index, (node_id, state) in enumerate(states):
+            if before and before[index] == (node_id, state):
+                continue
+            words = (
+                "waits for LSS"
+                if node_id == UNCONFIGURED
+                else f"{node_id} {name_in_words(state.name)}"
+            )
+            name = f"{self._escs[index].name}: CANopen node"
+            self._conditions.event(name, f"{name} {words}", now, logging.INFO)
+
+    def status_words(self) -> str:
+        """How things are, in one line."""
+        state = name_in_words(self._gateway.status.can_state.name)
+        words = [f"CAN {self._can.config.channel} {state}"]
+        words += [
+            f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}"
+            for esc in self._gateway.escs
+        ]
+        return "; ".join(words)
+
+    def _notify(self, now: int) -> None:
+        """Give the service manager a line, and a sign of life while everything is served in time."""
+        if now >= self._notify_due and self._notifier.present:
+            self._notify_due = now + STATUS_NS
+            self._notifier.status(self.status_words())
+        if self._alive_due is None or now < self._alive_due:
+            return
+        if any([*(esc.is_stuck() for esc in self._escs), self._can.is_stuck()]):
+            return  # not fed: a port that is not served in time is a reason to begin anew
+        self._alive_due = now + (self._notifier.watchdog_ns or SECOND)
+        self._notifier.watchdog()
+
+    def _log_status(self, now: int) -> None:
+        """One line about everything, for users that want it regularly."""
+        status, states = self._gateway.status, self._gateway.node_states()
+        counts = [status.sent_frames, *(pdos for _, _, pdos in states)]
+        then, before = self._last_counts
+        self._last_counts = (now, counts)
+        self._status_due = now + self._status_ns
+        if not before:
+            return
+        seconds = (now - then) / SECOND
+        rates = [(new - old) / seconds for new, old in zip(counts, before, strict=True)]
+        words = [f"CAN {name_in_words(status.can_state.name)} {rates[0]:.0f} frames/s"]
+        for number, esc in enumerate(self._gateway.escs):
+            rate = "" if esc.frame_rate is None else f" {esc.frame_rate / 10:.0f} Hz"
+            words.append(f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}{rate}")
+            if states and states[number][0] != UNCONFIGURED:
+                node_id, state, _ = states[number]
+                words.append(
+                    f"node {node_id} {name_in_words(state.name)} {rates[1 + number]:.0f} PDOs/s"
+                )
+        log.info("%s", "; ".join(words))
+
+
+def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:
+    """What the statistics show of the interface."""
+    config, known = can.config, can.controller.facts or LinkFacts(exists=False)
+    faults = (can.condition, can.transmitter.condition, can.controller.condition)
+    return CanFacts(
+        config.interface,
+        config.channel,
+        known.bitrate or (config.bitrate if config.interface != "socketcan" else None),
+        can.is_open,
+        next(filter(None, map(conditions.reason, faults)), ""),
+        can.transmitter.is_stalled,
+        known.restart_ms,
+        known.error_counters,
+    )

@@ -1,0 +1,45 @@
+"""What only one gateway may have on a CAN interface: its node-IDs and the ids of its messages."""
+
+import logging
+
+from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
+
+
+class IdLocks:
+    """The locks on the ids of a gateway. A virtual interface is in this process only: it needs none."""
+
+    def __init__(self, config: CanConfig, gateway: Gateway, conditions: FaultLog) -> None:
+        self._config = config
+        self._gateway = gateway
+        self._conditions = conditions
+        self._locks = Locks(report=lambda text: conditions.say(logging.WARNING, text))
+        self._names: list[str] = []
+
+    def lock(self, at_start: bool = False) -> None:
+        """Lock what the gateway has now. RunError ``at_start`` where another gateway has it; later that is logged, and tried again."""
+        if self._config.interface == "virtual":
+            return
+        channel = self._config.channel
+        names = [
+            node_lock(channel, node_id)
+            for node_id in self._gateway.node_ids
+            if node_id != UNCONFIGURED
+        ]
+        if (first := self._gateway.first_message_id) is not None:
+            names.append(messages_lock(channel, first))
+        if names == self._names:
+            return
+        all_taken = self._locks.hold(names)
+        self._names = [] if all_taken else names
+        for taken in all_taken:
+            if at_start:
+                raise in_use(taken)
+            self._conditions.say(logging.ERROR, str(in_use(taken)))
+
+    def close(self) -> None:
+        """Release them."""
+        self._locks.close()

@@ -1,0 +1,61 @@
+"""Parameters on their way from the nodes to the store, and what became of them on the way back."""
+
+import logging
+from collections import deque
+from collections.abc import Sequence
+
+from kontronik_can_gw.canopen.storage import Stored, encode
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.esc_port import EscPort
+from kontronik_can_gw.runtime.snapshot import StoreFacts
+from kontronik_can_gw.runtime.store import ParameterStore
+
+log = logging.getLogger("kontronik_can_gw")
+
+
+class ParameterSaver:
+    """Hands savings to the store's thread, in their order; ``store`` None: each is answered with an error."""
+
+    def __init__(
+        self, gateway: Gateway, escs: Sequence[EscPort], store: ParameterStore | None
+    ) -> None:
+        self._gateway = gateway
+        self._escs = escs
+        self._store = store
+        self._waiting: deque[tuple[int, Stored]] = deque()
+        self._being_saved = 0
+        self._last_error = ""
+
+    def save(self, now: int) -> None:
+        """Hand over what is to be stored; while the disk has not taken what came before, it waits."""
+        if saves := self._gateway.take_saves():
+            self._waiting += saves
+        while self._waiting:
+            index, stored = self._waiting[0]
+            name = self._escs[index].name
+            if self._store is not None and self._store.save(name, encode(stored)):
+                self._being_saved += 1
+            elif self._being_saved:
+                return
+            else:
+                log.error("%s: parameters cannot be stored: there is no store for them", name)
+                self._gateway.saved(index, "no store", now)
+            self._waiting.popleft()
+
+    def take_results(self, now: int, _events: int = 0) -> None:
+        """The store has something to report: pass it on."""
+        for name, error in self._store.results() if self._store is not None else ():
+            self._being_saved -= 1
+            index = next(index for index, esc in enumerate(self._escs) if esc.name == name)
+            if error is None:
+                log.info("%s: parameters stored", name)
+            else:
+                log.error("%s: parameters cannot be stored: %s", name, error)
+            self._last_error = "" if error is None else f"{name}: {error}"
+            self._gateway.saved(index, error, now)
+
+    def facts(self) -> StoreFacts | None:
+        """For the statistics; None without a store."""
+        if self._store is None:
+            return None
+        return StoreFacts(len(self._waiting) + self._being_saved, self._last_error)

@@ -1,0 +1,282 @@
+"""SocketCAN without waiting: a raw socket, its filters, error frames and answers; why an interface cannot be used."""
+
+import contextlib
+import errno
+import socket
+import struct
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.esc.values import CanState
+from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.runtime.can_port import (
+    MAX_EXTENDED_ID,
+    MAX_STANDARD_ID,
+    CanPort,
+    Received,
+)
+from kontronik_can_gw.transmit_queue import Sent
+
+_DISCARD_LIMIT = 4096
+_RECEIVE_BUFFER = 1 << 20
+"""Bytes asked for; the kernel grants what net.core.rmem_max allows, by default twice the usual 278 frames."""
+_SEND_BUFFER = 1
+"""Bytes asked for; the kernel gives its minimum, about six frames: what waits in there cannot be overtaken by newer values."""
+
+_CLASSIC = struct.Struct("=IB3x8s")
+_FD = struct.Struct("=IBB2x64s")
+_FD_BRS = 0x01
+_REMOTE = 0x40000000
+_ERROR_FLAG = 0x20000000
+_FILTER = struct.Struct("=II")
+_MAX_FILTERS = 512
+"""CAN_RAW_FILTER_MAX: the kernel takes no more for one socket."""
+_ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
+_CTRL_RX_OVERFLOW, _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x01, 0x0C, 0x30, 0x40
+_OK = Sent.OK
+_CAN_RAW_ERR_FILTER = 2
+_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD = 64, 35
+"""Times of reception, of two 64-bit numbers on every machine; and of kernels before 5.1, of the machine's own."""
+_TIMES = {16: struct.Struct("=qq"), 8: struct.Struct("=ii")}
+_ANCILLARY_SIZE = 64
+_SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
+"""The kernel's figures of a socket; the last one counts what it dropped for want of room."""
+
+
+class SocketCanPort(CanPort):
+    """A raw socket that is bound to an interface. ``close`` is called at the end: what else it takes to give the interface back."""
+
+    def __init__(self, opened: socket.socket, close: Callable[[], object]) -> None:
+        super().__init__()
+        self._socket = opened
+        self._give_back = close
+        # until ids are asked for only error frames (the socket asks for them) wake the process
+        opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+        opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 0)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        for option in (_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD):
+            with contextlib.suppress(OSError):
+                opened.setsockopt(socket.SOL_SOCKET, option, 1)
+                break
+        opened.setblocking(False)
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def discard(self) -> None:
+        self._receive(_DISCARD_LIMIT)
+        self._known_drops = self._drops()
+
+    def close(self) -> None:
+        with contextlib.suppress(Exception):
+            # of an interface that is gone: nothing is left to do
+            self._give_back()
+
+    def _filter(self) -> None:
+        packed = b"".join(_FILTER.pack(*each) for each in kernel_filters(self._ids))
+        try:
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed)
+        except OSError:  # of an interface that was removed a moment ago
+            self.gone = True
+
+    def _receive(self, limit: int) -> Received:
+        frames: Received = []
+        self.drained = True
+        for _ in range(limit):
+            try:
+                data, ancillary, _, _ = self._socket.recvmsg(_FD.size, _ANCILLARY_SIZE)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                if error.errno in (errno.ENETDOWN, errno.ENODEV):
+                    self.state = CanState.DOWN
+                    self.gone = self.gone or error.errno == errno.ENODEV
+                break
+            is_fd = len(data) != _CLASSIC.size
+            if is_fd:
+                if len(data) != _FD.size:
+                    continue
+                can_id, size, _, content = _FD.unpack(data)
+            else:
+                can_id, size, content = _CLASSIC.unpack(data)
+            if can_id & _ERROR_FLAG:
+                self._follow(can_id, content[1])
+            elif can_id in self._ids:
+                # with another flag set, of a remote frame, it is none of ours
+                frame = CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd)
+                frames.append((frame, _monotonic(ancillary)))
+        else:
+            self.drained = False
+            self._note_drops()  # there was more than we take at once: perhaps more than the kernel holds
+        return frames
+
+    def _drops(self) -> int:
+        try:
+            found = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+            return int(_MEMINFO.unpack(found)[-1])
+        except (OSError, struct.error):  # an old kernel, which has fewer figures
+            return 0
+
+    def _follow(self, can_id: int, detail: int) -> None:
+        if can_id & _ERR_BUS_OFF:
+            self.bus_off_count += self.state is not CanState.BUS_OFF
+            self.state = CanState.BUS_OFF
+        elif can_id & _ERR_RESTARTED:
+            self.state = CanState.ERROR_ACTIVE
+        elif can_id & _ERR_CONTROLLER:
+            self.overruns += bool(detail & _CTRL_RX_OVERFLOW)
+            if detail & _CTRL_PASSIVE:
+                self.state = CanState.ERROR_PASSIVE
+            elif detail & _CTRL_WARNING:
+                self.state = CanState.ERROR_WARNING
+            elif detail & _CTRL_ACTIVE:
+                self.state = CanState.ERROR_ACTIVE
+
+    def _send_each(
+        self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+    ) -> tuple[int, Sent]:
+        send, pack, count = self._socket.send, _CLASSIC.pack, 0
+        for can_id, data, extended, fd, _, remote, _ in frames:
+            if clock() > latest:
+                return count, Sent.LATE
+            if extended:
+                can_id |= EXTENDED
+            if remote:
+                can_id |= _REMOTE
+            if fd:
+                packed = _FD.pack(can_id, len(data), _FD_BRS, data)
+            else:
+                packed = pack(can_id, len(data), data)
+            try:
+                send(packed)
+            except OSError as error:
+                answer = self._send_again(packed, error)
+                if answer is not _OK:
+                    return count, answer
+            count += 1
+        return count, _OK
+
+    def _send_again(self, packed: bytes, refused: OSError) -> Sent:
+        """What a refusal means. An interface that was down and is up again reports its old error once: then the frame is sent."""
+        answer = _meaning(refused)
+        if answer is not Sent.DOWN:
+            return answer
+        try:
+            self._socket.send(packed)
+        except OSError as error:
+            return _meaning(error)
+        return _OK
+
+
+def _monotonic(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
+    """The time of reception that came with a frame, on the monotonic clock."""
+    for level, kind, data in ancillary:
+        if (
+            level == socket.SOL_SOCKET
+            and kind in (_SO_TIMESTAMPNS, _SO_TIMESTAMPNS_OLD)
+            and len(data) in _TIMES
+        ):
+            seconds, ns = _TIMES[len(data)].unpack(data)
+            return int(seconds * SECOND + ns - time.time_ns() + time.monotonic_ns())
+    return None
+
+
+def _meaning(error: OSError) -> Sent:
+    """What it says that the kernel did not take a frame."""
+    if error.errno == errno.EAGAIN:
+        return Sent.FULL
+    if error.errno in (errno.ENOBUFS, errno.ENOMEM):
+        return Sent.BUSY
+    return Sent.GONE if error.errno in (errno.ENXIO, errno.ENODEV, errno.EBADF) else Sent.DOWN
+
+
+def kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:
+    """(id, mask) pairs that let these data frames through; with too many ids blocks of 2, 4 ... of which one is wanted.
+
+    The flags are part of the mask, so that remote frames, and those of the other length, with the same number stay out.
+    """
+    step = 1
+    while len({can_id // step for can_id in ids}) > _MAX_FILTERS:
+        step *= 2
+    blocks = sorted({can_id // step * step for can_id in ids})
+    flags, low = EXTENDED | _REMOTE, step - 1
+    return [
+        (first, flags | (MAX_EXTENDED_ID if first & EXTENDED else MAX_STANDARD_ID) & ~low)
+        for first in blocks
+    ]
+
+
+def fault_of(name: str) -> int:
+    """Why a network interface cannot be used, as in errno: ENODEV, ENETDOWN; 0 where it is up or there is no way to know."""
+    interfaces = Path("/sys/class/net")
+    try:
+        return 0 if int((interfaces / name / "flags").read_text(), 16) & 1 else errno.ENETDOWN
+    except OSError:
+        return (
+            errno.ENODEV if (interfaces / "lo").exists() and not (interfaces / name).exists() else 0
+        )
+    except ValueError:
+        return 0
+
+
+def _has_socketcan() -> bool:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+def open_socketcan(config: CanConfig) -> SocketCanPort:
+    """Open an interface by a socket of our own: without 8 MB and 80 ms of python-can. RunError where that fails."""
+    try:
+        opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        try:
+            if config.fd:
+                opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+            opened.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, MAX_EXTENDED_ID)
+            opened.bind((config.channel,))
+            return SocketCanPort(opened, opened.close)
+        except OSError:
+            opened.close()
+            raise
+    except OSError as error:
+        raise socketcan_error(config, error.errno or 0, error.strerror or str(error)) from None
+    except AttributeError:  # a Python that was built without it
+        raise socketcan_error(config, errno.EAFNOSUPPORT) from None
+
+
+def check_socketcan(config: CanConfig) -> None:
+    """RunError where the interface cannot be used: known before it is tried, which takes a while."""
+    name = config.channel
+    mtu = Path("/sys/class/net", name, "mtu")
+    if config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
+        raise RunError(
+            f"CAN interface {name}: does not do CAN FD. Adapter: sudo ip link set {name} up type can bitrate {config.bitrate} "
+            f"dbitrate {config.data_bitrate} fd on; vcan: sudo ip link set {name} mtu {_FD.size}; or set can.fd = false."
+        )
+    if number := fault_of(name):
+        raise socketcan_error(config, number if _has_socketcan() else errno.EAFNOSUPPORT)
+
+
+def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
+    """What is said of an interface that cannot be used, with the remedy. ``number`` as in errno."""
+    name = config.channel
+    make = f"sudo ip link set {name} up type can bitrate {config.bitrate} restart-ms 100"
+    if number in (errno.ENODEV, errno.ENXIO):
+        virtual = f"sudo ip link add {name} type vcan && sudo ip link set {name} up"
+        return RunError(
+            f"CAN interface {name}: there is none. With an adapter plugged in: {make}. For a virtual one: {virtual}."
+        )
+    if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
+        return RunError(
+            f"CAN interface {name}: this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan."
+        )
+    if number == errno.ENETDOWN:
+        return RunError(f"CAN interface {name}: is down. Start it: {make}.")
+    return RunError(f"CAN interface {name}: cannot be opened: {text}")

@@ -1,0 +1,178 @@
+"""The thread beside the loop: what it is handed is done in order, and nothing that fails or stands still harms its owner."""
+
+import os
+import select
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from kontronik_can_gw.runtime import worker as worker_module
+from kontronik_can_gw.runtime.worker import Handover, Worker
+
+PATIENCE = 120
+
+
+def readable(fd: int) -> bool:
+    return bool(select.select([fd], [], [], 0)[0])
+
+
+def test_a_handover_has_a_limit_and_is_readable_while_it_holds_something() -> None:
+    handover: Handover[int] = Handover(3)
+    assert not readable(handover.fileno())
+    assert [handover.put(n) for n in range(4)] == [True, True, True, False]
+    assert handover.take(2) == [0, 1]
+    assert readable(handover.fileno())
+    assert handover.take(2) == [2]
+    assert not readable(handover.fileno())
+    handover.wake()
+    assert readable(handover.fileno())
+    assert handover.take() == []
+    handover.close()
+    handover.close()
+    assert handover.fileno() == -1
+
+
+def test_a_closed_handover_writes_to_no_descriptor_that_is_anothers_by_now() -> None:
+    handover: Handover[int] = Handover()
+    number = handover.fileno()
+    handover.close()
+    other = os.eventfd(0, os.EFD_NONBLOCK)
+    try:
+        assert other == number, "the number was not used again: this test shows nothing"
+        assert handover.put(1)
+        handover.wake()
+        assert not readable(other)
+        assert handover.take() == [1]
+    finally:
+        os.close(other)
+
+
+def test_what_was_put_before_the_end_is_done_in_order_and_nothing_after_it() -> None:
+    done: list[int] = []
+    worker: Worker[int] = Worker("test", done.extend)
+    assert worker.put(0), "before the start too"
+    assert worker.start() and worker.start()
+    for n in range(1, 100):
+        assert worker.put(n)
+    assert worker.stop(PATIENCE)
+    assert done == list(range(100))
+    assert not worker.put(100)
+    assert worker.stop(PATIENCE)
+
+
+def test_an_end_whose_wake_is_read_with_the_last_items_is_not_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[int] = []
+    worker: Worker[int] = Worker("test", done.extend)
+    take = worker._items.take
+
+    def ended_just_before() -> list[int]:
+        worker.end()
+        return take()
+
+    monkeypatch.setattr(worker._items, "take", ended_just_before)
+    worker.put(1)
+    assert worker.start()
+    assert worker._thread is not None
+    worker._thread.join(PATIENCE)
+    assert not worker._thread.is_alive()
+    assert done == [1]
+
+
+def test_a_worker_that_was_never_started_ends_at_once() -> None:
+    worker: Worker[int] = Worker("test", lambda _items: None)
+    assert worker.stop(0)
+    assert worker.fileno() == -1
+
+
+@pytest.mark.parametrize("is_logged", [True, False])
+def test_a_job_that_fails_is_reported_and_the_next_one_is_done(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, is_logged: bool
+) -> None:
+    monkeypatch.setattr(worker_module, "FAILURE_PAUSE_S", 0)
+    done, failures = [], []
+    reached = threading.Event()
+
+    def work(items: list[int]) -> None:
+        if 0 in items:
+            raise ZeroDivisionError("of ours")
+        done.extend(items)
+        reached.set()
+
+    def failed(error: Exception) -> None:
+        failures.append(repr(error))
+        reached.set()
+
+    worker: Worker[int] = Worker("test", work, failed=None if is_logged else failed)
+    worker.start()
+    worker.put(0)
+    if not is_logged:
+        assert reached.wait(PATIENCE)
+        reached.clear()
+        worker.put(1)
+        assert reached.wait(PATIENCE)
+    assert worker.stop(PATIENCE)
+    assert done == ([] if is_logged else [1])
+    assert failures == ([] if is_logged else ["ZeroDivisionError('of ours')"])
+    assert caplog.messages == (["test: ZeroDivisionError('of ours')"] if is_logged else [])
+
+
+def test_work_that_stands_still_is_waited_for_as_long_as_said_and_no_longer() -> None:
+    go, stands = threading.Event(), threading.Event()
+
+    def work(_items: list[int]) -> None:
+        stands.set()
+        assert go.wait(PATIENCE)
+
+    worker: Worker[int] = Worker("test", work)
+    worker.start()
+    worker.put(1)
+    assert stands.wait(PATIENCE)
+    assert not worker.stop(0)
+    go.set()
+    assert worker.stop(PATIENCE)
+
+
+def test_the_work_may_end_its_own_thread_and_the_end_comes_once() -> None:
+    calls: list[str] = []
+    ended = threading.Event()
+    worker: Worker[int]
+
+    def work(_items: list[int]) -> None:
+        calls.append("work")
+        worker.end()
+
+    def at_the_end() -> None:
+        calls.append("end")
+        ended.set()
+
+    worker = Worker("test", work, wait=lambda: None, ended=at_the_end)
+    worker.start()
+    assert ended.wait(PATIENCE)
+    assert worker.stop(PATIENCE)
+    assert calls == ["work", "work", "end"]
+
+
+def test_without_a_thread_to_give_nothing_starts_and_a_later_start_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    done: list[int] = []
+    worker: Worker[int] = Worker("test", done.extend)
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        assert not worker.start()
+    assert worker.put(1) and worker.start() and worker.stop(PATIENCE)
+    assert done == [1]
+
+
+def test_a_pause_ends_with_the_worker() -> None:
+    waits: list[Callable[[], None]] = []
+    worker: Worker[int] = Worker("test", lambda _items: None, wait=lambda: waits[0]())
+    waits.append(lambda: worker.pause(10 * PATIENCE))
+    worker.start()
+    assert worker.stop(PATIENCE)
