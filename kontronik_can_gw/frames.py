@@ -9,7 +9,7 @@ EXTENDED = 0x80000000
 class CanFrame(NamedTuple):
     """A frame: id (11 or 29 bit), data (0 to 8 bytes, CAN FD to 64).
 
-    ``page`` tells frames of one id apart that do not stand for each other (multiplexer pages). ``remote``: a remote frame (RTR), its
+    ``page`` separates frames of one id that do not replace each other (multiplexer pages). ``remote``: a remote frame (RTR), its
     data only says how much is asked for. ``queued``: it is sent in order and never replaced (answers of SDO, LSS and NMT, EMCY);
     where False the newest frame of an id is the one that is sent.
     """

@@ -3,17 +3,20 @@
 ``now`` is integer nanoseconds of one monotonic clock: the loop's when live, the capture's in replay.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.dbc.output import DbcOutput
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
-from kontronik_can_gw.esc.values import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.id_conflicts import Conflict, IdConflicts
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals.plan import Layout
+
+MakeOutput = Callable[[Sequence[EscTelemetry], GatewayStatus, int], Output]
+"""ESCs, gateway and time to an output that begins then."""
 
 
 class Gateway:
@@ -26,6 +29,7 @@ class Gateway:
         now: int,
         silent_on_loss: bool = False,
         canopen: CanopenSetup | None = None,
+        further: Sequence[MakeOutput] = (),
     ) -> None:
         self.escs = [EscTelemetry(settings, now) for settings in escs]
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
@@ -35,7 +39,11 @@ class Gateway:
             ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
             self.nodes = Nodes(canopen, self.escs, self.status, self._apply, ids)
         self._message_bits = dbc.bits
-        self._outputs: tuple[Output, ...] = (dbc,) if self.nodes is None else (self.nodes, dbc)
+        self._outputs: tuple[Output, ...] = (
+            *(() if self.nodes is None else (self.nodes,)),
+            *(make(self.escs, self.status, now) for make in further),
+            dbc,
+        )
         self._conflicts = IdConflicts(self._outputs)
         self._link_changes: list[int] = []
         self._dropped = False

@@ -7,8 +7,8 @@ is integer nanoseconds of one monotonic clock.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import CanState
 
 NEVER = 1 << 62
 """Later than every deadline, ns."""

@@ -20,6 +20,7 @@ ORDER = (
     ("errors",),
     ("frames",),
     ("lean",),
+    ("gateway_status",),
     ("esc",),
     ("output",),
     ("signals",),

@@ -16,8 +16,9 @@ from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable, ran
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.objects import BINDINGS, LINK, Bound
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
-from kontronik_can_gw.esc.values import GatewayStatus, Group, Kind
+from kontronik_can_gw.esc.values import Group, Kind
 from kontronik_can_gw.esc.values import Value as EscValue
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import Pack, compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
 

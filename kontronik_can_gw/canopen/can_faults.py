@@ -6,7 +6,7 @@ from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import Nmt
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.esc.values import CanState
+from kontronik_can_gw.gateway_status import CanState
 
 
 class CanFaults:

@@ -16,7 +16,7 @@ from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROF
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
-from kontronik_can_gw.esc.values import GatewayStatus
+from kontronik_can_gw.gateway_status import GatewayStatus
 
 _WHOLE = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x15, 0x1B})  # data types
 _UNSIGNED = {

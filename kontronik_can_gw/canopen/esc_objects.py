@@ -10,7 +10,7 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
 from kontronik_can_gw.esc.kontronik.states import Device, device_text
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
-from kontronik_can_gw.esc.values import GatewayState, GatewayStatus
+from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
 RESET = int.from_bytes(b"rset", "little")
 

@@ -144,7 +144,7 @@ class LssSlave:
             self._fastscan(number, *data[5:])
 
     def stored(self, ok: bool) -> None:
-        """Tell the master the result of the oldest saving under way.
+        """Report the result of the oldest saving under way.
 
         Not answered if the slave has left the configuration state since: another slave may be the selected one by now.
         """

@@ -28,8 +28,8 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.canopen.sync import SyncConsumer
 from kontronik_can_gw.canopen.tpdos import Tpdos
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
-from kontronik_can_gw.esc.values import GatewayStatus
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import GatewayStatus
 
 
 class Node:

@@ -23,8 +23,8 @@ from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, m
 from kontronik_can_gw.canopen.reception import FrameTaker
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
-from kontronik_can_gw.esc.values import CanState, GatewayStatus
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.output import Output, Owner
 
 SettingsChanged = Callable[[int, EscSettings], None]

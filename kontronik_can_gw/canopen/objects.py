@@ -8,17 +8,8 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from kontronik_can_gw.esc.telemetry import MS, EscTelemetry
-from kontronik_can_gw.esc.values import (
-    VALUES,
-    GatewayState,
-    GatewayStatus,
-    Group,
-    Kind,
-    Value,
-    scaled,
-    steps,
-    steps_of,
-)
+from kontronik_can_gw.esc.values import VALUES, Group, Kind, Value, scaled, steps, steps_of
+from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
 U8, U16, U32 = 0xFF, 0xFFFF, 0xFFFFFFFF
 LIVE, DERIVED, INFO, EXTREMES, LINK, GATEWAY = 0x2000, 0x2001, 0x2010, 0x2011, 0x2020, 0x2021

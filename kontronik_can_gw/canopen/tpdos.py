@@ -10,8 +10,8 @@ from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import COB_ID, COMMUNICATION, MAPPING, MAX_TPDOS
 from kontronik_can_gw.esc.telemetry import EscTelemetry
-from kontronik_can_gw.esc.values import GatewayStatus
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import GatewayStatus
 
 
 class Tpdos:

@@ -16,9 +16,9 @@ from kontronik_can_gw.capture.format import (
     read_json,
     read_number,
 )
-from kontronik_can_gw.esc.values import CanState, GatewayState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.transmit_queue import TransmitQueue
 
 

@@ -4,8 +4,9 @@ from collections.abc import Iterator, Sequence
 
 from kontronik_can_gw.dbc.schedule import Schedule
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
-from kontronik_can_gw.esc.values import CanState, GatewayStatus, Group
+from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway_status import CanState, GatewayStatus
 from kontronik_can_gw.output import NEVER, Output, Owner
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
@@ -23,7 +24,7 @@ _EVENT_OF_PACE = {
 class _Message:
     """One message at work.
 
-    ``last`` holds the bits of the last frame of each page, without alive counter and CRC; ``owed`` the places of the pages that
+    ``last`` holds the bits of the last frame of each page, without alive counter and CRC; ``pending`` the places of the pages that
     have to follow without waiting for an event.
     """
 
@@ -40,10 +41,10 @@ class _Message:
         "last",
         "length",
         "on_change",
-        "owed",
         "pack",
         "page",
         "pages",
+        "pending",
         "plan",
         "silent_able",
         "triggers",
@@ -63,14 +64,14 @@ class _Message:
         self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         self.pack = compile_pack(plan)
         self.page = 0
-        self.owed: list[int] = []
+        self.pending: list[int] = []
         self.alive = 0
         crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
         alive = next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)
         self.crc_at = None if crc is None else crc.pieces[0].at // 8
         self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 0
         self.last: dict[int | None, int] = {}
-        # what also tells of the link always goes on
+        # messages with the link's state always go on
         self.silent_able = (
             silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         )
@@ -139,7 +140,7 @@ class DbcOutput(Output):
         """The last word, without regard to the minimum distance of messages."""
         for index, message in self._changed_of_gateway(now):
             self._send(index, now)
-            while message.owed:
+            while message.pending:
                 self._send(index, now)
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
@@ -168,7 +169,7 @@ class DbcOutput(Output):
         for index, message in enumerate(self._messages):
             message.last.clear()
             if not message.plan.cycle_ns:
-                message.owed = list(range(len(message.pages)))
+                message.pending = list(range(len(message.pages)))
                 self._request(index, now)
 
     def bits(self, index: int, now: int, page: int | None) -> int:
@@ -183,7 +184,7 @@ class DbcOutput(Output):
         for index, message in self._listeners[esc][up][events]:
             if message.by_event:
                 if gone and len(message.pages) > 1:  # no further event will bring the other pages
-                    message.owed = list(range(len(message.pages)))
+                    message.pending = list(range(len(message.pages)))
             elif not self._note_changes(message, now):
                 continue
             if message.is_free or request(index, now):
@@ -211,10 +212,10 @@ class DbcOutput(Output):
         for index, cyclic in self._schedule.due(now):
             message = self._messages[index]
             if cyclic and len(message.pages) > 1:
-                if message.page not in message.owed:
-                    message.owed.append(message.page)
+                if message.page not in message.pending:
+                    message.pending.append(message.page)
                 message.page = (message.page + 1) % len(message.pages)
-            if cyclic or message.by_event or message.owed or self._note_changes(message, now):
+            if cyclic or message.by_event or message.pending or self._note_changes(message, now):
                 self._send(index, now)
 
     def next_deadline(self) -> int:
@@ -226,7 +227,7 @@ class DbcOutput(Output):
             self._send(index, now)
 
     def _note_changes(self, message: _Message, now: int) -> bool:
-        """True if a page differs from what was sent of it last; with several pages those that do are owed."""
+        """True if a page differs from what was sent of it last; with several pages those that do are pending."""
         pack, last, pages = message.pack, message.last, message.plan.pages
         if len(pages) == 1:
             return pack(self._escs, self._gateway, now, 0, pages[0] or 0) != last.get(pages[0])
@@ -235,17 +236,17 @@ class DbcOutput(Output):
             for place, page in enumerate(pages)
             if pack(self._escs, self._gateway, now, 0, page or 0) != last.get(page)
         ]
-        message.owed += [place for place in changed if place not in message.owed]
+        message.pending += [place for place in changed if place not in message.pending]
         return bool(changed)
 
     def _send(self, index: int, now: int) -> None:
         message = self._messages[index]
         if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
-            message.owed.clear()
+            message.pending.clear()
             return
         place = page = 0
-        if message.owed:
-            place = message.owed.pop(0)
+        if message.pending:
+            place = message.pending.pop(0)
             page = message.pages[place]
         elif message.is_paged:
             place = message.page
@@ -271,5 +272,5 @@ class DbcOutput(Output):
         )
         if not message.is_free:
             self._schedule.sent(index, now)
-            if message.owed:
+            if message.pending:
                 self._schedule.wait(index, now)

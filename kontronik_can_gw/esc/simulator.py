@@ -1,4 +1,4 @@
-"""An ESC that can be told to misbehave.
+"""An ESC with faults on request.
 
 Contract: time is handed in (integer ns), bytes are handed out; the same options, seed and start give the same bytes, however
 the calls are spaced. The data does not depend on the faults: they only change what becomes of it on the wire. Nothing blocks,
@@ -155,9 +155,9 @@ class EscOptions:
     period_ns: int = 10_000_000
     """From live frame to live frame, 100 µs..10 s."""
     info_every: int = 100
-    """An info frame with each so many-th live frame; 0: never."""
+    """An info frame with every n-th live frame; 0: never."""
     info_replaces: bool = False
-    """The info frame takes the live frame's place; otherwise it follows right behind it."""
+    """The info frame takes the live frame's place; otherwise it follows at once."""
     profile: tuple[Phase, ...] = FLIGHT
     faults: Faults = field(default_factory=Faults)
 
@@ -180,7 +180,7 @@ class EscOptions:
 
 
 def usual_layout(device: Device) -> Layout:
-    """The layout in which the simulated device sends unless told otherwise: legacy for the JIVEPro as recorded, else V4."""
+    """The layout in which the simulated device sends by default: legacy for the JIVEPro as recorded, else V4."""
     return Layout.LEGACY if device is Device.JIVEPRO else Layout.V4
 
 

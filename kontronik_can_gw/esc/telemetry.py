@@ -29,7 +29,7 @@ MWS_PER_WH = 3_600_000
 """Energy is kept in milliwatt seconds: one step of voltage (10 mV) by one of current (0.1 A) is exactly 1 mW."""
 _V4 = Layout.V4
 _LEGACY = 2
-_DEGRADED_DROPPED_SHARE = 10  # one dropped byte in so many received
+_DEGRADED_DROPPED_SHARE = 10  # one byte dropped in ten received
 
 
 class LinkState(IntEnum):
@@ -63,8 +63,8 @@ class Event:
 class EscSettings:
     """What a person knows of one ESC and its drive train.
 
-    ``gear``: motor revolutions per output revolution. ``cell_count`` 0: as the ESC tells. ``timeout_ns`` (20 ms to 60 s):
-    live data older than this is not available. ``crc_error_threshold``: so many CRC errors in a second make a link DEGRADED.
+    ``gear``: motor revolutions per output revolution. ``cell_count`` 0: as the ESC reports. ``timeout_ns`` (20 ms to 60 s):
+    live data older than this is not available. ``crc_error_threshold``: CRC errors in a second that make a link DEGRADED.
     """
 
     name: str = "esc"
@@ -113,7 +113,7 @@ class EscTelemetry:
         self._deframer = Deframer()
         self._arrivals: deque[tuple[int, int]] = (
             deque()
-        )  # (stream position behind a chunk, the bound of its last byte) while bytes are pending
+        )  # (stream position after a chunk, the bound of its last byte) while bytes are pending
         self._last_power = 0
         self._interval_ns = 0  # between live frames, as usual; 0: not known
         self._window_ns = now
@@ -198,7 +198,7 @@ class EscTelemetry:
                 INFO_TIMEOUT_NS if isinstance(frame.data, InfoData) else self.settings.timeout_ns
             )
             if now - bound + after > limit:
-                # with so many bytes behind it in one read it is old already
+                # the bytes after it in the same read make it old already
                 self.late_frames += 1
             else:
                 yield self._accept(frame, shown - after, bound - after)

@@ -8,7 +8,7 @@ of them; the packers generate the same arithmetic from the numbers of a Value.
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum, IntEnum
+from enum import Enum
 from fractions import Fraction
 from typing import Any
 
@@ -28,6 +28,7 @@ from kontronik_can_gw.esc.telemetry import (
     EscTelemetry,
     LinkState,
 )
+from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 
 
 class Group(Enum):
@@ -61,42 +62,6 @@ class Divisor(Enum):
     POLE_PAIRS = "pole pairs"
     OUTPUT = "pole pairs and gear"
     CELLS = "cells"
-
-
-class GatewayState(IntEnum):
-    STARTING = 0
-    RUNNING = 1
-    STOPPING = 2
-    REPLAY = 3
-
-
-class CanState(IntEnum):
-    UNKNOWN = 0
-    ERROR_ACTIVE = 1
-    ERROR_WARNING = 2
-    ERROR_PASSIVE = 3
-    BUS_OFF = 4
-    DOWN = 5
-
-
-@dataclass(slots=True)
-class GatewayStatus:
-    """What the gateway knows of itself; the runtime writes the CAN side."""
-
-    state: GatewayState = GatewayState.STARTING
-    can_state: CanState = CanState.UNKNOWN
-    esc_count: int = 0
-    escs_ok: int = 0
-    started_ns: int = 0
-    sent_frames: int = 0
-    replaced_frames: int = 0
-    send_failures: int = 0
-    received_frames: int = 0
-    bus_off_count: int = 0
-    dropped_frames: int = 0
-    """Frames to be sent in order that were lost: too many waited, or the interface was down."""
-    id_conflicts: int = 0
-    """Frames of others with ids that only this gateway may send with."""
 
 
 Read = Callable[[EscTelemetry, GatewayStatus, int], int | None]

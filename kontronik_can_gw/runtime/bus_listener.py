@@ -10,8 +10,8 @@ import time
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
 from kontronik_can_gw.runtime.open_can import open_can
 from kontronik_can_gw.runtime.socketcan_port import fault_of, socketcan_error

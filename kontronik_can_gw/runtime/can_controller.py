@@ -2,8 +2,8 @@
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor

@@ -11,8 +11,8 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
 
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.transmit_queue import Sent
 
 RECEIVE_LIMIT = 64

@@ -4,8 +4,8 @@ import contextlib
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH, BusReader
 from kontronik_can_gw.runtime.can_port import (
     MAX_EXTENDED_ID,

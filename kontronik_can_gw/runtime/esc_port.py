@@ -221,7 +221,7 @@ class EscPort:
         RunError where the configured path is another ESC's adapter now: its values would be taken for this one's.
         """
         if self.identity is None or self.path.startswith("/dev/serial/") or self.identity in others:
-            return self.path  # adapters with one serial number for all cannot be told apart
+            return self.path  # adapters with the same serial number cannot be distinguished
         found = find_adapter(self.identity)
         if found is not None:
             return self.path if Path(self.path).resolve() == Path(found) else found

@@ -9,7 +9,7 @@ from kontronik_can_gw.esc.telemetry import SECOND
 log = logging.getLogger("kontronik_can_gw")
 
 FLAPPING = 6
-"""So many beginnings within a minute, and a condition is summed up once a minute."""
+"""Beginnings within a minute from which a condition is summed up once a minute."""
 MINUTE = 60 * SECOND
 REMEMBERED = 20
 

@@ -56,7 +56,7 @@ def lock_folder() -> Path:
 
 
 def network_namespace() -> int:
-    """The number of the network namespace that this process is in; 0 where the system does not tell."""
+    """The number of the network namespace that this process is in; 0 where it is unknown."""
     with contextlib.suppress(OSError):
         return Path("/proc/self/ns/net").stat().st_ino
     return 0

@@ -8,7 +8,7 @@ _NAME = "kontronik-can-gw"
 
 
 def machine_identity(root: Path = Path("/")) -> bytes:
-    """What tells this board from others: the system's id and the board's serial number (copied memory cards share the former).
+    """What identifies this board: the system's id and the board's serial number (copied memory cards share the former).
 
     Empty where the system has neither.
     """

@@ -6,7 +6,7 @@ from typing import Any
 from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.esc.kontronik.states import ErrorBit, OperatingError, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
-from kontronik_can_gw.esc.values import CanState, GatewayState
+from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.runtime.snapshot import name_in_words
 
 _PREFIX = "kontronik_"

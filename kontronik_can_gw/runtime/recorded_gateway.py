@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.signals.plan import Layout
 
 Put = Callable[[int, int, int, bytes, int, int | None], None]

@@ -44,7 +44,7 @@ _MB = 1_000_000
 
 
 class Report(NamedTuple):
-    """What went wrong (``begins``) or is right again. ``name`` tells faults of different kinds apart."""
+    """What went wrong (``begins``) or is right again. ``name`` is the kind of fault."""
 
     name: str
     begins: bool

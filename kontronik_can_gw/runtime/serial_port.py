@@ -85,7 +85,7 @@ class SerialPort:
     def read(self) -> bytes:
         """What has come. PortLost when the port has gone.
 
-        A short read does not tell that nothing more waits: the kernel passes on what it has further back only when it is asked again.
+        A short read does not mean that nothing more waits: the kernel passes on what it has further back only when it is asked again.
         """
         found = b""
         self.drained = False
@@ -114,7 +114,7 @@ class SerialPort:
                 return True
             termios.tcsetattr(self._fd, termios.TCSANOW, self._settings)
         except (OSError, termios.error):
-            return True  # it has gone, which reading will tell
+            return True  # it has gone, which reading will show
         return False
 
     def line_errors(self) -> dict[str, int]:

@@ -26,16 +26,9 @@ from kontronik_can_gw.esc.kontronik.states import (
     state_text,
 )
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, SECOND, EscTelemetry
-from kontronik_can_gw.esc.values import (
-    VALUES,
-    GatewayStatus,
-    Group,
-    Value,
-    physical,
-    steps,
-    steps_of,
-)
+from kontronik_can_gw.esc.values import VALUES, Group, Value, physical, steps, steps_of
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import GatewayStatus
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import RecorderFacts
@@ -48,7 +41,7 @@ STALE_NS = 3 * SECOND
 LOG_LINES = 20
 _LAYOUTS = (None, "V4", "legacy")
 _OTHERWISE = ("variant", "device_raw", "firmware_main", "firmware_sub")
-"""Sources that stand beside the values, not among them."""
+"""Values that are shown apart from the others."""
 
 Document = dict[str, Any]
 
@@ -103,7 +96,7 @@ class ProgramFacts:
 
 @dataclass(frozen=True)
 class ProcessFacts:
-    """What the process uses. 0 where the system does not tell."""
+    """What the process uses. 0 where it is unknown."""
 
     rss_bytes: int = 0
     open_fds: int = 0
@@ -136,7 +129,7 @@ def process_facts() -> ProcessFacts:
 def start_ticks(pid: int) -> int:
     """When a process started, in clock ticks since boot: with the pid it is one and no other.
 
-    0 where the system does not tell, -1 for a process that has ended and only waits for its parent.
+    0 where it is unknown, -1 for a process that has ended and only waits for its parent.
     """
     with contextlib.suppress(OSError, ValueError, IndexError):
         found = _stat_fields(str(pid))
@@ -145,7 +138,7 @@ def start_ticks(pid: int) -> int:
 
 
 def pid_namespace() -> str:
-    """What pids of this process mean something to; '' where the system does not tell."""
+    """The namespace of this process's pids; '' where it is unknown."""
     with contextlib.suppress(OSError):
         return str(Path("/proc/self/ns/pid").readlink())
     return ""
@@ -247,7 +240,7 @@ def with_rates(document: Document, before: Document | None) -> Document:
 
 
 def _stat_fields(pid: str) -> list[bytes]:
-    """The fields of /proc/PID/stat behind the program's name, which may hold anything."""
+    """The fields of /proc/PID/stat after the program's name, which may hold anything."""
     return Path("/proc", pid, "stat").read_bytes().rpartition(b")")[2].split()
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import (
     MAX_EXTENDED_ID,
     MAX_STANDARD_ID,

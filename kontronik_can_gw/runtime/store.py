@@ -59,8 +59,8 @@ class ParameterStore:
         """Read what a node kept; to be called before its first saving.
 
         A missing file is an empty ``Stored``, a damaged or unreadable one too, and then the reason is there. A damaged file is kept as
-        ``NAME.params.damaged``, in place of an older one of that name. What a killed writer left half is removed. ValueError for a name
-        that is none.
+        ``NAME.params.damaged``, in place of an older one of that name. What a killed writer left half is removed. ValueError for an
+        invalid name.
         """
         path = self._path(name)
         with contextlib.suppress(OSError):
@@ -84,7 +84,7 @@ class ParameterStore:
     def save(self, name: str, data: bytes) -> bool:
         """Let ``data`` become the file's content; never blocks. True: exactly one result follows; results come in the order of the savings.
 
-        False: not accepted, because too many savings wait or the store is closed; no result follows. ValueError for a name that is none.
+        False: not accepted, because too many savings wait or the store is closed; no result follows. ValueError for an invalid name.
         """
         self._path(name)
         return self._worker.start() and self._worker.put((name, data))

@@ -1,4 +1,4 @@
-"""USB serial adapters that are plugged in, told apart by what stays the same when their number changes."""
+"""USB serial adapters that are plugged in, identified by what stays the same when their number changes."""
 
 import contextlib
 import os
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 class Identity(NamedTuple):
-    """What tells a USB adapter from others, whatever its number is: vendor, product, serial number, or place where it has none."""
+    """What identifies a USB adapter, whatever its number is: vendor, product, serial number, or place where it has none."""
 
     vendor: int
     product: int

@@ -11,7 +11,8 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry
-from kontronik_can_gw.esc.values import Divisor, GatewayStatus, Kind, Value
+from kontronik_can_gw.esc.values import Divisor, Kind, Value
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
 _PLAIN_VALUE = re.compile(r"reading\[\d+\]|x")

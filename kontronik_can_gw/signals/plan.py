@@ -82,7 +82,7 @@ class SignalPlan:
 
 
 def classic_bits(length: int, extended: bool = False) -> int:
-    """Bits of a classic CAN frame with so many data bytes, with the most stuffing that is possible."""
+    """Bits of a classic CAN frame with ``length`` data bytes and the most stuffing that is possible."""
     head = 54 if extended else 34
     return head + 13 + 8 * length + (head + 8 * length - 1) // 4
 

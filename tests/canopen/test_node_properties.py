@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from script import MS
 
 from kontronik_can_gw.canopen.dictionary import Variable
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import CanState
 
 FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 NODES = 2

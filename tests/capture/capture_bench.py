@@ -13,8 +13,8 @@ from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import TransmitQueue

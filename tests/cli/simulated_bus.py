@@ -18,9 +18,9 @@ from kontronik_can_gw.esc.simulator import (
     Faults,
     SimulatedEsc,
 )
-from kontronik_can_gw.esc.values import GatewayState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import GatewayState
 
 STEP_NS = 10_000_000
 START_S = 1_790_000_000

@@ -23,9 +23,9 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.driver_port import DriverPort
 from kontronik_can_gw.runtime.loop import Loop

@@ -17,7 +17,8 @@ from kontronik_can_gw.desk.describe.facts import DATA_TYPES
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
-from kontronik_can_gw.esc.values import VALUES, CanState, GatewayState, Group
+from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.gateway_status import CanState, GatewayState
 
 Facts = dict[str, Any]
 

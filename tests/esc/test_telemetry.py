@@ -26,7 +26,8 @@ from kontronik_can_gw.esc.telemetry import (
     Event,
     LinkState,
 )
-from kontronik_can_gw.esc.values import VALUES, GatewayStatus, Value, divisor, steps
+from kontronik_can_gw.esc.values import VALUES, Value, divisor, steps
+from kontronik_can_gw.gateway_status import GatewayStatus
 
 TIMEOUT = 250 * MS
 LIVE = LiveData(

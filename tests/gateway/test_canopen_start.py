@@ -8,9 +8,9 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse, shipped
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 
 
 def gateway() -> Gateway:

@@ -15,9 +15,9 @@ from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse, shipped
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.transmit_queue import TransmitQueue
 
 VERSION = kontronik_can_gw.__version__

@@ -41,7 +41,7 @@ from kontronik_can_gw.esc.simulator import (
     Swap,
 )
 from kontronik_can_gw.esc.simulator import Sent as Wired
-from kontronik_can_gw.esc.values import CanState
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import TransmitQueue

@@ -7,8 +7,8 @@ from simulated_bus import Clock
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import bus_listener, socketcan_port
 from kontronik_can_gw.runtime.bus_listener import BusListener
 

@@ -9,8 +9,8 @@ from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.esc.values import GatewayState
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import GatewayState
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.transmit_queue import Sent
 

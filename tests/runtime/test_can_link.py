@@ -11,9 +11,9 @@ from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import can_controller, can_link
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.fault_log import FaultLog

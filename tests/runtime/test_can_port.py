@@ -22,9 +22,9 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import CanConfig, parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import socketcan_port
 from kontronik_can_gw.runtime.bus_reader import QUEUE_LENGTH
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort

@@ -15,9 +15,9 @@ from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.prometheus import metrics
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway

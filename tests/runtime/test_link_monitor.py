@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kontronik_can_gw.esc.values import CanState
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime import link_monitor
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor
 

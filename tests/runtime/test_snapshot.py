@@ -13,7 +13,7 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.esc.kontronik.states import OperatingError, state_text
 from kontronik_can_gw.esc.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.esc.values import GatewayStatus
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.runtime.snapshot import (
     LOG_LINES,
     PortFacts,

@@ -33,7 +33,7 @@ from kontronik_can_gw.cli.status import (
     screen,
 )
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.esc.values import CanState
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.snapshot import (
     STALE_NS,
     CanFacts,

@@ -20,7 +20,7 @@ from esc import sheet
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
-from kontronik_can_gw.esc.values import CanState, GatewayState, GatewayStatus
+from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
 
 # --- bits, counted one by one -------------------------------------------------------------------------------------------
 

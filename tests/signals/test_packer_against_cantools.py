@@ -27,7 +27,8 @@ from packer_oracle import (
 
 from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
-from kontronik_can_gw.esc.values import VALUES, GatewayStatus
+from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.packer import compile_pack, float_bits
 from kontronik_can_gw.signals.plan import MessagePlan
 

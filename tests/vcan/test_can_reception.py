@@ -18,9 +18,9 @@ from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik import Layout as UartLayout
 from kontronik_can_gw.esc.kontronik import LiveData, encode
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
-from kontronik_can_gw.esc.values import CanState
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.open_can import open_can

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.esc.telemetry import LinkState
-from kontronik_can_gw.esc.values import CanState, GatewayState
+from kontronik_can_gw.gateway_status import CanState, GatewayState
 
 NOTHING = "Nothing to do."
 

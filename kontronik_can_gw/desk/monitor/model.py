@@ -23,8 +23,9 @@ from kontronik_can_gw.esc.kontronik.states import (
     state_text,
 )
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
-from kontronik_can_gw.esc.values import VALUES, CanState, GatewayState, Group
+from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 

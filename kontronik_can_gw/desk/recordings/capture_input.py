@@ -81,7 +81,7 @@ class CaptureInput(Input):
         self._add_losses(replay)
 
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        # who shows it tells names, pole pairs and gears
+        # the caller shows names, pole pairs and gears
         escs = [
             replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
             for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
-from kontronik_can_gw.esc.values import VALUES, Divisor, GatewayStatus, Group, physical, steps
+from kontronik_can_gw.esc.values import VALUES, Divisor, Group, physical, steps
 from kontronik_can_gw.esc.values import Kind as How
 from kontronik_can_gw.esc.values import Value as EscValue
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.unpacker import Value
 
 Values = tuple[Value, ...]

@@ -64,7 +64,7 @@ class Output:
         file = self._part.open()
         if not self._by_path:
             return file
-        file.close()  # it can be written: a library would tell it otherwise, or make folders
+        file.close()  # it can be written: a library would report it otherwise, or make folders
         return self._part.path
 
     def __enter__(self) -> Self:

@@ -98,7 +98,7 @@ class Decoder:
 
     def _record(self, frame: Frame) -> Record:
         if frame.layout is not self._layout:
-            # another device was plugged in: which, its info frame will tell
+            # another device was plugged in: its info frame will show which
             self._layout = frame.layout
             self._device = None
         data = frame.data

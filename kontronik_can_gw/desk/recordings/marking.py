@@ -1,14 +1,14 @@
-"""Frames of a log, marked as replay: where a message tells the gateway's state, it says Replay."""
+"""Frames of a log, marked as replay: a message with the gateway's state says Replay."""
 
-from kontronik_can_gw.esc.values import GatewayState
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway_status import GatewayState
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import place
 from kontronik_can_gw.signals.plan import Layout, Role
 
 
 class Marker:
-    """For the frames of one layout. ``can_mark`` False: no message of it tells the gateway's state."""
+    """For the frames of one layout. ``can_mark`` False: no message of it has the gateway's state."""
 
     def __init__(self, layout: Layout) -> None:
         self._changes: dict[int, tuple[int, int, int, int | None, int]] = {}

@@ -17,8 +17,9 @@ from kontronik_can_gw.desk.recordings.columns import Section, Values
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct, field_of_signal
 from kontronik_can_gw.esc.kontronik.deframer import Frame
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
-from kontronik_can_gw.esc.values import VALUES, GatewayState, GatewayStatus, Group
+from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import Column, Part, SignalReader, Value

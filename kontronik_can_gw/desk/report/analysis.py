@@ -36,7 +36,7 @@ from kontronik_can_gw.esc.kontronik.states import (
     state_text,
 )
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, LinkState
-from kontronik_can_gw.esc.values import GatewayState
+from kontronik_can_gw.gateway_status import GatewayState
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 CHUNK = 4096

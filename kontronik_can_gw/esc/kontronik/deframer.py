@@ -66,11 +66,11 @@ class Counters:
     dropped_noise: int = 0
     """Bytes that belong to no header."""
     dropped_crc: int = 0
-    """Bytes behind a header whose CRC failed, up to where its frame would have ended."""
+    """Bytes after a header whose CRC failed, up to where its frame would have ended."""
     dropped_unknown_kind: int = 0
     """The KOD of frames of unknown kind."""
     dropped_incomplete: int = 0
-    """Bytes behind a header when the stream ended."""
+    """Bytes after a header when the stream ended."""
     long_run_bytes: int = 0
     """Dropped bytes that look like a slower line read too fast (9600 baud of an old JIVE)."""
 

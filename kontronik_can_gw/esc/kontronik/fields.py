@@ -1,4 +1,4 @@
-"""One typed line per row of the sheet. Wire order, type, step, unit, stated range and absence are told here and nowhere else.
+"""One typed line per row of the sheet. Wire order, type, step, unit, stated range and absence are defined here and nowhere else.
 
 LiveData and InfoData hold raw wire integers. ``physical`` and ``raw`` convert by a Row. Nothing is clipped: the stated
 range is information for people, every value that fits the wire type is passed on.

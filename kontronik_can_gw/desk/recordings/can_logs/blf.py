@@ -271,7 +271,7 @@ class BlfReader:
 
 def _fits(data: bytes, after: int, following: int) -> bool:
     """True where an object that ends at ``after`` is followed by the next one, or by the end."""
-    # "LOBJ" may stand in an object's data: then it is the length that tells
+    # "LOBJ" may stand in an object's data: then the length decides
     return (
         after <= following < after + _PADDING
         or data.startswith(_SIGNATURE, after)

@@ -1,6 +1,6 @@
 """Writes CAN frames as candump log, ASC, BLF or TRC, as python-can's writers do, and as MF4 bus logging.
 
-The same frames give the same bytes: no file tells when it was written.
+The same frames give the same bytes: no file says when it was written.
 """
 
 import io
@@ -23,7 +23,7 @@ class CanLogWriter:
     """Writes one log.
 
     ``file``: open for bytes, stays open; of MF4 a path. ``wall_start_ns``: Unix time in ns of time 0, None where unknown.
-    ``first_ns``: time of the first frame, where an ASC, BLF, TRC or MF4 file that tells the Unix time begins.
+    ``first_ns``: time of the first frame, where an ASC, BLF, TRC or MF4 file with the Unix time begins.
     ``name``: what the file will be called (TRC says it).
     """
 
@@ -73,7 +73,7 @@ class CanLogWriter:
     def _asc(self, file: IO[bytes], base_ns: int, start_ns: int | None, _name: str) -> None:
         with without_asammdf():
             from can import ASCWriter
-        # python-can's header tells when the file was written, and cuts zeros of the milliseconds
+        # python-can's header has the time of writing, and cuts zeros of the milliseconds
         # local time, as ASC has it
         moment = datetime(1970, 1, 1)  # noqa: DTZ001
         if start_ns is not None:

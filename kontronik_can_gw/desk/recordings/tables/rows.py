@@ -205,7 +205,7 @@ def _cut(rows: Iterator[Row], start_ns: int | None, end_ns: int | None) -> Itera
 def thinned(
     rows: Iterator[Row], rate: float, by: Callable[[Row], object] | None = None
 ) -> Iterator[Row]:
-    """At most ``rate`` rows a second, the newest of each period; ``by`` tells rows apart that do not stand for each other."""
+    """At most ``rate`` rows a second, the newest of each period; ``by`` separates rows that do not replace each other."""
     period = SECOND_NS / rate
     held: dict[object, Row] = {}
     now = None

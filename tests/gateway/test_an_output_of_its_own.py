@@ -1,0 +1,80 @@
+"""The recipe for another output: one class, one line in the gateway's tuple. It sends one invented frame a second for each ESC."""
+
+from collections.abc import Sequence
+
+from kontronik_can_gw.esc.kontronik import LiveData, codec, encode
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.values import VALUES, steps
+from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.output import Output, Owner
+from kontronik_can_gw.signals.plan import Layout
+
+FIRST_ID, COMMAND_ID = 0x1234500, 0x12
+ESCS = [EscSettings("left"), EscSettings("right")]
+
+
+class Voltages(Output):
+    """Each ESC's battery voltage in 10 mV, FFFFh: not available; a command by CAN changes the period."""
+
+    def __init__(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> None:
+        super().__init__()
+        self.receive_ids = frozenset({COMMAND_ID})
+        self._escs, self._gateway = escs, gateway
+        self._due, self._period = now + SECOND, SECOND
+
+    def own_ids(self) -> dict[int, Owner]:
+        return {FIRST_ID + n | EXTENDED: Owner(n, "voltage") for n in range(len(self._escs))}
+
+    def next_deadline(self) -> int:
+        return self._due
+
+    def on_event(self, esc: int, events: int, now: int) -> None:
+        if events & Event.LINK and not self._escs[esc].up:
+            self._send(esc, now)
+
+    def receive(self, frame: CanFrame, now: int, at: int) -> None:
+        if frame.can_id == COMMAND_ID:
+            self._period = frame.data[0] * SECOND
+
+    def advance(self, now: int) -> None:
+        if now >= self._due:
+            self._due += self._period
+            for esc in range(len(self._escs)):
+                self._send(esc, now)
+
+    def _send(self, esc: int, now: int) -> None:
+        value = steps(VALUES["battery_voltage"], self._escs[esc], self._gateway, now)
+        data = (0xFFFF if value is None else value).to_bytes(2, "little")
+        self.frames.append(CanFrame(FIRST_ID + esc, data, extended=True))
+
+
+def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
+    gateway = Gateway(ESCS, Layout("", "", ()), 0, further=(Voltages,))
+    gateway.start(0)
+    found = []
+    for now in range(0, 4 * SECOND, SECOND // 10):
+        while gateway.next_deadline() < now:
+            gateway.advance(gateway.next_deadline())
+        if now < 2 * SECOND:
+            wire = encode(LiveData(battery_voltage=2400), codec.Layout.V4)
+            gateway.receive_bytes(1, wire, now, now)
+        gateway.advance(now)
+        found += [(now, f.can_id - FIRST_ID, f.data.hex()) for f in gateway.take_frames()]
+        if now == 2 * SECOND:
+            gateway.receive_frame(CanFrame(COMMAND_ID, b"\x09"), now, now)
+    assert [each for each in found if each[1] == 1] == [
+        (SECOND, 1, "6009"),
+        (2 * SECOND, 1, "6009"),
+        (2 * SECOND + 2 * SECOND // 10, 1, "ffff"),  # lost: 250 ms after the last
+        (3 * SECOND, 1, "ffff"),
+    ]
+    assert [each for each in found if each[1] == 0] == [(s * SECOND, 0, "ffff") for s in (1, 2, 3)]
+
+
+def test_another_device_with_its_ids_is_noticed() -> None:
+    gateway = Gateway(ESCS, Layout("", "", ()), 0, further=(Voltages,))
+    assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
+    gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
+    assert [(each.whose, each.node) for each in gateway.take_conflicts()] == [("voltage", 1)]
