@@ -45,6 +45,7 @@ class Gateway:
             dbc,
         )
         self._conflicts = IdConflicts(self._outputs)
+        self._being_saved: list[tuple[int, Output]] = []
         self._link_changes: list[int] = []
         self._dropped = False
         self._second_ns = now
@@ -114,6 +115,7 @@ class Gateway:
         for output in self._outputs:
             if output.saves:
                 found += output.saves
+                self._being_saved += [(esc, output) for esc, _ in output.saves]
                 output.saves = []
         return found
 
@@ -128,8 +130,11 @@ class Gateway:
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
         """An ESC's parameters are on disk; or could not be stored, and why."""
-        for output in self._outputs:
-            output.saved(esc, error, now)
+        for number, (of, output) in enumerate(self._being_saved):
+            if of == esc:
+                del self._being_saved[number]
+                output.saved(esc, error, now)
+                break
 
     def parameters_damaged(self, esc: int, now: int) -> None:
         """What was stored for an ESC could not be read: its node runs on defaults and reports it."""

@@ -168,6 +168,8 @@ def _mapping_problem(value: int, objects: Mapping[int, "EdsObject"]) -> str | No
     if not target.mappable or target.access == "rww":
         return f"{index:04X}h:{sub:02X} is not for TPDOs. Write PDOMapping=1 there or map another."
     length = TYPE_BITS.get(target.data_type, 0)
+    if target.data_type and (not length or target.access == "wo"):
+        return f"{index:04X}h:{sub:02X} cannot be sent: it is write-only or has no fixed length. Map another."
     if target.data_type and length != bits:
         return f"{index:04X}h:{sub:02X} has {length} bits. Write 0x{value & ~0xFF | length:08X}."
     return None

@@ -55,11 +55,6 @@ class Tpdos:
         """Take over the parameters as they are after a reset. Returns the keys of those that were rejected."""
         return [number for tpdo in self._tpdos for number in self._reset(tpdo, node_id, now)]
 
-    def configure(self, now: int) -> None:
-        """Take over the parameters, or other drive train settings."""
-        for tpdo in self._tpdos:
-            tpdo.configure(now)
-
     def _written(self, tpdo: Tpdo, now: int) -> bool:
         tpdo.configure(now)
         return self._rerouted(now)  # its COB-ID may be another one

@@ -82,9 +82,10 @@ class Housekeeping:
         self.follow_recorder(now)
         self.publish(now)
         self._notify(now)
-        if self._alive_due is not None:
-            self.due = min(self.due, max(now, self._alive_due))
         self.wake_due = self.due + PERIOD_NS
+        if self._alive_due is not None and self._alive_due > now:  # else something is stuck
+            self.due = min(self.due, self._alive_due)
+            self.wake_due = min(self.wake_due, self._alive_due)
 
     def publish(self, now: int) -> None:
         """Hand the statistics' thread a document, if it is time."""

@@ -214,8 +214,7 @@ class Loop:
         due = gateway.next_deadline()
         for esc in self._lost:
             due = min(due, esc.due)
-        can_due = self.can.due
-        return min(can_due, due)
+        return min(self.can.due, self._housekeeping.wake_due, due)
 
     def _others(self, esc: EscPort) -> tuple[Identity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)

@@ -164,9 +164,9 @@ class Statistics:
                 self._server.document = document
             if self._file is not None and self._worker is not None and not self._worker.is_ending:
                 self._write(self._file, with_rates(document, before))
-        if self._failed:
-            self._failed = False
-            self._reports.append(Report(False, "the statistics work again"))
+            if self._failed:
+                self._failed = False
+                self._reports.append(Report(False, "the statistics work again"))
 
     def _fail(self, error: Exception) -> None:
         """A mistake of ours in here must not go unsaid."""
@@ -189,9 +189,12 @@ class Statistics:
             + b"\n"
         )
         self._writing_since = time.monotonic_ns()
-        if (report := file.write(data)) is not None:
+        try:
+            report = file.write(data)
+        finally:
+            self._writing_since = None
+        if report is not None:
             self._reports.append(report)
-        self._writing_since = None
 
 
 def _server_at(address: tuple[str, int]) -> "MetricsServer":

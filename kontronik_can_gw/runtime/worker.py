@@ -47,7 +47,7 @@ class Handover(Generic[Item]):
     def __init__(self, capacity: int = sys.maxsize) -> None:
         self._capacity = capacity
         self._items: deque[Item] = deque()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # what is collected inside may log
         """Held for an instant only: nobody writes to the descriptor's number once it is closed, for it may be another's then."""
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
@@ -165,16 +165,18 @@ class Worker(Generic[Item]):
     def _run(self) -> None:
         is_last = False
         while not is_last:
-            if not self._ending.is_set():  # whose wake may be read already, with the last items
-                self._wait()
-            is_last = self._ending.is_set()  # asked first: what was put before the end is done
             try:
+                if not self._ending.is_set():  # whose wake may be read already, with the last items
+                    self._wait()
+                is_last = self._ending.is_set()  # asked first: what was put before the end is done
                 self._work(self._items.take())
-                if is_last:
-                    self._ended()
             except Exception as error:  # whatever it is: the next item has its turn
                 self._failed(error)
                 self.pause(FAILURE_PAUSE_S)
+        try:
+            self._ended()
+        except Exception as error:
+            self._failed(error)
 
     def _wait_for_items(self) -> None:
         poll = select.poll()

@@ -45,6 +45,14 @@ def float_bits(
     return error if bits == not_available else bits
 
 
+def quotient(numerator: int, denominator: int) -> float:
+    """A fraction as a double; infinite where it is too large."""
+    try:
+        return numerator / denominator
+    except OverflowError:
+        return math.inf if numerator > 0 else -math.inf
+
+
 def not_available_bits(signal: SignalPlan) -> int:
     """What a signal holds when its value is not available, at its place."""
     return place(signal.pieces, signal.not_available)
@@ -82,7 +90,7 @@ def source_text(plan: MessagePlan) -> str:
 
 def compile_pack(plan: MessagePlan) -> Pack:
     """The function of ``source_text``, compiled."""
-    names: dict[str, object] = {"float_bits": float_bits, "inf": math.inf}
+    names: dict[str, object] = {"float_bits": float_bits, "quotient": quotient, "inf": math.inf}
     for signal in plan.signals:
         if signal.numbers:
             names[_name("numbers", signal)] = {int(k): v for k, v in signal.numbers.items()}
@@ -245,7 +253,7 @@ def _float(signal: SignalPlan, steps: str) -> str:
     assert signal.source is not None
     by, over = _DIVISORS[signal.source.divisor]
     numerator, denominator = signal.slope.numerator, signal.slope.denominator
-    divided = f"{steps} * {numerator}{over} / ({denominator}{by})"
+    divided = f"quotient({steps} * {numerator}{over}, {denominator}{by})"
     return divided if signal.intercept == 0 else f"{divided} + {float(signal.intercept)!r}"
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.esc.kontronik import LiveData, codec, encode
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, steps
@@ -71,6 +72,31 @@ def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
         (3 * SECOND, 1, "ffff"),
     ]
     assert [each for each in found if each[1] == 0] == [(s * SECOND, 0, "ffff") for s in (1, 2, 3)]
+
+
+class Saving(Output):
+    """It has something to store."""
+
+    def __init__(self, escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> None:
+        super().__init__()
+        self.saves.append((0, b"parameters"))
+        self.answers: list[tuple[int, str | None]] = []
+
+    def saved(self, esc: int, error: str | None, now: int) -> None:
+        self.answers.append((esc, error))
+
+
+def test_what_one_output_stores_is_answered_to_it_alone() -> None:
+    made: list[Saving] = []
+
+    def make(escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> Saving:
+        made.append(Saving(escs, gateway, now))
+        return made[-1]
+
+    gateway = Gateway(ESCS, Layout("", "", ()), 0, canopen=shipped_canopen([1, 2]), further=(make,))
+    assert gateway.take_saves() == [(0, b"parameters")]
+    gateway.saved(0, "disk full", 1)
+    assert made[0].answers == [(0, "disk full")]
 
 
 def test_another_device_with_its_ids_is_noticed() -> None:

@@ -26,10 +26,17 @@ from recordings import (
     write_candump,
 )
 
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
 from kontronik_can_gw.desk.recordings.fields import Kind, distinct
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
+from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.desk.recordings.tables import Field, Row, Table, open_table
-from kontronik_can_gw.desk.recordings.tables.rows import thinned
+from kontronik_can_gw.desk.recordings.tables.rows import Choice, thinned
+from kontronik_can_gw.esc.kontronik import LiveData, encode
+from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
+from kontronik_can_gw.gateway_status import GatewayStatus
 
 Cells = list[dict[str, Any]]
 """Of each row the values by signal name, None where not available; Time in seconds, Utc as text to the microsecond."""
@@ -397,3 +404,40 @@ def test_any_values_read_back_equal(
             )
             assert cells["Utc"] == (f"{text}.{wall_ns % 10**9 // 1000:06d}Z" if text else None)
         assert tuple(cells[field.name] for field in FIELDS) == values
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_every_signal_of_the_shipped_dbc_still_names_its_column(count: int) -> None:
+    escs = [EscSettings(f"esc{n + 1}") for n in range(count)]
+    fields = fields_of_values(escs)
+    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
+    assert isinstance(database, cantools.database.can.Database)
+    signals = {s.name for m in database.messages for s in m.signals} - {"SentFrames"}
+    for name in sorted(name for name in signals if not name.endswith(("Alive", "Crc"))):
+        (index,) = Choice.of(fields, [name]).columns[:1]
+        assert fields[index].source.replace("_", "") in name.lower().removesuffix("percent")
+    if count == 2:
+        assert Choice.of(fields, ["Esc2BatteryVoltage"]).columns == [
+            [one.name for one in fields].index("esc2.battery_voltage")
+        ]
+
+
+def test_names_of_a_value_that_a_message_has_twice_are_those_of_its_signals() -> None:
+    twice = [Field("t", "°C", Kind.FLOAT, "M", signal=name) for name in ("TempC", "TempF")]
+    assert [one.name for one in distinct(twice)] == ["M.TempC", "M.TempF"]
+
+
+def test_the_age_of_an_esc_that_is_lost_goes_on_in_the_rows_of_another() -> None:
+    escs = [EscTelemetry(EscSettings(name), 0) for name in ("a", "b")]
+    fields = fields_of_values([esc.settings for esc in escs])
+    ages = [index for index, one in enumerate(fields) if one.source == "data_age"]
+    maker = RowMaker(escs, GatewayStatus(), sections(fields, ages), 0)
+    wire = encode(LiveData(), Layout.V4)
+    for now in range(SECOND, 3 * SECOND, 100 * MS):
+        for number, esc in enumerate(escs):
+            if number == 0 or now == SECOND:
+                for events in esc.receive_each(wire, now, now - 5 * MS):
+                    maker.follow(number, events, now)
+    rows = [row.values for row in maker.finish()]
+    assert [value for _, value in rows][-3:] == [1700, 1800, 1900]
+    assert {value for value, _ in rows} == {0}

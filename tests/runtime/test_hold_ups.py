@@ -253,6 +253,21 @@ def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
     assert len(fed) == 0 if blind else len(fed) > 8
 
 
+def test_the_watchdog_is_fed_on_a_silent_line_with_a_long_time_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World()
+    signs = Signs(world)
+    escs = (EscSettings("esc1", timeout_ns=60 * SECOND),)
+    loop = loop_in(world, monkeypatch, escs, notifier=signs)  # type: ignore[arg-type]
+    loop.open()
+    loop.begin()
+    begin = world.now
+    run(loop, world, begin + 5 * SECOND)
+    loop.close()
+    assert all(late - early <= 600 * MS for early, late in pairwise([begin, *signs.fed, world.now]))
+
+
 def test_bytes_that_came_while_the_interface_opened_are_as_old_as_that(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

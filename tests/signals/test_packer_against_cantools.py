@@ -29,7 +29,7 @@ from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.gateway_status import GatewayStatus
-from kontronik_can_gw.signals.packer import compile_pack, float_bits
+from kontronik_can_gw.signals.packer import compile_pack, float_bits, quotient
 from kontronik_can_gw.signals.plan import MessagePlan
 
 ESCS = (
@@ -130,6 +130,12 @@ def float_of(raw: int, length: int) -> float:
 
 def same(a: Any, b: Any) -> bool:
     return bool(a == b) or (isinstance(b, float) and math.isnan(b) and math.isnan(a))
+
+
+def test_a_quotient_beyond_a_double_is_infinite() -> None:
+    assert quotient(-(10**400), 3) == float("-inf")
+    assert quotient(10**400, 3) == float("inf")
+    assert quotient(1, 4) == 0.25
 
 
 @pytest.mark.parametrize("seed", range(FILES))

@@ -43,7 +43,8 @@ def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
 def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
     texts = tuple(sorted(value.names.items()))
     high = math.inf if value.high is None else value.high / value.per_unit
-    return Field(prefix + value.name, value.unit, _kind(value), "", texts, value.name, esc, high)
+    name = prefix + value.name
+    return Field(name, value.unit, _kind(value), "", texts, value.name, esc, high=high)
 
 
 def _kind(value: EscValue) -> Kind:
@@ -98,6 +99,8 @@ class Section(NamedTuple):
     esc: int | None
     nothing: Values
     read: Callable[[Any, int], Values]
+    ages: bool = False
+    """It changes with time alone."""
 
 
 def _words(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]:
@@ -170,7 +173,8 @@ def sections(fields: Sequence[Field], chosen: Sequence[int]) -> list[Section]:
         else:
             make = _words if source.bit is None else _flags
             read = make(names, source.group.value)
-        found.append(Section(source.group, esc, (None,) * len(names), read))
+        ages = source.kind is How.AGE
+        found.append(Section(source.group, esc, (None,) * len(names), read, ages))
     return found
 
 
@@ -178,4 +182,5 @@ def _together(field: Field) -> Hashable:
     """The same for columns that are read together."""
     source = VALUES[field.source]
     word = _word(source)
-    return field.esc, source.group, None if word is None else word if source.bit is not None else -1
+    way = None if word is None else word if source.bit is not None else -1
+    return field.esc, source.group, way, source.kind is How.AGE

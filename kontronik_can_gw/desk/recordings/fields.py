@@ -38,6 +38,8 @@ class Field:
     """A name of values.py."""
     esc: int | None = None
     """Index of the ESC; None for the gateway's own."""
+    signal: str = ""
+    """Name of the signal in the DBC, of a value that came in a CAN frame."""
     high: float = math.inf
     """The greatest value, at which a counter begins again."""
 
@@ -55,14 +57,24 @@ def field_of_signal(column: Column) -> Field:
     elif column.is_flag:
         kind = Kind.FLAG
     name, unit, message = column.name, column.unit, column.message
-    return Field(name, unit, kind, message, column.texts, column.source, column.esc, column.high)
+    return Field(
+        *(name, unit, kind, message, column.texts, column.source, column.esc),
+        signal=name,
+        high=column.high,
+    )
 
 
 def distinct(fields: Sequence[Field]) -> list[Field]:
-    """The fields; names that several have, or that a table itself uses, with the message in front: ``Message.Name``."""
+    """The fields; names that several have, or that a table itself uses, with the message in front: ``Message.Name``.
+
+    Where a message has a value twice, the names of its signals.
+    """
     counts = Counter(one.name for one in fields)
+    within = Counter((one.message, one.name) for one in fields)
     return [
-        replace(one, name=f"{one.message}.{one.name}")
+        replace(one, name=f"{one.message}.{one.signal or one.name}")
+        if within[one.message, one.name] > 1
+        else replace(one, name=f"{one.message}.{one.name}")
         if counts[one.name] > 1 or one.name in _OWN
         else one
         for one in fields

@@ -78,6 +78,7 @@ class RowMaker:
             for esc in range(len(escs))
         ]
         self._of_gateway = [(index, read) for of, _, index, read in listed if of is None]
+        self._ages = [(s.esc, index, s.read) for index, s in enumerate(sections) if s.ages]
 
     def take_rows(self) -> Sequence[Sample]:
         """The rows that are complete."""
@@ -109,6 +110,9 @@ class RowMaker:
         changed = self._by_esc if events & (Event.LINK | Event.INFO) else self._with_live
         for index, read in changed[esc]:
             parts[index] = read(state, when)
+        for of, index, read in self._ages:
+            if of is not None and of != esc:
+                parts[index] = read(self._escs[of], when)
         if when - self._gateway_ns >= GATEWAY_NS or events & Event.LINK:
             self._gateway_ns = when
             for index, read in self._of_gateway:

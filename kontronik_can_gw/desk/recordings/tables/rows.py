@@ -64,17 +64,26 @@ class Choice:
     ) -> "Choice":
         """The fields with one of these names (with * and ?), of one ESC. UserError for a name that fits none.
 
-        Case and underscores do not matter, and with several ESCs a name may be that of a value alone.
+        Case, underscores and dots do not matter, nor ``Percent`` at the end. With several ESCs a name may be that of a value alone; of
+        a CAN log it may be the signal's.
         """
         chosen: list[int] = []
         problems = []
-        known = [{_plain(one.name), _plain(one.name.rpartition(".")[2])} for one in fields]
+        known = [
+            {_plain(one.name), _plain(one.name.rpartition(".")[2]), _plain(one.signal)}
+            for one in fields
+        ]
         for name in names:
             wanted = _plain(name)
             found = [
                 index
                 for index, called in enumerate(known)
-                if any(fnmatch.fnmatchcase(one, wanted) for one in called)
+                if any(
+                    fnmatch.fnmatchcase(one, form)
+                    for one in called
+                    for form in (wanted, wanted.removesuffix("percent"))
+                    if one and form
+                )
             ]
             if not found:
                 shown = {_plain(one.name): one.name for one in reversed(fields)}
@@ -94,7 +103,7 @@ class Choice:
 
 
 def _plain(name: str) -> str:
-    return name.lower().replace("_", "")
+    return name.lower().replace("_", "").replace(".", "")
 
 
 def first_of(items: Iterator[T]) -> tuple[T | None, Iterator[T]]:
