@@ -18,9 +18,9 @@ from kontronik_can_gw.canopen.emergency_codes import (
     registered_bits,
     reported_bits,
 )
-from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.output import NEVER
 
 _MAX_PENDING = 64
 

@@ -6,9 +6,8 @@ from functools import partial
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
 from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.output import NEVER
 
-NEVER = 1 << 62
-"""A deadline that does not come."""
 _CATCHING_UP_NS = SECOND // 2
 """After a hold-up no heartbeat is missed for this long unless it was seen to be late: what came meanwhile is read piece by piece."""
 

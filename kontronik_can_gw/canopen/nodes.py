@@ -15,7 +15,6 @@ from kontronik_can_gw.canopen.cob_ids import (
 )
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
-from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nmt import NmtState, is_reset_of_all
 from kontronik_can_gw.canopen.node import Node
@@ -25,7 +24,7 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
-from kontronik_can_gw.output import Output, Owner
+from kontronik_can_gw.output import NEVER, Output, Owner
 
 SettingsChanged = Callable[[int, EscSettings], None]
 

@@ -11,7 +11,7 @@ from kontronik_can_gw.esc.telemetry import MS, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES, Group, Kind, Value, scaled, steps, steps_of
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
-U8, U16, U32 = 0xFF, 0xFFFF, 0xFFFFFFFF
+U8, U16 = 0xFF, 0xFFFF
 LIVE, DERIVED, INFO, EXTREMES, LINK, GATEWAY = 0x2000, 0x2001, 0x2010, 0x2011, 0x2020, 0x2021
 UNITS = 0x2002
 SETTINGS, NODE_ID, RESET_STATISTICS = 0x2100, 0x2101, 0x2102

@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 from kontronik_can_gw.canopen.bound_values import CompiledPdo, compile_pdo
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
-from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES, TpdoParameters
 from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ
 
 

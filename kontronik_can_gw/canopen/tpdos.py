@@ -6,12 +6,12 @@ from functools import partial
 from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.canopen.cob_ids import INVALID_BIT
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, key
-from kontronik_can_gw.canopen.heartbeat import NEVER
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import COB_ID, COMMUNICATION, MAPPING, MAX_TPDOS
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.output import NEVER
 
 
 class Tpdos:

@@ -11,6 +11,8 @@ from kontronik_can_gw.esc.values import VALUES, Group, Value
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
+_BY_KEY = {normalize(name): value for name, value in VALUES.items()}
+
 
 class Binder:
     """Resolves signal names to sources for a given set of ESCs."""
@@ -19,14 +21,13 @@ class Binder:
         self.escs = escs
         self.bind = bind
         self.used: set[str] = set()
-        self._by_key = {normalize(name): value for name, value in VALUES.items()}
         self._prefixes = sorted(
             ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
         )
 
     def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Value, int | None] | None:
         """The source of a normalized name without a final ``percent``; ``esc`` None: the name has no prefix."""
-        source = self._by_key.get(key) or self._by_key.get(key.removesuffix("percent"))
+        source = _BY_KEY.get(key) or _BY_KEY.get(key.removesuffix("percent"))
         if source is None:
             return None
         return (source, None) if source.group is Group.GATEWAY else (source, esc)
@@ -54,8 +55,8 @@ class Binder:
         key = normalize(name)
         for prefix, _ in self._prefixes:
             key = key.removeprefix(prefix) or key
-        near = difflib.get_close_matches(key, self._by_key, n=3, cutoff=0.5)
-        names = [self._by_key[n].name for n in near]
+        near = difflib.get_close_matches(key, _BY_KEY, n=3, cutoff=0.5)
+        names = [_BY_KEY[n].name for n in near]
         return f" Did you mean {' or '.join(names)}?" if names else ""
 
 

@@ -112,12 +112,9 @@ def steps(value: Value, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> 
     """The value now, in steps before the divisor; None: not available."""
     if value.read is not None:
         return value.read(esc, gateway, now)
-    return steps_of(value, esc, esc.live if value.group is Group.LIVE else info_of(value, esc))
-
-
-def info_of(value: Value, esc: EscTelemetry) -> InfoData | None:
-    """The info reading that a value is taken from."""
-    return esc.last_info if value.last else esc.info
+    if value.group is Group.LIVE:
+        return steps_of(value, esc, esc.live)
+    return steps_of(value, esc, esc.last_info if value.last else esc.info)
 
 
 def steps_of(value: Value, esc: EscTelemetry, reading: Sequence[int] | None) -> int | None:

@@ -4,11 +4,11 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts, LinkMonitor, link_monitor
 from kontronik_can_gw.runtime.snapshot import name_in_words
-from kontronik_can_gw.runtime.transmitter import NEVER
 
 ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
 """How often the kernel is asked for the controller's state: as a rule, and in bus-off."""

@@ -1,17 +1,16 @@
 """The transmit side of the CAN interface: what waits to be sent, an interface that takes nothing for now, a bus that stands still."""
 
-import sys
 import time
 from collections.abc import Callable, Sequence
 
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.transmit_queue import Sent, TransmitQueue
 
-NEVER = sys.maxsize
 BUSY_RETRY_NS = 2 * MS
 LASTING_BUSY_NS = SECOND
 MAX_LATE_NS = 250 * MS

@@ -94,11 +94,6 @@ class SignalReader:
             (c.source, c.esc): index for index, c in reversed(list(enumerate(columns)))
         }
 
-    def unpack_of(self, part: Part) -> Callable[[int], list[Value]]:
-        """What gives the values of a part from the bits of its message."""
-        unpacks = self._messages[part.plan.can_id | (EXTENDED if part.plan.extended else 0)][2]
-        return unpacks[part.page][1]
-
     @property
     def keys(self) -> frozenset[int]:
         """CAN ids of the layout's messages, with ``EXTENDED`` for 29 bits."""
