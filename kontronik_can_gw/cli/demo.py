@@ -240,7 +240,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _feed(esc: object, seed: int, stop: threading.Event) -> None:
     from kontronik_can_gw.desk import pty
-    from kontronik_can_gw.esc.simulator import (
+    from kontronik_can_gw.esc.kontronik.simulator import (
         FLIGHT,
         SECOND_NS,
         Dropout,

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from kontronik_can_gw.esc.kontronik import Device, Layout
-    from kontronik_can_gw.esc.simulator import Dropout, ErrorWindow, EscOptions, SimulatedEsc, Swap
+    from kontronik_can_gw.esc.kontronik.simulator import (
+        Dropout,
+        ErrorWindow,
+        EscOptions,
+        SimulatedEsc,
+        Swap,
+    )
 
 T = TypeVar("T")
 
@@ -119,7 +125,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Simulate. UserError for each bad value, RunError if a gateway transmitted or a file failed."""
     from kontronik_can_gw.errors import UserError
-    from kontronik_can_gw.esc.simulator import SimulatedEsc
+    from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
 
     read = _Options(args)
     count = read("--esc", args.esc, lambda text: _integer(text, 1, 1000)) or 1
@@ -162,7 +168,7 @@ def _to_files(escs: "list[SimulatedEsc]", path: str, seconds: float) -> int:
     from pathlib import Path
 
     from kontronik_can_gw.errors import RunError
-    from kontronik_can_gw.esc.simulator import SECOND_NS
+    from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS
 
     for index, esc in enumerate(escs):
         name = path.replace("{n}", str(index + 1))
@@ -195,7 +201,7 @@ def _to_terminals(escs: "list[SimulatedEsc]", link: str | None, seconds: float |
 
     from kontronik_can_gw.desk.pty import PtyEsc, run
     from kontronik_can_gw.errors import RunError
-    from kontronik_can_gw.esc.simulator import Sent
+    from kontronik_can_gw.esc.kontronik.simulator import Sent
 
     stopped = False
 
@@ -287,7 +293,7 @@ class _Options:
     def esc_options(self, number: int) -> "EscOptions | None":
         """Options of the ESC with this number, from 1."""
         from kontronik_can_gw.esc.kontronik import Device, Layout
-        from kontronik_can_gw.esc.simulator import FLIGHT, IDLE, EscOptions, Faults
+        from kontronik_can_gw.esc.kontronik.simulator import FLIGHT, IDLE, EscOptions, Faults
 
         args = self._args
         device = None if args.device is None else self("--device", args.device, _device)
@@ -410,7 +416,7 @@ def _firmware(text: str) -> tuple[int, int]:
 
 
 def _dropout(text: str) -> "Dropout":
-    from kontronik_can_gw.esc.simulator import Dropout
+    from kontronik_can_gw.esc.kontronik.simulator import Dropout
 
     duration, slash, interval = text.partition("/")
     if not slash:
@@ -425,7 +431,7 @@ def _dropout(text: str) -> "Dropout":
 
 def _error(text: str) -> "ErrorWindow":
     from kontronik_can_gw.esc.kontronik import OperatingError, SelfTestError
-    from kontronik_can_gw.esc.simulator import ErrorWindow
+    from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow
 
     name, at, when = text.partition("@")
     bits: dict[str, OperatingError | SelfTestError] = {bit.text: bit for bit in OperatingError}
@@ -438,7 +444,7 @@ def _error(text: str) -> "ErrorWindow":
 
 
 def _swap(text: str) -> "Swap":
-    from kontronik_can_gw.esc.simulator import Swap
+    from kontronik_can_gw.esc.kontronik.simulator import Swap
 
     what, at, when = text.partition("@")
     name, colon, layout = what.partition(":")

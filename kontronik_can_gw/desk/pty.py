@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Self
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.simulator import SECOND_NS, Sent, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, Sent, SimulatedEsc
 
 
 class PtyEsc:

@@ -27,7 +27,7 @@ _MB = 1_000_000
 
 def flight(context: Context) -> bytes:
     """About a MB."""
-    from kontronik_can_gw.esc.simulator import EscOptions, SimulatedEsc
+    from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 
     file = context.folder / f"flight-{FLIGHT_S}-{SEED}.bin"
     if not file.exists():

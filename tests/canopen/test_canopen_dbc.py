@@ -28,8 +28,7 @@ from kontronik_can_gw.dbc.expand import esc_prefix
 from kontronik_can_gw.dbc.writer import dbc_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
-from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
-from kontronik_can_gw.esc.simulator import (
+from kontronik_can_gw.esc.kontronik.simulator import (
     BYTE_NS,
     Dropout,
     ErrorWindow,
@@ -37,6 +36,7 @@ from kontronik_can_gw.esc.simulator import (
     Faults,
     SimulatedEsc,
 )
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway

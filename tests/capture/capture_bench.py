@@ -11,7 +11,7 @@ from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.esc.kontronik import Device
-from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState

@@ -25,7 +25,7 @@ from kontronik_can_gw.desk.recordings.inputs import (
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.kontronik import Device
-from kontronik_can_gw.esc.simulator import Dropout, EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.signals.unpacker import SignalReader
 

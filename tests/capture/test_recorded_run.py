@@ -14,7 +14,7 @@ import pytest
 
 from kontronik_can_gw.desk import pty
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 

@@ -9,8 +9,7 @@ from kontronik_can_gw.capture.format import block, data_payload, json_payload
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
-from kontronik_can_gw.esc.simulator import (
+from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,
     SECOND_NS,
     ErrorWindow,
@@ -18,6 +17,7 @@ from kontronik_can_gw.esc.simulator import (
     Faults,
     SimulatedEsc,
 )
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayState

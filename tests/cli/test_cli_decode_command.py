@@ -10,7 +10,7 @@ import pytest
 from command_line import refused, run, written
 
 from kontronik_can_gw.desk.recordings.decode import COLUMNS, Decoder, json_lines
-from kontronik_can_gw.esc.simulator import SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
 
 # Recorded from a JIVE PRO 120, firmware 1.14, idle.
 LIVE = bytes.fromhex("4B4F444C000000008A0900000000000000000000581FE90300001D20000002000C0039234C14")

@@ -18,7 +18,7 @@ from kontronik_can_gw.esc.kontronik import (
     LiveData,
     OperatingError,
 )
-from kontronik_can_gw.esc.simulator import SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
 
 COMMAND = [sys.executable, "-m", "kontronik_can_gw", "simulate"]
 

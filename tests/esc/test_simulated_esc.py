@@ -17,7 +17,7 @@ from kontronik_can_gw.esc.kontronik import (
     OperatingState,
     SelfTestError,
 )
-from kontronik_can_gw.esc.simulator import (
+from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,
     IDLE,
     Dropout,

@@ -14,7 +14,7 @@ from esc.reference import SHORTEST_FIRST, fits
 from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import FORMS
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
-from kontronik_can_gw.esc.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import (
     INFO_TIMEOUT_NS,
     MS,

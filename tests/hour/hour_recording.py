@@ -31,8 +31,7 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
-from kontronik_can_gw.esc.simulator import (
+from kontronik_can_gw.esc.kontronik.simulator import (
     Dropout,
     ErrorWindow,
     EscOptions,
@@ -40,7 +39,8 @@ from kontronik_can_gw.esc.simulator import (
     SimulatedEsc,
     Swap,
 )
-from kontronik_can_gw.esc.simulator import Sent as Wired
+from kontronik_can_gw.esc.kontronik.simulator import Sent as Wired
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.signals.plan import Layout

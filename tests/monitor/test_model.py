@@ -14,8 +14,8 @@ from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError, Severity
-from kontronik_can_gw.esc.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 

@@ -18,7 +18,7 @@ from kontronik_can_gw.cli.monitor import Recording
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.monitor import model as model
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.esc.simulator import SECOND_NS, EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions, SimulatedEsc
 from kontronik_can_gw.runtime import bus_listener
 
 DBC = shipped("dbc/kontronik_esc.dbc")

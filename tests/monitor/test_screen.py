@@ -16,8 +16,8 @@ from kontronik_can_gw.cli.monitor_screen import (
     screen,
 )
 from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
-from kontronik_can_gw.esc.simulator import SECOND_NS, EscOptions
 
 LIVE = Where("can0", hints=("Is the gateway running?",))
 

@@ -23,8 +23,14 @@ from kontronik_can_gw.desk.mqtt.messages import (
     entity,
     is_ours,
 )
+from kontronik_can_gw.esc.kontronik.simulator import (
+    SECOND_NS,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    Phase,
+)
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.esc.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, Phase
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 TOPICS = Topics("fleet", "boat")

@@ -18,8 +18,14 @@ from kontronik_can_gw.canopen.storage import decode
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.desk import pty
+from kontronik_can_gw.esc.kontronik.simulator import (
+    SECOND_NS,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    SimulatedEsc,
+)
 from kontronik_can_gw.esc.kontronik.states import OperatingError
-from kontronik_can_gw.esc.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.store import ParameterStore

@@ -12,7 +12,7 @@ from simulated_bus import capture_file
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.esc.kontronik import Device
-from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import SECOND
 
 WALL_NS = 1_700_000_000 * SECOND + 250_000_000

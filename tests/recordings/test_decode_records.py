@@ -13,7 +13,7 @@ from kontronik_can_gw.desk.recordings.decode import (
 )
 from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode, rows
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
-from kontronik_can_gw.esc.simulator import EscOptions, Faults, SimulatedEsc, Swap
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc, Swap
 
 S = 1_000_000_000
 

@@ -10,7 +10,7 @@ import pytest
 from kontronik_can_gw.desk.pty import PtyEsc, run
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import Deframer
-from kontronik_can_gw.esc.simulator import EscOptions, Sent, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Sent, SimulatedEsc
 
 ALL_BYTES = bytes(range(256))
 

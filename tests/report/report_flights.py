@@ -7,7 +7,7 @@ from simulated_bus import layout_of
 
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.esc.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.unpacker import SignalReader, Value

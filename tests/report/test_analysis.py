@@ -12,8 +12,8 @@ from kontronik_can_gw.desk.report.analysis import Analysis
 from kontronik_can_gw.desk.report.fit import ResistanceFit
 from kontronik_can_gw.desk.report.flight import Event, Flight
 from kontronik_can_gw.desk.report.quantities import PLOTS
+from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
-from kontronik_can_gw.esc.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
 from kontronik_can_gw.esc.telemetry import SECOND as S
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from command_line import refused, run
 
+from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import OperatingError
-from kontronik_can_gw.esc.simulator import ErrorWindow, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import SECOND as S
 
 

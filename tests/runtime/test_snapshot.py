@@ -10,8 +10,8 @@ from statistics_bench import Bench
 
 from kontronik_can_gw.esc.kontronik.deframer import Counters
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError, state_text
-from kontronik_can_gw.esc.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.runtime.snapshot import (

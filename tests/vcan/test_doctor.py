@@ -15,7 +15,7 @@ from vcan_tools import Candump, GatewayProcess, bench, canopen_table, configurat
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.esc.simulator import EscOptions
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions
 
 Start = Callable[..., GatewayProcess]
 

@@ -27,8 +27,8 @@ from foreign_tools import (
 from vcan_tools import Bench, Candump, GatewayProcess, bench, wait_for
 
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Faults, Phase
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState
-from kontronik_can_gw.esc.simulator import ErrorWindow, EscOptions, Faults, Phase
 
 pytestmark = pytest.mark.extended
 

@@ -14,8 +14,8 @@ import can
 from vcan_tools import LIMIT_S, Candump, GatewayProcess, bench, configuration, ip, wait_for
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError
-from kontronik_can_gw.esc.simulator import ErrorWindow, EscOptions, Faults
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.bus_listener import BusListener
 

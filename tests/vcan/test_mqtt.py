@@ -14,8 +14,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "mqtt"))
 from mqtt_bench import Mosquitto, Process, Subscriber, kept
 
 from kontronik_can_gw.esc.kontronik.fields import LiveData, rows
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Phase
 from kontronik_can_gw.esc.kontronik.states import OperatingState
-from kontronik_can_gw.esc.simulator import EscOptions, Phase
 
 pytestmark = pytest.mark.extended
 

@@ -26,7 +26,7 @@ from vcan_tools import (
 from kontronik_can_gw.capture.format import Kind
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
-from kontronik_can_gw.esc.simulator import Dropout, EscOptions, Faults
+from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults
 
 Start = Callable[..., GatewayProcess]
 pytestmark = pytest.mark.extended

@@ -27,7 +27,7 @@ from signals import table_of_configuration
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk import pty
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
-from kontronik_can_gw.esc.simulator import EscOptions, Sent, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Sent, SimulatedEsc
 
 LIMIT_S = 60.0
 NEVER_STALE = "telemetry_timeout_ms = 60000"
