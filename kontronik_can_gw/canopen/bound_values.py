@@ -14,7 +14,8 @@ from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.data_types import BOOLEAN, FLOATS, SIGNED
 from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable, range_of
 from kontronik_can_gw.canopen.eds_object import Entry
-from kontronik_can_gw.canopen.objects import BINDINGS, LINK, Bound
+from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
+from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group, Kind
 from kontronik_can_gw.esc.values import Value as EscValue
@@ -62,24 +63,25 @@ def bits_of(variable: Variable) -> int:
 
 def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatus) -> None:
     """Let the objects that show a value of the ESC or of the gateway do so."""
-    for (index, sub), bound in BINDINGS.items():
+    for (index, sub), bound in bindings_of(esc.protocol).items():
         variable = dictionary.get(index, sub)
         if variable is not None:
             low, high = range_of(variable)
             variable.read = partial(_read, bound, low, high, dictionary, esc, gateway)
 
 
-def compile_pdo(mapped: Sequence[Mapped]) -> CompiledPdo:
+def compile_pdo(mapped: Sequence[Mapped], protocol: EscProtocol) -> CompiledPdo:
     """The packer of a PDO with these objects."""
     if all(entry.bound is not None for entry in mapped):
-        return _shared_pdo(tuple(entry.variable.entry for entry in mapped))
+        return _shared_pdo(tuple(entry.variable.entry for entry in mapped), protocol)
     return _compile(mapped)
 
 
 @lru_cache(_MAX_PDOS)
-def _shared_pdo(entries: tuple[Entry, ...]) -> CompiledPdo:
+def _shared_pdo(entries: tuple[Entry, ...], protocol: EscProtocol) -> CompiledPdo:
     """Of values only: the same for all nodes."""
-    return _compile([Mapped(Variable(e), BINDINGS[e.index, e.sub]) for e in entries])
+    bindings = bindings_of(protocol)
+    return _compile([Mapped(Variable(e), bindings[e.index, e.sub]) for e in entries])
 
 
 def _read(

@@ -5,7 +5,7 @@ only the sign bit).
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
@@ -20,13 +20,7 @@ from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
-from kontronik_can_gw.esc.kontronik.states import (
-    Device,
-    ErrorBit,
-    OperatingError,
-    OperatingState,
-    SelfTestError,
-)
+from kontronik_can_gw.esc.decoder import ErrorBit
 from kontronik_can_gw.esc.telemetry import MS, LinkState
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import SignalPlan
@@ -68,6 +62,8 @@ class NodeMessages:
 
     def __init__(self, node: Node, prefix: str, message_names: Names, signal_names: Names) -> None:
         self._node = node
+        self._protocol = node.esc.protocol
+        self._errors = self._protocol.errors.get("operating_errors", ())
         self._title = f"CANopen node {node.node_id}"
         self._message_prefix = prefix or "Esc"
         self._prefix = prefix
@@ -115,7 +111,8 @@ class NodeMessages:
         )
 
     def _emergency(self, cob_id: int) -> Message:
-        bits = {int(bit): pascal_case(bit.name) for bit in OperatingError}
+        names = emergency_names(self._errors)
+        bits = {int(bit): pascal_case(bit.name) for bit in self._errors}
         sources = {bit: bits.get(bit, f"Bit{bit}") for bit in range(32)} | {0xFF: "Gateway"}
         signals = [
             Signal(
@@ -123,8 +120,8 @@ class NodeMessages:
                 0,
                 16,
                 "Emergency code.",
-                high=max(emergency_names()),
-                names=emergency_names(),
+                high=max(names),
+                names=names,
             ),
             *(
                 Signal(
@@ -163,10 +160,10 @@ class NodeMessages:
     def _tpdo(self, tpdo: Tpdo) -> Message:
         plan = message_plan("", tpdo.cob_id, tpdo.mapped)
         signals: list[Signal] = []
-        words: list[tuple[Mapped, SignalPlan, type[ErrorBit]]] = []
+        words: list[tuple[Mapped, SignalPlan, Sequence[ErrorBit]]] = []
         state_name = ""
         for entry, place in zip(tpdo.mapped, plan.signals, strict=True):
-            if bits := _error_bits(entry, place):
+            if bits := self._error_bits(entry, place):
                 words.append((entry, place, bits))
                 continue
             made = self._object(entry, place)
@@ -192,12 +189,12 @@ class NodeMessages:
         plain = Signal("", start, length, where, signed, place.is_float, low=lowest, high=highest)
         if bound is None:
             is_code = (item.index, item.sub, length, signed) == (at.ERROR_CODE, 0, 16, False)
-            names = emergency_names() if is_code else {}
+            names = emergency_names(self._errors) if is_code else {}
             return [replace(plain, name=self._name(own_stem), names=names)]
         source = bound.source
         if source.name == "link_status" and not signed:
             return self._link(start, where)
-        names, stem = _table(source.name, source.names)
+        names, stem = self._table(source.name, source.names)
         if item.index >= _MIRRORS:
             stem = own_stem
         unit = _ASCII_UNITS.get(source.unit, source.unit)
@@ -246,7 +243,7 @@ class NodeMessages:
         ]
 
     def _flags(
-        self, entry: Mapped, place: SignalPlan, bits: type[ErrorBit], state_name: str
+        self, entry: Mapped, place: SignalPlan, bits: Sequence[ErrorBit], state_name: str
     ) -> list[Signal]:
         then = f" and {state_name} is NotAvailable" if state_name else ""
         lost = f"While the word is not available all its bits are set{then}."
@@ -262,6 +259,29 @@ class NodeMessages:
             if bit < place.length
         ]
 
+    def _error_bits(self, entry: Mapped, place: SignalPlan) -> Sequence[ErrorBit]:
+        """The bits of an error word that is shown unsigned; empty for every other object."""
+        if entry.bound is None or place.signed:
+            return ()
+        return self._protocol.errors.get(entry.bound.source.name, ())
+
+    def _table(self, name: str, names: Mapping[int, str]) -> tuple[dict[int, str], str]:
+        """Value names and signal name of a source. An enumeration is closed: a number without a name gets one, because tools lose
+        all names by one sample that has none."""
+        if name == "operating_state_raw":
+            states = self._protocol.states
+            return {
+                number: pascal_case(states[number].text) if number in states else f"State{number}"
+                for number in range(0x100)
+            }, "OperatingState"
+        if name == "device_raw":
+            devices = self._protocol.devices
+            return {
+                number: pascal_case(devices.get(number, f"Device{number}"))
+                for number in range(0x40)
+            }, "Device"
+        return {int(number): pascal_case(text) for number, text in names.items()}, pascal_case(name)
+
 
 def _where(item: Entry) -> str:
     return f"Object {item.index:04X}h:{item.sub:02X}, {item.name}."
@@ -273,29 +293,6 @@ def _stem(item: Entry) -> str:
     return (
         stem if re.fullmatch("[A-Z].*[a-z].*", stem) else f"Object{item.index:04X}Sub{item.sub:02X}"
     )
-
-
-def _error_bits(entry: Mapped, place: SignalPlan) -> type[ErrorBit] | None:
-    """The bits of an error word that is shown unsigned; None for every other object."""
-    words: dict[str, type[ErrorBit]] = {
-        "operating_errors": OperatingError,
-        "selftest_errors": SelfTestError,
-    }
-    return None if entry.bound is None or place.signed else words.get(entry.bound.source.name)
-
-
-def _table(name: str, names: Mapping[int, str]) -> tuple[dict[int, str], str]:
-    """Value names and signal name of a source. An enumeration is closed: a number without a name gets one, because tools lose all
-    names by one sample that has none."""
-    if name == "operating_state_raw":
-        known = {int(state): pascal_case(state.text) for state in OperatingState}
-        return {
-            number: known.get(number, f"State{number}") for number in range(0x100)
-        }, "OperatingState"
-    if name == "device_raw":
-        known = {int(device): pascal_case(device.text) for device in Device}
-        return {number: known.get(number, f"Device{number}") for number in range(0x40)}, "Device"
-    return {int(number): pascal_case(text) for number, text in names.items()}, pascal_case(name)
 
 
 def _schedule(tpdo: Tpdo) -> tuple[str, int, int]:

@@ -1,9 +1,10 @@
 """Names in the PDO DBC."""
 
 import re
+from collections.abc import Sequence
 
-from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit
-from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
+from kontronik_can_gw.esc.decoder import ErrorBit
 
 _MAX_NAME = 32
 
@@ -35,10 +36,11 @@ def pascal_case(text: str) -> str:
     return "".join(word[:1].upper() + word[1:] for word in words)
 
 
-def emergency_names() -> dict[int, str]:
+def emergency_names(bits: Sequence[ErrorBit]) -> dict[int, str]:
     """Every emergency code a node can send, with its name; 0 is NoError."""
-    named = {int(bit): pascal_case(bit.name) for bit in OperatingError}
-    found = {0: "NoError"} | {code_of_bit(bit): named.get(bit, f"Bit{bit}") for bit in range(32)}
+    named = {int(bit): pascal_case(bit.name) for bit in bits}
+    codes = BitCodes(bits)
+    found = {0: "NoError"} | {codes.code(bit): named.get(bit, f"Bit{bit}") for bit in range(32)}
     found |= {error.value[0]: pascal_case(error.name) for error in GatewayError}
     found[GatewayError.TELEMETRY_LOST.value[0]] = (
         "TelemetryFault"  # several findings share this code

@@ -11,12 +11,10 @@ from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.emergency_codes import (
     FROM_GATEWAY,
     OF_COMMUNICATION,
+    BitCodes,
     Condition,
     GatewayError,
-    code_of_bit,
     register_of,
-    registered_bits,
-    reported_bits,
 )
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.esc.telemetry import MS
@@ -37,8 +35,10 @@ class Emergencies:
         send: Callable[[int, bytes], None],
         taken: Callable[[int, object], bool],
         rerouted: Callable[[int], bool],
+        bits: BitCodes,
     ) -> None:
         self._dictionary = dictionary
+        self._bits = bits
         self._send = send
         self._taken = taken
         self._node_id = UNCONFIGURED
@@ -100,13 +100,13 @@ class Emergencies:
         if word == self._word and not force:
             return
         self._word = word
-        bits = reported_bits(word, self.mask)
+        bits, code = self._bits.reported(word, self.mask), self._bits.code
         self._word_register = 0
-        registered = registered_bits(word, self.mask)
+        registered = self._bits.registered(word, self.mask)
         for bit in range(32):
             if registered >> bit & 1:
-                self._word_register |= register_of(code_of_bit(bit))
-        wanted = {Condition(code_of_bit(bit), bit, 0): None for bit in range(32) if bits >> bit & 1}
+                self._word_register |= register_of(code(bit))
+        wanted = {Condition(code(bit), bit, 0): None for bit in range(32) if bits >> bit & 1}
         gone = [c for c in self._active if c.source != FROM_GATEWAY and c not in wanted]
         for condition in gone:
             del self._active[condition]

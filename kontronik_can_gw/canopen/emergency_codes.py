@@ -6,10 +6,11 @@
     error code   1001h   ESC bit number, FFh: gateway   ESC's error word; gateway: byte 4 says which, see GatewayError
 """
 
+from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple, Self
 
-from kontronik_can_gw.esc.kontronik.states import OperatingError, Severity
+from kontronik_can_gw.esc.decoder import ErrorBit, Severity
 
 GENERIC, CURRENT, VOLTAGE, TEMPERATURE, COMMUNICATION, MANUFACTURER = (
     0x01,
@@ -27,29 +28,6 @@ _REGISTER_OF_CLASS = {
     0xF: MANUFACTURER,
 }
 FROM_GATEWAY = 0xFF
-
-_CODES = {
-    OperatingError.UNDERVOLTAGE: 0x3220,
-    OperatingError.OVERVOLTAGE: 0x3210,
-    OperatingError.OVERCURRENT_INTEGRAL_ERROR: 0x2350,
-    OperatingError.OVERCURRENT_INTEGRAL_WARNING: 0x2351,
-    OperatingError.POWER_STAGE_OVERTEMP_ERROR: 0x4210,
-    OperatingError.BEC_UNDERVOLTAGE: 0x5114,
-    OperatingError.BEC_OVERVOLTAGE: 0x5115,
-    OperatingError.BEC_OVERCURRENT: 0x2220,
-    OperatingError.BEC_OVERTEMPERATURE: 0x4410,
-    OperatingError.OPERATING_ERROR_FOUND: 0x1000,
-    OperatingError.SELFTEST_ERROR: 0x5000,
-    OperatingError.EEPROM_ERROR: 0x5530,
-    OperatingError.WATCHDOG_ERROR_TRIPPED: 0x6010,
-}
-_ERROR_BITS = sum(1 << bit for bit in OperatingError if bit.severity is Severity.ERROR)
-_WARNING_BITS = sum(1 << bit for bit in OperatingError if bit.severity is Severity.WARNING)
-_SUMMARIES = (
-    (1 << OperatingError.OPERATING_ERROR_FOUND, _ERROR_BITS),
-    (1 << OperatingError.OPERATING_WARNING_FOUND, _WARNING_BITS),
-)
-_SUMMARY_BITS = sum(bit for bit, _ in _SUMMARIES)
 
 
 class GatewayError(Enum):
@@ -107,25 +85,36 @@ class Condition(NamedTuple):
     """Byte 4 of a gateway error; 0 for an ESC's bit, whose word is sent."""
 
 
-def code_of_bit(bit: int) -> int:
-    """The emergency code of an ESC's error bit: a standard one where there is one, else FF00h + bit."""
-    return _CODES.get(bit, 0xFF00 + bit)  # type: ignore[call-overload, no-any-return]
-
-
-def reported_bits(word: int, mask: int) -> int:
-    """The bits of an ESC's error word that get an emergency: those in the mask, a summary bit only where it is not explained by another."""
-    bits = word & mask
-    for summary, explained_by in _SUMMARIES:
-        if word & explained_by & ~_SUMMARY_BITS:
-            bits &= ~summary
-    return bits
-
-
 def register_of(code: int) -> int:
     """The bits of 1001h that an error code sets: the generic one and that of its class."""
     return GENERIC | _REGISTER_OF_CLASS.get(code >> 12, 0)
 
 
-def registered_bits(word: int, mask: int) -> int:
-    """The bits of an ESC's error word that set bits of 1001h: all errors, and the warnings in the mask."""
-    return word & (_ERROR_BITS & ~_SUMMARY_BITS) | reported_bits(word, mask)
+class BitCodes:
+    """The emergencies of an ESC's error word, whose bits the ESC's protocol lists."""
+
+    def __init__(self, bits: Sequence[ErrorBit]) -> None:
+        self._codes = {int(bit): bit.code for bit in bits if bit.code is not None}
+        self._summaries = [
+            (1 << bit, sum(1 << other for other in bits if other.severity is bit.severity))
+            for bit in bits
+            if bit.is_summary
+        ]
+        self._summary_bits = sum(bit for bit, _ in self._summaries)
+        self._error_bits = sum(1 << bit for bit in bits if bit.severity is Severity.ERROR)
+
+    def code(self, bit: int) -> int:
+        """The emergency code of a bit: a standard one where there is one, else FF00h + bit."""
+        return self._codes.get(bit, 0xFF00 + bit)
+
+    def reported(self, word: int, mask: int) -> int:
+        """The bits that get an emergency: those in the mask, a summary bit only where it is not explained by another."""
+        bits = word & mask
+        for summary, explained_by in self._summaries:
+            if word & explained_by & ~self._summary_bits:
+                bits &= ~summary
+        return bits
+
+    def registered(self, word: int, mask: int) -> int:
+        """The bits that set bits of 1001h: all errors, and the warnings in the mask."""
+        return word & self._error_bits & ~self._summary_bits | self.reported(word, mask)

@@ -8,7 +8,6 @@ from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
-from kontronik_can_gw.esc.kontronik.states import Device, device_text
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
@@ -24,13 +23,14 @@ class EscObjects:
         esc: EscTelemetry,
         gateway: GatewayStatus,
         emergencies: Emergencies,
-        expected: Device | None,
+        expected: int | None,
         changed: Callable[[EscSettings], None],
         lost: Callable[[int], None],
     ) -> None:
         self._dictionary = dictionary
         self._esc = esc
         self._base = esc.settings
+        self._errors = esc.protocol.by_name.get("operating_errors")
         self._gateway = gateway
         self._emergencies = emergencies
         self._expected = expected
@@ -47,8 +47,8 @@ class EscObjects:
     def apply_settings(self, now: int) -> None:
         """Take over 2100h."""
         self._emergencies.mask = self._dictionary.number(at.SETTINGS, 6)
-        if self._esc.live is not None:
-            self._emergencies.set_word(self._esc.live.operating_errors, now, force=True)
+        if self._esc.live is not None and self._errors is not None:
+            self._emergencies.set_word(self._errors.of(self._esc.live), now, force=True)
         settings = esc_settings(self._dictionary, self._base)
         if settings != self._esc.settings:
             self._changed(settings)
@@ -56,8 +56,8 @@ class EscObjects:
     def on_event(self, events: int, now: int) -> None:
         """Something of the ESC changed: bits of telemetry.Event."""
         live = self._esc.live
-        if events & Event.LIVE and live is not None:
-            self._emergencies.set_word(live.operating_errors, now)
+        if events & Event.LIVE and live is not None and self._errors is not None:
+            self._emergencies.set_word(self._errors.of(live), now)
         if events & (Event.LINK | Event.INFO) or self._live is (live is None):
             self._follow_link(events, now)
 
@@ -71,7 +71,8 @@ class EscObjects:
             found.set(GatewayError.CRC_RATE, link is LinkState.DEGRADED, now)
             found.set(GatewayError.PORT_GONE, link is LinkState.PORT_ERROR, now)
         if events & Event.INFO and esc.info is not None and self._expected is not None:
-            found.set(GatewayError.OTHER_DEVICE, esc.info.device != self._expected, now)
+            device = esc.protocol.value("device_raw", esc.info)
+            found.set(GatewayError.OTHER_DEVICE, device != self._expected, now)
         if self._live and esc.live is None and link in (LinkState.LOST, LinkState.PORT_ERROR):
             self._lost(now)
         self._live = esc.live is not None
@@ -91,16 +92,17 @@ class EscObjects:
         )
 
     def _device_name(self, _now: int) -> bytes:
-        info = self._esc.last_info
-        if info is None:
+        protocol, info = self._esc.protocol, self._esc.last_info
+        device = protocol.value("device_raw", info)
+        if device is None:
             raise SdoAbort(Abort.NO_DATA)
-        return (device_text(info.device) or f"device {info.device}").encode("ascii")
+        return (protocol.device_name(info) or f"device {device}").encode("ascii")
 
     def _firmware(self, _now: int) -> bytes:
-        info = self._esc.last_info
-        if info is None:
+        text = self._esc.protocol.firmware_text(self._esc.last_info)
+        if text is None:
             raise SdoAbort(Abort.NO_DATA)
-        return info.firmware.encode("ascii")
+        return text.encode("ascii")
 
     def _settings_written(self, now: int) -> bool:
         self.apply_settings(now)

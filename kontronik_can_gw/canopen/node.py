@@ -13,7 +13,7 @@ from kontronik_can_gw.canopen.cob_ids import HEARTBEAT, LSS_ANSWER, SDO_ANSWER
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency import Emergencies
-from kontronik_can_gw.canopen.emergency_codes import GatewayError
+from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.esc_objects import EscObjects
 from kontronik_can_gw.canopen.heartbeat import Consumer, Producer
 from kontronik_can_gw.canopen.identity import Identity
@@ -53,7 +53,8 @@ class Node:
         self._owner = owner
         taken = owner.cob_id_taken
         self.nmt = Nmt(dictionary, settings.self_start, self._entered)
-        self.emergencies = Emergencies(dictionary, self._send, taken, self._rerouted)
+        codes = BitCodes(esc.protocol.errors.get("operating_errors", ()))
+        self.emergencies = Emergencies(dictionary, self._send, taken, self._rerouted, codes)
         self._producer = Producer(dictionary)
         self.consumer = Consumer(dictionary, self._watch_changed, self._rerouted)
         self.sync = SyncConsumer(dictionary, taken, self._rerouted)

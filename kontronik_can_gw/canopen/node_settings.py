@@ -7,7 +7,6 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.storage import APPLICATION, Stored
-from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 
 _SELF_START_OFF = 4
@@ -19,7 +18,7 @@ class NodeSettings:
     """What the configuration says of a node.
 
     ``node_id``: 1..127, or 255 for a node that waits for LSS. ``vendor_id`` None: as the EDS says. ``segment_ns``: distance of the
-    segments of a block upload. ``device``: the device that is expected on the line, None for any.
+    segments of a block upload. ``device``: number of the device that is expected on the line, None for any.
     """
 
     node_id: int
@@ -30,7 +29,7 @@ class NodeSettings:
     bitrate: int = 500_000
     segment_ns: int = 0
     version: str = ""
-    device: Device | None = None
+    device: int | None = None
 
 
 def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:

@@ -6,9 +6,21 @@ The objects' types, names, limits and PDO defaults are in the EDS; the values, u
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cache
 
+from kontronik_can_gw.esc.decoder import EscProtocol
+from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import MS, EscTelemetry
-from kontronik_can_gw.esc.values import VALUES, Group, Kind, Value, scaled, steps, steps_of
+from kontronik_can_gw.esc.values import (
+    VALUES,
+    Group,
+    Kind,
+    Value,
+    scaled,
+    steps,
+    steps_of,
+    values_of,
+)
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
 U8, U16 = 0xFF, 0xFFFF
@@ -17,49 +29,60 @@ UNITS = 0x2002
 SETTINGS, NODE_ID, RESET_STATISTICS = 0x2100, 0x2101, 0x2102
 ERROR_CODE, VELOCITY, DC_LINK_VOLTAGE = 0x603F, 0x606C, 0x6079
 
-# Values in the order of their sub-indices, 1 first.
-_LIVE_VALUES = (
-    "electrical_speed",
-    "battery_voltage",
-    "battery_current",
-    "motor_current",
-    "peak_current",
-    "consumed_charge",
-    "bec_current",
-    "bec_voltage",
-    "pwm_input",
-    "throttle",
-    "output_opening",
-    "power_stage_temperature",
-    "bec_temperature",
-    "operating_errors",
-    "operating_state_raw",
-    "timing",
-)
-_EXTREMES = (
-    "max_electrical_speed",
-    "min_battery_voltage",
-    "max_battery_voltage",
-    "max_battery_current",
-    "max_motor_current",
-    "max_peak_current",
-    "max_bec_current",
-    "min_bec_voltage",
-    "max_throttle",
-    "max_output_opening",
-    "min_power_stage_temperature",
-    "max_power_stage_temperature",
-    "min_bec_temperature",
-    "max_bec_temperature",
-)
-_DERIVED_VALUES = (
-    ("motor_speed", 1),
-    ("output_speed", 1),
-    ("battery_power", 10),
-    ("energy_used", 10),
-    ("mean_cell_voltage", 1000),
-    ("motor_run_time", 1),
-)
+# Sub-index to the name of a value, and steps of the object to one of the value's units.
+_LIVE_VALUES = {
+    1: ("electrical_speed", 1),
+    2: ("battery_voltage", 100),
+    3: ("battery_current", 10),
+    4: ("motor_current", 10),
+    5: ("peak_current", 10),
+    6: ("consumed_charge", 1),
+    7: ("bec_current", 1000),
+    8: ("bec_voltage", 1000),
+    9: ("pwm_input", 1),
+    10: ("throttle", 1),
+    11: ("output_opening", 1),
+    12: ("power_stage_temperature", 1),
+    13: ("bec_temperature", 1),
+    14: ("operating_errors", 1),
+    15: ("operating_state_raw", 1),
+    16: ("timing", 1),
+}
+_DERIVED_VALUES = {
+    1: ("motor_speed", 1),
+    2: ("output_speed", 1),
+    3: ("battery_power", 10),
+    4: ("energy_used", 10),
+    5: ("mean_cell_voltage", 1000),
+    6: ("motor_run_time", 1),
+}
+_EXTREMES = {
+    1: ("max_electrical_speed", 1),
+    2: ("min_battery_voltage", 100),
+    3: ("max_battery_voltage", 100),
+    4: ("max_battery_current", 10),
+    5: ("max_motor_current", 10),
+    6: ("max_peak_current", 10),
+    7: ("max_bec_current", 1000),
+    8: ("min_bec_voltage", 1000),
+    9: ("max_throttle", 1),
+    10: ("max_output_opening", 1),
+    11: ("min_power_stage_temperature", 1),
+    12: ("max_power_stage_temperature", 1),
+    13: ("min_bec_temperature", 1),
+    14: ("max_bec_temperature", 1),
+}
+_GATEWAY_VALUES = {
+    1: ("uptime", 1),
+    2: ("can_state", 1),
+    3: ("sent_frames", 1),
+    4: ("received_frames", 1),
+    5: ("send_failures", 1),
+    6: ("bus_off_count", 1),
+    7: ("replaced_frames", 1),
+    8: ("esc_count", 1),
+    9: ("escs_ok", 1),
+}
 _STATUS = frozenset({"operating_errors", "operating_state_raw", "link_status"})
 """A change of these is news by itself; a PDO that carries one is sent on that change."""
 
@@ -128,62 +151,58 @@ def _kept(value: Value) -> Value:
     return replace(value, group=Group.LINK, last=True, optional=True, pace=Group.INFO)
 
 
-_FIRMWARE = Value(
-    *("firmware", "", Group.INFO, Kind.WIRE, VALUES["firmware_main"].words), low=0, high=U16
-)
-_LINK_VALUES = (
-    Value("link_status", "", Group.LINK, Kind.STATE, read=_link_status, low=0, high=U8),
-    _of_link("live_counter", lambda esc: esc.counters.live, Group.LIVE),
-    _age("data_age", lambda esc: esc.live_ns),
-    _age("info_age", lambda esc: esc.last_info_ns),
-    _of_link("live_frames", lambda esc: esc.counters.live - esc.base.live),
-    _of_link("info_frames", lambda esc: esc.counters.info - esc.base.info),
-    _of_link("crc_errors", lambda esc: esc.counters.crc_errors - esc.base.crc_errors),
-    _of_link("line_errors", lambda esc: esc.line_errors - esc.base_line_errors),
-    _of_link("dropped_bytes", lambda esc: esc.counters.dropped_bytes - esc.base.dropped_bytes),
-    _of_link("losses", lambda esc: esc.losses - esc.base_losses),
-    VALUES["frame_rate"],
-)
-_GATEWAY_VALUES = (
-    ("uptime", 1),
-    ("can_state", 1),
-    ("sent_frames", 1),
-    ("received_frames", 1),
-    ("send_failures", 1),
-    ("bus_off_count", 1),
-    ("replaced_frames", 1),
-    ("esc_count", 1),
-    ("escs_ok", 1),
-)
+def _firmware(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | None:
+    value, info = esc.protocol.value, esc.last_info
+    main, sub = value("firmware_main", info), value("firmware_sub", info)
+    return None if main is None or sub is None else main << 8 | sub
 
 
-def _bindings() -> Iterator[tuple[int, int, Value, int]]:
-    """Index, sub-index, value and steps of the object to one unit."""
-    for sub, name in enumerate(_LIVE_VALUES, 1):
-        yield LIVE, sub, VALUES[name], VALUES[name].per_unit
-    for sub, (name, per_unit) in enumerate(_DERIVED_VALUES, 1):
-        rolls = name in ("energy_used", "motor_run_time")
-        yield DERIVED, sub, replace(VALUES[name], rolls=rolls), per_unit
-    info = (
-        VALUES["device_raw"],
-        VALUES["variant"],
-        _FIRMWARE,
-        VALUES["selftest_errors"],
-        VALUES["cell_count"],
-    )
-    for sub, value in enumerate(info, 1):
-        yield INFO, sub, _kept(value), 1
-    for sub, name in enumerate(_EXTREMES, 1):
-        yield EXTREMES, sub, _kept(VALUES[name]), VALUES[name].per_unit
-    for sub, value in enumerate(_LINK_VALUES, 1):
-        yield LINK, sub, value, value.per_unit
-    for sub, (name, per_unit) in enumerate(_GATEWAY_VALUES, 1):
-        yield GATEWAY, sub, VALUES[name], per_unit
-    yield VELOCITY, 0, VALUES["motor_speed"], 1
-    yield DC_LINK_VOLTAGE, 0, VALUES["battery_voltage"], 1000
-
-
-BINDINGS: Mapping[tuple[int, int], Bound] = {
-    (index, sub): Bound(value, Fraction(per_unit)) for index, sub, value, per_unit in _bindings()
+_FIRMWARE = Value("firmware", "", Group.INFO, Kind.BITS, read=_firmware, low=0, high=U16)
+_LINK_VALUES = {
+    1: Value("link_status", "", Group.LINK, Kind.STATE, read=_link_status, low=0, high=U8),
+    2: _of_link("live_counter", lambda esc: esc.counters.live, Group.LIVE),
+    3: _age("data_age", lambda esc: esc.live_ns),
+    4: _age("info_age", lambda esc: esc.last_info_ns),
+    5: _of_link("live_frames", lambda esc: esc.counters.live - esc.base.live),
+    6: _of_link("info_frames", lambda esc: esc.counters.info - esc.base.info),
+    7: _of_link("crc_errors", lambda esc: esc.counters.crc_errors - esc.base.crc_errors),
+    8: _of_link("line_errors", lambda esc: esc.line_errors - esc.base_line_errors),
+    9: _of_link("dropped_bytes", lambda esc: esc.counters.dropped_bytes - esc.base.dropped_bytes),
+    10: _of_link("losses", lambda esc: esc.losses - esc.base_losses),
+    11: VALUES["frame_rate"],
 }
-"""(Index, sub-index) to what the object shows."""
+
+
+def _bindings(values: Mapping[str, Value]) -> Iterator[tuple[int, int, Value, int]]:
+    """Index, sub-index, value and steps of the object to one unit."""
+    for sub, (name, per_unit) in _LIVE_VALUES.items():
+        yield LIVE, sub, values[name], per_unit
+    for sub, (name, per_unit) in _DERIVED_VALUES.items():
+        rolls = name in ("energy_used", "motor_run_time")
+        yield DERIVED, sub, replace(values[name], rolls=rolls), per_unit
+    yield INFO, 1, _kept(values["device_raw"]), 1
+    yield INFO, 2, _kept(values["variant"]), 1
+    yield INFO, 3, _kept(_FIRMWARE), 1
+    yield INFO, 4, _kept(values["selftest_errors"]), 1
+    yield INFO, 5, _kept(values["cell_count"]), 1
+    for sub, (name, per_unit) in _EXTREMES.items():
+        yield EXTREMES, sub, _kept(values[name]), per_unit
+    for sub, value in _LINK_VALUES.items():
+        yield LINK, sub, value, value.per_unit
+    for sub, (name, per_unit) in _GATEWAY_VALUES.items():
+        yield GATEWAY, sub, values[name], per_unit
+    yield VELOCITY, 0, values["motor_speed"], 1
+    yield DC_LINK_VOLTAGE, 0, values["battery_voltage"], 1000
+
+
+@cache
+def bindings_of(protocol: EscProtocol) -> Mapping[tuple[int, int], Bound]:
+    """(Index, sub-index) to what the object shows of an ESC of this protocol."""
+    return {
+        (index, sub): Bound(value, Fraction(per_unit))
+        for index, sub, value, per_unit in _bindings(values_of(protocol))
+    }
+
+
+BINDINGS = bindings_of(PROTOCOLS[0])
+"""Those of an ESC whose configuration names no protocol; the objects are the same for all."""

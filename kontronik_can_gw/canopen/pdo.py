@@ -31,7 +31,7 @@ class Tpdo(TpdoParameters):
         send: Callable[[CanFrame], None],
         taken: Callable[[int, object], bool],
     ) -> None:
-        super().__init__(number, dictionary, taken)
+        super().__init__(number, dictionary, taken, esc.protocol)
         self.due = NEVER
         self.sent = 0
         """Frames so far."""
@@ -78,7 +78,7 @@ class Tpdo(TpdoParameters):
         self.read()
         self._by_event = self.type in EVENT_TYPES
         self._held_until = self._last_ns + self.inhibit_ns
-        self._compiled = compile_pdo(self.mapped) if self.mapped else None
+        self._compiled = compile_pdo(self.mapped, self._esc.protocol) if self.mapped else None
         self.triggers = 0 if self._compiled is None else self._compiled.triggers
         if self._started and self._running:
             if was_running:

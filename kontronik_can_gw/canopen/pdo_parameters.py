@@ -6,7 +6,8 @@ from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.bound_values import Mapped, bits_of
 from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, restricted
 from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.canopen.objects import bindings_of
+from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.telemetry import MS
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
@@ -25,6 +26,7 @@ class TpdoParameters:
         number: int,
         dictionary: Dictionary,
         taken: Callable[[int, object], bool],
+        protocol: EscProtocol,
     ) -> None:
         self.number = number
         self.cob_id = 0
@@ -37,6 +39,7 @@ class TpdoParameters:
         """What is in the PDO; empty where nothing is."""
         self._dictionary = dictionary
         self._taken = taken
+        self._bindings = bindings_of(protocol)
 
     def bind(self, written: Callable[[int], bool]) -> None:
         """Check what is written to the objects of this PDO; ``written`` follows."""
@@ -84,7 +87,7 @@ class TpdoParameters:
         mappable = variable.entry.mappable and variable.readable
         if not mappable or not bits_of(variable) or bits_of(variable) != bits:
             raise SdoAbort(Abort.NOT_MAPPABLE)
-        return Mapped(variable, BINDINGS.get((index, sub)))
+        return Mapped(variable, self._bindings.get((index, sub)))
 
     def _check_cob_id(self, value: int) -> None:
         """A new 180xh:1.

@@ -161,7 +161,7 @@ class Replay:
     def _take_up(self, state: Mapping[str, Any]) -> None:
         """Adopt the counters from before the recording began."""
         for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
-            esc.energy_mw_ns, esc.run_time, esc.losses = (
+            esc.drawn.energy_mw_ns, esc.drawn.run_time, esc.losses = (
                 found[name] for name in ("energy", "run_time", "losses")
             )
         if "started_ns" in state:

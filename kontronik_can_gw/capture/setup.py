@@ -28,7 +28,7 @@ from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
@@ -70,10 +70,7 @@ class CaptureSetup:
             setup = self.canopen
             canopen = {
                 "eds": {"file": setup.eds.name, "text": setup.eds.data.decode("latin-1")},
-                "nodes": [
-                    asdict(node) | {"device": node.device and int(node.device)}
-                    for node in setup.settings
-                ],
+                "nodes": [asdict(node) for node in setup.settings],
                 "stored": [encode(stored).decode("ascii") for stored in setup.stored],
                 "escs": [_esc_json(esc) for esc in setup.escs],
             }
@@ -180,6 +177,9 @@ def _esc(found: Mapping[str, Any]) -> EscSettings:
         _number(found["cell_count"], 0, 255),
         _number(found["timeout_ns"], MS, 65_536 * MS),
         _number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
+        protocol_named(
+            found.get("protocol", PROTOCOLS[0].name)
+        ).name,  # not in captures of 0.6.0 and before
     )
 
 
@@ -243,7 +243,7 @@ def _node(found: Mapping[str, Any]) -> NodeSettings:
         _number(found["bitrate"], 1, 100_000_000),
         _number(found["segment_ns"], 0, _LATEST),
         _text(found["version"], 100),
-        None if device is None else Device(device),
+        None if device is None else _number(device, 0, 0xFFFF),
     )
 
 

@@ -21,7 +21,7 @@ from kontronik_can_gw.dbc import send_types
 from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.kontronik.states import Device
+from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.signals import units
@@ -247,7 +247,15 @@ class EscConfig:
         "the device that belongs here; another one is reported (CANopen EMCY 7510h)",
         "string",
         None,
-        choices=tuple(device.text for device in Device),
+        choices=lambda: tuple(
+            dict.fromkeys(text for protocol in PROTOCOLS for text in protocol.devices.values())
+        ),
+    )
+    protocol: str = _key(
+        "what the ESC's telemetry line speaks",
+        "string",
+        PROTOCOLS[0].name,
+        choices=lambda: tuple(protocol.name for protocol in PROTOCOLS),
     )
 
     @property
@@ -258,7 +266,14 @@ class EscConfig:
             self.gear,
             self.cell_count,
             timeout_ns=self.telemetry_timeout_ms * MS,
+            protocol=self.protocol,
         )
+
+    @property
+    def device_number(self) -> int | None:
+        """Number of the device that belongs here; None for any."""
+        devices = protocol_named(self.protocol).devices
+        return next((number for number, text in devices.items() if text == self.device), None)
 
 
 @dataclass(frozen=True)
@@ -677,9 +692,9 @@ def _value(value: Any, f: Field[Any]) -> Any:
             return dict(value)
     if not isinstance(value, str) or not value.strip() or "\0" in value:
         raise ValueError(f"{value!r} is not a text")
-    choices = limits.get("choices")
-    if choices and value not in choices:
-        raise ValueError(f"{value!r} is none of {', '.join(choices)}.{_nearest(value, choices)}")
+    listed = choices(limits)
+    if listed and value not in listed:
+        raise ValueError(f"{value!r} is none of {', '.join(listed)}.{_nearest(value, listed)}")
     if limits["kind"] == "loopback" and not re.fullmatch(_LOOPBACK, value):
         raise ValueError(
             f"{value!r} is no port on this machine, as 127.0.0.1:9123 or [::1]:9123. The statistics are not for the network."
@@ -694,6 +709,12 @@ def _value(value: Any, f: Field[Any]) -> Any:
             f"{value!r} is not a name of 1 to 12 letters, digits and underscores that begins with a letter"
         )
     return value
+
+
+def choices(limits: Mapping[str, Any]) -> tuple[str, ...]:
+    """The values that a key can have; empty for any."""
+    found = limits.get("choices", ())
+    return tuple(found() if callable(found) else found)
 
 
 def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -935,7 +956,7 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
             if kind == "string":
                 entry["pattern"] = _TEXT
     if "choices" in limits:
-        entry["enum"] = list(limits["choices"])
+        entry["enum"] = list(choices(limits))
     if "pattern" in limits:
         entry["pattern"] = f"^{limits['pattern']}$"
     if f.default not in (MISSING, None, "", ()):

@@ -21,7 +21,6 @@ from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.config.keys import Config, shipped
 from kontronik_can_gw.dbc.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
 from kontronik_can_gw.runtime.store import ParameterStore, parameter_file
@@ -82,7 +81,7 @@ def plain_setup(config: Config) -> CanopenSetup:
                 config.can.bitrate,
                 segment_ns=segment_ns,
                 version=__version__,
-                device=next((device for device in Device if device.text == esc.device), None),
+                device=esc.device_number,
             )
         )
     return CanopenSetup(

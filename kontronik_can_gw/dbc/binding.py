@@ -5,13 +5,14 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import VALUES, Group, Value
+from kontronik_can_gw.esc.values import VALUES, Group, Value, values_of, values_of_esc
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
-_BY_KEY = {normalize(name): value for name, value in VALUES.items()}
+_NAMES = {normalize(name): name for name in VALUES}
 
 
 class Binder:
@@ -20,6 +21,7 @@ class Binder:
     def __init__(self, escs: Sequence[EscSettings], bind: Mapping[str, str | float]) -> None:
         self.escs = escs
         self.bind = bind
+        self._values = [values_of_esc(esc) for esc in escs] or [values_of(PROTOCOLS[0])]
         self.used: set[str] = set()
         self._prefixes = sorted(
             ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
@@ -27,9 +29,10 @@ class Binder:
 
     def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Value, int | None] | None:
         """The source of a normalized name without a final ``percent``; ``esc`` None: the name has no prefix."""
-        source = _BY_KEY.get(key) or _BY_KEY.get(key.removesuffix("percent"))
-        if source is None:
+        name = _NAMES.get(key) or _NAMES.get(key.removesuffix("percent"))
+        if name is None:
             return None
+        source = self._values[esc or 0][name]
         return (source, None) if source.group is Group.GATEWAY else (source, esc)
 
     def by_name(self, name: str) -> tuple[Value, int | None] | None:
@@ -55,8 +58,8 @@ class Binder:
         key = normalize(name)
         for prefix, _ in self._prefixes:
             key = key.removeprefix(prefix) or key
-        near = difflib.get_close_matches(key, _BY_KEY, n=3, cutoff=0.5)
-        names = [_BY_KEY[n].name for n in near]
+        near = difflib.get_close_matches(key, _NAMES, n=3, cutoff=0.5)
+        names = [_NAMES[n] for n in near]
         return f" Did you mean {' or '.join(names)}?" if names else ""
 
 

@@ -16,19 +16,14 @@ from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
 
-from kontronik_can_gw.esc.kontronik.codec import Layout
-from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
-from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
+from kontronik_can_gw.esc.decoder import Counters, Data, Decoder, Reading
+from kontronik_can_gw.esc.drawn import Drawn
+from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 
 MS = 1_000_000
 SECOND = 1000 * MS
-NS_PER_BYTE = 11 * SECOND // 115_200
 INFO_TIMEOUT_NS = 10 * SECOND
 """Info frames come about every second (every five where the ESC sends at 20 Hz); without any for so long, info is not available."""
-MWS_PER_WH = 3_600_000
-"""Energy is kept in milliwatt seconds: one step of voltage (10 mV) by one of current (0.1 A) is exactly 1 mW."""
-_V4 = Layout.V4
-_LEGACY = 2
 _DEGRADED_DROPPED_SHARE = 10  # one byte dropped in ten received
 
 
@@ -73,57 +68,57 @@ class EscSettings:
     cell_count: int = 0
     timeout_ns: int = 250 * MS
     crc_error_threshold: int = 5
+    protocol: str = PROTOCOLS[0].name
+    """Name of the ESC's protocol."""
 
 
 class EscTelemetry:
     """One ESC's stream and what is known from it.
 
-    Attributes read by the packers: ``live``, ``info`` (None where not available), ``link``, ``layout`` (0 unknown, 1 V4,
-    2 legacy), ``cells`` (0 unknown), ``pole_pairs``, ``output_divisor`` / ``gear_denominator`` (pole pairs x gear),
-    ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``,
-    ``energy`` (drawn from the battery, milliwatt seconds), ``run_time`` (ns with the motor turning), ``live_ns`` and
+    Attributes read by the packers: ``live``, ``info`` (data of a reading, None where not available), ``link``, ``layout`` (0 unknown,
+    else as the protocol lists them), ``cells`` (0 unknown), ``pole_pairs``, ``output_divisor`` / ``gear_denominator`` (pole pairs x
+    gear), ``frame_rate`` (live frames of the last full second in 0.1 Hz, None before it), ``losses``, ``drawn``, ``live_ns`` and
     ``last_info_ns`` (time of the newest live and info frame's last byte, as ages are shown, None before the first). ``live_bound_ns`` and
     ``info_bound_ns`` are the earliest that byte can have come, for time-outs. ``last_live`` and ``last_info`` are the newest ever, fresh or
     not, of the layout now on the line; ``line_errors`` (parity, framing, overrun) is written by who owns the port.
     """
 
     def __init__(self, settings: EscSettings, now: int) -> None:
-        self.live: LiveData | None = None
-        self.info: InfoData | None = None
-        self.last_live: LiveData | None = None
-        self.last_info: InfoData | None = None
+        self.protocol = protocol_named(settings.protocol)
+        self.decoder: Decoder = self.protocol.make()
+        self.live: Data | None = None
+        self.info: Data | None = None
+        self.last_live: Data | None = None
+        self.last_info: Data | None = None
         self.link = LinkState.NEVER_SEEN
         self.layout = 0
         self.apply(settings)
         self.frame_rate: int | None = 0
         self.losses = 0
-        self.energy = 0
-        self._energy_rest = 0  # milliwatt nanoseconds, less than a milliwatt second
-        self.run_time = 0
+        self.drawn = Drawn(self.protocol)
         self.live_ns: int | None = None
         self.live_bound_ns = 0
         self.info_bound_ns: int | None = None
         self.last_info_ns: int | None = None
         self.line_errors = 0
-        self.base = Counters()
+        self.base: Counters = self.counters.copy()
         self.base_losses = 0
         self.base_line_errors = 0
         self.suspect_frames = 0
         self.late_frames = 0
-        self._deframer = Deframer()
         self._arrivals: deque[tuple[int, int]] = (
             deque()
         )  # (stream position after a chunk, the bound of its last byte) while bytes are pending
-        self._last_power = 0
         self._interval_ns = 0  # between live frames, as usual; 0: not known
         self._window_ns = now
-        self._window_counters = Counters()
-        self._diagnosis_counters = Counters()  # at the start of the window before
+        self._window_counters = self.base
+        self._diagnosis_counters = self.base  # at the start of the window before
 
     @property
     def counters(self) -> Counters:
         """Counters of the whole stream so far."""
-        return self._deframer.counters
+        found: Counters = self.decoder.counters
+        return found
 
     @property
     def up(self) -> bool:
@@ -132,25 +127,15 @@ class EscTelemetry:
 
     def supplies(self, not_on: frozenset[int], raw: int) -> bool:
         """False for a value that the device (the last known one) does not have, and at 0 as long as the device is not known."""
-        if self.info is not None:
-            return self.info.device not in not_on
-        return raw != 0 and (self.last_info is None or self.last_info.device not in not_on)
+        device = self.protocol.value("device_raw", self.last_info)
+        return (self.info is not None or raw != 0) and (device is None or device not in not_on)
 
     @property
     def last_cells(self) -> int:
         """Number of cells, 0: unknown. While telemetry is lost that of the last value."""
         if self.cells or self.live is not None or self.last_info is None:
             return self.cells
-        return self.last_info.cell_count
-
-    @property
-    def energy_mw_ns(self) -> int:
-        """Energy drawn from the battery in milliwatt nanoseconds, as a capture holds it."""
-        return self.energy * SECOND + self._energy_rest
-
-    @energy_mw_ns.setter
-    def energy_mw_ns(self, energy: int) -> None:
-        self.energy, self._energy_rest = divmod(energy, SECOND)
+        return self.protocol.value("cell_count", self.last_info) or 0
 
     def age_ms(self, now: int) -> int | None:
         """Age of the newest live frame, None before the first."""
@@ -162,7 +147,7 @@ class EscTelemetry:
         self.pole_pairs = settings.pole_pairs
         self.output_divisor = settings.pole_pairs * settings.gear.numerator
         self.gear_denominator = settings.gear.denominator
-        self.cells = settings.cell_count or (self.info.cell_count if self.info else 0)
+        self.cells = settings.cell_count or self.protocol.value("cell_count", self.info) or 0
 
     def reset_statistics(self) -> None:
         """Let the counters that are shown relative to ``base`` begin anew; the stream's own go on."""
@@ -176,32 +161,32 @@ class EscTelemetry:
         """
         if events := self._expire(now):
             yield events
-        deframer, arrivals = self._deframer, self._arrivals
+        decoder, arrivals = self.decoder, self._arrivals
+        byte_ns = self.protocol.byte_ns
         if arrivals and now - arrivals[0][1] > self.settings.timeout_ns:
-            self.late_frames += len(deframer.flush())
+            self.late_frames += len(decoder.flush())
             arrivals.clear()
-        bound = since + (len(data) - 1) * NS_PER_BYTE
+        bound = since + (len(data) - 1) * byte_ns
         if bound > now:  # a pseudo terminal is faster than the wire
             bound = now
-        frames = deframer.feed(data)
-        end = deframer.counters.bytes
-        if pending := deframer.pending:
+        readings = decoder.feed(data, now)
+        end = decoder.counters.bytes
+        if pending := decoder.pending:
             arrivals.append((end, bound))
             while arrivals[0][0] <= end - pending:
                 arrivals.popleft()
         elif arrivals:
             arrivals.clear()
         shown = now if now - bound <= self._interval_ns else bound
-        for frame in frames:
-            after = (end - frame.offset - frame.form.length) * NS_PER_BYTE
-            limit = (
-                INFO_TIMEOUT_NS if isinstance(frame.data, InfoData) else self.settings.timeout_ns
-            )
+        for reading in readings:
+            form = reading.form
+            after = (end - reading.offset - form.length) * byte_ns
+            limit = INFO_TIMEOUT_NS if form.is_info else self.settings.timeout_ns
             if now - bound + after > limit:
                 # the bytes after it in the same read make it old already
                 self.late_frames += 1
             else:
-                yield self._accept(frame, shown - after, bound - after)
+                yield self.accept(reading, shown - after, bound - after)
         if self.link is _NEVER_SEEN:
             yield self._set_link(LinkState.SEARCHING)
 
@@ -213,7 +198,7 @@ class EscTelemetry:
 
     def port_lost(self) -> int:
         """The port is gone: what was pending is dropped, nothing is fresh any more."""
-        self._deframer.flush()
+        self.decoder.flush()
         self._arrivals.clear()
         return self._lose(LinkState.PORT_ERROR)
 
@@ -237,24 +222,19 @@ class EscTelemetry:
         """Why no frame comes, in words, from the bytes of one to two seconds; None while frames come."""
         return None if self.up else self.counters.diagnosis(self._diagnosis_counters)
 
-    def _accept(self, frame: Frame, when: int, bound: int) -> int:
-        form, _, data = frame
-        layout = 1 if form.layout is _V4 else _LEGACY
+    def accept(self, reading: Reading, when: int, bound: int) -> int:
+        """Take a reading that came at ``when``, at ``bound`` at the earliest (see Arrival); its events."""
+        form, _, data = reading
         events = Event.NONE
-        if layout != self.layout:
-            self.layout = layout
+        if form.layout_number != self.layout:
+            self.layout = form.layout_number
             self._forget_device()
             self.last_live = self.last_info = None  # of another device
             self.last_info_ns = None
             events = Event.INFO | Event.LINK
-        if isinstance(data, InfoData):
-            if self.info is not None and data.device_and_variant != self.info.device_and_variant:
-                events |= Event.LINK
-            self.info = self.last_info = data
-            self.last_info_ns, self.info_bound_ns = when, bound
-            self.cells = self.settings.cell_count or data.cell_count
-            return events | Event.INFO
-        if layout == _LEGACY and frame.suspect:
+        if form.is_info:
+            return events | self._accept_info(data, when, bound)
+        if form.partly_protected and reading.suspect:
             self.suspect_frames += 1
         if (before := self.live_ns) is not None:
             if when < before:
@@ -262,15 +242,8 @@ class EscTelemetry:
             if bound < self.live_bound_ns:
                 bound = self.live_bound_ns
             if self.live is not None:
-                if self._last_power > 0:
-                    rest = self._energy_rest + self._last_power * (when - before)
-                    if rest >= SECOND:
-                        self.energy += rest // SECOND
-                        rest %= SECOND
-                    self._energy_rest = rest
-                if self.live.electrical_speed:
-                    self.run_time += when - before
-        self._last_power = data.battery_voltage * data.battery_current
+                self.drawn.add(when - before)
+        self.drawn.take(data)
         self.live = self.last_live = data
         self.live_ns, self.live_bound_ns = when, bound
         if self.link is not _OK and self.link is not _DEGRADED:
@@ -280,6 +253,16 @@ class EscTelemetry:
             self._window_ns = when
             self._window_counters = self._diagnosis_counters = self.counters.copy()
         return events | Event.LIVE
+
+    def _accept_info(self, data: Data, when: int, bound: int) -> int:
+        value, old = self.protocol.value, self.info
+        another = old is not None and any(
+            value(name, data) != value(name, old) for name in ("device_raw", "variant")
+        )
+        self.info = self.last_info = data
+        self.last_info_ns, self.info_bound_ns = when, bound
+        self.cells = self.settings.cell_count or value("cell_count", data) or 0
+        return Event.INFO | Event.LINK if another else Event.INFO
 
     def _forget_device(self) -> None:
         self.info = None

@@ -7,28 +7,18 @@ of them; the packers generate the same arithmetic from the numbers of a Value.
 
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
-from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, rows
-from kontronik_can_gw.esc.kontronik.states import (
-    Device,
-    ErrorBit,
-    OperatingError,
-    OperatingState,
-    SelfTestError,
-)
-from kontronik_can_gw.esc.telemetry import (
-    MS,
-    MWS_PER_WH,
-    SECOND,
-    EscSettings,
-    EscTelemetry,
-    LinkState,
-)
+from kontronik_can_gw.esc.decoder import EscProtocol, Field
+from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry, LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
+
+MWS_PER_WH = 3_600_000
 
 
 class Group(Enum):
@@ -119,7 +109,7 @@ def steps(value: Value, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> 
 
 def steps_of(value: Value, esc: EscTelemetry, reading: Sequence[int] | None) -> int | None:
     """The value in a live or info reading of the ESC, in steps before the divisor; None: not available."""
-    if reading is None:
+    if reading is None or not value.words:
         return None
     found = reading[value.words[0]]
     if value.kind is Kind.PRODUCT:
@@ -169,31 +159,26 @@ def physical(value: Value, esc: EscTelemetry, found: int | None) -> float | None
     return round(found * parts[1] / (value.per_unit * parts[0]), 6)
 
 
-def _wire(data: DataType, group: Group) -> list[Value]:
-    found = []
-    for index, (name, row) in enumerate(rows(data).items()):
-        low, high = row.type_range
-        found.append(
-            Value(
-                *(name, row.unit, group, Kind.WIRE, (index,)),
-                per_unit=row.per_unit,
-                low=low,
-                high=high,
-                not_on=row.not_on,
-                optional=bool(row.not_on),
-            )
+def _supplied(protocol: EscProtocol, group: Group) -> Iterator[Value]:
+    """The values of live data or of information, then the flags of their error words."""
+    fields = [f for f in protocol.fields if f.is_info is (group is Group.INFO)]
+    for found in fields:
+        yield Value(
+            *(found.name, found.unit, group, Kind.WIRE if found.mask == -1 else Kind.BITS),
+            words=(found.word,),
+            shift=found.shift,
+            mask=found.mask,
+            per_unit=found.per_unit,
+            low=found.low,
+            high=found.high,
+            names=found.names,
+            not_on=found.not_on,
+            optional=bool(found.not_on),
         )
-    return found
-
-
-def _flags(bits: type[ErrorBit], group: Group, word: int) -> list[Value]:
-    return [
-        Value(bit.text, "", group, Kind.BITS, (word,), int(bit), 1, low=0, high=1) for bit in bits
-    ]
-
-
-def _bits(name: str, word: int, shift: int, mask: int, **more: Any) -> Value:
-    return Value(*(name, "", Group.INFO, Kind.BITS, (word,), shift, mask), low=0, high=mask, **more)
+    for found in fields:
+        for bit in protocol.errors.get(found.name, ()):
+            name = (bit.text, "", group, Kind.BITS)
+            yield Value(*name, (found.word,), int(bit), 1, low=0, high=1)
 
 
 def _of_link(name: str, unit: str, kind: Kind, read: Read, per_unit: int = 1) -> Value:
@@ -222,63 +207,52 @@ def _pascal(text: str) -> str:
     return "".join(part[:1].upper() + part[1:].lower() for part in text.split("_"))
 
 
-def _listed() -> Iterator[Value]:
-    live = {name: index for index, name in enumerate(LiveData._fields)}
-    info = {name: index for index, name in enumerate(InfoData._fields)}
-    device, firmware = info["device_and_variant"], info["firmware_word"]
-    state = (live["operating_state"],)
-    yield from (value for value in _wire(LiveData, Group.LIVE) if value.name != "operating_state")
-    of_state: dict[str, Any] = {"words": state, "low": 0, "high": 255}
-    yield Value(
-        *("operating_state", "", Group.LIVE, Kind.WIRE),
-        **of_state,
-        names={state: state.text for state in OperatingState},
-    )
-    yield Value("operating_state_raw", "", Group.LIVE, Kind.WIRE, **of_state)
-    yield from _flags(OperatingError, Group.LIVE, live["operating_errors"])
-    yield from (
-        value
-        for value in _wire(InfoData, Group.INFO)
-        if value.name not in ("device_and_variant", "firmware_word")
-    )
-    yield _bits("device", device, 10, 0x3F, names={device: device.text for device in Device})
-    yield _bits("device_raw", device, 10, 0x3F)
-    yield _bits("variant", device, 0, 0x3FF)
-    yield _bits("firmware_main", firmware, 8, 0xFF)
-    yield _bits("firmware_sub", firmware, 0, 0xFF)
-    yield from _flags(SelfTestError, Group.INFO, info["selftest_errors"])
-    yield from _derived(live)
-    yield from _link()
-    yield from _gateway()
+def _listed(protocol: EscProtocol) -> Iterator[Value]:
+    yield from _supplied(protocol, Group.LIVE)
+    yield from _supplied(protocol, Group.INFO)
+    yield from _derived(protocol.by_name)
+    yield from _link(protocol)
+    yield from _GATEWAY_VALUES
 
 
-def _derived(live: Mapping[str, int]) -> Iterator[Value]:
-    speed, voltage = (live["electrical_speed"],), live["battery_voltage"]
+def _derived(fields: Mapping[str, Field]) -> Iterator[Value]:
+    """Values that are made of fields; what a protocol does not supply leaves them out."""
+    speed, voltage = fields.get("electrical_speed"), fields.get("battery_voltage")
+    current = fields.get("battery_current")
     wire = (Group.LIVE, Kind.WIRE)
-    of_speed: dict[str, Any] = {"words": speed, "low": 0, "high": (1 << 32) - 1}
-    yield Value("motor_speed", "1/min", *wire, **of_speed, divisor=Divisor.POLE_PAIRS)
-    yield Value("output_speed", "1/min", *wire, **of_speed, divisor=Divisor.OUTPUT)
-    yield Value(
-        *("battery_power", "W", Group.LIVE, Kind.PRODUCT, (voltage, live["battery_current"])),
-        per_unit=1000,
-        low=-0xFFFF * 0x8000,
-        high=0xFFFF * 0x7FFF,
+    if speed is not None:
+        of_speed: dict[str, Any] = {
+            "words": (speed.word,),
+            "per_unit": speed.per_unit,
+            "low": speed.low,
+            "high": speed.high,
+        }
+        yield Value("motor_speed", "1/min", *wire, **of_speed, divisor=Divisor.POLE_PAIRS)
+        yield Value("output_speed", "1/min", *wire, **of_speed, divisor=Divisor.OUTPUT)
+    if voltage is not None and current is not None:
+        products = [v * i for v in (voltage.low, voltage.high) for i in (current.low, current.high)]
+        yield Value(
+            *("battery_power", "W", Group.LIVE, Kind.PRODUCT, (voltage.word, current.word)),
+            per_unit=voltage.per_unit * current.per_unit,
+            low=min(products),
+            high=max(products),
+        )
+    if voltage is not None:
+        yield Value(
+            *("mean_cell_voltage", "V", *wire, (voltage.word,)),
+            per_unit=voltage.per_unit,
+            divisor=Divisor.CELLS,
+            optional=True,
+        )
+    drawn: tuple[tuple[str, str, Kind, Read, int], ...] = (
+        ("energy_used", "Wh", Kind.INTEGRAL, lambda esc, _g, _now: esc.drawn.energy, MWS_PER_WH),
+        ("motor_run_time", "s", Kind.RUN_TIME, lambda esc, _g, _now: esc.drawn.run_time, SECOND),
     )
-    yield Value(
-        *("mean_cell_voltage", "V", *wire, (voltage,)),
-        per_unit=100,
-        divisor=Divisor.CELLS,
-        optional=True,
-    )
-    yield _of_link(
-        "energy_used", "Wh", Kind.INTEGRAL, lambda esc, _gateway, _now: esc.energy, MWS_PER_WH
-    )
-    yield _of_link(
-        "motor_run_time", "s", Kind.RUN_TIME, lambda esc, _gateway, _now: esc.run_time, SECOND
-    )
+    for value in drawn:
+        yield _of_link(*value)
 
 
-def _link() -> Iterator[Value]:
+def _link(protocol: EscProtocol) -> Iterator[Value]:
     yield Value(
         *("link_state", "", Group.LINK, Kind.STATE),
         read=lambda esc, _gateway, _now: esc.link,
@@ -290,8 +264,8 @@ def _link() -> Iterator[Value]:
         *("layout", "", Group.LINK, Kind.STATE),
         read=lambda esc, _gateway, _now: esc.layout,
         low=0,
-        high=2,
-        names={0: "Unknown", 1: "V4", 2: "Legacy"},
+        high=len(protocol.layouts),
+        names={0: "Unknown", **{n: _pascal(t) for n, t in enumerate(protocol.layouts, 1)}},
     )
     yield _of_link("data_age", "ms", Kind.AGE, lambda esc, _gateway, now: esc.age_ms(now))
     yield _of_link("frame_rate", "Hz", Kind.RATE, lambda esc, _gateway, _now: esc.frame_rate, 10)
@@ -334,5 +308,36 @@ def _gateway() -> Iterator[Value]:
         yield _of_gateway(name, operator.attrgetter(name), rolls=True)
 
 
-VALUES: Mapping[str, Value] = {value.name: value for value in _listed()}
-"""Every value of one ESC and of the gateway by name."""
+_GATEWAY_VALUES = tuple(_gateway())
+"""The same for all protocols."""
+
+
+def _never(_esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> None:
+    """Of a value that the ESC's protocol does not supply."""
+
+
+VALUES: Mapping[str, Value] = {
+    value.name: value for protocol in reversed(PROTOCOLS) for value in _listed(protocol)
+}
+"""Every value of one ESC and of the gateway by name, as the first protocol that has it supplies it."""
+
+
+@cache
+def values_of(protocol: EscProtocol) -> Mapping[str, Value]:
+    """Every value of VALUES by name, as an ESC of this protocol supplies it; others are never available."""
+    own = {value.name: value for value in _listed(protocol)}
+    for name, value in own.items():
+        if name not in VALUES or value.unit != VALUES[name].unit:
+            raise ValueError(
+                f"ESC protocol {protocol.name}: value {name} in {value.unit!r} is unknown"
+            )
+    return {name: own.get(name) or _missing(value) for name, value in VALUES.items()}
+
+
+def values_of_esc(settings: EscSettings) -> Mapping[str, Value]:
+    """Every value by name, as this ESC supplies it."""
+    return values_of(protocol_named(settings.protocol))
+
+
+def _missing(value: Value) -> Value:
+    return replace(value, words=(), read=_never, low=None, high=None, optional=True)

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Mapping
 
-from kontronik_can_gw.esc.kontronik.states import device_text
 from kontronik_can_gw.esc.telemetry import SECOND, LinkState
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.fault_log import FaultLog
@@ -53,8 +52,8 @@ class EscLog:
             return
         self._diagnosed.clear()
         conditions.forget(self._diagnosis_condition)
-        layout = ("unknown layout", "V4", "legacy")[esc.layout]
-        device = device_text(esc.info.device) if esc.info else None
+        layout = esc.protocol.layout_text(esc.layout) or "unknown layout"
+        device = esc.protocol.device_name(esc.info)
         said = (
             f"{name}: telemetry {esc.link.name.lower()} ({layout}{f', {device}' if device else ''})"
         )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import NS_PER_BYTE, SECOND
+from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.esc_log import EscLog
 from kontronik_can_gw.runtime.fault_log import FaultLog
@@ -54,6 +54,7 @@ class EscPort:
         self._index = index
         self._lost = lost
         self._gateway = gateway
+        self._protocol = gateway.escs[index].protocol
         self._selector = selector
         self._conditions = conditions
         self._clock = clock
@@ -97,7 +98,7 @@ class EscPort:
         ``others``: adapters that are known to belong to other ESCs.
         """
         try:
-            port = SerialPort(self._path_now(others))
+            port = SerialPort(self._path_now(others), self._protocol)
         except RunError as error:
             if not wait:
                 raise RunError(f"{self.name}: {error}") from None
@@ -123,7 +124,7 @@ class EscPort:
             self._conditions.end(self.log.port_condition, said, now)
         else:
             self._conditions.say(logging.INFO, said)
-        if is_mini_uart(port.path):
+        if self._protocol.even_parity and is_mini_uart(port.path):
             self._conditions.say(
                 logging.WARNING,
                 f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which cannot do even parity: frames may be lost or never "
@@ -161,7 +162,7 @@ class EscPort:
                 since = max(self._empty_ns, self._selector.before)
             # nothing came faster than the wire allows
             self._undrained_ns = (
-                None if self.port.drained else min(now, since + len(data) * NS_PER_BYTE)
+                None if self.port.drained else min(now, since + len(data) * self._protocol.byte_ns)
             )
             self._gateway.receive_bytes(self._index, data, now, since)
 
@@ -193,7 +194,7 @@ class EscPort:
             self._count_due = now + SECOND
             self._count(self.port.line_errors())
         if not self.port.settings_hold():
-            text = f"{self.name}: another program changed the settings of {self.port.path}: set to 115200 8E1 again"
+            text = f"{self.name}: another program changed the settings of {self.port.path}: set to {self._protocol.line} again"
             self._conditions.event(f"{self.name}: settings", text, now)
         self.log.diagnose(self.line_errors, now)
 

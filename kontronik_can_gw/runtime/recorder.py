@@ -21,7 +21,6 @@ from kontronik_can_gw.capture.format import (
     number_data,
 )
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik.states import device_text
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.capture_folder import make_folder, remove_oldest
@@ -309,7 +308,11 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
     """What a replay that begins now cannot know."""
     return {
         "escs": [
-            {"energy": esc.energy_mw_ns, "run_time": esc.run_time, "losses": esc.losses}
+            {
+                "energy": esc.drawn.energy_mw_ns,
+                "run_time": esc.drawn.run_time,
+                "losses": esc.losses,
+            }
             for esc in gateway.escs
         ],
         "can_state": int(gateway.status.can_state),
@@ -323,10 +326,10 @@ def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
         None
         if esc.last_info is None
         else {
-            "device": device_text(esc.last_info.device) or str(esc.last_info.device),
-            "variant": esc.last_info.variant,
-            "firmware": esc.last_info.firmware,
-            "layout": ("", "V4", "legacy")[esc.layout],
+            "device": esc.protocol.device_text(esc.last_info),
+            "variant": esc.protocol.value("variant", esc.last_info),
+            "firmware": esc.protocol.firmware_text(esc.last_info),
+            "layout": esc.protocol.layout_text(esc.layout) or "",
         }
         for esc in gateway.escs
     ]

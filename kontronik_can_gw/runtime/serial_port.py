@@ -1,4 +1,4 @@
-"""A serial port that is only ever read: 115200 baud, 8 data bits, even parity, 1 stop bit, exclusive.
+"""A serial port that is only ever read: set as the ESC's protocol says, exclusive.
 
 Nothing is written to it, ever: an answer could switch an ESC into a mode in which its parameters can be changed. This class has no
 way to write, and the line's echo is switched off before anything else.
@@ -17,9 +17,9 @@ from pathlib import Path
 import serial
 
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.runtime.usb_adapters import Identity, identity_at
 
-BAUD_RATE = 115_200
 READ_SIZE = 4096
 _MAX_READS = 4
 
@@ -47,7 +47,7 @@ class NoPort(RunError):
 class SerialPort:
     """An open port. RunError with one clear line where it cannot be opened."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, protocol: EscProtocol) -> None:
         self.path = path
         is_pty = os.path.realpath(path).startswith("/dev/pts/")
         # one that does not lock it, as a getty, could write to it; its terminal is not touched
@@ -57,7 +57,7 @@ class SerialPort:
             raise _in_use(path, users)
         quiet = _open_quietly(path)
         try:
-            self._serial = _open(path, serial.PARITY_EVEN, is_pty)
+            self._serial = _open(path, protocol, is_pty)
         finally:
             os.close(quiet)
         self._fd = self._serial.fileno()
@@ -202,9 +202,14 @@ def _open_quietly(path: str) -> int:
     return fd
 
 
-def _open(path: str, parity: str, is_pty: bool) -> serial.Serial:
+def _open(
+    path: str, protocol: EscProtocol, is_pty: bool, refuses_parity: bool = False
+) -> serial.Serial:
+    parity = serial.PARITY_EVEN if protocol.even_parity else serial.PARITY_NONE
+    if refuses_parity:
+        parity = serial.PARITY_NONE
     try:
-        return serial.Serial(path, BAUD_RATE, parity=parity, timeout=0, exclusive=True)
+        return serial.Serial(path, protocol.baud_rate, parity=parity, timeout=0, exclusive=True)
     except (
         OSError,
         termios.error,
@@ -218,9 +223,9 @@ def _open(path: str, parity: str, is_pty: bool) -> serial.Serial:
         )
         if number == errno.EINVAL and parity == serial.PARITY_EVEN:
             if is_pty:  # a pseudo terminal has no parity and may say so
-                return _open(path, serial.PARITY_NONE, is_pty)
+                return _open(path, protocol, is_pty, refuses_parity=True)
             raise RunError(
-                f"{path}: cannot do 115200 baud with even parity. {_NO_PARITY}"
+                f"{path}: cannot do {protocol.baud_rate} baud with even parity. {_NO_PARITY}"
             ) from None
         raise _explained(path, number, str(error)) from None
 

@@ -7,7 +7,7 @@ made, or is null.
 import contextlib
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
@@ -15,18 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
-from kontronik_can_gw.esc.kontronik.states import (
-    ErrorBit,
-    OperatingError,
-    SelfTestError,
-    Severity,
-    bit_texts,
-    device_text,
-    peak_current_of,
-    state_text,
-)
+from kontronik_can_gw.esc.decoder import Data, EscProtocol, Severity, bit_texts
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, SECOND, EscTelemetry
-from kontronik_can_gw.esc.values import VALUES, Group, Value, physical, steps, steps_of
+from kontronik_can_gw.esc.values import VALUES, Group, Value, physical, steps, steps_of, values_of
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayStatus
 
@@ -39,7 +30,6 @@ PROGRAM = "kontronik-can-gw"
 STALE_NS = 3 * SECOND
 """A document older than this says nothing of now."""
 LOG_LINES = 20
-_LAYOUTS = (None, "V4", "legacy")
 _OTHERWISE = ("variant", "device_raw", "firmware_main", "firmware_sub")
 """Values that are shown apart from the others."""
 
@@ -262,7 +252,7 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS
     ):
         info = None
-    alarms = None if live is None else _alarms(live.operating_errors)
+    protocol = esc.protocol
     return {
         "name": esc.settings.name,
         "port": {
@@ -278,11 +268,11 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         "link": name_in_words(esc.link.name),
         "fresh": live is not None,
         "diagnosis": esc.diagnosis() if live is None and port.open else None,
-        "layout": _LAYOUTS[esc.layout],
-        "device": None if info is None else device_text(info.device) or str(info.device),
-        "variant": None if info is None else info.variant,
-        "firmware": None if info is None else info.firmware,
-        "peak_current_of": None if info is None else peak_current_of(info.device),
+        "layout": protocol.layout_text(esc.layout),
+        "device": protocol.device_text(info),
+        "variant": protocol.value("variant", info),
+        "firmware": protocol.firmware_text(info),
+        "peak_current_of": protocol.peak_current_text(info),
         "frame_rate_hz": None if esc.frame_rate is None else esc.frame_rate / 10,
         "data_age_ms": esc.age_ms(now),
         "losses": esc.losses,
@@ -292,33 +282,48 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
             "late_frames": esc.late_frames,
             "line_errors": esc.line_errors,
         },
-        "operating_state": None
-        if live is None
-        else state_text(live.operating_state) or str(live.operating_state),
-        "errors": None if alarms is None else alarms[Severity.ERROR],
-        "warnings": None if alarms is None else alarms[Severity.WARNING],
-        "statuses": None if alarms is None else alarms[Severity.STATUS],
-        "selftest_errors": None if info is None else _selftest(info.selftest_errors),
+        **_words(protocol, live, info),
         "values": {
-            **{value.name: physical(value, esc, steps_of(value, esc, live)) for value in _LIVE},
-            **{value.name: physical(value, esc, steps_of(value, esc, info)) for value in _INFO},
-            **{value.name: physical(value, esc, steps(value, esc, status, now)) for value in _LINK},
+            **_physical(esc, _LIVE, lambda value: steps_of(value, esc, live)),
+            **_physical(esc, _INFO, lambda value: steps_of(value, esc, info)),
+            **_physical(esc, _LINK, lambda value: steps(value, esc, status, now)),
         },
     }
 
 
+def _physical(
+    esc: EscTelemetry, names: Sequence[str], found: Callable[[Value], int | None]
+) -> Document:
+    values = values_of(esc.protocol)
+    return {name: physical(values[name], esc, found(values[name])) for name in names}
+
+
+def _words(protocol: EscProtocol, live: Data | None, info: Data | None) -> Document:
+    """State and error bits in words."""
+    alarms = _alarms(protocol, protocol.value("operating_errors", live))
+    selftest = protocol.value("selftest_errors", info)
+    return {
+        "operating_state": protocol.state_text(live),
+        "errors": alarms.get(Severity.ERROR),
+        "warnings": alarms.get(Severity.WARNING),
+        "statuses": alarms.get(Severity.STATUS),
+        "selftest_errors": None
+        if selftest is None
+        else bit_texts(selftest, protocol.errors["selftest_errors"]),
+    }
+
+
 @lru_cache(maxsize=256)
-def _alarms(word: int) -> dict[Severity, list[str]]:
-    """The bits of the error word by their class; one without a name counts as an error."""
+def _alarms(protocol: EscProtocol, word: int | None) -> dict[Severity, list[str]]:
+    """The bits of the error word by their class, one without a name is an error; empty without a word."""
+    if word is None:
+        return {}
+    bits = protocol.errors["operating_errors"]
+    severities = {bit.text: bit.severity for bit in bits}
     found: dict[Severity, list[str]] = {severity: [] for severity in Severity}
-    for text in bit_texts(word, OperatingError):
-        found[_SEVERITIES.get(text, Severity.ERROR)].append(text)
+    for text in bit_texts(word, bits):
+        found[severities.get(text, Severity.ERROR)].append(text)
     return found
-
-
-@lru_cache(maxsize=256)
-def _selftest(word: int) -> list[str]:
-    return bit_texts(word, SelfTestError)
 
 
 def _numbers(*groups: Group) -> tuple[Value, ...]:
@@ -334,14 +339,9 @@ def _numbers(*groups: Group) -> tuple[Value, ...]:
     )
 
 
-_LIVE, _INFO, _LINK = (_numbers(group) for group in (Group.LIVE, Group.INFO, Group.LINK))
-
-
-def _severities(bits: type[ErrorBit]) -> dict[str, Severity]:
-    return {bit.text: bit.severity for bit in bits}
-
-
-_SEVERITIES = _severities(OperatingError)
+_LIVE, _INFO, _LINK = (
+    tuple(value.name for value in _numbers(group)) for group in (Group.LIVE, Group.INFO, Group.LINK)
+)
 _UNITS = {value.name: value.unit for value in _numbers(Group.LIVE, Group.INFO, Group.LINK)}
 _STATUS_COUNTERS = tuple(
     f.name

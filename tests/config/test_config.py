@@ -42,7 +42,7 @@ DEFAULTS: dict[str, dict[str, object]] = {
     "mqtt": dict.fromkeys(("broker", "ca_file", "cert_file", "key_file", "username", "password_file"), None)
     | {"tls": False, "gateway": None, "topic": "kontronik", "rate": 1.0, "retain": False, "discovery": None},
     "esc": {"name": "esc1", "pole_pairs": 1, "gear": Fraction(1), "cell_count": 0, "telemetry_timeout_ms": 250}
-    | {"node_id": None, "device": None},
+    | {"node_id": None, "device": None, "protocol": "kontronik"},
 }  # fmt: skip
 TABLES = {table: [*keys, *(["port"] if table == "esc" else [])] for table, keys in DEFAULTS.items()}
 _WHOLE = """
@@ -678,6 +678,7 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     **dict.fromkeys(BOOLEANS, st.booleans()),
     ("dbc", "on_loss"): st.sampled_from(["not_available", "silent"]),
     ("esc", "device"): st.sampled_from([device.text for device in Device]),
+    ("esc", "protocol"): st.just("kontronik"),
     ("can", "options"): st.dictionaries(
         _TEXT,
         st.one_of(

@@ -4,7 +4,10 @@ import pytest
 
 from esc.reference import ambiguous
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
-from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry, Event
+
+NS_PER_BYTE = KONTRONIK.byte_ns
 
 STEP = 10 * MS
 FLIGHT = [
@@ -46,9 +49,9 @@ def test_values_counters_energy_and_run_time() -> None:
         assert read(telemetry, encode(data, Layout.V4), now) == [Event.LIVE]
         assert (telemetry.live, telemetry.last_live) == (data, data)
         assert telemetry.live_ns == now
-        assert telemetry.energy_mw_ns == energy
-        assert telemetry.run_time == run_time
-        counters = telemetry.counters
+        assert telemetry.drawn.energy_mw_ns == energy
+        assert telemetry.drawn.run_time == run_time
+        counters = telemetry.decoder.counters
         assert counters.live_v4 == counters.headers == 1 + number
         assert counters.bytes == (1 + number) * length
         assert counters.pending == counters.dropped_bytes == 0
@@ -59,10 +62,10 @@ def test_no_energy_while_time_stands_still_or_goes_back() -> None:
     telemetry, now = started()
     frame = encode(FLIGHT[0], Layout.V4)
     read(telemetry, frame, now + STEP)
-    energy, run_time = telemetry.energy, telemetry.run_time
+    energy, run_time = telemetry.drawn.energy, telemetry.drawn.run_time
     assert read(telemetry, frame, now + STEP) == [Event.LIVE]
     assert read(telemetry, frame, now) == [Event.LIVE]
-    assert (telemetry.energy, telemetry.run_time, telemetry.live_ns) == (
+    assert (telemetry.drawn.energy, telemetry.drawn.run_time, telemetry.live_ns) == (
         energy,
         run_time,
         now + STEP,
@@ -77,7 +80,7 @@ def test_frames_between_damage_are_at_their_places() -> None:
     for data in (broken, frame, frame, b"\x55" * 7, frame, frame[:20], frame[20:], frame):
         now += STEP
         read(telemetry, data, now)
-    counters = telemetry.counters
+    counters = telemetry.decoder.counters
     assert counters.bytes == counters.dropped_bytes + (1 + 5) * len(frame)
     assert (counters.live, counters.crc_errors, counters.headers) == (6, 1, 7)
     assert (counters.dropped_crc, counters.dropped_noise) == (len(broken), 7)
@@ -103,4 +106,4 @@ FRAME = encode(FLIGHT[0], Layout.V4)
 def test_where_two_layouts_match_it_is_the_shorter() -> None:
     telemetry, now = started()
     read(telemetry, ambiguous("live"), now + STEP)
-    assert (telemetry.counters.live_v4, telemetry.counters.live_legacy) == (1, 1)
+    assert (telemetry.decoder.counters.live_v4, telemetry.decoder.counters.live_legacy) == (1, 1)

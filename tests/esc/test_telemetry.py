@@ -14,20 +14,21 @@ from esc.reference import SHORTEST_FIRST, fits
 from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import FORMS
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import (
     INFO_TIMEOUT_NS,
     MS,
-    MWS_PER_WH,
-    NS_PER_BYTE,
     SECOND,
     EscSettings,
     EscTelemetry,
     Event,
     LinkState,
 )
-from kontronik_can_gw.esc.values import VALUES, Value, divisor, steps
+from kontronik_can_gw.esc.values import MWS_PER_WH, VALUES, Value, divisor, steps
 from kontronik_can_gw.gateway_status import GatewayStatus
+
+NS_PER_BYTE = KONTRONIK.byte_ns
 
 TIMEOUT = 250 * MS
 LIVE = LiveData(
@@ -276,17 +277,17 @@ def test_bytes_that_were_bundled_in_one_read_get_the_times_they_had_on_the_wire(
     assert telemetry.live is not None
     assert telemetry.live.electrical_speed == 3
     assert telemetry.live_ns == SECOND - 20 * NS_PER_BYTE
-    assert telemetry.run_time == 2 * 40 * NS_PER_BYTE
-    assert telemetry.energy_mw_ns == 2 * 40 * NS_PER_BYTE * 2400 * 100
+    assert telemetry.drawn.run_time == 2 * 40 * NS_PER_BYTE
+    assert telemetry.drawn.energy_mw_ns == 2 * 40 * NS_PER_BYTE * 2400 * 100
 
 
 def test_times_never_run_backwards_when_reads_are_closer_than_the_wire_allows() -> None:
     telemetry = alive(SECOND)
     read(telemetry, live(), SECOND + 10 * MS)
-    before = telemetry.energy, telemetry.run_time
+    before = telemetry.drawn.energy, telemetry.drawn.run_time
     read(telemetry, live() + b"\x55" * 300, SECOND + 11 * MS)
-    assert telemetry.energy >= before[0]
-    assert telemetry.run_time >= before[1]
+    assert telemetry.drawn.energy >= before[0]
+    assert telemetry.drawn.run_time >= before[1]
     assert telemetry.live_ns is not None
     assert telemetry.live_ns >= SECOND + 10 * MS
 
@@ -376,14 +377,14 @@ def test_energy_and_run_time_agree_with_an_independent_integration_of_a_flight()
 def test_energy_is_not_counted_over_a_gap_and_is_kept_over_a_loss() -> None:
     telemetry = alive(SECOND)
     read(telemetry, live(), SECOND + 100 * MS)
-    kept = telemetry.energy
+    kept = telemetry.drawn.energy
     assert kept == 2400 * 100 // 10
     read(telemetry, live(), 20 * SECOND)
-    assert (telemetry.energy, telemetry.run_time) == (kept, 100 * MS)
+    assert (telemetry.drawn.energy, telemetry.drawn.run_time) == (kept, 100 * MS)
     telemetry.port_lost()
     telemetry.port_opened()
     read(telemetry, live(), 20 * SECOND + 10 * MS)
-    assert (telemetry.energy, telemetry.run_time) == (kept, 100 * MS)
+    assert (telemetry.drawn.energy, telemetry.drawn.run_time) == (kept, 100 * MS)
 
 
 @pytest.mark.parametrize(
@@ -524,7 +525,7 @@ def test_the_counters_are_those_of_the_whole_stream() -> None:
     read(telemetry, NOISE + live() + BROKEN + live(layout=Layout.LEGACY) + info(), SECOND)
     read(telemetry, encode(LIVE._replace(operating_state=27), Layout.LEGACY), SECOND + 10 * MS)
     telemetry.advance(50 * SECOND)
-    counters = telemetry.counters
+    counters = telemetry.decoder.counters
     assert (counters.live_v4, counters.live_legacy, counters.info_v4) == (1, 2, 1)
     assert (counters.crc_errors, counters.dropped_bytes) == (1, 60)
     assert counters.bytes == 20 + 40 + 40 + 38 + 44 + 38
@@ -679,4 +680,4 @@ def test_a_clean_stream_loses_nothing_however_it_is_cut(seed: int) -> None:
         assert telemetry.live is not None
         assert telemetry.live.electrical_speed == number
         assert telemetry.live_ns == begin + len(frame) * NS_PER_BYTE
-    assert telemetry.counters.dropped_bytes == 0
+    assert telemetry.decoder.counters.dropped_bytes == 0

@@ -9,7 +9,7 @@ import cantools.database
 
 from kontronik_can_gw.canopen.data_types import ARRAY, RECORD
 from kontronik_can_gw.canopen.eds import Eds, load
-from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit
+from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import (
     CanConfig,
@@ -20,6 +20,7 @@ from kontronik_can_gw.config.keys import (
     RecordConfig,
     RunConfig,
     StatisticsConfig,
+    choices,
     shipped,
 )
 from kontronik_can_gw.esc.kontronik.states import OperatingError
@@ -70,8 +71,8 @@ def configuration() -> str:
             span = f"{limits['low']} … {limits['high']}" if "low" in limits else limits["kind"]
             if "also" in limits:
                 span += f", {limits['also']}"
-            if "choices" in limits:
-                span = ", ".join(f'"{choice}"' for choice in limits["choices"])
+            if listed := choices(limits):
+                span = ", ".join(f'"{choice}"' for choice in listed)
             default = (
                 "**required**" if f.default is MISSING and f.default_factory is MISSING else ""
             )
@@ -135,7 +136,9 @@ def emergencies() -> str:
     lines = ["| code | byte 3 | meaning |", "|---|---|---|"]
     for bit in OperatingError:
         if bit is not OperatingError.PROGRAMMING_ALLOWED:
-            lines.append(f"| {code_of_bit(bit):04X}h | {int(bit)} | {bit.meaning} |")
+            lines.append(
+                f"| {BitCodes(tuple(OperatingError)).code(bit):04X}h | {int(bit)} | {bit.meaning} |"
+            )
     for error in GatewayError:
         code, which = error.value
         lines.append(

@@ -15,6 +15,7 @@ from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import esc_port as esc_input
@@ -35,7 +36,7 @@ class Port:
 
     there: dict[str, Identity | None]
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, _protocol: object) -> None:
         if path not in self.there:
             raise RunError(f"{path}: no such serial port.")
         self.path = path
@@ -307,7 +308,7 @@ def test_a_usb_adapter_is_known_by_vendor_product_serial_number_and_interface(
 
 def test_settings_that_another_program_changes_are_set_again() -> None:
     with PtyEsc() as esc:
-        port = serial_port.SerialPort(esc.path)
+        port = serial_port.SerialPort(esc.path, KONTRONIK)
         try:
             assert port.settings_hold()
             changed = termios.tcgetattr(port.fileno())
@@ -377,7 +378,7 @@ def test_echo_is_off_before_anything_else_is_done_to_a_port(
         ):
             for name in names:
                 watched(module, name)
-        port = serial_port.SerialPort(esc.path)
+        port = serial_port.SerialPort(esc.path, KONTRONIK)
         port.close()
     assert done[:3] == ["open", "tcgetattr", "echo off"]
     assert "echo on" not in done
@@ -401,7 +402,7 @@ def test_an_adapter_that_is_pulled_out_while_it_is_set_is_one_line(
 
     monkeypatch.setattr(serial_port, "_open", gone)
     with PtyEsc() as esc, pytest.raises(RunError, match="cannot be opened"):
-        serial_port.SerialPort(esc.path)
+        serial_port.SerialPort(esc.path, KONTRONIK)
 
 
 def test_the_mini_uart_of_a_raspberry_pi_is_known_by_its_device_tree(tmp_path: Path) -> None:

@@ -10,9 +10,12 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from wire_world import CAN_FD, NOT_AVAILABLE, Wire, World, layout_of, live, loop_in, run
 
-from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.loop import Loop
+
+NS_PER_BYTE = KONTRONIK.byte_ns
 
 
 def shown(frame: CanFrame) -> tuple[int, int]:

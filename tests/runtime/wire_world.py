@@ -17,7 +17,8 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import MS, NS_PER_BYTE, SECOND, EscSettings
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
+from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
@@ -30,6 +31,8 @@ from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import Sent
+
+NS_PER_BYTE = KONTRONIK.byte_ns
 
 NOT_AVAILABLE = 0xFFFFFFFF
 _FIRST_PORT, CAN_FD = 1000, 2000
@@ -301,7 +304,7 @@ def loop_in(
 
     by_path = {wire.path: wire for wire in world.wires}
     patch.setattr(can_link, "open_can", open_bus)
-    patch.setattr(esc_input, "SerialPort", by_path.__getitem__)
+    patch.setattr(esc_input, "SerialPort", lambda path, _protocol: by_path[path])
     gateway = Gateway(escs, layout or layout_of(escs), world.now, canopen=canopen)
     config = CanConfig(interface="virtual", channel="world")
     poller = FakePoller(world)

@@ -21,7 +21,7 @@ from kontronik_can_gw.canopen.dbc_names import pascal_case
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
-from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit, register_of
+from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
@@ -600,7 +600,7 @@ def _emergencies(eds: Eds) -> Iterator[EmergencyFacts]:
     for bit in range(32):
         if not mask >> bit & 1:
             continue
-        code = code_of_bit(bit)
+        code = BitCodes(tuple(OperatingError)).code(bit)
         named = bits.get(bit)
         if named is None:
             text = ErrorFacts(

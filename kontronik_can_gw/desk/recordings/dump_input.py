@@ -14,8 +14,7 @@ from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
 from kontronik_can_gw.desk.recordings.samples import FoundTelemetry, Sample, samples_of_bytes
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.esc.kontronik.codec import Kind
-from kontronik_can_gw.esc.kontronik.deframer import Counters, Frame
+from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.telemetry import SECOND
 
 LIVE_RATE = 100.0
@@ -25,7 +24,7 @@ MAX_WAITING = 1 << 16
 _LONGEST_FRAME = 64
 _UNDECIDED = len(UART_MAGIC) - 1
 """Bytes at the end of a read that may begin a header."""
-Found = tuple[int, bytes, Frame | None]
+Found = tuple[int, bytes, Reading | None]
 """Bytes up to the end of a frame, its time, and the frame; without a frame at the time of the one before."""
 
 
@@ -92,7 +91,7 @@ class DumpInput(Input):
         for piece in chain(self._pieces(), (b"",)):
             waiting += piece
             for frame in esc.find(piece):
-                if frame.form.kind is Kind.LIVE:
+                if not frame.form.is_info:
                     now = lives * self._period_ns
                     lives += 1
                 else:

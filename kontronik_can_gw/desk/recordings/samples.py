@@ -15,7 +15,7 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.columns import Section, Values
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct, field_of_signal
-from kontronik_can_gw.esc.kontronik.deframer import Frame
+from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.gateway import Gateway
@@ -151,18 +151,18 @@ class SampledGateway(Gateway):
 class FoundTelemetry(EscTelemetry):
     """Telemetry of bytes whose times are only known when their frames are found."""
 
-    def find(self, data: bytes) -> list[Frame]:
-        """The frames of the next bytes; of none, what is left."""
-        return self._deframer.feed(data) if data else self._deframer.flush()
+    def find(self, data: bytes) -> Sequence[Reading]:
+        """The readings of the next bytes; of none, what is left."""
+        return self.decoder.feed(data) if data else self.decoder.flush()
 
-    def take(self, frame: Frame, now: int) -> int:
-        """A frame that came at a time; its events."""
-        return self._accept(frame, now, now)
+    def take(self, reading: Reading, now: int) -> int:
+        """A reading that came at a time; its events."""
+        return self.accept(reading, now, now)
 
 
 def samples_of_bytes(
     esc: FoundTelemetry,
-    found: Iterable[tuple[int, bytes, Frame | None]],
+    found: Iterable[tuple[int, bytes, Reading | None]],
     sections: Sequence[Section],
 ) -> Iterator[Sample]:
     """The rows of one ESC's frames (time, bytes, frame); a gateway runs from the first one on."""

@@ -47,15 +47,21 @@ class Form:
         "crc_at",
         "data_type",
         "header",
+        "is_info",
         "kind",
         "layout",
+        "layout_number",
         "length",
         "name",
+        "partly_protected",
     )
 
     def __init__(self, kind: Kind, layout: Layout) -> None:
         self.kind = kind
         self.layout = layout
+        self.is_info = kind is Kind.INFO
+        self.layout_number = list(Layout).index(layout) + 1
+        self.partly_protected = layout is Layout.LEGACY
         self.name = f"{kind.value}_{layout.value}"
         self.header = b"KODL" if kind is Kind.LIVE else b"KODI"
         self.data_type: DataType = LiveData if kind is Kind.LIVE else InfoData

@@ -8,9 +8,9 @@ is counted and dropped. At most 43 bytes are held; work is linear in the bytes f
 
 import struct
 from dataclasses import dataclass, fields
-from typing import NamedTuple
 from zlib import crc32
 
+from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.kontronik.codec import FORMS, FORMS_BY_KIND_BYTE, Form, Kind, Layout
 from kontronik_can_gw.esc.kontronik.fields import Data, LiveData
 from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
@@ -22,11 +22,11 @@ _PREFIX = b"KOD"
 _LONG_RUNS = bytes(0x100 - (1 << n) for n in range(8)) + b"\0"
 
 
-class Frame(NamedTuple):
-    """An accepted frame: its form, the stream position of its first byte, its fields."""
+class Frame(Reading):
+    """A reading with the names of this protocol."""
 
+    __slots__ = ()
     form: Form
-    offset: int
     data: Data
 
     @property
@@ -143,7 +143,7 @@ class Deframer:
         """How many bytes are held, undecided: 0..43."""
         return len(self._pending)
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes, now: int = 0) -> list[Frame]:  # noqa: ARG002  frames have headers
         """Take the next bytes; return the frames that are now certain, in stream order."""
         size = len(data)
         counters = self.counters

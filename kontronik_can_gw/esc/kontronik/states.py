@@ -3,16 +3,11 @@
 Numbers without a name stay numbers: no function here raises for a value that newer firmware may send.
 """
 
-from enum import Enum, IntEnum
-from typing import Self
+from enum import IntEnum
 
+from kontronik_can_gw.esc.decoder import ErrorBit, Severity, bit_texts
 
-class Severity(Enum):
-    """Class of a bit: an error, a warning, or a mere status that is no alarm."""
-
-    ERROR = "error"
-    WARNING = "warning"
-    STATUS = "status"
+__all__ = ["ErrorBit", "Severity", "bit_texts"]  # while desk modules take them from here
 
 
 class Device(IntEnum):
@@ -115,29 +110,7 @@ _STATE_REMEDIES = {
 LARGEST_STATE = max(OperatingState)
 
 
-class ErrorBit(IntEnum):
-    """A bit number with a severity, a meaning and a remedy; the base of both error words."""
-
-    severity: Severity
-    meaning: str
-    remedy: str
-    """What a person should do. The sheet has no remedies: these are common practice with any ESC."""
-
-    def __new__(cls, bit: int, severity: Severity, meaning: str, remedy: str) -> Self:
-        member = int.__new__(cls, bit)
-        member._value_ = bit
-        member.severity = severity
-        member.meaning = meaning
-        member.remedy = remedy
-        return member
-
-    @property
-    def text(self) -> str:
-        """The name as decode prints it and DBC signals bind to it."""
-        return self.name.lower()
-
-
-# Two lines a bit: number, severity and meaning; remedy.
+# Two lines a bit: number, severity and meaning; remedy (common practice with any ESC: the sheet has none), emergency code, summary.
 # fmt: off
 _E, _W, _S = Severity.ERROR, Severity.WARNING, Severity.STATUS
 
@@ -146,39 +119,41 @@ class OperatingError(ErrorBit):
     """Bits of the live frame's error word, offset 28."""
 
     UNDERVOLTAGE = (0, _E, "battery voltage too low",
-        "Stop soon. Charge or check the battery. Check connectors and cables: long or thin ones lose voltage under load.")
+        "Stop soon. Charge or check the battery. Check connectors and cables: long or thin ones lose voltage under load.", 0x3220)
     OVERVOLTAGE = (1, _E, "battery voltage too high",
-        "Check that the number of cells suits the ESC. If it comes while braking: a full battery or a power supply takes no energy back.")
+        "Check that the number of cells suits the ESC. If it comes while braking: a full battery or a power supply takes no energy back.",
+        0x3210)
     OVERCURRENT_INTEGRAL_ERROR = (2, _E, "current too high for too long: switched off",
-        "Do not go on. Check that motor and drive turn freely. Reduce the load: smaller propeller or pinion, less pitch, less throttle.")
+        "Do not go on. Check that motor and drive turn freely. Reduce the load: smaller propeller or pinion, less pitch, less throttle.",
+        0x2350)
     OVERCURRENT_INTEGRAL_WARNING = (3, _W, "current high for long",
-        "Reduce the load before the ESC switches off.")
+        "Reduce the load before the ESC switches off.", 0x2351)
     POWER_STAGE_OVERTEMP_WARNING = (4, _W, "power stage hot",
         "Reduce the load. Let the ESC cool and give it more air.")
     POWER_STAGE_OVERTEMP_ERROR = (5, _E, "power stage too hot",
-        "Stop and let the ESC cool. Then give it more air, or reduce the load.")
+        "Stop and let the ESC cool. Then give it more air, or reduce the load.", 0x4210)
     BEC_UNDERVOLTAGE = (6, _E, "BEC voltage too low",
-        "Stop soon: receiver and servos may fail. Check the battery, the BEC's wiring and what the servos draw.")
+        "Stop soon: receiver and servos may fail. Check the battery, the BEC's wiring and what the servos draw.", 0x5114)
     BEC_OVERVOLTAGE = (7, _E, "BEC voltage too high",
-        "Check what else supplies the receiver: a second BEC, a backup battery. If nothing does, have the ESC checked.")
+        "Check what else supplies the receiver: a second BEC, a backup battery. If nothing does, have the ESC checked.", 0x5115)
     BEC_OVERCURRENT = (8, _E, "BEC current too high",
-        "Look for a blocked or short-circuited servo. If all are well, take load off the BEC.")
+        "Look for a blocked or short-circuited servo. If all are well, take load off the BEC.", 0x2220)
     BEC_OVERTEMPERATURE = (9, _E, "BEC too hot",
-        "Take load off the BEC. Let the ESC cool and give it more air.")
+        "Take load off the BEC. Let the ESC cool and give it more air.", 0x4410)
     SWITCHED_OFF_BY_RUNNING_DOWN = (10, _S, "switched off by running down (in speed control)",
         "No alarm. If the motor was meant to go on, check battery and load.")
     CAPACITY_LIMIT_REACHED = (11, _W, "set capacity limit reached",
         "Stop and charge the battery. The limit is a setting of the ESC.")
     OPERATING_ERROR_FOUND = (12, _E, "summary: an operating error was found",
-        "See which other error is set: its remedy holds. If none is, see the operating state.")
+        "See which other error is set: its remedy holds. If none is, see the operating state.", 0x1000, True)
     OPERATING_WARNING_FOUND = (13, _W, "summary: an operating warning was found",
-        "See which other warning is set: its remedy holds.")
+        "See which other warning is set: its remedy holds.", None, True)
     SELFTEST_ERROR = (14, _E, "self-test failed: see the self-test error bits",
-        "Do not run the motor. See the remedy of the self-test error that is set.")
+        "Do not run the motor. See the remedy of the self-test error that is set.", 0x5000)
     EEPROM_ERROR = (15, _E, "EEPROM error",
-        "Switch the ESC off and on. If it stays, set the ESC up anew; if it stays even then, have it checked.")
+        "Switch the ESC off and on. If it stays, set the ESC up anew; if it stays even then, have it checked.", 0x5530)
     WATCHDOG_ERROR_TRIPPED = (16, _E, "the ESC's watchdog had tripped",
-        "Switch the ESC off and on. If it comes again, have the ESC checked: its program had hung.")
+        "Switch the ESC off and on. If it comes again, have the ESC checked: its program had hung.", 0x6010)
     PROGRAMMING_ALLOWED = (17, _S, "programming still allowed (set in every idle frame: no alarm)",
         "Nothing to do.")
     LIMIT_BATTERY_VOLTAGE_MINIMUM = (18, _W, "preset threshold: battery voltage minimum",
@@ -249,12 +224,6 @@ def device_text(number: int) -> str | None:
 def state_text(number: int) -> str | None:
     """The operating state's name, or None for a number that has none."""
     return OperatingState(number).text if number in OperatingState._value2member_map_ else None
-
-
-def bit_texts(word: int, names: type[ErrorBit]) -> list[str]:
-    """Names of the bits set in a 32-bit error word, lowest first; a bit without a name is ``bit24`` and the like."""
-    known = {int(bit): bit.text for bit in names}
-    return [known.get(bit, f"bit{bit}") for bit in range(32) if word >> bit & 1]
 
 
 def peak_current_of(device: int) -> str | None:

@@ -1,0 +1,65 @@
+"""The KONTRONIK protocol for the gateway: the tables of fields.py and states.py in the form of an EscProtocol."""
+
+from kontronik_can_gw.esc.decoder import EscProtocol, Field, State
+from kontronik_can_gw.esc.kontronik.deframer import Deframer
+from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, rows
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+    peak_current_of,
+)
+
+_STATES = {int(state): State(state.text, state.meaning, state.remedy) for state in OperatingState}
+_DEVICES = {int(device): device.text for device in Device}
+_PARTS = ("operating_state", "device_and_variant", "firmware_word")
+"""Rows of the sheet that are several values, or have names."""
+
+
+def _wire(data: DataType) -> list[Field]:
+    found = []
+    for word, (name, row) in enumerate(rows(data).items()):
+        if name not in _PARTS:
+            is_info = data is InfoData
+            ends = row.type_range
+            found.append(
+                Field(name, row.unit, word, is_info, row.per_unit, *ends, not_on=row.not_on)
+            )
+    return found
+
+
+def _bits(name: str, row: str, shift: int, mask: int, names: dict[int, str] | None = None) -> Field:
+    word = InfoData._fields.index(row)
+    return Field(name, "", word, True, 1, 0, mask, shift, mask, names=names or {})
+
+
+_STATE = LiveData._fields.index("operating_state")
+
+KONTRONIK = EscProtocol(
+    name="kontronik",
+    make=Deframer,
+    fields=(
+        *_wire(LiveData),
+        Field(
+            *("operating_state", "", _STATE),
+            high=255,
+            names={number: state.text for number, state in _STATES.items()},
+        ),
+        Field("operating_state_raw", "", _STATE, high=255),
+        *_wire(InfoData),
+        _bits("device", "device_and_variant", 10, 0x3F, _DEVICES),
+        _bits("device_raw", "device_and_variant", 10, 0x3F),
+        _bits("variant", "device_and_variant", 0, 0x3FF),
+        _bits("firmware_main", "firmware_word", 8, 0xFF),
+        _bits("firmware_sub", "firmware_word", 0, 0xFF),
+    ),
+    even_parity=True,
+    layouts=("V4", "legacy"),
+    errors={"operating_errors": tuple(OperatingError), "selftest_errors": tuple(SelfTestError)},
+    states=_STATES,
+    devices=_DEVICES,
+    peak_current_of={
+        int(device): whose for device in Device if (whose := peak_current_of(device)) is not None
+    },
+)

@@ -1,0 +1,16 @@
+"""The ESC protocols that the gateway can decode. Another one is a folder beside ``kontronik`` and a line here."""
+
+from kontronik_can_gw.esc.decoder import EscProtocol
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
+
+PROTOCOLS: tuple[EscProtocol, ...] = (KONTRONIK,)
+"""The first is that of an ESC whose configuration names none."""
+
+
+def protocol_named(name: str) -> EscProtocol:
+    """The protocol of this name. ValueError where there is none."""
+    for protocol in PROTOCOLS:
+        if protocol.name == name:
+            return protocol
+    known = ", ".join(protocol.name for protocol in PROTOCOLS)
+    raise ValueError(f"ESC protocol {name[:40]!r} is unknown, there is {known}")
