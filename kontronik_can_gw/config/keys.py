@@ -21,7 +21,7 @@ from kontronik_can_gw.dbc import send_types
 from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
+from kontronik_can_gw.esc.protocols import device_names, protocol_named, protocol_names
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.signals import units
@@ -247,15 +247,13 @@ class EscConfig:
         "the device that belongs here; another one is reported (CANopen EMCY 7510h)",
         "string",
         None,
-        choices=lambda: tuple(
-            dict.fromkeys(text for protocol in PROTOCOLS for text in protocol.devices.values())
-        ),
+        choices=device_names,
     )
     protocol: str = _key(
         "what the ESC's telemetry line speaks",
         "string",
-        PROTOCOLS[0].name,
-        choices=lambda: tuple(protocol.name for protocol in PROTOCOLS),
+        "kontronik",
+        choices=protocol_names,
     )
 
     @property

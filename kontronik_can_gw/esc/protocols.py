@@ -12,5 +12,16 @@ def protocol_named(name: str) -> EscProtocol:
     for protocol in PROTOCOLS:
         if protocol.name == name:
             return protocol
-    known = ", ".join(protocol.name for protocol in PROTOCOLS)
-    raise ValueError(f"ESC protocol {name[:40]!r} is unknown, there is {known}")
+    raise ValueError(
+        f"ESC protocol {name[:40]!r} is unknown, there is {', '.join(protocol_names())}"
+    )
+
+
+def protocol_names() -> tuple[str, ...]:
+    """Names of all protocols."""
+    return tuple(protocol.name for protocol in PROTOCOLS)
+
+
+def device_names() -> tuple[str, ...]:
+    """Names of all devices of all protocols."""
+    return tuple(dict.fromkeys(text for each in PROTOCOLS for text in each.devices.values()))

@@ -431,7 +431,9 @@ def test_the_age_of_an_esc_that_is_lost_goes_on_in_the_rows_of_another() -> None
     escs = [EscTelemetry(EscSettings(name), 0) for name in ("a", "b")]
     fields = fields_of_values([esc.settings for esc in escs])
     ages = [index for index, one in enumerate(fields) if one.source == "data_age"]
-    maker = RowMaker(escs, GatewayStatus(), sections(fields, ages), 0)
+    maker = RowMaker(
+        escs, GatewayStatus(), sections(fields, ages, [esc.settings for esc in escs]), 0
+    )
     wire = encode(LiveData(), Layout.V4)
     for now in range(SECOND, 3 * SECOND, 100 * MS):
         for number, esc in enumerate(escs):

@@ -5,14 +5,14 @@ their word, the others one by one. A value that is not fresh is None.
 """
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import groupby
 from operator import attrgetter, getitem, itemgetter
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
-from kontronik_can_gw.esc.values import VALUES, Divisor, Group, physical, steps
+from kontronik_can_gw.esc.values import VALUES, Divisor, Group, physical, steps, values_of_esc
 from kontronik_can_gw.esc.values import Kind as How
 from kontronik_can_gw.esc.values import Value as EscValue
 from kontronik_can_gw.gateway_status import GatewayStatus
@@ -23,10 +23,15 @@ LEFT_OUT = frozenset({"sent_frames"})
 """Only the frames themselves show it: they are not made for a table."""
 _MAX_KNOWN = 1 << 13
 _ORDER = {Group.LIVE: 0, Group.LINK: 1, Group.INFO: 2, Group.GATEWAY: 3}
-_LISTED = sorted(
-    (value for value in VALUES.values() if value.name not in LEFT_OUT),
-    key=lambda value: _ORDER[value.group],
-)
+
+
+def _listed(values: Mapping[str, EscValue], of_gateway: bool) -> list[EscValue]:
+    chosen = (
+        value
+        for value in values.values()
+        if value.name not in LEFT_OUT and (value.group is Group.GATEWAY) is of_gateway
+    )
+    return sorted(chosen, key=lambda value: _ORDER[value.group])
 
 
 def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
@@ -34,10 +39,8 @@ def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
     found = []
     for index, esc in enumerate(escs):
         prefix = f"{esc.name}." if len(escs) > 1 else ""
-        listed = (value for value in _LISTED if value.group is not Group.GATEWAY)
-        found += [_field(value, prefix, index) for value in listed]
-    listed = (value for value in _LISTED if value.group is Group.GATEWAY)
-    return found + [_field(value, "", None) for value in listed]
+        found += [_field(value, prefix, index) for value in _listed(values_of_esc(esc), False)]
+    return found + [_field(value, "", None) for value in _listed(VALUES, True)]
 
 
 def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
@@ -60,7 +63,7 @@ def _kind(value: EscValue) -> Kind:
 
 def _word(value: EscValue) -> int | None:
     """Where in its frame's fields a value or flag stands as it is; None for one that is derived."""
-    if value.not_on or value.divisor is not Divisor.ONE:
+    if value.not_on or value.divisor is not Divisor.ONE or value.read is not None:
         return None
     if value.kind is How.WIRE or value.bit is not None:
         return value.words[0]
@@ -103,12 +106,12 @@ class Section(NamedTuple):
     """It changes with time alone."""
 
 
-def _words(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]:
+def _words(values: Sequence[EscValue], attribute: str) -> Callable[[Any, int], Values]:
     """What gives values that stand in a frame's fields as they are."""
-    words = [_word(VALUES[name]) for name in names]
+    words = [_word(value) for value in values]
     take = itemgetter(*words, words[0])  # one more: of a single word it would be no tuple
-    scales = [Known(_scaling(VALUES[name])) for name in names]
-    nothing: Values = (None,) * len(names)
+    scales = [Known(_scaling(value)) for value in values]
+    nothing: Values = (None,) * len(values)
     data_of = attrgetter(attribute)
 
     def read(esc: EscTelemetry, _: int) -> Values:
@@ -118,13 +121,13 @@ def _words(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]
     return read
 
 
-def _flags(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]:
+def _flags(values: Sequence[EscValue], attribute: str) -> Callable[[Any, int], Values]:
     """What gives the bits of one word of a frame."""
-    word = _word(VALUES[names[0]])
+    word = _word(values[0])
     assert word is not None
-    bits = [VALUES[name].bit or 0 for name in names]
+    bits = [value.bit or 0 for value in values]
     known = Known(lambda found: tuple([found >> bit & 1 for bit in bits]))
-    nothing: Values = (None,) * len(names)
+    nothing: Values = (None,) * len(values)
     data_of = attrgetter(attribute)
 
     def read(esc: EscTelemetry, _: int) -> Values:
@@ -134,9 +137,8 @@ def _flags(names: Sequence[str], attribute: str) -> Callable[[Any, int], Values]
     return read
 
 
-def _derived(names: Sequence[str]) -> Callable[[Any, int], Values]:
+def _derived(listed: Sequence[EscValue]) -> Callable[[Any, int], Values]:
     """What gives values of an ESC that are computed, by its pole pairs and gear as they are then."""
-    listed = [VALUES[name] for name in names]
     gateway = GatewayStatus()
 
     def read(esc: EscTelemetry, now: int) -> Values:
@@ -152,35 +154,41 @@ def _derived(names: Sequence[str]) -> Callable[[Any, int], Values]:
     return read
 
 
-def _of_gateway(names: Sequence[str]) -> Callable[[Any, int], Values]:
+def _of_gateway(values: Sequence[EscValue]) -> Callable[[Any, int], Values]:
     readers: list[tuple[Any, Callable[[Any], Value]]] = [
-        (VALUES[name].read, _scaling(VALUES[name])) for name in names
+        (value.read, _scaling(value)) for value in values
     ]
     return lambda status, now: tuple([scale(read(None, status, now)) for read, scale in readers])
 
 
-def sections(fields: Sequence[Field], chosen: Sequence[int]) -> list[Section]:
+def sections(
+    fields: Sequence[Field], chosen: Sequence[int], escs: Sequence[EscSettings]
+) -> list[Section]:
     """The sections of chosen fields, in their order."""
+    tables = [values_of_esc(esc) for esc in escs]
+
+    def value_of(field: Field) -> EscValue:
+        return (VALUES if field.esc is None else tables[field.esc])[field.source]
+
+    def together(field: Field) -> Hashable:
+        """The same for columns that are read together."""
+        value = value_of(field)
+        word = _word(value)
+        way = None if word is None else word if value.bit is not None else -1
+        return field.esc, value.group, way, value.kind is How.AGE
+
     found = []
-    for _, neighbours in groupby((fields[index] for index in chosen), _together):
-        together = list(neighbours)
-        names = [one.source for one in together]
-        source, esc = VALUES[names[0]], together[0].esc
+    for _, neighbours in groupby((fields[index] for index in chosen), together):
+        of_section = list(neighbours)
+        values = [value_of(field) for field in of_section]
+        value, esc = values[0], of_section[0].esc
         if esc is None:
-            read = _of_gateway(names)
-        elif _word(source) is None:
-            read = _derived(names)
+            read = _of_gateway(values)
+        elif _word(value) is None:
+            read = _derived(values)
         else:
-            make = _words if source.bit is None else _flags
-            read = make(names, source.group.value)
-        ages = source.kind is How.AGE
-        found.append(Section(source.group, esc, (None,) * len(names), read, ages))
+            make = _words if value.bit is None else _flags
+            read = make(values, value.group.value)
+        ages = value.kind is How.AGE
+        found.append(Section(value.group, esc, (None,) * len(values), read, ages))
     return found
-
-
-def _together(field: Field) -> Hashable:
-    """The same for columns that are read together."""
-    source = VALUES[field.source]
-    word = _word(source)
-    way = None if word is None else word if source.bit is not None else -1
-    return field.esc, source.group, way, source.kind is How.AGE

@@ -74,4 +74,5 @@ class Input(ABC):
         self.close()
 
     def _sections(self, chosen: Sequence[int] | None) -> list[Section]:
-        return sections(self.fields, range(len(self.fields)) if chosen is None else chosen)
+        found = range(len(self.fields)) if chosen is None else chosen
+        return sections(self.fields, found, self.bus.escs)

@@ -363,6 +363,15 @@ _SPEED_PER_VOLT = 2500.0  # electrical 1/min for each V at the motor
 _SUPPLIES_NO_BEC_CURRENT = rows(LiveData)["bec_current"].not_on
 
 
+_LOGGED_FROM_ZERO = frozenset(
+    {
+        *("electrical_speed", "battery_current", "motor_current", "peak_current", "bec_current"),
+        *("throttle", "output_opening"),
+    }
+)
+"""The log of their greatest values begins at 0."""
+
+
 class _Model:
     """Battery, motor and heat of one ESC since its power-up, stepped once a period."""
 
@@ -408,7 +417,7 @@ class _Model:
         self._throttle = 0.0
         self._peak = 0
         self._has_run = False
-        self._log: list[int] = []
+        self._log: dict[str, int] = {}
         self._next_phase = 0
         self._phase_s = 0.0
         self._ramp_from = 0.0
@@ -502,70 +511,53 @@ class _Model:
             errors |= 1 << OperatingError.PROGRAMMING_ALLOWED
         rounded_throttle = round(throttle)
         live = LiveData(
-            round(speed),
-            min(max(round(voltage * 100), 0), 65_535),
-            battery_raw,
-            motor_raw,
-            self._peak,
-            min(int(self._charge), 65_535),
-            round(bec_current * 1000) if self._supplies_bec_current else 0,
-            round(bec_voltage * 1000),
-            1001 + (9 * rounded_throttle if rounded_throttle > 0 else rounded_throttle),
-            rounded_throttle,
-            abs(rounded_throttle) if speed > 0 else 0,
-            min(max(round(stage), -128), 127),
-            min(max(round(bec), -128), 127),
-            errors,
-            phase.state,
-            20,
+            electrical_speed=round(speed),
+            battery_voltage=min(max(round(voltage * 100), 0), 65_535),
+            battery_current=battery_raw,
+            motor_current=motor_raw,
+            peak_current=self._peak,
+            consumed_charge=min(int(self._charge), 65_535),
+            bec_current=round(bec_current * 1000) if self._supplies_bec_current else 0,
+            bec_voltage=round(bec_voltage * 1000),
+            pwm_input=1001 + (9 * rounded_throttle if rounded_throttle > 0 else rounded_throttle),
+            throttle=rounded_throttle,
+            output_opening=abs(rounded_throttle) if speed > 0 else 0,
+            power_stage_temperature=min(max(round(stage), -128), 127),
+            bec_temperature=min(max(round(bec), -128), 127),
+            operating_errors=errors,
+            operating_state=phase.state,
+            timing=20,
         )
         self._remember(live)
         return live
 
     def _remember(self, live: LiveData) -> None:
-        """The ESC's own log: the fields of InfoData from max_electrical_speed on."""
-        (
-            speed,
-            voltage,
-            battery,
-            motor,
-            peak,
-            _,
-            bec_current,
-            bec_voltage,
-            _,
-            throttle,
-            opening,
-            stage,
-            bec,
-            *_,
-        ) = live
-        if speed > 0:
-            self._has_run = True
-        log = self._log or [0, voltage, 0, 0, 0, 0, 0, bec_voltage, 0, 0, stage, stage, bec, bec]
-        self._log = [
-            max(log[0], speed),
-            min(log[1], voltage),
-            max(log[2], voltage) if self._has_run else 0,
-            max(log[3], battery),
-            max(log[4], motor),
-            max(log[5], peak),
-            max(log[6], bec_current),
-            min(log[7], bec_voltage),
-            max(log[8], throttle),
-            max(log[9], opening),
-            min(log[10], stage),
-            max(log[11], stage),
-            min(log[12], bec),
-            max(log[13], bec),
-        ]
+        """The ESC's own log: the extremes of InfoData."""
+        self._has_run = self._has_run or live.electrical_speed > 0
+        log = self._log
+        for name in InfoData._fields:
+            extreme, _, of = name.partition("_")
+            if extreme not in ("max", "min"):
+                continue
+            value: int = getattr(live, of)
+            if name not in log:
+                log[name] = 0 if of in _LOGGED_FROM_ZERO else value
+            log[name] = max(log[name], value) if extreme == "max" else min(log[name], value)
+        if not self._has_run:
+            log["max_battery_voltage"] = 0
 
     def info(self, selftest_errors: int) -> InfoData:
         """The info data now: extremes of all live data since power-up, sent or not."""
         options = self._options
         main, sub = options.firmware
         pair = device_and_variant(self._device, options.variant)
-        return InfoData(pair, main << 8 | sub, selftest_errors, options.cell_count, *self._log)
+        return InfoData(
+            device_and_variant=pair,
+            firmware_word=main << 8 | sub,
+            selftest_errors=selftest_errors,
+            cell_count=options.cell_count,
+            **self._log,
+        )
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

@@ -1,0 +1,124 @@
+"""KISS/BLHeli32 serial telemetry: the recipe for another ESC protocol. 115200 8N1, ten bytes big-endian without a header.
+
+Temperature (°C), voltage (10 mV), current (10 mA), charge (mAh), electrical speed (100 1/min), CRC-8 of polynomial 07h. Frames are apart
+by a gap: what follows an error is dropped up to the next one.
+"""
+
+import struct
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from kontronik_can_gw.esc.decoder import EscProtocol, Field, Reading
+
+GAP_NS = 2_000_000
+_BODY = struct.Struct(">bHHHH")
+
+
+class Form(NamedTuple):
+    """The one form of a frame."""
+
+    is_info: bool = False
+    length: int = 10
+    layout_number: int = 1
+    partly_protected: bool = False
+
+
+FORM = Form()
+
+
+@dataclass
+class Counters:
+    """What a stream held."""
+
+    bytes: int = 0
+    live: int = 0
+    info: int = 0
+    crc_errors: int = 0
+    dropped_bytes: int = 0
+
+    def copy(self) -> "Counters":
+        return replace(self)
+
+    def as_dict(self) -> dict[str, int]:
+        return dict(vars(self))
+
+    def diagnosis(self, since: "Counters | None" = None) -> str | None:
+        old = since or Counters()
+        if self.live > old.live:
+            return None
+        return "bytes but no frame" if self.bytes > old.bytes else "no bytes"
+
+
+class Kiss:
+    """Finds the frames of one stream."""
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self._pending = b""
+        self._lost = False
+        self._last_ns = 0
+
+    @property
+    def pending(self) -> int:
+        return len(self._pending)
+
+    def feed(self, data: bytes, now: int = 0) -> list[Reading]:
+        if now - self._last_ns >= GAP_NS:
+            self.flush()
+        self._last_ns = now
+        self.counters.bytes += len(data)
+        self._pending += data
+        found = []
+        while len(self._pending) >= FORM.length and not self._lost:
+            frame = self._pending[: FORM.length]
+            if crc8(frame):
+                self.counters.crc_errors += 1
+                self._lost = True
+                break
+            temperature, voltage, current, charge, speed = _BODY.unpack(frame[:9])
+            offset = self.counters.bytes - len(self._pending)
+            data_of_it = (temperature, voltage, current, charge, speed * 100)
+            found.append(Reading(FORM, offset, data_of_it))
+            self._pending = self._pending[FORM.length :]
+            self.counters.live += 1
+        if self._lost:
+            self._drop()
+        return found
+
+    def flush(self) -> list[Reading]:
+        self._drop()
+        self._lost = False
+        return []
+
+    def _drop(self) -> None:
+        self.counters.dropped_bytes += len(self._pending)
+        self._pending = b""
+
+
+def crc8(data: bytes) -> int:
+    """0 over a frame with its CRC."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc << 1 ^ (0x107 if crc & 0x80 else 0)
+    return crc
+
+
+def frame(temperature: int, voltage: int, current: int, charge: int, speed: int) -> bytes:
+    """The bytes of a frame, of its raw values."""
+    body = _BODY.pack(temperature, voltage, current, charge, speed)
+    return body + bytes((crc8(body),))
+
+
+KISS = EscProtocol(
+    name="kiss",
+    make=Kiss,
+    fields=(
+        Field("power_stage_temperature", "°C", 0, low=-128, high=127),
+        Field("battery_voltage", "V", 1, per_unit=100, high=0xFFFF),
+        Field("battery_current", "A", 2, per_unit=100, high=0xFFFF),
+        Field("consumed_charge", "mAh", 3, high=0xFFFF),
+        Field("electrical_speed", "1/min", 4, high=6_553_500),
+    ),
+)

@@ -1,0 +1,81 @@
+"""A field put in front of all others of a live frame moves no other value, object or frame: nobody knows a field by its position."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+PACKAGE = Path(__file__).resolve().parents[2] / "kontronik_can_gw"
+FIRST = "    electrical_speed: ElectricalSpeed = 0\n"
+SHOW = """
+import json
+from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
+from kontronik_can_gw.esc.kontronik import Device, Layout, LiveData
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.snapshot import PortFacts, _esc
+
+esc = [{"port": "/dev/null"}, {"port": "/dev/zero"}]
+config = parse({"can": {"interface": "virtual", "channel": "x"}, "esc": esc}, "x.toml")
+gateway = Gateway(config.escs, assemble(config).layout, 0, canopen=shipped_canopen([1, 2]))
+gateway.start(0)
+escs = [SimulatedEsc(EscOptions(device=device, layout=Layout.V4), seed=device) for device in (Device.KOSMIK, Device.JIVEPRO)]
+frames = []
+for now in range(0, 3_000_000_000, 10_000_000):
+    for index, esc in enumerate(escs):
+        for sent in esc.frames_until(now):
+            gateway.receive_bytes(index, sent.wire, now, now)
+    gateway.advance(now)
+    frames += [f"{now} {f.can_id:X} {f.data.hex()}" for f in gateway.take_frames()]
+fields = [f for f in fields_of_values(config.escs) if f.source != "dummy"]
+parts = sections(fields, [n for n, f in enumerate(fields) if f.esc == 1], config.escs)
+port = PortFacts("esc", "/dev/null", open=True)
+status = _esc(gateway.escs[1], port, gateway.status, now)
+status["values"].pop("dummy", None)
+print(json.dumps({
+    "first": LiveData._fields[0],
+    "words": VALUES["electrical_speed"].words,
+    "frames": frames,
+    "values": [
+        (v.name, v.unit, v.per_unit, v.low, v.high) for v in VALUES.values() if v.name != "dummy"
+    ],
+    "objects": sorted((*at, b.source.name, str(b.slope)) for at, b in BINDINGS.items()),
+    "row": [value for part in parts for value in part.read(gateway.escs[1], now)],
+    "status": status,
+}))
+"""
+
+
+def _shown(folder: Path) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, "-c", SHOW], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert isinstance(found, dict)
+    return found
+
+
+def test_a_field_in_front_of_all_others_moves_nothing(tmp_path: Path) -> None:
+    copy = shutil.copytree(
+        PACKAGE, tmp_path / "kontronik_can_gw", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    for name in ("dbc", "eds"):
+        if (PACKAGE.parent / name).is_dir():
+            shutil.copytree(PACKAGE.parent / name, tmp_path / name)
+    fields = copy / "esc" / "kontronik" / "fields.py"
+    text = fields.read_text(encoding="utf-8")
+    assert text.count(FIRST) == 1
+    fields.write_text(text.replace(FIRST, f"    dummy: Count = 0\n{FIRST}"), encoding="utf-8")
+    before, after = _shown(PACKAGE.parent), _shown(tmp_path)
+    assert (before.pop("first"), before.pop("words")) == ("electrical_speed", [0])
+    assert (after.pop("first"), after.pop("words")) == ("dummy", [1])
+    assert len(before["frames"]) > 1000
+    assert after == before

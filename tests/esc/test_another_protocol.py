@@ -1,0 +1,221 @@
+"""The recipe for another ESC protocol: kiss.py goes through the whole gateway, beside a KONTRONIK ESC, without a change of the package."""
+
+import termios
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cantools
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kontronik_can_gw.canopen.abort import SdoAbort
+from kontronik_can_gw.capture.setup import CaptureSetup
+from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.dbc.compiler import DbcSettings
+from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
+from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc import protocols
+from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
+from kontronik_can_gw.esc.telemetry import SECOND, LinkState
+from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.serial_port import SerialPort
+from kontronik_can_gw.runtime.snapshot import PortFacts, _esc
+
+from .kiss import GAP_NS, KISS, Kiss, frame
+
+DBC = Path(__file__).with_name("kiss.dbc")
+PERIOD = SECOND // 10
+MIXED: dict[str, Any] = {
+    "can": {"interface": "virtual", "channel": "kiss"},
+    "dbc": {"file": str(DBC), "node": "Gateway"},
+    "esc": [
+        {"port": "/dev/null", "name": "old"},
+        {"port": "/dev/zero", "name": "kiss", "protocol": "kiss", "pole_pairs": 7},
+    ],
+}
+
+
+@pytest.fixture(autouse=True)
+def kiss_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(protocols, "PROTOCOLS", (*protocols.PROTOCOLS, KISS))
+
+
+class Flight:
+    """Both ESCs send ten times a second; the newest message of each id as cantools reads it, None for a code."""
+
+    def __init__(self, **options: Any) -> None:
+        config = parse(MIXED, "mixed.toml")
+        self.loaded = assemble(config)
+        self.gateway = Gateway(config.escs, self.loaded.layout, 0, **options)
+        self.gateway.start(0)
+        self.now = 0
+        self.seen: dict[str, float] = {}
+        self._database = cantools.database.load_file(str(DBC))
+
+    def send(self, *data: bytes) -> None:
+        self.now += PERIOD
+        for esc, wire in enumerate(data):
+            if wire:
+                self.gateway.receive_bytes(esc, wire, self.now, self.now)
+        self.gateway.advance(self.now)
+        for sent in self.gateway.take_frames():
+            if 257 <= sent.can_id <= 259:
+                found: Any = self._database.decode_message(sent.can_id, sent.data)  # type: ignore[union-attr]
+                self.seen |= found
+
+
+OLD = encode(LiveData(electrical_speed=9_000, battery_voltage=2_500, battery_current=-5), Layout.V4)
+
+
+def test_both_protocols_reach_the_bus_side_by_side() -> None:
+    flight = Flight()
+    for _ in range(361):
+        flight.send(OLD, frame(-7, 2_400, 1_234, 55, 210))
+    assert flight.seen == {
+        "KissBatteryVoltage": 24.0,
+        "KissBatteryCurrent": pytest.approx(12.3),  # 12.34 A in steps of 0.1 A
+        "KissMotorSpeed": 3_000,
+        "KissPowerStageTemperature": -7,
+        "KissBecVoltage": pytest.approx(655.35),  # FFFFh: KISS has none
+        "KissEnergyUsed": pytest.approx(2.96),  # 24 V by 12.34 A for 36 s
+        "KissLinkState": LinkState.OK,
+        "KissLayout": 1,
+        "KissUndervoltage": 0,
+        "OldBatteryVoltage": 25.0,
+        "OldBatteryCurrent": pytest.approx(-0.5),
+        "OldElectricalSpeed": 9_000,
+    }
+
+
+def test_lost_telemetry_is_not_available_and_the_other_esc_goes_on() -> None:
+    flight = Flight()
+    flight.send(OLD, frame(20, 2_400, 0, 0, 0))
+    for _ in range(4):
+        flight.send(OLD, b"")
+    assert flight.seen["KissBatteryVoltage"] == pytest.approx(655.35)
+    assert flight.seen["KissLinkState"] == LinkState.LOST
+    assert flight.seen["OldBatteryVoltage"] == 25.0
+
+
+def test_a_node_shows_what_there_is_and_nothing_else() -> None:
+    flight = Flight(canopen=shipped_canopen([1, 2]))
+    flight.send(OLD, frame(20, 2_400, 1_234, 55, 210))
+    assert flight.gateway.nodes is not None
+    dictionary = flight.gateway.nodes.nodes[1].dictionary
+    shown = {sub: dictionary.find(0x2000, sub) for sub in range(1, 17)}
+    found: dict[int, object] = {}
+    for sub, variable in shown.items():
+        assert variable.read is not None
+        try:
+            found[sub] = variable.read(flight.now)
+        except SdoAbort:
+            found[sub] = None
+    # 1/min, 10 mV, 0.1 A, mAh, °C by the sub-indices of the EDS; nothing else
+    assert {sub: value for sub, value in found.items() if value is not None} == {
+        1: 21_000,
+        2: 2_400,
+        3: 123,
+        6: 55,
+        12: 20,
+    }
+
+
+def test_the_status_shows_it() -> None:
+    flight = Flight()
+    flight.send(OLD, frame(20, 2_400, 1_234, 55, 210))
+    document = _esc(
+        flight.gateway.escs[1],
+        PortFacts("kiss", "/dev/zero", open=True),
+        flight.gateway.status,
+        flight.now,
+    )
+    assert document["values"]["battery_current"] == 12.34
+    assert document["values"]["bec_voltage"] is None
+    assert document["counters"]["live"] == 1
+    assert (document["operating_state"], document["errors"], document["device"]) == (None,) * 3
+
+
+def test_a_capture_names_the_protocol() -> None:
+    config = parse(MIXED, "mixed.toml")
+    setup = CaptureSetup(tuple(config.escs), ("a", "b"), None, DbcSettings(), False, False, None)
+    assert CaptureSetup.of(setup.header()).escs == tuple(config.escs)
+    old = setup.header()
+    old["escs"] = [
+        {k: v for k, v in asdict(esc).items() if k != "protocol"} | {"gear": "1"}
+        for esc in config.escs
+    ]
+    assert [esc.protocol for esc in CaptureSetup.of(old).escs] == ["kontronik", "kontronik"]
+
+
+def test_a_table_has_its_values_by_name() -> None:
+    flight = Flight()
+    escs = [esc.settings for esc in flight.gateway.escs]
+    fields = fields_of_values(escs)
+    chosen = [n for n, field in enumerate(fields) if field.esc == 1]
+    of_kiss = sections(fields, chosen, escs)
+    flight.send(OLD, frame(20, 2_400, 1_234, 55, 210))
+    esc = flight.gateway.escs[1]
+    read = [value for section in of_kiss for value in section.read(esc, flight.now)]
+    row = {fields[n].source: value for n, value in zip(chosen, read, strict=True)}
+    live = {
+        name: value
+        for name, value in row.items()
+        if value is not None and VALUES[name].group is Group.LIVE
+    }
+    assert live == {
+        "electrical_speed": 21_000,
+        "battery_voltage": 24.0,
+        "battery_current": 12.34,
+        "consumed_charge": 55,
+        "power_stage_temperature": 20,
+        "motor_speed": 3_000,
+        "output_speed": 3_000,
+        "battery_power": pytest.approx(24 * 12.34),
+    }
+
+
+def test_its_line_is_set_without_parity() -> None:
+    with PtyEsc() as esc:
+        port = SerialPort(esc.path, KISS)
+        try:
+            flags, speed = (termios.tcgetattr(port.fileno())[at] for at in (2, 4))
+            assert not flags & termios.PARENB
+            assert speed == termios.B115200
+        finally:
+            port.close()
+
+
+def test_an_unknown_protocol_is_refused_with_the_nearest() -> None:
+    wrong = MIXED | {"esc": [{"port": "/dev/null", "protocol": "kis"}]}
+    with pytest.raises(
+        UserError, match=r"esc\[1\].protocol: 'kis' is none of kontronik, kiss. Did you mean kiss?"
+    ):
+        parse(wrong, "mixed.toml")
+
+
+@given(
+    frames=st.lists(st.tuples(*[st.integers(0, 100)] * 5), max_size=5),
+    damaged=st.binary(min_size=1, max_size=25).filter(lambda data: len(data) % 10),
+    cut=st.integers(1, 10),
+)
+def test_frames_are_found_however_cut_and_after_a_gap_whatever_came(
+    frames: list[tuple[int, ...]], damaged: bytes, cut: int
+) -> None:
+    decoder, now, found = Kiss(), 0, []
+    decoder.feed(damaged, now)
+    before = decoder.counters.live
+    for values in frames:
+        now += GAP_NS
+        wire = frame(*values)
+        for at in range(0, len(wire), cut):
+            found += [reading.data for reading in decoder.feed(wire[at : at + cut], now)]
+    assert found == [(t, u, i, q, 100 * n) for t, u, i, q, n in frames]
+    counters = decoder.counters
+    assert counters.bytes == 10 * counters.live + counters.dropped_bytes + decoder.pending
+    assert counters.live == before + len(frames)
