@@ -78,7 +78,7 @@ def u32(value: int) -> bytes:
 
 
 def sent_speeds(run: Bench, index: int = 0) -> set[tuple[int, int, int]]:
-    return {(d.electrical_speed, d.battery_voltage, d.battery_current) for _, d in run.live(index)}
+    return {(d.electrical_speed, d.battery_voltage, d.battery_current) for d in run.live(index)}
 
 
 # --- zencan-cli
@@ -113,10 +113,8 @@ def test_zencan_scans_reads_writes_and_stores(
         assert read(0x1008, 0, "utf8") == "KONTRONIK ESC gateway"  # segmented
         assert read(0x2101, 1, "u8") == "5"
         assert read(0x2101, 1, "u8", node=6) == "6"
-        assert int(read(0x2000, 2, "u16")) in {data.battery_voltage for _, data in run.live(0)}
-        assert int(read(0x2000, 12, "i8")) in {
-            data.power_stage_temperature for _, data in run.live(0)
-        }
+        assert int(read(0x2000, 2, "u16")) in {data.battery_voltage for data in run.live(0)}
+        assert int(read(0x2000, 12, "i8")) in {data.power_stage_temperature for data in run.live(0)}
 
         def refusal(command: str) -> str:
             said = zencan(vcan, command)
@@ -346,7 +344,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
             node_master.upload(7, 0x2000, 1)
         assert refused.value.code == DEVICE_STATE
         assert node_master.upload(7, 0x2020, 1)[0] & 0x3F == 4  # lost
-        sent = [data for _, data in run.live(0)]
+        sent = run.live(0)
         counts = Counter(told["cob_id"] for told in node_master.of("pdo"))
         run.start()
         wait_for(lambda: len(node_master.of("emergency")) >= 4, "telemetry back")

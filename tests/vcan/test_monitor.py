@@ -83,7 +83,7 @@ def test_once_tells_of_all_escs_of_the_configuration(
     assert (first["name"], second["name"]) == ("esc1", "esc2")
     assert (first["errors"], second["errors"]) == (["bec_overcurrent"], [])
     assert [esc["link"] for esc in found["escs"]] == ["Ok", "Ok"]
-    sent = {live.battery_voltage / 100 for _, live in run.live(0)}
+    sent = {live.battery_voltage / 100 for live in run.live(0)}
     assert first["values"]["battery_voltage"] in sent
     assert second["values"]["cell_count"] == 12
 

@@ -222,7 +222,7 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
             run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4
         )
         assert gateway.end() == 0
-        sent = {live.battery_voltage for _, live in run.live(0)}
+        sent = {live.battery_voltage for live in run.live(0)}
     link = tmp_path / "played"
     words = f"replay {folder} --to pty --link {link} --delay 4".split()
     quiet = subprocess.DEVNULL

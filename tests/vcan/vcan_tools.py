@@ -308,12 +308,28 @@ def chain(
 # --- simulated ESCs in real time
 
 
+class NotedEsc(SimulatedEsc):
+    """A simulated ESC that notes each frame before anybody can have it."""
+
+    def __init__(self, options: EscOptions, seed: int, noted: list[Sent]) -> None:
+        super().__init__(options, seed=seed)
+        self._noted = noted
+
+    def frames_until(self, now_ns: int) -> list[Sent]:
+        frames = super().frames_until(now_ns)
+        self._noted.extend(frames)
+        return frames
+
+
 class Bench:
-    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent."""
+    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent.
+
+    A frame is in the record before it is written: a value that came from an ESC is in a record read after it came.
+    """
 
     def __init__(self, escs: Sequence[EscOptions], seed: int = 1) -> None:
         self.ports = [pty.PtyEsc() for _ in escs]
-        self.sent: list[list[tuple[float, Sent]]] = [[] for _ in escs]
+        self.sent: list[list[Sent]] = [[] for _ in escs]
         self._options = escs
         self._seed = seed
         self._stop = threading.Event()
@@ -321,17 +337,13 @@ class Bench:
 
     def start(self) -> None:
         self._stop.clear()
-        simulated = [
-            SimulatedEsc(options, seed=self._seed + i) for i, options in enumerate(self._options)
+        noted = [
+            NotedEsc(options, self._seed + i, sent)
+            for i, (options, sent) in enumerate(zip(self._options, self.sent, strict=True))
         ]
-        pairs = list(zip(simulated, self.ports, strict=True))
-
-        def note(index: int, sent: Sent, taken: bool) -> None:
-            assert taken
-            self.sent[index].append((time.time(), sent))
-
+        pairs = list(zip(noted, self.ports, strict=True))
         self._thread = threading.Thread(
-            target=lambda: pty.run(pairs, stop=self._stop.is_set, on_sent=note), daemon=True
+            target=lambda: pty.run(pairs, stop=self._stop.is_set), daemon=True
         )
         self._thread.start()
 
@@ -340,15 +352,11 @@ class Bench:
         if self._thread:
             self._thread.join(LIMIT_S)
 
-    def live(self, index: int) -> list[tuple[float, LiveData]]:
-        return [
-            (when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, LiveData)
-        ]
+    def live(self, index: int) -> list[LiveData]:
+        return [sent.data for sent in self.sent[index] if isinstance(sent.data, LiveData)]
 
-    def info(self, index: int) -> list[tuple[float, InfoData]]:
-        return [
-            (when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, InfoData)
-        ]
+    def info(self, index: int) -> list[InfoData]:
+        return [sent.data for sent in self.sent[index] if isinstance(sent.data, InfoData)]
 
     def close(self) -> None:
         self.stop()
