@@ -5,6 +5,7 @@ judges order, values and counts. A ``Chain`` sends an ESC's next frame when the 
 to not happen is followed by something that has to.
 """
 
+import itertools
 import re
 import socket
 import struct
@@ -117,10 +118,28 @@ MARK = 0x7F2
 """An id of nobody: what was sent before it has been recorded when it has."""
 
 
-def send_mark(interface: str, number: int) -> None:
+DELIVERY_MARK = 0x7F3
+_delivery_marks = itertools.count(1)
+
+
+def send_mark(interface: str, number: int, can_id: int = MARK) -> None:
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
         bus.bind((interface,))
-        bus.send(struct.pack("=IB3x8s", MARK, 4, number.to_bytes(4, "little")))
+        bus.send(struct.pack("=IB3x8s", can_id, 4, number.to_bytes(4, "little")))
+
+
+def wait_for_delivery(interface: str) -> None:
+    """Wait until every socket on this interface has what was sent so far."""
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as witness:
+        witness.setsockopt(
+            socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", DELIVERY_MARK, 0x7FF)
+        )
+        witness.bind((interface,))
+        witness.settimeout(LIMIT_S)
+        number = next(_delivery_marks)
+        send_mark(interface, number, DELIVERY_MARK)
+        while int.from_bytes(witness.recv(16)[8:12], "little") != number:
+            pass
 
 
 class Candump:
@@ -170,7 +189,7 @@ class Candump:
             self.catch_up()
         self._process.terminate()
         self._process.wait()
-        self._thread.join(5)
+        self._thread.join(LIMIT_S)
         if self._process.stdout:
             self._process.stdout.close()
 
