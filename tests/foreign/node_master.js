@@ -79,8 +79,9 @@ const calls = {
     nmt({ command, node }) {
         master.nmt[command](node);
     },
-    fastscan(request) {
-        return master.lss.fastscan(request);
+    /** With hints, or it learns each 1 of an identity from an answer that does not come in time. */
+    fastscan(hints) {
+        return master.lss.fastscan({ timeout: ANSWER_TIMEOUT, ...hints });
     },
     /** inquireVendorId ..., configureNodeId, storeConfiguration */
     lss({ command, args = [] }) {

@@ -84,7 +84,7 @@ def port_on(
 def readable(port: CanPort, interface: str) -> bool:
     """Whether the socket has something to read of what was sent so far."""
     wait_for_delivery(interface)
-    return bool(select.select([port], [], [], 0)[0])
+    return port.waits_to_be_read
 
 
 def all_of(port: CanPort, interface: str) -> list[CanFrame]:

@@ -42,8 +42,6 @@ LIVELY = (
 )
 LOSS_MS = 10_000
 """Until telemetry counts as lost, where that is to happen: no machine stands still for so long."""
-SCAN_MS = 2000
-"""For each answer of a fastscan, which learns each 1 of an identity from none."""
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 # CiA 301 data types: bytes of a number; strings and domains have any length
 SIZES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
@@ -229,9 +227,13 @@ def node_master(vcan: str) -> Iterator[NodeMaster]:
         yield master
 
 
-def scanned(master: NodeMaster) -> dict[str, int]:
-    """What a fastscan finds that knows the product code: it has the most bits that are 1."""
-    return cast(dict[str, int], master("fastscan", timeout=SCAN_MS, productCode=PRODUCT))
+def scanned(master: NodeMaster, serial: int) -> dict[str, int]:
+    """What a fastscan finds that has to find the vendor-ID, 0, bit by bit: every one of its requests is answered.
+
+    (One that knows nothing: the examples of docs/canopen.md.)
+    """
+    known = {"productCode": PRODUCT, "revisionNumber": REVISION, "serialNumber": serial}
+    return cast(dict[str, int], master("fastscan", **known))
 
 
 def test_node_canopen_polls_every_object_of_the_eds(
@@ -389,8 +391,8 @@ def test_node_canopen_names_nodes_by_lss(
         gateway = start_nodes(vcan, start_gateway, run, tmp_path, 255)
         gateway.wait_for_line("esc2: CANopen node waits for LSS")
         found = []
-        for node_id in (0x31, 0x32):
-            identity = scanned(node_master)
+        for node_id, serial in ((0x31, SERIAL + 1), (0x32, SERIAL)):
+            identity = scanned(node_master, serial)
             found.append(identity)
             for name, field in (
                 ("inquireVendorId", "vendorId"),
@@ -411,7 +413,7 @@ def test_node_canopen_names_nodes_by_lss(
         assert {(i["vendorId"], i["productCode"], i["revisionNumber"]) for i in found} == {
             (0, PRODUCT, REVISION)
         }
-        assert node_master("fastscan", timeout=SCAN_MS) is None
+        assert node_master("fastscan", timeout=500) is None
 
         # a configured node is found by its whole identity, and gets another node-ID that holds from the next reset on
         node_master("select", **found[0])
@@ -439,7 +441,7 @@ def test_tshark_reads_what_was_said(
         with Candump(vcan) as dump:
             gateway = start_nodes(vcan, start_gateway, run, tmp_path / "store", 255, LOSS_MS)
             gateway.wait_for_line("esc1: CANopen node waits for LSS")
-            assert scanned(node_master)["serialNumber"] == SERIAL
+            assert scanned(node_master, SERIAL)["serialNumber"] == SERIAL
             node_master("add", node=0x55)
             node_master("lss", command="configureNodeId", args=[0x55])
             node_master("waiting")
@@ -465,7 +467,7 @@ def test_tshark_reads_what_was_said(
         frames = tshark(dump.frames, tmp_path / "bus.log")
 
     told = [frame.can_id for frame in dump.frames]
-    assert len(frames) == len(told) > 300
+    assert len(frames) == len(told) > 100
     assert [f for f in frames if f.malformed] == []
     assert [int(f.can_id, 0) for f in frames] == told
     assert {int(f.function, 0) for f in frames} == {id_ >> 7 for id_ in told}
