@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.printable import printable, printable_json
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.desk.describe.facts import Description
+    from kontronik_can_gw.desk.describe.parts import Facts
 
 EPILOG = """\
 Signals and messages of the DBC in use, the CANopen nodes with their objects and emergencies, error bits and states with meaning and
@@ -49,14 +49,13 @@ def main(args: argparse.Namespace) -> int:
 def _text(args: argparse.Namespace) -> str:
     facts = _facts(args)
     if args.format == "json":
-        return printable_json(facts.as_json(), indent=2, allow_nan=False) + "\n"
+        return printable_json(facts, indent=2, allow_nan=False) + "\n"
     from kontronik_can_gw.desk.describe.document import document
-    from kontronik_can_gw.desk.describe.markdown import markdown
 
-    return markdown(document(facts))
+    return document(facts)
 
 
-def _facts(args: argparse.Namespace) -> "Description":
+def _facts(args: argparse.Namespace) -> "Facts":
     from kontronik_can_gw.cli.common import load_all
     from kontronik_can_gw.config.keys import shipped
     from kontronik_can_gw.config.nodes import shipped_canopen

@@ -50,7 +50,7 @@ def telemetry(*options: EscOptions) -> Iterator[list[str]]:
         yield [terminal.path for terminal in terminals]
     finally:
         stopped.set()
-        thread.join(5)
+        thread.join(120)
         received = [terminal.received for terminal in terminals]
         for terminal in terminals:
             terminal.close()

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 from kontronik_can_gw.cli import COMMANDS
-from kontronik_can_gw.desk.describe.document import Code, Document, Section, Table
-from kontronik_can_gw.desk.describe.markdown import markdown
+from kontronik_can_gw.desk.describe.markdown import Code, Section, Table, markdown
 
 Rows = list[list[str]]
 
@@ -129,8 +128,7 @@ words = st.one_of(texts, markup)
 def test_any_text_comes_back_as_it_is(title: str, paragraph: str, cell: str, name: str) -> None:
     table = Table(("one", "two"), ((cell, Code(name)), (paragraph, "end")))
     blocks = (f"x {paragraph}", table) if not paragraph.strip() else (paragraph, table)
-    document = Document("All", ("lead",), (Section(f"T {title}", 2, "t", blocks),))
-    found = read_markdown(markdown(document))
+    found = read_markdown(markdown("All", ["lead"], [Section(f"T {title}", 2, blocks)]))
     assert list(map(one_line, found.titles)) == ["All", one_line(f"T {title}")]
     assert one_line(blocks[0] if isinstance(blocks[0], str) else "") in map(
         one_line, found.paragraphs

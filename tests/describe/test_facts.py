@@ -12,8 +12,8 @@ from canopen.objectdictionary import ODVariable
 from command_line import run
 from described import DBC, EDS, TWO_ESCS, configuration, described
 
+from kontronik_can_gw.canopen.data_types import TYPE_NAMES
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
-from kontronik_can_gw.desk.describe.facts import DATA_TYPES
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
@@ -119,7 +119,7 @@ def test_objects_are_those_that_canopen_reads(facts: Facts) -> None:
             variable = variables[entry["sub"]]
             assert (entry["name"], entry["access"]) == (variable.name, variable.access_type)
             assert (entry["readable"], entry["writable"]) == (variable.readable, variable.writable)
-            assert entry["type"] == DATA_TYPES[variable.data_type]
+            assert entry["type"] == TYPE_NAMES[variable.data_type]
             assert entry["mappable"] == variable.pdo_mappable
             assert (entry["low"], entry["high"]) == (variable.min, variable.max)
             assert entry["plus_node_id"] == variable.relative

@@ -6,7 +6,7 @@
 
    In:   {"call": NAME, ...}   one of the functions in `calls`; calls are done one after the other
    Out:  {"result": ...} or {"error": TEXT, "code": ABORT CODE or LSS error}   for each call, in their order
-         {"event": "heartbeat" | "timeout" | "emergency" | "pdo", ...}
+         {"event": "heartbeat" | "emergency" | "pdo", ...}
    Bytes are hexadecimal texts. Ends with its input. */
 
 const path = require('path');
@@ -17,7 +17,7 @@ const load = (name) => require(path.join(packages, 'node_modules', name));
 const { Device, Eds, LssMode } = load('canopen');
 
 const MASTER = 0x7c;
-const SDO_TIMEOUT = 1000;
+const ANSWER_TIMEOUT = 60000; // every call is answered, however slow the machine is
 const tell = (message) => process.stdout.write(JSON.stringify(message) + '\n');
 
 const channel = load('socketcan').createRawChannel(networkInterface, true);
@@ -29,7 +29,6 @@ master.start();
 master.lss.start();
 master.nmt.startNode(); // itself, or it would take no PDO
 master.nmt.on('heartbeat', ({ deviceId, state }) => tell({ event: 'heartbeat', node: deviceId, state }));
-master.nmt.on('timeout', (deviceId) => tell({ event: 'timeout', node: deviceId }));
 master.emcy.on('emergency', ({ cobId, em }) => tell({
     event: 'emergency', cob_id: cobId, code: em.code, register: em.register, info: Buffer.from(em.info).toString('hex'),
 }));
@@ -38,16 +37,16 @@ master.pdo.on('pdo', ({ cobId, dataObjects }) => tell({
 }));
 
 const address = ({ node, index, sub = 0, block = false }) =>
-    ({ deviceId: node, index, subIndex: sub, blockTransfer: block, timeout: SDO_TIMEOUT });
+    ({ deviceId: node, index, subIndex: sub, blockTransfer: block, timeout: ANSWER_TIMEOUT });
 // [sub-index, variable]; the package's own subIndex is wrong from 10 on
 const variables = (entry) => Array.from((entry.subNumber ? entry._subObjects : [entry]).entries()).filter(([, v]) => v);
 
 let nextReceived = 0x3000;
 const calls = {
-    /** Take a node under control: its SDO server, its heartbeat (ms until it counts as lost), its emergencies. */
-    add({ node, heartbeat }) {
+    /** Take a node under control: its SDO server, its heartbeat, its emergencies. */
+    add({ node }) {
         master.eds.addSdoClientParameter(node, 0x600 + node, 0x580 + node);
-        master.eds.addHeartbeatConsumer(node, heartbeat);
+        master.eds.addHeartbeatConsumer(node, ANSWER_TIMEOUT);
         master.eds.addEmcyConsumer(0x80 + node);
     },
     /** All that the package reads in an EDS: [index, sub-index, name, data type, access type] of each variable. */
@@ -80,15 +79,16 @@ const calls = {
     nmt({ command, node }) {
         master.nmt[command](node);
     },
-    fastscan({ timeout }) {
-        return master.lss.fastscan({ timeout });
+    /** With hints, or it learns each 1 of an identity from an answer that does not come in time. */
+    fastscan(hints) {
+        return master.lss.fastscan({ timeout: ANSWER_TIMEOUT, ...hints });
     },
     /** inquireVendorId ..., configureNodeId, storeConfiguration */
-    lss({ command, args }) {
-        return master.lss[command](...args);
+    lss({ command, args = [] }) {
+        return master.lss[command](...args, ANSWER_TIMEOUT);
     },
     select(identity) {
-        return master.lss.switchModeSelective({ ...identity, timeout: SDO_TIMEOUT }).then(() => null);
+        return master.lss.switchModeSelective({ ...identity, timeout: ANSWER_TIMEOUT }).then(() => null);
     },
     waiting() {
         master.lss.switchModeGlobal(LssMode.OPERATION);

@@ -22,6 +22,10 @@ pytestmark = [
 ]
 
 
+SLOWLY = ("--speed", "0.25")
+"""The recording must not be over before the last key."""
+
+
 class Terminal:
     """A shell of 80 x 24 characters in a tmux server of its own."""
 
@@ -76,7 +80,7 @@ def test_values_move_and_keys_are_obeyed(terminal: Terminal, tmp_path: Path) -> 
     toml = tmp_path / "8.toml"
     toml.write_text(f"[can]\nbitrate = 1000000\n{escs}")
     command = shlex.join(
-        [sys.executable, "-m", "kontronik_can_gw", "monitor", str(log), "-c", str(toml)]
+        [sys.executable, "-m", "kontronik_can_gw", "monitor", str(log), "-c", str(toml), *SLOWLY]
     )
     terminal.tmux("send-keys", "-l", f"{command}; echo code $?\n")
     terminal.until(

@@ -1,7 +1,9 @@
 """A real mosquitto on loopback, clients that are not ours, and the program as a process."""
 
+import contextlib
 import json
 import os
+import random
 import shutil
 import signal
 import socket
@@ -34,10 +36,12 @@ def need_mosquitto() -> str:
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """A port that nobody listens on, below those that the kernel gives to connections."""
+    while True:
+        port = random.randrange(20_000, 30_000)
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 def wait_for(condition: Callable[[], object], what: object) -> None:

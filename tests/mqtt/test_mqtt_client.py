@@ -71,7 +71,7 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
         client.start()
         heard.wait("k/test/other", b"999")
         client.stop(PATIENCE)
-        heard.wait(ONLINE, b"offline")
+        wait_for(lambda: heard.heard[-1].payload == b"offline", heard.heard)
     assert [(m.topic, m.payload) for m in heard.heard if not m.retained] == [
         (ONLINE, b"online"),
         ("k/test/known", b"2"),
@@ -105,7 +105,7 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(
                 ),
                 "a line",
             )
-            assert client.replaced > 100
+            wait_for(lambda: offer() or client.replaced > 100, "many replaced")
             assert len(client._waiting) <= 1
             assert client.published < 120  # what the kernel took, of several hundred
             made.freeze(False)
@@ -142,19 +142,25 @@ def test_two_with_one_client_id_do_not_throw_each_other_out_for_ever(
     assert 1 <= said.text.count(text) <= 2
 
 
-def served(*answers: bytes, pause_s: float = 0.02) -> tuple[socket.socket, int, list[bytes]]:
-    """A broker of our own making: what it answers to each connection's first bytes; then it ends it. And what it got."""
+def served(
+    *answers: bytes, until: threading.Event | None = None
+) -> tuple[socket.socket, int, list[bytes]]:
+    """A broker of our own making: what it answers to each connection's first bytes; then it ends it. And what it got.
+
+    The last connection ends when ``until`` is set.
+    """
     listener = socket.create_server(("127.0.0.1", 0))
     got: list[bytes] = []
 
     def serve() -> None:
         with contextlib.suppress(OSError):
-            for answer in answers:
+            for number, answer in enumerate(answers, 1):
                 connection, _ = listener.accept()
                 with connection:
                     got.append(connection.recv(4096))
                     connection.sendall(answer)
-                    time.sleep(pause_s)
+                    if until is not None and number == len(answers):
+                        until.wait(PATIENCE)
 
     threading.Thread(target=serve, daemon=True).start()
     port: int = listener.getsockname()[1]
@@ -169,9 +175,11 @@ OLD = b"\x20\x02\x00\x00"
     "refusal", [b"\x20\x02\x00\x01", b"\x20\x03\x00\x84\x00", b""], ids=["v3", "v5", "closed"]
 )
 def test_a_broker_that_knows_only_mqtt_3_is_spoken_to_in_it(refusal: bytes) -> None:
-    listener, port, got = served(refusal, OLD, pause_s=0.3)
+    over = threading.Event()
+    listener, port, got = served(refusal, OLD, until=over)
     with listener, connecting(to(port)) as client:
         wait_for(lambda: client.connected, lambda: client.problem)
+        over.set()
     assert [greeting[8] for greeting in got[:2]] == [5, 4]  # protocol level of MQTT 5 and 3.1.1
 
 
@@ -186,7 +194,7 @@ def test_rubbish_instead_of_an_answer_ends_nothing() -> None:
     rubbish += [b"\x20" + rng.randbytes(rng.randrange(1, 60)) for _ in range(6)]
     rubbish += [rng.randbytes(rng.randrange(1, 200)) for _ in range(6)]
     for answer in rubbish:
-        listener, port, got = served(answer, answer, pause_s=0)
+        listener, port, got = served(answer, answer)
         with listener, connecting(to(port)):
             wait_for(lambda got=got: len(got) == 2, answer)  # type: ignore[misc]  # it tries again
 

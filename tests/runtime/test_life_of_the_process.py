@@ -65,14 +65,15 @@ class Manager:
                 self.lines.append(line.rstrip())
 
     def _watch(self) -> None:
-        while not self._ending:
+        while True:
             try:
                 message = dict(
                     line.split("=", 1) for line in self._socket.recv(4096).decode().splitlines()
                 )
                 self.messages.append(message)
             except TimeoutError:
-                pass
+                if self._ending:  # and nothing is left to be read
+                    return
 
     def said(self, key: str) -> list[str]:
         return [message[key] for message in list(self.messages) if key in message]
@@ -95,11 +96,11 @@ class Manager:
         self.wait(lambda: any(text in line for line in list(self.lines)), text)
 
     def close(self) -> None:
-        self._ending = True
-        self._thread.join(5)
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
+        self._ending = True
+        self._thread.join(LIMIT_S)
         self._socket.close()
 
 
@@ -143,7 +144,9 @@ def test_it_is_ready_alive_and_tells_how_it_is_until_it_says_that_it_ends(
         manager.wait(
             lambda: "esc1: telemetry ok" in manager.said("STATUS")[-1], "telemetry in the status"
         )
-        document = json.loads((manager.path.parent / "status.json").read_text())
+        file = manager.path.parent / "status.json"
+        manager.wait(file.exists, "the status file")
+        document = json.loads(file.read_text())
         assert document["escs"][0]["name"] == "esc1"
     finally:
         stop.set()

@@ -32,7 +32,7 @@ Facts = dict[str, Any]
 
 
 def run(*words: str) -> dict[str, Any]:
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=100)
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LIMIT_S)
     return {"code": done.returncode, "out": done.stdout, "talk": done.stderr}
 
 
@@ -131,6 +131,7 @@ def trial(facts: Facts) -> None:
     )
     facts["frozen"] = shown()
     pid = facts["frozen"]["MainPID"]
+    until(lambda: "telemetry ok" in shown()["StatusText"])
 
     good = CONFIGURATION.read_text()
     CONFIGURATION.write_text(good + "nonsense = 1\n")
@@ -181,7 +182,17 @@ def networkd() -> str:
     if daemon is None:
         return "missing"
     Path("/etc/systemd/network/60-wrong.network").write_text("[Match]\nName=x\n[CAN]\nBitrat=5\n")
-    return str(run("env", "SYSTEMD_LOG_LEVEL=debug", "timeout", "4", daemon)["talk"])
+    words = ["env", "SYSTEMD_LOG_LEVEL=debug", "timeout", f"{LIMIT_S:g}", daemon]
+    said = ""
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            said += line
+            if "60-wrong.network:" in line:  # the last of the files, which it reads in order
+                break
+        process.terminate()
+        process.stderr.read()
+    return said
 
 
 def probed() -> Facts:

@@ -6,13 +6,13 @@ import queue
 import shutil
 import subprocess
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
 
 import pytest
+from vcan_tools import LIMIT_S, Recorded
 
 FOREIGN = Path(__file__).resolve().parents[1] / "foreign"
 PACKAGES = FOREIGN / ".cache"
@@ -59,7 +59,7 @@ class NodeMaster:
         )
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
-        assert self._ready.wait(60), "node_master.js did not start"
+        assert self._ready.wait(LIMIT_S), "node_master.js did not start"
 
     def _read(self) -> None:
         assert self._process.stdout
@@ -103,26 +103,12 @@ class NodeMaster:
         assert self._process.stdout
         self._process.stdin.close()
         try:
-            self._process.wait(5)
+            self._process.wait(LIMIT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._thread.join(5)
+        self._thread.join(LIMIT_S)
         self._process.stdout.close()
-
-
-@contextmanager
-def recording(interface: str, log: Path) -> Iterator[Path]:
-    """Every frame of an interface in a candump log, complete when the block ends."""
-    with log.open("wb") as out:
-        command = ["candump", "-D", "-L", "-r", "4194304", f"{interface},0:0,#FFFFFFFF"]
-        process = subprocess.Popen(["stdbuf", "-oL", *command], stdout=out)
-        try:
-            yield log
-            threading.Event().wait(0.2)  # what the kernel still holds for it
-        finally:
-            process.terminate()
-            process.wait()
 
 
 FIELDS = {
@@ -142,8 +128,13 @@ FIELDS = {
 """What is asked of tshark, by our names."""
 
 
-def tshark(log: Path) -> list[SimpleNamespace]:
-    """A candump log decoded by tshark: of each frame ``FIELDS`` as tshark writes them, empty where there is none."""
+def tshark(frames: Sequence[Recorded], log: Path) -> list[SimpleNamespace]:
+    """Frames decoded by tshark, from a log: of each ``FIELDS`` as tshark writes them, empty where there is none."""
+    log.write_text(
+        "".join(
+            f"({at:.6f}) can0 {can_id:03X}#{data.hex().upper()}\n" for at, can_id, data in frames
+        )
+    )
     command = ["tshark", "-r", str(log), "-d", "can.subdissector,canopen", "-T", "fields"]
     command += ["-E", "separator=/t", "-E", "occurrence=f"]
     for name in FIELDS.values():

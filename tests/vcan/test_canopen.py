@@ -180,6 +180,8 @@ def test_all_pdos_of_a_moment_show_one_frame(nodes: Nodes, at_sync: bool) -> Non
         tpdo[number].trans_type = 1 if at_sync else 254
         tpdo[number].save()
     nodes.go(1, OPERATIONAL)
+    assert master.number(1, 0x1018, 4) == SERIAL  # after it no PDO comes that tells how it begins
+    nodes.run.catch_up()
     pdos = PDOS if at_sync else PDOS[:3]
     shown = []
     for n in range(1, 21):
@@ -317,7 +319,8 @@ def test_heartbeats_of_another_node_are_watched(nodes: Nodes) -> None:
     for n in (1, 2, 3):  # each begins or goes on with the watch, and is the last one for 200 ms
         master.network.send_message(0x764, b"\x05")
         wait_for(lambda n=n: len(nodes.of(0x81)) == 2 * n - 1, "an emergency")  # type: ignore[misc]
-        assert nodes.of(0x81)[-1].time - nodes.of(0x764)[-1].time >= 0.2
+        # less what the clocks, of which the times are, may be apart
+        assert nodes.of(0x81)[-1].time - nodes.of(0x764)[-1].time >= 0.19
         wait_for(lambda: nodes.states(1)[-1] == PRE_OPERATIONAL, "what 1029h:1 says")
     missed, back = bytes((0x30, 0x81, 0x11, 0xFF, 100, 0, 0, 0)), bytes(8)
     assert [frame.data[:2] + frame.data[4:5] for frame in nodes.of(0x81)] == [

@@ -20,7 +20,6 @@ from foreign_tools import (
     Refused,
     has_tshark,
     need,
-    recording,
     tshark,
     zencan,
 )
@@ -41,6 +40,8 @@ LIVELY = (
     Phase("up", 0.5, 80, OperatingState.Forward, 0.5),
     Phase("down", 0.5, 20, OperatingState.Forward, 0.5),
 )
+LOSS_MS = 10_000
+"""Until telemetry counts as lost, where that is to happen: no machine stands still for so long."""
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 # CiA 301 data types: bytes of a number; strings and domains have any length
 SIZES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
@@ -50,7 +51,9 @@ NO_OBJECT, NO_SUB, TOO_HIGH, TOO_LOW = 0x06020000, 0x06090011, 0x06090031, 0x060
 TOO_LONG, NO_DATA, DEVICE_STATE = 0x06070012, 0x08000024, 0x08000022
 
 
-def canopen_only(interface: str, run: Bench, folder: Path, node_id: int) -> str:
+def canopen_only(
+    interface: str, run: Bench, folder: Path, node_id: int, timeout_ms: int = 60_000
+) -> str:
     """A configuration with nodes and no DBC."""
     parts = [
         f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 500000\n[dbc]\nenabled = false\n'
@@ -59,15 +62,17 @@ def canopen_only(interface: str, run: Bench, folder: Path, node_id: int) -> str:
         f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{folder}"\n'
     ]
     parts += [
-        f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ntelemetry_timeout_ms = 2000\n'
+        f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ntelemetry_timeout_ms = {timeout_ms}\n'
         for port in run.ports
     ]
     return "\n".join(parts)
 
 
-def start_nodes(vcan: str, start: Start, run: Bench, folder: Path, node_id: int) -> GatewayProcess:
+def start_nodes(
+    vcan: str, start: Start, run: Bench, folder: Path, node_id: int, timeout_ms: int = 60_000
+) -> GatewayProcess:
     """The gateway, starting its nodes, and telemetry running. The ports are named in the log when the CAN side is open."""
-    gateway = start(canopen_only(vcan, run, folder, node_id))
+    gateway = start(canopen_only(vcan, run, folder, node_id, timeout_ms))
     gateway.wait_for_line(f"esc{len(run.ports)}: /dev/pts")
     run.start()
     return gateway
@@ -78,7 +83,7 @@ def u32(value: int) -> bytes:
 
 
 def sent_speeds(run: Bench, index: int = 0) -> set[tuple[int, int, int]]:
-    return {(d.electrical_speed, d.battery_voltage, d.battery_current) for _, d in run.live(index)}
+    return {(d.electrical_speed, d.battery_voltage, d.battery_current) for d in run.live(index)}
 
 
 # --- zencan-cli
@@ -113,10 +118,8 @@ def test_zencan_scans_reads_writes_and_stores(
         assert read(0x1008, 0, "utf8") == "KONTRONIK ESC gateway"  # segmented
         assert read(0x2101, 1, "u8") == "5"
         assert read(0x2101, 1, "u8", node=6) == "6"
-        assert int(read(0x2000, 2, "u16")) in {data.battery_voltage for _, data in run.live(0)}
-        assert int(read(0x2000, 12, "i8")) in {
-            data.power_stage_temperature for _, data in run.live(0)
-        }
+        assert int(read(0x2000, 2, "u16")) in {data.battery_voltage for data in run.live(0)}
+        assert int(read(0x2000, 12, "i8")) in {data.power_stage_temperature for data in run.live(0)}
 
         def refusal(command: str) -> str:
             said = zencan(vcan, command)
@@ -224,9 +227,13 @@ def node_master(vcan: str) -> Iterator[NodeMaster]:
         yield master
 
 
-def scanned(master: NodeMaster) -> dict[str, int]:
-    """What a fastscan finds that waits so many ms for each answer."""
-    return cast(dict[str, int], master("fastscan", timeout=500))
+def scanned(master: NodeMaster, serial: int) -> dict[str, int]:
+    """What a fastscan finds that has to find the vendor-ID, 0, bit by bit: every one of its requests is answered.
+
+    (One that knows nothing: the examples of docs/canopen.md.)
+    """
+    known = {"productCode": PRODUCT, "revisionNumber": REVISION, "serialNumber": serial}
+    return cast(dict[str, int], master("fastscan", **known))
 
 
 def test_node_canopen_polls_every_object_of_the_eds(
@@ -234,7 +241,7 @@ def test_node_canopen_polls_every_object_of_the_eds(
 ) -> None:
     with bench(EscOptions()) as run:
         start_nodes(vcan, start_gateway, run, tmp_path, 5)
-        node_master("add", node=5, heartbeat=3000)
+        node_master("add", node=5)
         wait_for(lambda: node_master.states(5) != [], "a heartbeat")
         wait_for(lambda: bool(run.info(0)), "an info frame")
         objects = node_master("eds", file=str(EDS))
@@ -282,7 +289,7 @@ def test_node_canopen_downloads_in_every_way(
 ) -> None:
     with bench(EscOptions()) as run:
         start_nodes(vcan, start_gateway, run, tmp_path, 5)
-        node_master("add", node=5, heartbeat=3000)
+        node_master("add", node=5)
         wait_for(lambda: node_master.states(5) != [], "a heartbeat")
         for value, block in ((11, False), (12, True)):
             node_master.download(5, 0x2100, 2, u32(value), block)
@@ -317,8 +324,8 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
 ) -> None:
     hot = ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_ERROR, 3_000_000_000, 1_000_000_000)
     with bench(EscOptions(profile=LIVELY, faults=Faults(errors=(hot,)))) as run:
-        node_master("add", node=7, heartbeat=3000)
-        start_nodes(vcan, start_gateway, run, tmp_path, 7)
+        node_master("add", node=7)
+        start_nodes(vcan, start_gateway, run, tmp_path, 7, LOSS_MS)
         wait_for(
             lambda: node_master.states(7) == [BOOT_UP, PRE_OPERATIONAL], "boot-up and heartbeat"
         )
@@ -338,7 +345,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
         wait_for(lambda: all(len(pdos(cob_id)) >= 3 for cob_id in ids), "changes in all four PDOs")
         wait_for(lambda: bool(node_master.of("emergency")), "an emergency")
         wait_for(lambda: len(node_master.of("emergency")) >= 2, "its end")
-        assert node_master.states(7)[-1] == OPERATIONAL
+        wait_for(lambda: node_master.states(7)[-1] == OPERATIONAL, "OPERATIONAL")
 
         run.stop()
         wait_for(lambda: len(node_master.of("emergency")) >= 3, "telemetry lost")
@@ -346,7 +353,7 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
             node_master.upload(7, 0x2000, 1)
         assert refused.value.code == DEVICE_STATE
         assert node_master.upload(7, 0x2020, 1)[0] & 0x3F == 4  # lost
-        sent = [data for _, data in run.live(0)]
+        sent = run.live(0)
         counts = Counter(told["cob_id"] for told in node_master.of("pdo"))
         run.start()
         wait_for(lambda: len(node_master.of("emergency")) >= 4, "telemetry back")
@@ -375,7 +382,6 @@ def test_node_canopen_hears_heartbeats_pdos_and_emergencies(
             node_master("nmt", command=command, node=7)
             wait_for(lambda wanted=state: node_master.states(7)[-1] == wanted, command)  # type: ignore[misc]
         assert node_master.states(7)[-2:] == [BOOT_UP, PRE_OPERATIONAL]
-        assert not node_master.of("timeout")
 
 
 def test_node_canopen_names_nodes_by_lss(
@@ -385,8 +391,8 @@ def test_node_canopen_names_nodes_by_lss(
         gateway = start_nodes(vcan, start_gateway, run, tmp_path, 255)
         gateway.wait_for_line("esc2: CANopen node waits for LSS")
         found = []
-        for node_id in (0x31, 0x32):
-            identity = scanned(node_master)
+        for node_id, serial in ((0x31, SERIAL + 1), (0x32, SERIAL)):
+            identity = scanned(node_master, serial)
             found.append(identity)
             for name, field in (
                 ("inquireVendorId", "vendorId"),
@@ -394,13 +400,13 @@ def test_node_canopen_names_nodes_by_lss(
                 ("inquireRevisionNumber", "revisionNumber"),
                 ("inquireSerialNumber", "serialNumber"),
             ):
-                assert node_master("lss", command=name, args=[500]) == identity[field]
+                assert node_master("lss", command=name) == identity[field]
             for wrong in (0, 128, 254):
                 with pytest.raises(Refused) as refused:
-                    node_master("lss", command="configureNodeId", args=[wrong, 500])
+                    node_master("lss", command="configureNodeId", args=[wrong])
                 assert refused.value.code == 1, wrong
-            node_master("lss", command="configureNodeId", args=[node_id, 500])
-            node_master("lss", command="storeConfiguration", args=[2000])
+            node_master("lss", command="configureNodeId", args=[node_id])
+            node_master("lss", command="storeConfiguration")
             node_master("waiting")
             wait_for(lambda n=node_id: dump.of(0x700 + n) != [], "a boot-up")  # type: ignore[misc]
         assert [i["serialNumber"] for i in sorted(found, key=str)] == [SERIAL, SERIAL + 1]
@@ -411,7 +417,7 @@ def test_node_canopen_names_nodes_by_lss(
 
         # a configured node is found by its whole identity, and gets another node-ID that holds from the next reset on
         node_master("select", **found[0])
-        node_master("lss", command="configureNodeId", args=[0x41, 500])
+        node_master("lss", command="configureNodeId", args=[0x41])
         node_master("waiting")
         node_master("nmt", command="resetCommunication", node=0x31)
         wait_for(lambda: dump.of(0x741) != [], "a boot-up with the new node-ID")
@@ -432,12 +438,12 @@ def test_tshark_reads_what_was_said(
 ) -> None:
     need(has_tshark(), "tshark")
     with bench(EscOptions(profile=LIVELY)) as run:
-        with recording(vcan, tmp_path / "bus.log") as log:
-            gateway = start_nodes(vcan, start_gateway, run, tmp_path / "store", 255)
+        with Candump(vcan) as dump:
+            gateway = start_nodes(vcan, start_gateway, run, tmp_path / "store", 255, LOSS_MS)
             gateway.wait_for_line("esc1: CANopen node waits for LSS")
-            assert scanned(node_master)["serialNumber"] == SERIAL
-            node_master("add", node=0x55, heartbeat=3000)
-            node_master("lss", command="configureNodeId", args=[0x55, 500])
+            assert scanned(node_master, SERIAL)["serialNumber"] == SERIAL
+            node_master("add", node=0x55)
+            node_master("lss", command="configureNodeId", args=[0x55])
             node_master("waiting")
             wait_for(
                 lambda: node_master.states(0x55) == [BOOT_UP, PRE_OPERATIONAL],
@@ -458,12 +464,11 @@ def test_tshark_reads_what_was_said(
             wait_for(lambda: node_master.of("emergency") != [], "an emergency")
             node_master("nmt", command="stopNode", node=0x55)
             wait_for(lambda: node_master.states(0x55)[-1] == STOPPED, "STOPPED")
-        frames = tshark(log)
+        frames = tshark(dump.frames, tmp_path / "bus.log")
 
-    lines = log.read_text().splitlines()
-    assert len(frames) == len(lines) > 300
+    told = [frame.can_id for frame in dump.frames]
+    assert len(frames) == len(told) > 100
     assert [f for f in frames if f.malformed] == []
-    told = [int(line.split(" ")[2].split("#")[0], 16) for line in lines]
     assert [int(f.can_id, 0) for f in frames] == told
     assert {int(f.function, 0) for f in frames} == {id_ >> 7 for id_ in told}
 

@@ -43,22 +43,25 @@ def test_an_interface_that_goes_down_and_up_or_away_and_back_is_used_again(
         for n in (1, 2):
             ip("link", "set", vcan, "down")
             wait_for(
-                lambda n=n: gateway.log.count("is down. Start it") == n,  # type: ignore[misc]
+                lambda n=n: gateway.log.count("is down. Start it") >= n,  # type: ignore[misc]
                 "the log says that it is down",
             )
             run.escs[0].send_one()  # which nobody sees
             ip("link", "set", vcan, "up")
             wait_for(
-                lambda n=n: gateway.log.count("frames are sent again") == n,  # type: ignore[misc]
+                lambda n=n: gateway.log.count("frames are sent again") >= n,  # type: ignore[misc]
                 "the log says that it is up",
             )
             run.feed(times=3)
         ip("link", "del", vcan)
-        wait_for(lambda: f"{vcan}: " in gateway.lines[-1], "the log says that it is gone")
+        wait_for(
+            lambda: gateway.log.count(f"CAN interface {vcan}: ") >= 3,
+            "the log says that it is gone",
+        )
         ip("link", "add", vcan, "type", "vcan")
         ip("link", "set", vcan, "up")
         wait_for(
-            lambda: gateway.log.count("frames are sent again") == 3, "the log says that it is back"
+            lambda: gateway.log.count("frames are sent again") >= 3, "the log says that it is back"
         )
         run.feed(times=3)
         assert gateway.end() == 0, gateway.log

@@ -41,7 +41,11 @@ PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 
 def program(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*PROGRAM, *map(str, words)], capture_output=True, text=True, timeout=60, check=False
+        [*PROGRAM, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=2 * LIMIT_S,
+        check=False,
     )
 
 
@@ -222,7 +226,7 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
             run, start_gateway, configuration(vcan, [run.ports[0].path]), folder, 4
         )
         assert gateway.end() == 0
-        sent = {live.battery_voltage for _, live in run.live(0)}
+        sent = {live.battery_voltage for live in run.live(0)}
     link = tmp_path / "played"
     words = f"replay {folder} --to pty --link {link} --delay 4".split()
     quiet = subprocess.DEVNULL
@@ -231,7 +235,10 @@ def test_a_capture_on_pseudo_terminals_is_telemetry_for_a_gateway(
         Candump(vcan) as live,
     ):
         wait_for(link.exists, "the pseudo terminal")
+        player.send_signal(signal.SIGSTOP)  # until there is a reader
         gateway = start_gateway(configuration(vcan, [str(link)]))
+        gateway.wait_for_line(f"esc1: {link}")
+        player.send_signal(signal.SIGCONT)
         gateway.wait_for_line("telemetry ok")
         assert player.wait(LIMIT_S) == 0
         gateway.kill()

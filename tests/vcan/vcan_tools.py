@@ -5,6 +5,7 @@ judges order, values and counts. A ``Chain`` sends an ESC's next frame when the 
 to not happen is followed by something that has to.
 """
 
+import itertools
 import re
 import socket
 import struct
@@ -117,10 +118,28 @@ MARK = 0x7F2
 """An id of nobody: what was sent before it has been recorded when it has."""
 
 
-def send_mark(interface: str, number: int) -> None:
+DELIVERY_MARK = 0x7F3
+_delivery_marks = itertools.count(1)
+
+
+def send_mark(interface: str, number: int, can_id: int = MARK) -> None:
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
         bus.bind((interface,))
-        bus.send(struct.pack("=IB3x8s", MARK, 4, number.to_bytes(4, "little")))
+        bus.send(struct.pack("=IB3x8s", can_id, 4, number.to_bytes(4, "little")))
+
+
+def wait_for_delivery(interface: str) -> None:
+    """Wait until every socket on this interface has what was sent so far."""
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as witness:
+        witness.setsockopt(
+            socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", DELIVERY_MARK, 0x7FF)
+        )
+        witness.bind((interface,))
+        witness.settimeout(LIMIT_S)
+        number = next(_delivery_marks)
+        send_mark(interface, number, DELIVERY_MARK)
+        while int.from_bytes(witness.recv(16)[8:12], "little") != number:
+            pass
 
 
 class Candump:
@@ -170,7 +189,7 @@ class Candump:
             self.catch_up()
         self._process.terminate()
         self._process.wait()
-        self._thread.join(5)
+        self._thread.join(LIMIT_S)
         if self._process.stdout:
             self._process.stdout.close()
 
@@ -308,12 +327,28 @@ def chain(
 # --- simulated ESCs in real time
 
 
+class NotedEsc(SimulatedEsc):
+    """A simulated ESC that notes each frame before anybody can have it."""
+
+    def __init__(self, options: EscOptions, seed: int, noted: list[Sent]) -> None:
+        super().__init__(options, seed=seed)
+        self._noted = noted
+
+    def frames_until(self, now_ns: int) -> list[Sent]:
+        frames = super().frames_until(now_ns)
+        self._noted.extend(frames)
+        return frames
+
+
 class Bench:
-    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent."""
+    """Simulated ESCs on ptys, sending in real time in a thread, with a record of what was sent.
+
+    A frame is in the record before it is written: a value that came from an ESC is in a record read after it came.
+    """
 
     def __init__(self, escs: Sequence[EscOptions], seed: int = 1) -> None:
         self.ports = [pty.PtyEsc() for _ in escs]
-        self.sent: list[list[tuple[float, Sent]]] = [[] for _ in escs]
+        self.sent: list[list[Sent]] = [[] for _ in escs]
         self._options = escs
         self._seed = seed
         self._stop = threading.Event()
@@ -321,17 +356,13 @@ class Bench:
 
     def start(self) -> None:
         self._stop.clear()
-        simulated = [
-            SimulatedEsc(options, seed=self._seed + i) for i, options in enumerate(self._options)
+        noted = [
+            NotedEsc(options, self._seed + i, sent)
+            for i, (options, sent) in enumerate(zip(self._options, self.sent, strict=True))
         ]
-        pairs = list(zip(simulated, self.ports, strict=True))
-
-        def note(index: int, sent: Sent, taken: bool) -> None:
-            assert taken
-            self.sent[index].append((time.time(), sent))
-
+        pairs = list(zip(noted, self.ports, strict=True))
         self._thread = threading.Thread(
-            target=lambda: pty.run(pairs, stop=self._stop.is_set, on_sent=note), daemon=True
+            target=lambda: pty.run(pairs, stop=self._stop.is_set), daemon=True
         )
         self._thread.start()
 
@@ -340,15 +371,11 @@ class Bench:
         if self._thread:
             self._thread.join(LIMIT_S)
 
-    def live(self, index: int) -> list[tuple[float, LiveData]]:
-        return [
-            (when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, LiveData)
-        ]
+    def live(self, index: int) -> list[LiveData]:
+        return [sent.data for sent in self.sent[index] if isinstance(sent.data, LiveData)]
 
-    def info(self, index: int) -> list[tuple[float, InfoData]]:
-        return [
-            (when, sent.data) for when, sent in self.sent[index] if isinstance(sent.data, InfoData)
-        ]
+    def info(self, index: int) -> list[InfoData]:
+        return [sent.data for sent in self.sent[index] if isinstance(sent.data, InfoData)]
 
     def close(self) -> None:
         self.stop()

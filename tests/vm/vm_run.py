@@ -56,7 +56,7 @@ TMPFS = ("/tmp", "/var/tmp", "/run", "/dev/shm")  # guest-init.sh mounts an empt
 
 UML_MEMORY_MIB = 512
 QEMU_MEMORY_MIB = 1024
-START_TIMEOUT_S = {"uml": 30.0, "qemu": 180.0}
+START_TIMEOUT_S = {"uml": 120.0, "qemu": 180.0}
 
 GLIBC_WITHOUT_AVX512 = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW"
 # CPUID leaf 7, EBX: the bits of AVX512 F, DQ, IFMA, PF, ER, CD, BW, VL
@@ -387,7 +387,7 @@ def run_in_vm(
             os.write(guard_fd, b".")
             os.close(guard_fd)
         for thread in pumps:
-            thread.join(5)
+            thread.join(60)
         started = os.path.exists(os.path.join(job, "started"))
         if late:
             print(f"vm/run: {backend}: {late}", file=sys.stderr)

@@ -1,81 +1,13 @@
-"""Turns a description into a document of titles, lines and tables, which ``markdown`` renders. Pure."""
+"""Makes sections with lines and tables of the facts, which ``markdown`` renders. Pure."""
 
-import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from kontronik_can_gw.desk.describe.facts import (
-    BY_GATEWAY,
-    CanopenFacts,
-    DbcFacts,
-    Description,
-    EmergencyFacts,
-    EntryFacts,
-    ErrorFacts,
-    MessageFacts,
-    NodeFacts,
-    ObjectFacts,
-    SignalFacts,
-    SourceFacts,
-    StateFacts,
-    ValueFacts,
-)
+from kontronik_can_gw.desk.describe.canopen_facts import BY_GATEWAY
+from kontronik_can_gw.desk.describe.markdown import Code, Section, Table, markdown
+from kontronik_can_gw.desk.describe.parts import Facts
 
-
-class Code(str):
-    """A text that is a name in a program or a file."""
-
-    __slots__ = ()
-
-
-@dataclass(frozen=True)
-class Table:
-    """Cells are plain text or Code; every row is as long as ``head``."""
-
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class Section:
-    """``level`` 2 or 3; ``anchor`` is unique in the document."""
-
-    title: str
-    level: int
-    anchor: str
-    blocks: tuple[str | Table, ...]
-
-
-@dataclass(frozen=True)
-class Document:
-    """``lead``: lines before the first section."""
-
-    title: str
-    lead: tuple[str, ...]
-    sections: tuple[Section, ...]
-
-
-def document(facts: Description) -> Document:
-    """The description as a document."""
-    titled: list[tuple[str, int, list[str | Table]]] = []
-    if facts.dbc is not None:
-        titled += _messages(facts.dbc, several=len(facts.escs) > 1)
-    titled += _faults(facts)
-    if facts.canopen is not None:
-        titled += _canopen(facts.canopen)
-    titled.append(("Sources", 2, [_SOURCES, _sources(facts.sources)]))
-    sections: list[Section] = []
-    anchors: set[str] = set()
-    for title, level, blocks in titled:
-        sections.append(
-            Section(
-                title, level, _anchor(title, anchors), tuple(block for block in blocks if block)
-            )
-        )
-    return Document(
-        "What the gateway sends and what it means", tuple(_lead(facts)), tuple(sections)
-    )
-
+Columns = Mapping[str, str | Callable[[Facts], str]]
+"""The columns of a table by their heads: each shows what has this key, or what a function makes of the fact."""
 
 _SOURCES = (
     "What a signal of a DBC of your own can be bound to, by its name or under [dbc.bind]. Those without a signal name in this table are "
@@ -83,265 +15,289 @@ _SOURCES = (
 )
 
 
-def _lead(facts: Description) -> Iterator[str]:
-    yield f"Made by {facts.program} from the files in use, by: kontronik-can-gw describe."
-    yield f"ESCs: {', '.join(facts.escs)}."
+def document(facts: Facts) -> str:
+    """The description as Markdown."""
+    return markdown(
+        "What the gateway sends and what it means", list(_lead(facts)), list(_sections(facts))
+    )
+
+
+def _lead(facts: Facts) -> Iterator[str]:
+    dbc, canopen = facts["dbc"], facts["canopen"]
+    yield f"Made by {facts['program']} from the files in use, by: kontronik-can-gw describe."
+    yield f"ESCs: {', '.join(facts['escs'])}."
     yield (
-        f"DBC: {facts.dbc.file}, messages of {facts.dbc.node}."
-        if facts.dbc
+        f"DBC: {dbc['file']}, messages of {dbc['node']}."
+        if dbc
         else "DBC: none, dbc.enabled is false."
     )
-    yield (
-        f"EDS: {facts.canopen.file}."
-        if facts.canopen
-        else "CANopen: none, canopen.enabled is false."
-    )
+    yield (f"EDS: {canopen['file']}." if canopen else "CANopen: none, canopen.enabled is false.")
 
 
-def _anchor(title: str, taken: set[str]) -> str:
-    """The anchor that GitHub makes from a heading."""
-    plain = re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") or "section"
-    anchor, number = plain, 0
-    while anchor in taken:
-        number += 1
-        anchor = f"{plain}-{number}"
-    taken.add(anchor)
-    return anchor
+def _sections(facts: Facts) -> Iterator[Section]:
+    if facts["dbc"]:
+        yield from _messages(facts["dbc"], several=len(facts["escs"]) > 1)
+    yield from _states_and_errors(facts)
+    if facts["canopen"]:
+        yield from _canopen(facts["canopen"])
+    yield Section("Sources", 2, [_SOURCES, _sources(facts["sources"])])
+
+
+def _table(facts: Iterable[Facts], columns: Columns) -> Table:
+    """A row for each of the facts."""
+    rows = [
+        tuple(
+            str(fact[column]) if isinstance(column, str) else column(fact)
+            for column in columns.values()
+        )
+        for fact in facts
+    ]
+    return Table(tuple(columns), rows)
+
+
+def _name(fact: Facts) -> Code:
+    return Code(fact["name"])
 
 
 # --- messages
 
 
-def _messages(dbc: DbcFacts, several: bool) -> Iterator[tuple[str, int, list[str | Table]]]:
-    rows = []
-    for message in dbc.messages:
-        rows.append(
-            (
-                Code(message.name),
-                _id(message),
-                str(message.length),
-                _timing(message),
-                message.comment,
-            )
-        )
-    yield (
-        "Messages",
-        2,
-        [dbc.comment, Table(("message", "id", "bytes", "sent", "meaning"), tuple(rows))],
-    )
-    for message in dbc.messages:
-        text = f"{_id(message)}, {message.length} bytes{', CAN FD' if message.fd else ''}. Sent {_timing(message)}."
-        yield (
-            f"{message.name} {_id(message)}",
-            3,
-            [text, message.comment, _signals(message, several)],
-        )
+def _messages(dbc: Facts, several: bool) -> Iterator[Section]:
+    columns: Columns = {
+        "message": _name,
+        "id": _id,
+        "bytes": "length",
+        "sent": _timing,
+        "meaning": "comment",
+    }
+    yield Section("Messages", 2, [dbc["comment"], _table(dbc["messages"], columns)])
+    for message in dbc["messages"]:
+        fd = ", CAN FD" if message["fd"] else ""
+        text = f"{_id(message)}, {message['length']} bytes{fd}. Sent {_timing(message)}."
+        table = _signals(message["signals"], several)
+        yield Section(f"{message['name']} {_id(message)}", 3, [text, message["comment"], table])
 
 
-def _id(message: MessageFacts) -> str:
-    return f"{message.id:08X}h" if message.extended else f"{message.id:03X}h"
+def _id(message: Facts) -> str:
+    return f"{message['id']:08X}h" if message["extended"] else f"{message['id']:03X}h"
 
 
-def _timing(message: MessageFacts) -> str:
+def _timing(message: Facts) -> str:
     words = {
         "event": "with each new value",
         "on change": "on change",
-        "cyclic": f"every {_number(message.cycle_ms)} ms",
+        "cyclic": f"every {_number(message['cycle_ms'])} ms",
     }
-    text = " and ".join(words[kind] for kind in message.send_type) or "never"
-    return f"{text}, at least {_number(message.delay_ms)} ms apart" if message.delay_ms else text
+    text = " and ".join(words[kind] for kind in message["send_type"]) or "never"
+    if message["delay_ms"]:
+        text += f", at least {_number(message['delay_ms'])} ms apart"
+    return text
 
 
-def _signals(message: MessageFacts, several: bool) -> Table:
-    head = (
-        "signal",
-        "bits",
-        "unit",
-        "resolution",
-        "range",
-        "not available, error",
-        "shows",
-        "meaning",
-    )
-    return Table(head, tuple(_signal(signal, several) for signal in message.signals))
+def _signals(signals: Iterable[Facts], several: bool) -> Table:
+    columns: Columns = {
+        "signal": _name,
+        "bits": _bits,
+        "unit": "unit",
+        "resolution": _resolution,
+        "range": _range,
+        "not available, error": _codes,
+        "shows": lambda signal: _shown(signal, several),
+        "meaning": _meaning,
+    }
+    return _table(signals, columns)
 
 
-def _signal(signal: SignalFacts, several: bool) -> tuple[str, ...]:
-    kind = "float" if signal.is_float else "signed" if signal.signed else "unsigned"
-    order = "" if signal.byte_order == "little_endian" else ", big-endian"
-    bits = f"{signal.start_bit}+{signal.length} {kind}{order}"
-    is_flag = signal.length == 1 and not signal.signed
-    if is_flag:
-        bits = str(signal.start_bit)
-    if signal.page is not None:
-        bits += f", page {signal.page}"
-    steps = f"{_number(signal.factor)}" + (
-        f", offset {_number(signal.offset)}" if signal.offset else ""
-    )
-    span = f"{_number(signal.minimum)} … {_number(signal.maximum)}"
-    if is_flag and (signal.factor, signal.minimum, signal.maximum) == (1, 0, 1):
-        steps, span = "", "0, 1"
-    codes = ", ".join(
-        f"{raw} ({raw & (1 << signal.length) - 1:X}h)"
-        for raw in (signal.not_available, signal.error)
-        if raw is not None
-    )
-    shows = signal.role if signal.source is None else signal.source
-    if signal.source is not None and signal.esc is not None and several:
-        shows = f"{signal.esc}.{signal.source}"
-    named = [
-        value for value in signal.values if value.value not in (signal.not_available, signal.error)
-    ]
-    meaning = " ".join(
-        filter(None, (signal.comment, _named(named), *(f"{note}." for note in signal.notes)))
-    )
-    shown = shows if signal.source is None else Code(shows)
-    return Code(signal.name), bits, signal.unit, steps, span, codes, shown, meaning
+def _is_flag(signal: Facts) -> bool:
+    return signal["length"] == 1 and not signal["signed"]
 
 
-def _named(values: Sequence[ValueFacts]) -> str:
-    text = ", ".join(f"{value.value} {value.name}" for value in values)
-    return f"Values: {text}." if text else ""
+def _is_plain_flag(signal: Facts) -> bool:
+    steps = signal["factor"], signal["minimum"], signal["maximum"]
+    return _is_flag(signal) and steps == (1, 0, 1)
+
+
+def _bits(signal: Facts) -> str:
+    kind = "float" if signal["is_float"] else "signed" if signal["signed"] else "unsigned"
+    order = "" if signal["byte_order"] == "little_endian" else ", big-endian"
+    bits = f"{signal['start_bit']}+{signal['length']} {kind}{order}"
+    if _is_flag(signal):
+        bits = str(signal["start_bit"])
+    return bits if signal["page"] is None else f"{bits}, page {signal['page']}"
+
+
+def _resolution(signal: Facts) -> str:
+    if _is_plain_flag(signal):
+        return ""
+    offset = f", offset {_number(signal['offset'])}" if signal["offset"] else ""
+    return _number(signal["factor"]) + offset
+
+
+def _range(signal: Facts) -> str:
+    if _is_plain_flag(signal):
+        return "0, 1"
+    return f"{_number(signal['minimum'])} … {_number(signal['maximum'])}"
+
+
+def _codes(signal: Facts) -> str:
+    mask = (1 << signal["length"]) - 1
+    codes = [code for code in (signal["not_available"], signal["error"]) if code is not None]
+    return ", ".join(f"{code} ({code & mask:X}h)" for code in codes)
+
+
+def _shown(signal: Facts, several: bool) -> str:
+    if signal["source"] is None:
+        return str(signal["role"])
+    if signal["esc"] is not None and several:
+        return Code(f"{signal['esc']}.{signal['source']}")
+    return Code(signal["source"])
+
+
+def _meaning(signal: Facts) -> str:
+    codes = (signal["not_available"], signal["error"])
+    values = [each for each in signal["values"] if each["value"] not in codes]
+    named = ", ".join(f"{each['value']} {each['name']}" for each in values)
+    texts = [signal["comment"], f"Values: {named}." if named else ""]
+    texts += [f"{note}." for note in signal["notes"]]
+    return " ".join(filter(None, texts))
 
 
 # --- errors and states
 
 
-def _faults(facts: Description) -> Iterator[tuple[str, int, list[str | Table]]]:
+def _states_and_errors(facts: Facts) -> Iterator[Section]:
     live = "Bits of the error word that the ESC sends with each live frame."
     test = "Bits that the ESC sends about once a second, in its info frame. All of them mean that the self-test failed."
-    yield "Operating errors", 2, [live, _errors(facts.operating_errors)]
-    yield "Self-test errors", 2, [test, _errors(facts.selftest_errors)]
+    yield Section("Operating errors", 2, [live, _table(facts["operating_errors"], _ERROR)])
+    yield Section("Self-test errors", 2, [test, _table(facts["selftest_errors"], _ERROR)])
     sheet = "What the ESC is doing. Other numbers have no name; newer firmware may send them."
-    yield "Operating states", 2, [sheet, _states(facts.operating_states)]
-    rows = []
-    for device in facts.devices:
-        whose = "unknown" if device.peak_current is None else f"of the {device.peak_current}"
-        missing = ", ".join(device.not_supplied) or "nothing"
-        rows.append((str(device.value), Code(device.name), whose, missing))
-    yield (
-        "Devices",
-        2,
-        [Table(("number", "device", "peak current", "does not supply"), tuple(rows))],
-    )
-    yield (
-        "Link states",
-        2,
-        ["The telemetry line between an ESC and the gateway.", _states(facts.link_states)],
-    )
-    yield "CAN states", 2, ["The gateway's CAN controller.", _states(facts.can_states)]
-    yield "Gateway states", 2, [_states(facts.gateway_states)]
-    found = tuple((Code(f.name), f.meaning, f.remedy) for f in facts.gateway_faults)
+    yield Section("Operating states", 2, [sheet, _table(facts["operating_states"], _STATE)])
+    devices: Columns = {
+        "number": "value",
+        "device": _name,
+        "peak current": _peak_current,
+        "does not supply": lambda device: ", ".join(device["not_supplied"]) or "nothing",
+    }
+    yield Section("Devices", 2, [_table(facts["devices"], devices)])
+    line = "The telemetry line between an ESC and the gateway."
+    yield Section("Link states", 2, [line, _table(facts["link_states"], _STATE)])
+    controller = "The gateway's CAN controller."
+    yield Section("CAN states", 2, [controller, _table(facts["can_states"], _STATE)])
+    yield Section("Gateway states", 2, [_table(facts["gateway_states"], _STATE)])
     where = "Reported as emergencies on CANopen nodes, in the log and by kontronik-can-gw status."
-    yield (
-        "Faults that the gateway finds",
-        2,
-        [where, Table(("fault", "meaning", "what to do"), found)],
-    )
+    faults: Columns = {"fault": _name, "meaning": "meaning", "what to do": "remedy"}
+    found = _table(facts["gateway_faults"], faults)
+    yield Section("Faults that the gateway finds", 2, [where, found])
 
 
-def _errors(errors: Iterable[ErrorFacts]) -> Table:
-    rows = tuple((str(e.bit), Code(e.name), e.severity, e.meaning, e.remedy) for e in errors)
-    return Table(("bit", "name", "class", "meaning", "what to do"), rows)
+_ERROR: Columns = {
+    "bit": "bit",
+    "name": _name,
+    "class": "severity",
+    "meaning": "meaning",
+    "what to do": "remedy",
+}
+_STATE: Columns = {"number": "value", "state": _name, "meaning": "meaning", "what to do": "remedy"}
 
 
-def _states(states: Iterable[StateFacts]) -> Table:
-    rows = tuple((str(s.value), Code(s.name), s.meaning, s.remedy) for s in states)
-    return Table(("number", "state", "meaning", "what to do"), rows)
+def _peak_current(device: Facts) -> str:
+    return "unknown" if device["peak_current"] is None else f"of the {device['peak_current']}"
 
 
 # --- CANopen
 
 
-def _canopen(facts: CanopenFacts) -> Iterator[tuple[str, int, list[str | Table]]]:
-    yield "CANopen nodes", 2, ["One node for each ESC, all with the objects below."]
-    for node in facts.nodes:
-        title = (
-            f"Node {node.node_id} ({node.esc})"
-            if node.node_id is not None
-            else f"Node of {node.esc}"
-        )
-        yield title, 3, list(_node(node))
-    head = ("code", "byte 3", "byte 4", "name", "class", "meaning", "what to do")
+def _canopen(facts: Facts) -> Iterator[Section]:
+    yield Section("CANopen nodes", 2, ["One node for each ESC, all with the objects below."])
+    for node in facts["nodes"]:
+        yield _node(node)
     text = "Emergency messages: bytes 0 and 1 are the code, byte 2 is 1001h, byte 3 the bit of the ESC's error word, or FFh."
-    yield "Emergencies", 2, [text, Table(head, tuple(map(_emergency, facts.emergencies)))]
-    writes = (
-        "Nothing can be written over the bus: canopen.read_only is true." if facts.read_only else ""
-    )
-    yield "CANopen objects", 2, [*facts.notes, writes]
-    for item in facts.objects:
-        yield f"{item.index:04X}h {item.name}", 3, [*item.notes, _object(item)]
+    columns: Columns = {
+        "code": lambda emergency: f"{emergency['code']:04X}h",
+        "byte 3": lambda e: "FFh" if e["byte3"] == BY_GATEWAY else str(e["byte3"]),
+        "byte 4": lambda emergency: str(emergency["byte4"] or ""),
+        "name": _name,
+        "class": "severity",
+        "meaning": "meaning",
+        "what to do": "remedy",
+    }
+    yield Section("Emergencies", 2, [text, _table(facts["emergencies"], columns)])
+    writes = "Nothing can be written over the bus: canopen.read_only is true."
+    notes = [*facts["notes"], writes if facts["read_only"] else ""]
+    yield Section("CANopen objects", 2, notes)
+    for item in facts["objects"]:
+        blocks = [*item["notes"], _table(item["entries"], _ENTRY)]
+        yield Section(f"{item['index']:04X}h {item['name']}", 3, blocks)
 
 
-def _node(node: NodeFacts) -> Iterator[str | Table]:
-    if node.node_id is None:
-        yield "It waits for a node-ID by LSS, so it has no COB-IDs yet."
-    yield Table(("COB-ID", "used for"), tuple((f"{cob.id:03X}h", cob.use) for cob in node.cob_ids))
-    pdos = tuple(
-        (
-            str(pdo.number),
-            f"{pdo.cob_id:03X}h",
-            str(pdo.transmission_type),
-            _number(pdo.inhibit_ms),
-            _number(pdo.event_ms),
-            ", ".join(pdo.mapped),
-        )
-        for pdo in node.pdos
-    )
-    if pdos:
-        yield Table(("TPDO", "COB-ID", "type", "inhibit time ms", "event timer ms", "mapped"), pdos)
+def _node(node: Facts) -> Section:
+    cob_ids: Columns = {"COB-ID": lambda cob: f"{cob['id']:03X}h", "used for": "use"}
+    table = _table(node["cob_ids"], cob_ids)
+    if node["node_id"] is None:
+        waits = "It waits for a node-ID by LSS, so it has no COB-IDs yet."
+        return Section(f"Node of {node['esc']}", 3, [waits, table])
+    pdos: Columns = {
+        "TPDO": "number",
+        "COB-ID": lambda pdo: f"{pdo['cob_id']:03X}h",
+        "type": "transmission_type",
+        "inhibit time ms": lambda pdo: _number(pdo["inhibit_ms"]),
+        "event timer ms": lambda pdo: _number(pdo["event_ms"]),
+        "mapped": lambda pdo: ", ".join(pdo["mapped"]),
+    }
+    tables = [table, _table(node["pdos"], pdos)] if node["pdos"] else [table]
+    return Section(f"Node {node['node_id']} ({node['esc']})", 3, tables)
 
 
-def _emergency(e: EmergencyFacts) -> tuple[str, ...]:
-    byte3 = "FFh" if e.byte3 == BY_GATEWAY else str(e.byte3)
-    byte4 = "" if not e.byte4 else str(e.byte4)
-    return f"{e.code:04X}h", byte3, byte4, Code(e.name), e.severity, e.meaning, e.remedy
+def _default(entry: Facts) -> str:
+    default = entry["default"]
+    if default is None or entry["source"] is not None:  # a live value has no default of its own
+        text = ""
+    elif isinstance(default, int) and default > 0xFFFF:
+        text = f"{default:X}h"
+    else:
+        text = str(default)
+    return f"$NODEID + {text}" if entry["plus_node_id"] else text
 
 
-def _object(item: ObjectFacts) -> Table:
-    head = ("sub", "name", "type", "access", "PDO", "default", "limits", "unit", "shows", "meaning")
-    return Table(head, tuple(_entry(entry) for entry in item.entries))
+def _limits(entry: Facts) -> str:
+    if entry["low"] is None and entry["high"] is None:
+        return ""
+    return f"{_number(entry['low'])} … {_number(entry['high'])}"
 
 
-def _entry(e: EntryFacts) -> tuple[str, ...]:
-    # a live value has no default of its own
-    default = "" if e.default is None or e.source is not None else _hex(e.default)
-    if e.plus_node_id:
-        default = f"$NODEID + {default}"
-    limits = "" if e.low is e.high is None else f"{_number(e.low)} … {_number(e.high)}"
-    unit = e.unit
-    if e.resolution not in (None, 1):
-        unit = f"{_number(e.resolution)} {e.unit}".strip()
-    shows = "" if e.source is None else Code(e.source)
-    return (
-        f"{e.sub:02X}",
-        e.name,
-        e.type,
-        e.access,
-        "yes" if e.mappable else "",
-        default,
-        limits,
-        unit,
-        shows,
-        e.meaning,
-    )
+def _steps(entry: Facts) -> str:
+    if entry["resolution"] in (None, 1):
+        return str(entry["unit"])
+    return f"{_number(entry['resolution'])} {entry['unit']}".strip()
 
 
-def _hex(value: float | str) -> str:
-    return f"{value:X}h" if isinstance(value, int) and value > 0xFFFF else str(value)
+_ENTRY: Columns = {
+    "sub": lambda entry: f"{entry['sub']:02X}",
+    "name": "name",
+    "type": "type",
+    "access": "access",
+    "PDO": lambda entry: "yes" if entry["mappable"] else "",
+    "default": _default,
+    "limits": _limits,
+    "unit": _steps,
+    "shows": lambda entry: Code(entry["source"] or ""),
+    "meaning": "meaning",
+}
 
 
 # --- sources
 
 
-def _sources(found: Iterable[SourceFacts]) -> Table:
-    rows = []
-    for source in found:
-        if source.bindable:
-            meaning = f"{source.meaning} Counter." if source.counter else source.meaning
-            cells = (Code(source.name), source.unit, source.available, meaning)
-            rows.append((*cells, ", ".join(source.signals), ", ".join(source.objects)))
-    return Table(("source", "unit", "available", "meaning", "signals", "objects"), tuple(rows))
+def _sources(sources: Iterable[Facts]) -> Table:
+    columns: Columns = {
+        "source": _name,
+        "unit": "unit",
+        "available": "available",
+        "meaning": lambda s: f"{s['meaning']} Counter." if s["counter"] else s["meaning"],
+        "signals": lambda source: ", ".join(source["signals"]),
+        "objects": lambda source: ", ".join(source["objects"]),
+    }
+    return _table((source for source in sources if source["bindable"]), columns)
 
 
 def _number(value: float | None) -> str:

@@ -1,28 +1,61 @@
-"""Renders a document as Markdown (CommonMark with GitHub's tables). All texts are escaped."""
+"""Renders sections as Markdown (CommonMark with GitHub's tables). All texts are escaped."""
 
 import re
-from collections.abc import Iterator
-
-from kontronik_can_gw.desk.describe.document import Code, Document, Section, Table
-
-
-def markdown(document: Document) -> str:
-    """The Markdown text, ending with a line end."""
-    return "\n\n".join(_blocks(document)) + "\n"
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 
-def _blocks(document: Document) -> Iterator[str]:
-    yield f"# {text(document.title)}"
-    yield from map(text, document.lead)
-    yield "\n".join(f"* [{text(s.title)}](#{s.anchor})" for s in document.sections if s.level == 2)
-    for section in document.sections:
-        yield from _section(section)
+class Code(str):
+    """A text that is a name in a program or a file."""
+
+    __slots__ = ()
 
 
-def _section(section: Section) -> Iterator[str]:
-    yield f"{'#' * section.level} {text(section.title)}"
-    for block in section.blocks:
-        yield _table(block) if isinstance(block, Table) else text(block)
+class Table(NamedTuple):
+    """Cells are plain text or Code; every row is as long as ``head``."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+class Section(NamedTuple):
+    """``level`` 2 or 3. Empty blocks are left out."""
+
+    title: str
+    level: int
+    blocks: Sequence[str | Table]
+
+
+def markdown(title: str, lead: Sequence[str], sections: Sequence[Section]) -> str:
+    """The Markdown text, ending with a line end. ``lead``: lines before the table of contents."""
+    blocks = [f"# {text(title)}", *map(text, lead), _contents(sections)]
+    for section in sections:
+        blocks.append(f"{'#' * section.level} {text(section.title)}")
+        blocks += [
+            _table(block) if isinstance(block, Table) else text(block)
+            for block in section.blocks
+            if block
+        ]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _contents(sections: Sequence[Section]) -> str:
+    titles = [section.title for section in sections]
+    listed = zip(sections, _anchors(titles), strict=True)
+    return "\n".join(f"* [{text(s.title)}](#{anchor})" for s, anchor in listed if s.level == 2)
+
+
+def _anchors(titles: Sequence[str]) -> Iterator[str]:
+    """The anchors that GitHub makes from headings."""
+    taken: set[str] = set()
+    for title in titles:
+        plain = re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") or "section"
+        anchor, number = plain, 0
+        while anchor in taken:
+            number += 1
+            anchor = f"{plain}-{number}"
+        taken.add(anchor)
+        yield anchor
 
 
 def _table(table: Table) -> str:
