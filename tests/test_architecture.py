@@ -51,7 +51,6 @@ BLOCKING = {
 ONLY_IN = {
     "cantools": (
         "dbc/",
-        "canopen/dbc.py",
         "capture/setup.py",
         "config/assemble.py",
         "desk/recordings/layouts.py",

@@ -6,20 +6,21 @@ only the sign bit).
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 
 from kontronik_can_gw.canopen import emergency_codes
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.bound_values import Mapped, message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
 from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
-from kontronik_can_gw.canopen.dbc_rows import Message, Signal, number
+from kontronik_can_gw.canopen.dbc_rows import message_row, number, signal_row
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
+from kontronik_can_gw.dbc.rows import Message, Signal
 from kontronik_can_gw.esc.kontronik.states import (
     Device,
     ErrorBit,
@@ -91,7 +92,7 @@ class NodeMessages:
 
     def _heartbeat(self) -> Message:
         period = self._node.dictionary.number(0x1017)
-        state = Signal(
+        state = signal_row(
             self._name("NodeState"),
             0,
             8,
@@ -110,15 +111,14 @@ class NodeMessages:
         name = self._message_names.take(self._message_prefix, "Heartbeat")
         cob_id = HEARTBEAT + self._node.node_id
         comment = f"Heartbeat of {self._title}, {when}."
-        return Message(
-            cob_id, name, 1, comment, "Cyclic" if period else "Event", period, 0, [state]
-        )
+        schedule = ("Cyclic" if period else "Event", period, 0)
+        return message_row(cob_id, name, 1, comment, schedule, [state])
 
     def _emergency(self, cob_id: int) -> Message:
         bits = {int(bit): pascal_case(bit.name) for bit in OperatingError}
         sources = {bit: bits.get(bit, f"Bit{bit}") for bit in range(32)} | {0xFF: "Gateway"}
         signals = [
-            Signal(
+            signal_row(
                 self._name("EmergencyCode"),
                 0,
                 16,
@@ -127,7 +127,7 @@ class NodeMessages:
                 names=emergency_names(),
             ),
             *(
-                Signal(
+                signal_row(
                     self._name("ErrorRegister", what),
                     16 + mask.bit_length() - 1,
                     1,
@@ -135,7 +135,7 @@ class NodeMessages:
                 )
                 for mask, what in _REGISTER.items()
             ),
-            Signal(
+            signal_row(
                 self._name("EmergencySource"),
                 24,
                 8,
@@ -144,7 +144,7 @@ class NodeMessages:
                 start_value=0xFF,
                 names=sources,
             ),
-            Signal(
+            signal_row(
                 self._name("EmergencyWord"),
                 32,
                 32,
@@ -156,7 +156,7 @@ class NodeMessages:
         delay = self._node.dictionary.number(0x1015) // 10
         name = self._message_names.take(self._message_prefix, "Emergency")
         comment = f"Emergencies of {self._title}, sent when an error comes, again after a reset or outage, NoError when all are gone."
-        return Message(cob_id, name, 8, comment, "Event", 0, delay, signals)
+        return message_row(cob_id, name, 8, comment, ("Event", 0, delay), signals)
 
     # --- PDOs
 
@@ -177,48 +177,44 @@ class NodeMessages:
             signals += self._flags(entry, place, bits, state_name)
         name = self._message_names.take(self._message_prefix, f"Tpdo{tpdo.number + 1}")
         comment = f"TPDO {tpdo.number + 1} of {self._title}. {_when(tpdo)}"
-        return Message(tpdo.cob_id, name, plan.length, comment, *_schedule(tpdo), signals)
+        return message_row(tpdo.cob_id, name, plan.length, comment, _schedule(tpdo), signals)
 
     def _object(self, entry: Mapped, place: SignalPlan) -> list[Signal]:
         """The signals of one mapped object that is no error word."""
         item, bound = entry.variable.entry, entry.bound
         where = _where(item)
-        own_stem = _stem(item)
         length, signed = place.length, place.signed
         start = place.pieces[0].at
-        lowest, highest = (
-            (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        lowest = -(1 << length - 1) if signed else 0
+        highest = lowest + (1 << length) - 1
+        row = partial(
+            signal_row, start=start, length=length, signed=signed, is_float=place.is_float
         )
-        plain = Signal("", start, length, where, signed, place.is_float, low=lowest, high=highest)
         if bound is None:
             is_code = (item.index, item.sub, length, signed) == (at.ERROR_CODE, 0, 16, False)
             names = emergency_names() if is_code else {}
-            return [replace(plain, name=self._name(own_stem), names=names)]
+            name = self._name(_stem(item))
+            return [row(name, comment=where, low=lowest, high=highest, names=names)]
         source = bound.source
         if source.name == "link_status" and not signed:
             return self._link(start, where)
         names, stem = _table(source.name, source.names)
         if item.index >= _MIRRORS:
-            stem = own_stem
+            stem = _stem(item)
         unit = _ASCII_UNITS.get(source.unit, source.unit)
         end = "Percent" if unit == "%" else ""
         comment = " ".join(filter(None, (where, _NOTES.get(source.name))))
-        scaled = replace(
-            plain, name=self._name(stem.removesuffix(end), end), factor=1 / bound.steps, unit=unit
+        row = partial(
+            row, self._name(stem.removesuffix(end), end), factor=1 / bound.steps, unit=unit
         )
         if source.rolls:
-            return [
-                replace(
-                    scaled,
-                    comment=f"{comment} Starts again at 0 after {number(highest / bound.steps)}.",
-                )
-            ]
+            comment += f" Starts again at 0 after {number(highest / bound.steps)}."
+            return [row(comment=comment, low=lowest, high=highest)]
         not_available = lowest if signed else highest
         lowest, highest = (lowest + 1, highest) if signed else (lowest, highest - 1)
         names = {number: text for number, text in names.items() if lowest <= number <= highest}
         return [
-            replace(
-                scaled,
+            row(
                 comment=comment,
                 low=lowest,
                 high=max(names) if names else highest,
@@ -233,7 +229,7 @@ class NodeMessages:
         replay = "The values come from a recording, not from an ESC."
         info = "The information of the ESC (its info frame) is fresh."
         return [
-            Signal(
+            signal_row(
                 self._name("LinkState"),
                 start,
                 _LINK_BITS,
@@ -241,8 +237,8 @@ class NodeMessages:
                 high=max(states),
                 names=states,
             ),
-            Signal(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
-            Signal(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
+            signal_row(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
+            signal_row(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
         ]
 
     def _flags(
@@ -252,7 +248,7 @@ class NodeMessages:
         lost = f"While the word is not available all its bits are set{then}."
         where = _where(entry.variable.entry)
         return [
-            Signal(
+            signal_row(
                 self._name(pascal_case(bit.name)),
                 place.pieces[0].at + bit,
                 1,

@@ -16,6 +16,8 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
+    from kontronik_can_gw.dbc.rows import Rows
+
 _MAX_NODES = 127
 
 
@@ -86,7 +88,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _canopen(args: argparse.Namespace) -> "Database":
+def _canopen(args: argparse.Namespace) -> "Rows":
     """The DBC of the configured nodes, or of nodes from the shipped EDS with node-IDs from 1."""
     _refuse(
         args,
