@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.dbc.expand import dbc_text
+    from kontronik_can_gw.dbc.writer import dbc_text
 
     text = dbc_text(_canopen(args) if args.canopen else _database(args))
     try:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.dbc import expand
+from kontronik_can_gw.dbc import expand, writer
 from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database, parse_database
@@ -28,8 +28,7 @@ PAIR = [EscSettings("left"), EscSettings("right")]
 
 
 def written(database: Database) -> str:
-    text: str = expand.dbc_text(database)
-    return text
+    return writer.dbc_text(database)
 
 
 def multiplied(text: str, escs: list[EscSettings], node: str, **more: Any) -> tuple[Database, str]:
