@@ -270,20 +270,9 @@ def test_enumerations_name_every_value_that_can_be_sent() -> None:
     assert sorted(tables["EmergencySource"]) == [*range(32), 255]
     codes = tables["EmergencyCode"]
     design = [
-        0x3220,
-        0x3210,
-        0x2350,
-        0x2351,
-        0xFF04,
-        0x4210,
-        0x5114,
-        0x5115,
-        0x2220,
-        0x4410,
-        0xFF0A,
-        0xFF0B,
-    ]
-    design += [0x1000, 0xFF0D, 0x5000, 0x5530, 0x6010, *range(0xFF11, 0xFF18)]
+        0x3220, 0x3210, 0x2350, 0x2351, 0xFF04, 0x4210, 0x5114, 0x5115, 0x2220, 0x4410, 0xFF0A, 0xFF0B,
+        0x1000, 0xFF0D, 0x5000, 0x5530, 0x6010, *range(0xFF11, 0xFF18),
+    ]  # fmt: skip
     assert [codes[code] for code in design] == [pascal(bit.name) for bit in OperatingError]
     assert set(codes) == {0, *design, *range(0xFF18, 0xFF20)} | {
         error.value[0] for error in GatewayError

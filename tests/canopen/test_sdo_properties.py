@@ -287,32 +287,9 @@ def test_the_crc_of_the_model_and_of_the_server_agree(data: bytes) -> None:
 
 
 PLACES = [
-    *usual_entries(),
-    (0x1000, 7),
-    (0x3000, 0),
-    (0x2003, 0),
-    (0x2003, 0),
-    (0x2004, 0),
-    (0x2005, 0),
-]
-INITIATES = (
-    0x40,
-    0x21,
-    0x20,
-    0x23,
-    0x27,
-    0x2B,
-    0x2F,
-    0x22,
-    0xA0,
-    0xA4,
-    0xA4,
-    0xC0,
-    0xC2,
-    0xC4,
-    0xC6,
-    0xC6,
-)
+    *usual_entries(), (0x1000, 7), (0x3000, 0), (0x2003, 0), (0x2003, 0), (0x2004, 0), (0x2005, 0),
+]  # fmt: skip
+INITIATES = bytes.fromhex("40 21 20 23 27 2B 2F 22 A0 A4 A4 C0 C2 C4 C6 C6")
 GAPS = (0, 0, 0, 1 * MS, 30 * MS, 60 * MS, 1990 * MS, 2000 * MS, 5000 * MS)
 
 
