@@ -613,6 +613,12 @@ def test_a_live_frame_is_followed_by_a_frame_of_the_right_kind(
         assert (frame.can_id, frame.extended, frame.fd) == (0x123, extended, fd_format > 0)
         assert frame.data == (number << at).to_bytes(size, "little")
     assert len(bench.sent) == 3
+    for other, conflicts in (
+        (not extended, 0),
+        (extended, 1),
+    ):  # its id, and the other of the number
+        bench.gateway.receive_frame(CanFrame(0x123, b"", other), bench.now, bench.now)
+        assert bench.gateway.status.id_conflicts == conflicts
 
 
 # --- settings that a master writes --------------------------------------------------------------------------------------
