@@ -5,16 +5,16 @@ Nodes in, rows for ``dbc/writer.py`` out.
 
 from collections.abc import Sequence
 
-from kontronik_can_gw.canopen.dbc_messages import NodeMessages
+from kontronik_can_gw.canopen.dbc_messages import GATEWAY, LOGGER, NodeMessages
 from kontronik_can_gw.canopen.dbc_names import Names
-from kontronik_can_gw.canopen.dbc_rows import DEFINITIONS, GATEWAY, LAYOUT_VERSION, LOGGER
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.dbc.expand import esc_prefix
-from kontronik_can_gw.dbc.rows import Message, Node, Rows, Specifics, specifics
+from kontronik_can_gw.dbc.rows import Message, Node, Rows
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
+LAYOUT_VERSION = "1.0.0"
 _NODES = (
     Node(
         GATEWAY,
@@ -38,13 +38,7 @@ def database(nodes: Nodes, escs: Sequence[EscSettings]) -> Rows:
         prefix = esc_prefix(esc.name) if len(escs) > 1 else ""
         messages += NodeMessages(node, prefix, message_names, signal_names).all()
     _check_ids(messages)
-    own = specifics(DEFINITIONS, {"LayoutVersion": LAYOUT_VERSION, "BusType": "CAN"})
-    return Rows(
-        _NODES,
-        [Node("", _about(nodes, escs))],
-        messages,
-        Specifics(own.attributes, DEFINITIONS),
-    )
+    return Rows(_NODES, _about(nodes, escs), LAYOUT_VERSION, messages)
 
 
 def waiting_for_lss(nodes: Nodes, escs: Sequence[EscSettings]) -> list[str]:

@@ -14,13 +14,12 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.bound_values import Mapped, message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
 from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
-from kontronik_can_gw.canopen.dbc_rows import message_row, number, signal_row
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
-from kontronik_can_gw.dbc.rows import Message, Signal
+from kontronik_can_gw.dbc.rows import Message, Signal, number
 from kontronik_can_gw.esc.kontronik.states import (
     Device,
     ErrorBit,
@@ -32,6 +31,9 @@ from kontronik_can_gw.esc.telemetry import MS, LinkState
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import SignalPlan
 
+GATEWAY, LOGGER = "KontronikGateway", "Logger"
+_SENDERS = (GATEWAY,)
+_signal = partial(Signal, receivers=(LOGGER,))
 _MAX_START_VALUE_BITS = 32
 """That the range of GenSigStartValue holds."""
 _ASCII_UNITS = {"°C": "degC", "µs": "us"}
@@ -92,13 +94,13 @@ class NodeMessages:
 
     def _heartbeat(self) -> Message:
         period = self._node.dictionary.number(0x1017)
-        state = signal_row(
+        state = _signal(
             self._name("NodeState"),
             0,
             8,
             f"NMT state of {self._title}. BootUp is sent once, after each start and reset.",
             high=NmtState.PRE_OPERATIONAL,
-            names={
+            choices={
                 NmtState.INITIALISING: "BootUp",
                 NmtState.STOPPED: "Stopped",
                 NmtState.OPERATIONAL: "Operational",
@@ -111,23 +113,23 @@ class NodeMessages:
         name = self._message_names.take(self._message_prefix, "Heartbeat")
         cob_id = HEARTBEAT + self._node.node_id
         comment = f"Heartbeat of {self._title}, {when}."
-        schedule = ("Cyclic" if period else "Event", period, 0)
-        return message_row(cob_id, name, 1, comment, schedule, [state])
+        send_type = "Cyclic" if period else "Event"
+        return Message(cob_id, name, 1, comment, _SENDERS, send_type, period, 0, [state])
 
     def _emergency(self, cob_id: int) -> Message:
         bits = {int(bit): pascal_case(bit.name) for bit in OperatingError}
         sources = {bit: bits.get(bit, f"Bit{bit}") for bit in range(32)} | {0xFF: "Gateway"}
         signals = [
-            signal_row(
+            _signal(
                 self._name("EmergencyCode"),
                 0,
                 16,
                 "Emergency code.",
                 high=max(emergency_names()),
-                names=emergency_names(),
+                choices=emergency_names(),
             ),
             *(
-                signal_row(
+                _signal(
                     self._name("ErrorRegister", what),
                     16 + mask.bit_length() - 1,
                     1,
@@ -135,16 +137,16 @@ class NodeMessages:
                 )
                 for mask, what in _REGISTER.items()
             ),
-            signal_row(
+            _signal(
                 self._name("EmergencySource"),
                 24,
                 8,
                 "Bit of the error word of the ESC that caused the emergency, or the gateway.",
                 high=0xFF,
                 start_value=0xFF,
-                names=sources,
+                choices=sources,
             ),
-            signal_row(
+            _signal(
                 self._name("EmergencyWord"),
                 32,
                 32,
@@ -156,7 +158,7 @@ class NodeMessages:
         delay = self._node.dictionary.number(0x1015) // 10
         name = self._message_names.take(self._message_prefix, "Emergency")
         comment = f"Emergencies of {self._title}, sent when an error comes, again after a reset or outage, NoError when all are gone."
-        return message_row(cob_id, name, 8, comment, ("Event", 0, delay), signals)
+        return Message(cob_id, name, 8, comment, _SENDERS, "Event", 0, delay, signals)
 
     # --- PDOs
 
@@ -177,7 +179,8 @@ class NodeMessages:
             signals += self._flags(entry, place, bits, state_name)
         name = self._message_names.take(self._message_prefix, f"Tpdo{tpdo.number + 1}")
         comment = f"TPDO {tpdo.number + 1} of {self._title}. {_when(tpdo)}"
-        return message_row(tpdo.cob_id, name, plan.length, comment, _schedule(tpdo), signals)
+        schedule = _schedule(tpdo)
+        return Message(tpdo.cob_id, name, plan.length, comment, _SENDERS, *schedule, signals)
 
     def _object(self, entry: Mapped, place: SignalPlan) -> list[Signal]:
         """The signals of one mapped object that is no error word."""
@@ -188,13 +191,13 @@ class NodeMessages:
         lowest = -(1 << length - 1) if signed else 0
         highest = lowest + (1 << length) - 1
         row = partial(
-            signal_row, start=start, length=length, signed=signed, is_float=place.is_float
+            _signal, start=start, length=length, is_signed=signed, is_float=place.is_float
         )
         if bound is None:
             is_code = (item.index, item.sub, length, signed) == (at.ERROR_CODE, 0, 16, False)
             names = emergency_names() if is_code else {}
             name = self._name(_stem(item))
-            return [row(name, comment=where, low=lowest, high=highest, names=names)]
+            return [row(name, comment=where, low=lowest, high=highest, choices=names)]
         source = bound.source
         if source.name == "link_status" and not signed:
             return self._link(start, where)
@@ -219,7 +222,7 @@ class NodeMessages:
                 low=lowest,
                 high=max(names) if names else highest,
                 start_value=not_available if length <= _MAX_START_VALUE_BITS else 0,
-                names=names | {not_available: "NotAvailable"},
+                choices=names | {not_available: "NotAvailable"},
             )
         ]
 
@@ -229,16 +232,16 @@ class NodeMessages:
         replay = "The values come from a recording, not from an ESC."
         info = "The information of the ESC (its info frame) is fresh."
         return [
-            signal_row(
+            _signal(
                 self._name("LinkState"),
                 start,
                 _LINK_BITS,
                 f"{where} {state}",
                 high=max(states),
-                names=states,
+                choices=states,
             ),
-            signal_row(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
-            signal_row(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
+            _signal(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
+            _signal(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
         ]
 
     def _flags(
@@ -248,7 +251,7 @@ class NodeMessages:
         lost = f"While the word is not available all its bits are set{then}."
         where = _where(entry.variable.entry)
         return [
-            signal_row(
+            _signal(
                 self._name(pascal_case(bit.name)),
                 place.pieces[0].at + bit,
                 1,
@@ -260,7 +263,9 @@ class NodeMessages:
 
 
 def _where(item: Entry) -> str:
-    return f"Object {item.index:04X}h:{item.sub:02X}, {item.name}."
+    """An object for a comment, without what a parser may take for syntax: its name comes from any EDS."""
+    name = item.name.translate(str.maketrans('";\\', "',/"))
+    return f"Object {item.index:04X}h:{item.sub:02X}, {name}."
 
 
 def _stem(item: Entry) -> str:
