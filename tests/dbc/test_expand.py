@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
-from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc import expand, writer
 from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
 from kontronik_can_gw.dbc.prepare import prepare
@@ -474,13 +473,3 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
     assert [plain_plan(plan) for plan in new.messages] == [
         plain_plan(plan) for plan in old.messages
     ]
-
-
-def test_the_command_writes_eight_escs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "eight.dbc"
-    assert main(["dbc", "--esc", "8", "-o", str(out)]) == 0
-    assert out.read_text() == eight()[1]
-    assert [p.name for p in tmp_path.iterdir()] == ["eight.dbc"]
-    capsys.readouterr()
-    assert main(["dbc", "--esc", "8"]) == 0
-    assert capsys.readouterr().out == eight()[1]
