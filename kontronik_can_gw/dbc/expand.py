@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.binding import Binder, bind_key, escs_of, is_one_esc_layout
+from kontronik_can_gw.dbc.names import MAX_NAME
 from kontronik_can_gw.dbc.writer import frame_id
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from cantools.database.can import Database, Message
     from cantools.database.can.formats.dbc import DbcSpecifics
 
-_NAME_LIMIT = 32
 _SDO_END, _RESTRICTED = 0x67F, 0x6E0
 """CiA 301 uses no 11-bit ids in this range: it is after the SDO requests and before the restricted ids."""
 
@@ -178,16 +178,16 @@ def _length_problems(
     """One line for all names that become too long."""
     names = [made.new.name for made in copies]
     names += [new for made in copies for _, new in made.signals()]
-    if all(len(name) <= _NAME_LIMIT for name in names):
+    if all(len(name) <= MAX_NAME for name in names):
         return []
     signals = (signal.name for message in per_esc for signal in message.signals)
     longest = max(signals, key=len, default="")
-    room = _NAME_LIMIT - len(longest)
+    room = MAX_NAME - len(longest)
     long = [esc.name for esc in escs if len(esc_prefix(esc.name)) > room]
     remedy = (
         f"Take ESC names of at most {room} letters" if room > 0 else "Shorten the names in the DBC"
     )
-    which = f"names are longer than {_NAME_LIMIT} characters, as that of {longest}"
+    which = f"names are longer than {MAX_NAME} characters, as that of {longest}"
     return [f"ESC name {' and '.join(long)}: with it in front, {which}. {remedy}."]
 
 

@@ -428,6 +428,10 @@ def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
     assert bench.write(0x1802, 1, 0xC0000381, size=4) is None
     assert bench.write(0x1803, 5, 0, size=2) is None
     assert bench.write(0x1017, 0, 0, size=2) is None
+    assert bench.write(0x1015, 0, 1230, size=2) is None
+    db = parse(described(bench).encode())
+    (emergency,) = [message for message in db.messages if message.id == 0x81]
+    assert db.number("GenMsgDelayTime", emergency) == 123
     assert bench.write(0x1014, 0, 0x80000081, size=4) is None
     bench.describe_anew()
     db = parse(described(bench).encode())
