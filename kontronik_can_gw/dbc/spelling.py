@@ -30,7 +30,7 @@ def spelled_out(text: str, path: str) -> tuple[str, Mapping[str, Sequence[str]]]
     """The text of a DBC for cantools: a VAL_ that names a VAL_TABLE_, and enumeration attributes given by text, are written out.
 
     Entries for missing signals, tables and attributes are removed and returned by reason; cantools would refuse the whole file.
-    UserError for an attribute that is none of its enumeration's values.
+    UserError for a text that the attribute's enumeration lacks.
     """
     rewriting = _Rewriting(text, path)
     rewriting.write_out_tables()
