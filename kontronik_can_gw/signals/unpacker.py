@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
+from typing import NamedTuple
 
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED
@@ -64,6 +65,19 @@ class Part:
     page: int | None
 
 
+_Unpack = Callable[[int], list[Value]]
+
+
+class _Message(NamedTuple):
+    """How the frames of one message are read."""
+
+    length: int
+    page_of: Callable[[int], int] | None
+    """The multiplexer's value, from the bits of a frame."""
+    unpacks: dict[int | None, tuple[int, _Unpack]]
+    """For each page (None: every frame) the index of its first column, and what makes the values."""
+
+
 class SignalReader:
     """Reads the frames of one layout. ``columns`` in the order of messages, pages and signals."""
 
@@ -71,9 +85,7 @@ class SignalReader:
         self.layout = layout
         columns: list[Column] = []
         self.parts: list[Part] = []
-        self._messages: dict[
-            int, tuple[int, Callable[[int], int] | None, dict[int | None, tuple[int, _Unpack]]]
-        ] = {}
+        self._messages: dict[int, _Message] = {}
         for plan in layout.messages:
             key = plan.can_id | (EXTENDED if plan.extended else 0)
             multiplexer = next((s for s in plan.signals if s.role is Role.MULTIPLEXER), None)
@@ -85,11 +97,8 @@ class SignalReader:
                 self.parts.append(Part(len(columns), len(signals), plan, page))
                 unpacks[page] = (len(columns), unpack_of(signals))
                 columns += [_column(s, plan, key) for s in signals]
-            self._messages[key] = (
-                plan.length,
-                None if multiplexer is None else partial(take, multiplexer.pieces),
-                unpacks,
-            )
+            page_of = None if multiplexer is None else partial(take, multiplexer.pieces)
+            self._messages[key] = _Message(plan.length, page_of, unpacks)
         self.columns = tuple(columns)
         self._by_source = {
             (c.source, c.esc): index for index, c in reversed(list(enumerate(columns)))
@@ -107,19 +116,17 @@ class SignalReader:
     def read(self, key: int, data: bytes) -> list[Chunk] | None:
         """The values of a frame; None where its id is not ours, or it is shorter than its message."""
         message = self._messages.get(key)
-        if message is None or len(data) < message[0]:
+        if message is None or len(data) < message.length:
             return None
-        bits = int.from_bytes(data[: message[0]], "little")
-        _, multiplexer, unpacks = message
+        length, page_of, unpacks = message
+        bits = int.from_bytes(data[:length], "little")
         chunks = []
         if (common := unpacks.get(None)) is not None:
             chunks.append((common[0], common[1](bits)))
-        if multiplexer is not None and (paged := unpacks.get(multiplexer(bits))) is not None:
+        if page_of is not None and (paged := unpacks.get(page_of(bits))) is not None:
             chunks.append((paged[0], paged[1](bits)))
         return chunks
 
-
-_Unpack = Callable[[int], list[Value]]
 
 _TABLE_BITS = 8
 """Up to this length a signal's values are looked up in a table of all its raw values."""
