@@ -1,34 +1,35 @@
 """The CANopen side as a DBC: transmit PDOs as they are mapped now, heartbeats and emergencies, so that a plain logger reads them.
 
-Nodes in, cantools database out.
+Nodes in, rows for ``dbc/writer.py`` out.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.dbc_messages import NodeMessages
+from kontronik_can_gw.canopen.dbc_messages import GATEWAY, LOGGER, NodeMessages
 from kontronik_can_gw.canopen.dbc_names import Names
-from kontronik_can_gw.canopen.dbc_rows import LAYOUT_VERSION, Message, dbc_lines
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.dbc.expand import esc_prefix
+from kontronik_can_gw.dbc.rows import Message, Node, Rows
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.lean import without_asammdf
 
-if TYPE_CHECKING:
-    from cantools.database.can import Database
+LAYOUT_VERSION = "1.0.0"
+_NODES = (
+    Node(
+        GATEWAY,
+        "Gateway that is a CANopen node for each KONTRONIK ESC. It sends every message of this file.",
+    ),
+    Node(LOGGER, "Any receiver: logger, display or controller."),
+)
 
 
-def database(nodes: Nodes, escs: Sequence[EscSettings]) -> "Database":
+def database(nodes: Nodes, escs: Sequence[EscSettings]) -> Rows:
     """What the nodes send by themselves, as they are configured now; ``escs`` in their order.
 
     With several ESCs each name begins with that of its ESC. Nodes that wait for LSS have no frames; the database's comment names
     them. UserError for a COB-ID that is used twice.
     """
-    with without_asammdf():
-        import cantools.database
-
     message_names, signal_names = Names(), Names()
     messages: list[Message] = []
     for node, esc in zip(nodes.nodes, escs, strict=True):
@@ -37,10 +38,7 @@ def database(nodes: Nodes, escs: Sequence[EscSettings]) -> "Database":
         prefix = esc_prefix(esc.name) if len(escs) > 1 else ""
         messages += NodeMessages(node, prefix, message_names, signal_names).all()
     _check_ids(messages)
-    text = "\n".join(dbc_lines(messages, _about(nodes, escs)))
-    found = cantools.database.load_string(text, database_format="dbc", strict=True)
-    assert isinstance(found, cantools.database.Database)
-    return found
+    return Rows(_NODES, _about(nodes, escs), LAYOUT_VERSION, messages)
 
 
 def waiting_for_lss(nodes: Nodes, escs: Sequence[EscSettings]) -> list[str]:
@@ -55,12 +53,12 @@ def waiting_for_lss(nodes: Nodes, escs: Sequence[EscSettings]) -> list[str]:
 def _check_ids(messages: Sequence[Message]) -> None:
     seen: dict[int, str] = {}
     for message in messages:
-        if message.cob_id in seen:
+        if message.frame_id in seen:
             raise UserError(
-                f"{message.name} and {seen[message.cob_id]} have the same COB-ID {message.cob_id:03X}h. "
+                f"{message.name} and {seen[message.frame_id]} have the same COB-ID {message.frame_id:03X}h. "
                 "Give one of them another (180xh:1, 1014h)."
             )
-        seen[message.cob_id] = message.name
+        seen[message.frame_id] = message.name
 
 
 def _about(nodes: Nodes, escs: Sequence[EscSettings]) -> str:

@@ -6,25 +6,28 @@ only the sign bit).
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 
 from kontronik_can_gw.canopen import emergency_codes
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.bound_values import Mapped, message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
 from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
-from kontronik_can_gw.canopen.dbc_rows import Message, Signal, number
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
+from kontronik_can_gw.dbc.rows import Message, Signal, number
 from kontronik_can_gw.esc.decoder import ErrorBit
 from kontronik_can_gw.esc.telemetry import MS, LinkState
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import SignalPlan
 
+GATEWAY, LOGGER = "KontronikGateway", "Logger"
+_SENDERS = (GATEWAY,)
+_signal = partial(Signal, receivers=(LOGGER,))
 _MAX_START_VALUE_BITS = 32
 """That the range of GenSigStartValue holds."""
 _ASCII_UNITS = {"°C": "degC", "µs": "us"}
@@ -87,13 +90,13 @@ class NodeMessages:
 
     def _heartbeat(self) -> Message:
         period = self._node.dictionary.number(0x1017)
-        state = Signal(
+        state = _signal(
             self._name("NodeState"),
             0,
             8,
             f"NMT state of {self._title}. BootUp is sent once, after each start and reset.",
             high=NmtState.PRE_OPERATIONAL,
-            names={
+            choices={
                 NmtState.INITIALISING: "BootUp",
                 NmtState.STOPPED: "Stopped",
                 NmtState.OPERATIONAL: "Operational",
@@ -106,25 +109,24 @@ class NodeMessages:
         name = self._message_names.take(self._message_prefix, "Heartbeat")
         cob_id = HEARTBEAT + self._node.node_id
         comment = f"Heartbeat of {self._title}, {when}."
-        return Message(
-            cob_id, name, 1, comment, "Cyclic" if period else "Event", period, 0, [state]
-        )
+        send_type = "Cyclic" if period else "Event"
+        return Message(cob_id, name, 1, comment, _SENDERS, send_type, period, 0, [state])
 
     def _emergency(self, cob_id: int) -> Message:
         names = emergency_names(self._errors)
         bits = {int(bit): pascal_case(bit.name) for bit in self._errors}
         sources = {bit: bits.get(bit, f"Bit{bit}") for bit in range(32)} | {0xFF: "Gateway"}
         signals = [
-            Signal(
+            _signal(
                 self._name("EmergencyCode"),
                 0,
                 16,
                 "Emergency code.",
                 high=max(names),
-                names=names,
+                choices=names,
             ),
             *(
-                Signal(
+                _signal(
                     self._name("ErrorRegister", what),
                     16 + mask.bit_length() - 1,
                     1,
@@ -132,16 +134,16 @@ class NodeMessages:
                 )
                 for mask, what in _REGISTER.items()
             ),
-            Signal(
+            _signal(
                 self._name("EmergencySource"),
                 24,
                 8,
                 "Bit of the error word of the ESC that caused the emergency, or the gateway.",
                 high=0xFF,
                 start_value=0xFF,
-                names=sources,
+                choices=sources,
             ),
-            Signal(
+            _signal(
                 self._name("EmergencyWord"),
                 32,
                 32,
@@ -153,7 +155,7 @@ class NodeMessages:
         delay = self._node.dictionary.number(0x1015) // 10
         name = self._message_names.take(self._message_prefix, "Emergency")
         comment = f"Emergencies of {self._title}, sent when an error comes, again after a reset or outage, NoError when all are gone."
-        return Message(cob_id, name, 8, comment, "Event", 0, delay, signals)
+        return Message(cob_id, name, 8, comment, _SENDERS, "Event", 0, delay, signals)
 
     # --- PDOs
 
@@ -174,53 +176,50 @@ class NodeMessages:
             signals += self._flags(entry, place, bits, state_name)
         name = self._message_names.take(self._message_prefix, f"Tpdo{tpdo.number + 1}")
         comment = f"TPDO {tpdo.number + 1} of {self._title}. {_when(tpdo)}"
-        return Message(tpdo.cob_id, name, plan.length, comment, *_schedule(tpdo), signals)
+        schedule = _schedule(tpdo)
+        return Message(tpdo.cob_id, name, plan.length, comment, _SENDERS, *schedule, signals)
 
     def _object(self, entry: Mapped, place: SignalPlan) -> list[Signal]:
         """The signals of one mapped object that is no error word."""
         item, bound = entry.variable.entry, entry.bound
         where = _where(item)
-        own_stem = _stem(item)
         length, signed = place.length, place.signed
         start = place.pieces[0].at
-        lowest, highest = (
-            (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        lowest = -(1 << length - 1) if signed else 0
+        highest = lowest + (1 << length) - 1
+        row = partial(
+            _signal, start=start, length=length, is_signed=signed, is_float=place.is_float
         )
-        plain = Signal("", start, length, where, signed, place.is_float, low=lowest, high=highest)
         if bound is None:
             is_code = (item.index, item.sub, length, signed) == (at.ERROR_CODE, 0, 16, False)
             names = emergency_names(self._errors) if is_code else {}
-            return [replace(plain, name=self._name(own_stem), names=names)]
+            name = self._name(_stem(item))
+            return [row(name, comment=where, low=lowest, high=highest, choices=names)]
         source = bound.source
         if source.name == "link_status" and not signed:
             return self._link(start, where)
         names, stem = self._table(source.name, source.names)
         if item.index >= _MIRRORS:
-            stem = own_stem
+            stem = _stem(item)
         unit = _ASCII_UNITS.get(source.unit, source.unit)
         end = "Percent" if unit == "%" else ""
         comment = " ".join(filter(None, (where, _NOTES.get(source.name))))
-        scaled = replace(
-            plain, name=self._name(stem.removesuffix(end), end), factor=1 / bound.steps, unit=unit
+        row = partial(
+            row, self._name(stem.removesuffix(end), end), factor=1 / bound.steps, unit=unit
         )
         if source.rolls:
-            return [
-                replace(
-                    scaled,
-                    comment=f"{comment} Starts again at 0 after {number(highest / bound.steps)}.",
-                )
-            ]
+            comment += f" Starts again at 0 after {number(highest / bound.steps)}."
+            return [row(comment=comment, low=lowest, high=highest)]
         not_available = lowest if signed else highest
         lowest, highest = (lowest + 1, highest) if signed else (lowest, highest - 1)
         names = {number: text for number, text in names.items() if lowest <= number <= highest}
         return [
-            replace(
-                scaled,
+            row(
                 comment=comment,
                 low=lowest,
                 high=max(names) if names else highest,
                 start_value=not_available if length <= _MAX_START_VALUE_BITS else 0,
-                names=names | {not_available: "NotAvailable"},
+                choices=names | {not_available: "NotAvailable"},
             )
         ]
 
@@ -230,16 +229,16 @@ class NodeMessages:
         replay = "The values come from a recording, not from an ESC."
         info = "The information of the ESC (its info frame) is fresh."
         return [
-            Signal(
+            _signal(
                 self._name("LinkState"),
                 start,
                 _LINK_BITS,
                 f"{where} {state}",
                 high=max(states),
-                names=states,
+                choices=states,
             ),
-            Signal(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
-            Signal(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
+            _signal(self._name("Replay"), start + _REPLAY_BIT, 1, f"{where} {replay}"),
+            _signal(self._name("InfoValid"), start + _INFO_BIT, 1, f"{where} {info}"),
         ]
 
     def _flags(
@@ -249,7 +248,7 @@ class NodeMessages:
         lost = f"While the word is not available all its bits are set{then}."
         where = _where(entry.variable.entry)
         return [
-            Signal(
+            _signal(
                 self._name(pascal_case(bit.name)),
                 place.pieces[0].at + bit,
                 1,
@@ -284,7 +283,9 @@ class NodeMessages:
 
 
 def _where(item: Entry) -> str:
-    return f"Object {item.index:04X}h:{item.sub:02X}, {item.name}."
+    """An object for a comment, without what a parser may take for syntax: its name comes from any EDS."""
+    name = item.name.translate(str.maketrans('";\\', "',/"))
+    return f"Object {item.index:04X}h:{item.sub:02X}, {name}."
 
 
 def _stem(item: Entry) -> str:

@@ -4,9 +4,8 @@ import re
 from collections.abc import Sequence
 
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
+from kontronik_can_gw.dbc.names import MAX_NAME
 from kontronik_can_gw.esc.decoder import ErrorBit
-
-_MAX_NAME = 32
 
 
 class Names:
@@ -20,7 +19,7 @@ class Names:
         number = 1
         while True:
             tail = f"{number if number > 1 else ''}{end}"
-            name = prefix + stem[: _MAX_NAME - len(prefix) - len(tail)] + tail
+            name = prefix + stem[: MAX_NAME - len(prefix) - len(tail)] + tail
             if name.lower() not in self._taken:
                 self._taken.add(name.lower())
                 return name

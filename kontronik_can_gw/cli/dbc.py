@@ -16,6 +16,8 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
+    from kontronik_can_gw.dbc.rows import Rows
+
 _MAX_NODES = 127
 
 
@@ -71,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.dbc.expand import dbc_text
+    from kontronik_can_gw.dbc.writer import dbc_text
 
     text = dbc_text(_canopen(args) if args.canopen else _database(args))
     try:
@@ -86,7 +88,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _canopen(args: argparse.Namespace) -> "Database":
+def _canopen(args: argparse.Namespace) -> "Rows":
     """The DBC of the configured nodes, or of nodes from the shipped EDS with node-IDs from 1."""
     _refuse(
         args,

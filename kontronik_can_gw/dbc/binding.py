@@ -10,7 +10,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Group, Value, values_of, values_of_esc
 
 if TYPE_CHECKING:
-    from cantools.database.can import Database
+    from cantools.database.can import Database, Message
 
 _NAMES = {normalize(name): name for name in VALUES}
 
@@ -47,11 +47,11 @@ class Binder:
 
     def bound(self, message: str, signal: str) -> str | float | None:
         """The entry of ``[dbc.bind]`` for a signal."""
-        for key in (f"{message}.{signal}", signal):
-            if key in self.bind:
-                self.used.add(key)
-                return self.bind[key]
-        return None
+        key = bind_key(self.bind, message, signal)
+        if key is None:
+            return None
+        self.used.add(key)
+        return self.bind[key]
 
     def suggestions(self, name: str) -> str:
         """A sentence with the nearest known names, or an empty string."""
@@ -63,14 +63,26 @@ class Binder:
         return f" Did you mean {' or '.join(names)}?" if names else ""
 
 
+def bind_key(bind: Mapping[str, str | float], message: str, signal: str) -> str | None:
+    """The key of a signal's entry in ``[dbc.bind]``: its name with that of its message, or alone."""
+    return next((key for key in (f"{message}.{signal}", signal) if key in bind), None)
+
+
+def escs_of(message: "Message", binder: Binder) -> set[int | None]:
+    """The ESCs that a message has values of, by index; None: of one that is not named."""
+    escs = set()
+    for signal in message.signals:
+        bound = binder.bound(message.name, signal.name)
+        found = binder.by_name(bound if isinstance(bound, str) else signal.name)
+        if found and found[0].group is not Group.GATEWAY:
+            escs.add(found[1])
+    return escs
+
+
 def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
     """True if our signals are bound to values of an ESC, and none names which one."""
-    escs = set()
+    escs: set[int | None] = set()
     for message in database.messages:
         if node in message.senders:
-            for signal in message.signals:
-                bound = binder.bound(message.name, signal.name)
-                found = binder.by_name(bound if isinstance(bound, str) else signal.name)
-                if found and found[0].group is not Group.GATEWAY:
-                    escs.add(found[1])
+            escs |= escs_of(message, binder)
     return escs == {None}

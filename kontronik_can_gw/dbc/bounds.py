@@ -45,7 +45,8 @@ _PAGES = _Bound("number of multiplexer values in all", 0, 65_536)
 _POWERS = _Bound("exponent", 0, 4_200)
 _NESTING = _Bound("depth of multiplexers", 0, 8)
 
-_TEXT = re.compile(r'"(?:\\"|[^"])*"|//[^\n]*')
+STRING = r'"(?:\\"|[^"])*"'
+_TEXT = re.compile(rf"{STRING}|//[^\n]*")
 _TOKEN = re.compile(r"\w+|[^\w\s]")
 _MANY_DIGITS = re.compile(rf"\d[\d_]{{{_MAX_DIGITS}}}")
 _POWER = re.compile(r"(?<![\w.])[\d_.]+[eE][-+]?([\d_]+)")

@@ -2,22 +2,21 @@
 
 import re
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy, deepcopy
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc.binding import Binder, is_one_esc_layout
-from kontronik_can_gw.dbc.writer import dbc_text, frame_id
+from kontronik_can_gw.dbc.binding import Binder, bind_key, escs_of, is_one_esc_layout
+from kontronik_can_gw.dbc.names import MAX_NAME
+from kontronik_can_gw.dbc.writer import frame_id
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import Group
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
     from cantools.database.can.formats.dbc import DbcSpecifics
 
-__all__ = ["dbc_text", "esc_prefix", "expand", "needs_expansion"]
-_NAME_LIMIT = 32
 _SDO_END, _RESTRICTED = 0x67F, 0x6E0
 """CiA 301 uses no 11-bit ids in this range: it is after the SDO requests and before the restricted ids."""
 
@@ -42,7 +41,7 @@ def expand(
     node: str,
     escs: Sequence[EscSettings],
     file: str,
-    bind: dict[str, str | float] | None = None,
+    bind: Mapping[str, str | float] | None = None,
     base_id: int | None = None,
     id_step: int | None = None,
 ) -> tuple["Database", dict[str, str | float]]:
@@ -52,66 +51,92 @@ def expand(
     are moved by ``id_step`` for each ESC; None: the smallest step without a clash. ``base_id`` becomes the lowest of our ids. Messages of
     the gateway itself and of other nodes are copied once. UserError for names or ids that do not fit.
     """
-    import cantools.database.can
-
-    bind = dict(bind or {})
+    bind = bind or {}
     ours = [message for message in database.messages if node in message.senders]
-    per_esc = (
-        [message for message in ours if _has_values_of_an_esc(message, bind)]
-        if len(escs) > 1
-        else []
-    )
+    binder = Binder([EscSettings()], bind)
+    per_esc = [m for m in ours if escs_of(m, binder)] if len(escs) > 1 else []
     shift = 0 if base_id is None else base_id - min(message.frame_id for message in ours)
     once = [message for message in database.messages if message not in per_esc]
     taken = {(m.frame_id + (shift if m in ours else 0), m.is_extended_frame) for m in once}
-    step = _step(
-        [(m.frame_id + shift, m.is_extended_frame) for m in per_esc],
-        taken,
-        len(escs),
-        id_step,
-        file,
-    )
-    messages: list[Message] = []
-    moved: dict[int, list[tuple[int, dict[str, str]]]] = {}
-    moves: list[tuple[int, int, bool]] = []
-    out_bind = dict(bind)  # keys that match no signal stay, and the compiler reports them
+    shifted = [(m.frame_id + shift, m.is_extended_frame) for m in per_esc]
+    step = _step(shifted, taken, len(escs), id_step, file)
+    copies = []
     for message in database.messages:
-        copies = enumerate(escs) if message in per_esc else [(0, None)]
-        for index, esc in copies:
-            made = _copy(message)
-            if message in ours:
-                made.frame_id = message.frame_id + shift + index * step
-                moves.append((message.frame_id, made.frame_id, message.is_extended_frame))
-            if esc is not None:
-                _rename(made, esc_prefix(esc.name))
-            for old, new in zip(message.signals, made.signals, strict=True):
-                for key in (f"{message.name}.{old.name}", old.name):
-                    if key in bind and message in ours:
-                        value = bind[key]
-                        out_bind.pop(key, None)
-                        if esc is not None and isinstance(value, str):
-                            value = f"{esc.name}.{value}"
-                        out_bind[f"{made.name}.{new.name}"] = value
-                        break
-            messages.append(made)
-            names = {
-                old.name: new.name for old, new in zip(message.signals, made.signals, strict=True)
-            }
-            moved.setdefault(frame_id(message), []).append((frame_id(made), names))
-    problems = [f"{file}: {problem}" for problem in _id_problems(moves, len(escs), base_id)]
-    _check_lengths(messages, per_esc, escs, problems, file)
+        distance = shift if message in ours else 0
+        if message in per_esc:
+            copies += [
+                _copy(message, distance + index * step, esc) for index, esc in enumerate(escs)
+            ]
+        else:
+            copies.append(_copy(message, distance, None))
+    moved = [made for made in copies if made.old in ours]
+    problems = _id_problems([made.new for made in moved], len(escs), base_id)
+    problems += _length_problems(copies, per_esc, escs)
     if problems:
-        raise UserError(*problems)
-    result = cantools.database.can.Database(
-        messages=messages,
+        raise UserError(*(f"{file}: {problem}" for problem in problems))
+    messages = [made.new for made in copies]
+    expanded = with_messages(database, messages, _relations(database.dbc, copies))
+    return expanded, _bindings(bind, moved)
+
+
+def with_messages(
+    database: "Database", messages: Sequence["Message"], specifics: "DbcSpecifics | None"
+) -> "Database":
+    """A database with other messages, and what the file says of attributes (``specifics``)."""
+    import cantools.database.can
+
+    return cantools.database.can.Database(
+        messages=list(messages),
         nodes=database.nodes,
         buses=database.buses,
         version=database.version,
-        dbc_specifics=_relations(database.dbc, moved),
+        dbc_specifics=specifics,
         strict=False,
         sort_signals=None,
     )
-    return result, out_bind
+
+
+@dataclass(frozen=True)
+class _Copy:
+    """A message and what became of it."""
+
+    old: "Message"
+    new: "Message"
+    esc: EscSettings | None
+    """Whose name it has; None for one that is taken over once."""
+
+    def signals(self) -> Iterator[tuple[str, str]]:
+        """Old and new names."""
+        for old, new in zip(self.old.signals, self.new.signals, strict=True):
+            yield old.name, new.name
+
+
+def _copy(message: "Message", distance: int, esc: EscSettings | None) -> _Copy:
+    """A copy of a message, moved and renamed; it shares everything that does not change."""
+    made = copy(message)
+    made._signals = [copy(signal) for signal in message.signals]
+    if message.signal_groups is not None:
+        made.signal_groups = [copy(group) for group in message.signal_groups]
+    made.frame_id = message.frame_id + distance
+    if esc is not None:
+        _rename(made, esc_prefix(esc.name))
+    return _Copy(message, made, esc)
+
+
+def _bindings(bind: Mapping[str, str | float], copies: Sequence[_Copy]) -> dict[str, str | float]:
+    """The bindings of the copies. Keys that match no signal stay, and the compiler reports them."""
+    found = dict(bind)
+    for made in copies:
+        for old, new in made.signals():
+            key = bind_key(bind, made.old.name, old)
+            if key is None:
+                continue
+            value = bind[key]
+            if made.esc is not None and isinstance(value, str):
+                value = f"{made.esc.name}.{value}"
+            found.pop(key, None)
+            found[f"{made.new.name}.{new}"] = value
+    return found
 
 
 def among_canopen(database: "Database", expanded: "Database", node: str) -> str:
@@ -131,51 +156,47 @@ def among_canopen(database: "Database", expanded: "Database", node: str) -> str:
     )
 
 
-def _id_problems(
-    moves: Sequence[tuple[int, int, bool]], count: int, base_id: int | None
-) -> list[str]:
-    """A line for ids outside the range of CAN ids. ``moves``: from, to, 29 bits."""
+def _id_problems(messages: Sequence["Message"], count: int, base_id: int | None) -> list[str]:
+    """A line for ids outside the range of CAN ids."""
     problems = []
     why = f"for {count} ESCs" if base_id is None else f"with {base_id:X}h as the lowest id"
+    every = [message.frame_id for message in messages]
     for extended, limit in ((False, 0x7FF), (True, 0x1FFFFFFF)):
-        ids = [made for _, made, is_extended in moves if is_extended is extended]
-        if outside := [made for made in ids if not 0 <= made <= limit]:
-            most = max(made for _, made, _ in moves) - min(made for _, made, _ in moves)
-            remedy = f" The lowest id can be at most {limit - most:X}h." if limit > most else ""
+        ids = [m.frame_id for m in messages if m.is_extended_frame is extended]
+        if outside := [can_id for can_id in ids if not 0 <= can_id <= limit]:
+            span = max(every) - min(every)
+            remedy = f" The lowest id can be at most {limit - span:X}h." if limit > span else ""
             problems.append(
-                f"{why}, {len(outside)} of {len(moves)} messages lie outside 0..{limit:X}h, up to {max(outside):X}h.{remedy}"
+                f"{why}, {len(outside)} of {len(every)} messages lie outside 0..{limit:X}h, up to {max(outside):X}h.{remedy}"
             )
     return problems
 
 
-def _check_lengths(
-    messages: Sequence["Message"],
-    per_esc: Sequence["Message"],
-    escs: Sequence[EscSettings],
-    problems: list[str],
-    file: str,
-) -> None:
+def _length_problems(
+    copies: Sequence[_Copy], per_esc: Sequence["Message"], escs: Sequence[EscSettings]
+) -> list[str]:
     """One line for all names that become too long."""
-    longest = max(
-        (signal.name for message in per_esc for signal in message.signals), key=len, default=""
+    names = [made.new.name for made in copies]
+    names += [new for made in copies for _, new in made.signals()]
+    if all(len(name) <= MAX_NAME for name in names):
+        return []
+    signals = (signal.name for message in per_esc for signal in message.signals)
+    longest = max(signals, key=len, default="")
+    room = MAX_NAME - len(longest)
+    long = [esc.name for esc in escs if len(esc_prefix(esc.name)) > room]
+    remedy = (
+        f"Take ESC names of at most {room} letters" if room > 0 else "Shorten the names in the DBC"
     )
-    if any(
-        len(name) > _NAME_LIMIT
-        for m in messages
-        for name in (m.name, *(signal.name for signal in m.signals))
-    ):
-        room = _NAME_LIMIT - len(longest)
-        long = [esc.name for esc in escs if len(esc_prefix(esc.name)) > room]
-        problems.append(
-            f"{file}: ESC name {' and '.join(long)}: with it in front, names are longer than {_NAME_LIMIT} characters, as that of "
-            f"{longest}. {f'Take ESC names of at most {room} letters' if room > 0 else 'Shorten the names in the DBC'}."
-        )
+    which = f"names are longer than {MAX_NAME} characters, as that of {longest}"
+    return [f"ESC name {' and '.join(long)}: with it in front, {which}. {remedy}."]
 
 
-def _relations(
-    specifics: "DbcSpecifics | None", moved: Mapping[int, list[tuple[int, dict[str, str]]]]
-) -> "DbcSpecifics | None":
+def _relations(specifics: "DbcSpecifics | None", copies: Sequence[_Copy]) -> "DbcSpecifics | None":
     """Copies attributes of relations (BA_REL_), which refer to messages and signals by id and name."""
+    moved: dict[int, list[tuple[int, dict[str, str]]]] = {}
+    for made in copies:
+        names = dict(made.signals())
+        moved.setdefault(frame_id(made.old), []).append((frame_id(made.new), names))
     specifics = deepcopy(specifics)
     relations = specifics.relation_attributes if specifics is not None else None
     if relations is not None:
@@ -192,16 +213,6 @@ def _relations(
             for new, _ in moved.get(number, [(number, {})]):
                 messages[new] = by_node
     return specifics
-
-
-def _has_values_of_an_esc(message: "Message", bind: dict[str, str | float]) -> bool:
-    binder = Binder([EscSettings()], bind)
-    for signal in message.signals:
-        bound = binder.bound(message.name, signal.name)
-        found = binder.by_name(bound if isinstance(bound, str) else signal.name)
-        if found and found[0].group is not Group.GATEWAY:
-            return True
-    return False
 
 
 def _step(
@@ -225,15 +236,6 @@ def _step(
     raise UserError(
         f"{file}: no step moves the ids for {count} ESCs without a clash. Give the messages other ids."
     )
-
-
-def _copy(message: "Message") -> "Message":
-    """A copy that can be moved and renamed; it shares everything that does not change."""
-    made = copy(message)
-    made._signals = [copy(signal) for signal in message.signals]
-    if message.signal_groups is not None:
-        made.signal_groups = [copy(group) for group in message.signal_groups]
-    return made
 
 
 def _rename(message: "Message", prefix: str) -> None:

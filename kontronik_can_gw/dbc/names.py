@@ -1,4 +1,7 @@
-"""Normalizes names for comparison."""
+"""Names in a DBC: their length, and how they are compared."""
+
+MAX_NAME = 32
+"""Characters that every tool takes."""
 
 
 def normalize(name: str) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
-from kontronik_can_gw.dbc.expand import among_canopen, expand, needs_expansion
+from kontronik_can_gw.dbc.expand import among_canopen, expand, needs_expansion, with_messages
 from kontronik_can_gw.dbc.reader import choose_node
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -35,7 +35,7 @@ def prepare(
     if needs_expansion(database, node, escs, settings.bind) or settings.base_id is not None:
         plain = database
         database, bind = expand(
-            plain, node, escs, file, dict(settings.bind), settings.base_id, settings.id_step
+            plain, node, escs, file, settings.bind, settings.base_id, settings.id_step
         )
         settings = replace(settings, bind=bind)
         if settings.base_id is None and (reason := among_canopen(plain, database, node)):
@@ -46,8 +46,6 @@ def prepare(
 
 def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file: str) -> "Database":
     """The database with only those messages of a node that match a pattern. UserError for a pattern without a match."""
-    import cantools.database.can
-
     ours = {message.name for message in database.messages if node in message.senders}
     problems = []
     for pattern in patterns:
@@ -70,19 +68,8 @@ def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file:
     if problems:
         raise UserError(*problems)
     chosen = {name for pattern in patterns for name in fnmatch.filter(ours, pattern)}
-    return cantools.database.can.Database(
-        messages=[
-            message
-            for message in database.messages
-            if message.name in chosen or message.name not in ours
-        ],
-        nodes=database.nodes,
-        buses=database.buses,
-        version=database.version,
-        dbc_specifics=database.dbc,
-        strict=False,
-        sort_signals=None,
-    )
+    messages = [m for m in database.messages if m.name in chosen or m.name not in ours]
+    return with_messages(database, messages, database.dbc)
 
 
 def check_load(

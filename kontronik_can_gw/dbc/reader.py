@@ -1,11 +1,11 @@
-"""Reads a DBC file with cantools, after rewriting what other tools write and cantools does not understand."""
+"""Reads a DBC file with cantools, after checks of its size and numbers and the rewriting of ``spelling.py``."""
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc.bounds import MAX_BYTES, check_bounds, check_size
+from kontronik_can_gw.dbc.spelling import spelled_out
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.lean import without_asammdf
 
@@ -49,9 +49,11 @@ def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> 
     with without_asammdf():
         import cantools.database
 
-    text, ignored = _spelled_out(text, path)
+    text, ignored = spelled_out(text, path)
     if warnings is not None:
-        warnings += ignored
+        warnings += [
+            f"{path}: ignored, {reason}: {listed(entries)}" for reason, entries in ignored.items()
+        ]
     try:
         database = cantools.database.load_string(
             text, database_format="dbc", strict=False, sort_signals=None
@@ -64,114 +66,6 @@ def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> 
     if not database.messages:
         raise UserError(f"{path}: has no message; is it a DBC file?")
     return database
-
-
-_STRING = re.compile(r'"(?:\\"|[^"])*"')
-
-_PAIRS = r'(?:[^\s";]+\s+"\0\d+\0"\s*)*'
-"""Values and their masked texts. Not simply up to a semicolon: NS_ lists keywords without one."""
-
-_MASKED = re.compile(r'"\0(\d+)\0"')
-
-
-def _spelled_out(text: str, path: str) -> tuple[str, list[str]]:
-    """Rewrite what cantools does not read: a VAL_ that names a VAL_TABLE_, and enumeration attributes given by text.
-
-    Entries for missing signals, tables and attributes are removed, each kind with a warning; cantools would refuse the whole file. Strings
-    are masked meanwhile, so that comments and value texts stay unchanged and lines keep their numbers.
-    """
-    strings: list[str] = []
-
-    def mask(found: re.Match[str]) -> str:
-        strings.append(found[0])
-        return f'"\0{len(strings) - 1}\0"'
-
-    def shown(masked: str) -> str:
-        return _MASKED.sub(lambda found: strings[int(found[1])], masked)
-
-    text = _STRING.sub(mask, text)
-    ignored: dict[str, list[str]] = {}
-
-    def without(entry: re.Match[str], reason: str, what: str) -> str:
-        ignored.setdefault(reason, []).append(shown(what))
-        return "\n" * entry[0].count("\n")
-
-    tables = dict(re.findall(rf"^[ \t]*VAL_TABLE_\s+(\w+)\s+({_PAIRS});", text, re.MULTILINE))
-    signals: set[tuple[str, str]] = set()
-    message = ""
-    for found in re.finditer(r"^[ \t]*(?:BO_\s+0*(\d+)\s+\w+\s*:|SG_\s+(\w+))", text, re.MULTILINE):
-        message = found[1] or message
-        signals.add((message, found[2]))
-
-    def of_signal(found: re.Match[str]) -> str:
-        keyword, number, name, body = (
-            found["keyword"],
-            found["message"],
-            found["signal"],
-            found["body"],
-        )
-        what = f"{keyword} {number or ''} {name}".replace("  ", " ")
-        if number is not None and (number.lstrip("0") or "0", name) not in signals:
-            return without(found, "for signals that are not in the file", what)
-        if keyword != "VAL_" or not re.fullmatch(r"[A-Za-z_]\w*", body.strip()):
-            return found[0]
-        if (table := tables.get(body.strip())) is None:
-            return without(
-                found, "naming a VAL_TABLE_ that is not in the file", f"{what} {body.strip()}"
-            )
-        return f"{found['head']}{table};"
-
-    text = re.sub(
-        r"^(?P<head>[ \t]*(?P<keyword>VAL_|SIG_VALTYPE_)\s+(?:(?P<message>\d+)\s+)?(?P<signal>[A-Za-z_]\w*+)\s*+)"
-        rf"(?P<body>{_PAIRS}|[A-Za-z_]\w*\s*|:?\s*\d+\s*);",
-        of_signal,
-        text,
-        flags=re.MULTILINE,
-    )
-    defined = set(
-        map(shown, re.findall(r"^[ \t]*BA_DEF_\s+(?:\w+\s+)?(\"\0\d+\0\")", text, re.MULTILINE))
-    )
-    text = re.sub(
-        r"^[ \t]*(BA_|BA_DEF_DEF_)\s+(\"\0\d+\0\")[^;\n]*;",
-        lambda found: (
-            found[0]
-            if shown(found[2]) in defined
-            else without(found, "of attributes that no BA_DEF_ defines", f"{found[1]} {found[2]}")
-        ),
-        text,
-        flags=re.MULTILINE,
-    )
-    enumerations = re.findall(
-        r"^[ \t]*BA_DEF_\s+(?:BO_\s+|SG_\s+|BU_\s+|EV_\s+)?(\"\0\d+\0\")\s+ENUM\s+([^;]*)",
-        text,
-        re.MULTILINE,
-    )
-    numbers = {
-        shown(name): {
-            shown(value[0]): str(n) for n, value in enumerate(re.finditer(_MASKED, values))
-        }
-        for name, values in enumerations
-    }
-
-    def number(found: re.Match[str]) -> str:
-        name, value = shown(found[2]), shown(found[4])
-        if name in numbers and value not in numbers[name]:
-            raise UserError(
-                f"{path}: attribute {name}: {value} is none of its values {', '.join(numbers[name])}"
-            )
-        return (
-            f"{found[1]}{found[2]}{found[3]}{numbers.get(name, {}).get(value, found[4])}{found[5]}"
-        )
-
-    text = re.sub(
-        r"^([ \t]*BA_\s+)(\"\0\d+\0\")(\s[^\";]*)(\"\0\d+\0\")(\s*;)",
-        number,
-        text,
-        flags=re.MULTILINE,
-    )
-    return shown(text), [
-        f"{path}: ignored, {reason}: {listed(found)}" for reason, found in ignored.items()
-    ]
 
 
 def listed(names: Sequence[str], limit: int = 6) -> str:

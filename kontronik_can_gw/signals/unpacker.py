@@ -1,18 +1,20 @@
 """CAN frames of a layout -> values: what a logger with the DBC sees. The other way round of packer.py, from the same plans.
 
-One function a message (and multiplexer page) is generated from its plan. A value is an int or a float in the signal's unit, a text
-where the signal is an enumeration, None where it is not available (or could not be sent: the Error code). A flag, which has no code for
-that, is not available where the other values of its message are not.
+Each message (and multiplexer page) is a list of signals: where the raw value stands, and what makes the value of it. A value is an int
+or a float in the signal's unit, a text where the signal is an enumeration, None where it is not available (or could not be sent: the
+Error code). A flag, which has no code for that, is not available where the other values of its message are not.
 """
 
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
+from typing import NamedTuple
 
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED
-from kontronik_can_gw.signals.packer import take
+from kontronik_can_gw.signals.packer import place, take
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 
 Value = int | float | str | None
@@ -63,6 +65,19 @@ class Part:
     page: int | None
 
 
+_Unpack = Callable[[int], list[Value]]
+
+
+class _Message(NamedTuple):
+    """How the frames of one message are read."""
+
+    length: int
+    page_of: Callable[[int], int] | None
+    """The multiplexer's value, from the bits of a frame."""
+    unpacks: dict[int | None, tuple[int, _Unpack]]
+    """For each page (None: every frame) the index of its first column, and what makes the values."""
+
+
 class SignalReader:
     """Reads the frames of one layout. ``columns`` in the order of messages, pages and signals."""
 
@@ -70,25 +85,20 @@ class SignalReader:
         self.layout = layout
         columns: list[Column] = []
         self.parts: list[Part] = []
-        self._messages: dict[
-            int, tuple[int, Callable[[int], int] | None, dict[int | None, _Unpack]]
-        ] = {}
+        self._messages: dict[int, _Message] = {}
         for plan in layout.messages:
             key = plan.can_id | (EXTENDED if plan.extended else 0)
             multiplexer = next((s for s in plan.signals if s.role is Role.MULTIPLEXER), None)
-            unpacks: dict[int | None, _Unpack] = {}
+            unpacks: dict[int | None, tuple[int, _Unpack]] = {}
             for page in dict.fromkeys((None, *plan.pages)):
                 signals = [s for s in plan.signals if s.role is Role.SOURCE and s.page == page]
                 if not signals:
                     continue
                 self.parts.append(Part(len(columns), len(signals), plan, page))
-                unpacks[page] = (len(columns), compile_unpack(signals, f"{plan.name}{page or ''}"))
+                unpacks[page] = (len(columns), unpack_of(signals))
                 columns += [_column(s, plan, key) for s in signals]
-            self._messages[key] = (
-                plan.length,
-                None if multiplexer is None else _number(multiplexer),
-                unpacks,
-            )
+            page_of = None if multiplexer is None else partial(take, multiplexer.pieces)
+            self._messages[key] = _Message(plan.length, page_of, unpacks)
         self.columns = tuple(columns)
         self._by_source = {
             (c.source, c.esc): index for index, c in reversed(list(enumerate(columns)))
@@ -106,54 +116,115 @@ class SignalReader:
     def read(self, key: int, data: bytes) -> list[Chunk] | None:
         """The values of a frame; None where its id is not ours, or it is shorter than its message."""
         message = self._messages.get(key)
-        if message is None or len(data) < message[0]:
+        if message is None or len(data) < message.length:
             return None
-        bits = int.from_bytes(data[: message[0]], "little")
-        _, multiplexer, unpacks = message
+        length, page_of, unpacks = message
+        bits = int.from_bytes(data[:length], "little")
         chunks = []
         if (common := unpacks.get(None)) is not None:
             chunks.append((common[0], common[1](bits)))
-        if multiplexer is not None and (paged := unpacks.get(multiplexer(bits))) is not None:
+        if page_of is not None and (paged := unpacks.get(page_of(bits))) is not None:
             chunks.append((paged[0], paged[1](bits)))
         return chunks
 
 
-_Unpack = tuple[int, Callable[[int], list[Value]]]
+_TABLE_BITS = 8
+"""Up to this length a signal's values are looked up in a table of all its raw values."""
 
 
-def compile_unpack(signals: Sequence[SignalPlan], name: str) -> Callable[[int], list[Value]]:
+def unpack_of(signals: Sequence[SignalPlan]) -> _Unpack:
     """A function from the bits of a frame (bit 0 is bit 0 of byte 0) to the signals' values."""
-    names: dict[str, object] = {"float_value": float_value}
-    lines = ["def unpack(bits):"]
-    for index, signal in enumerate(signals):
-        if signal.numbers is not None:
-            names[f"texts{index}"] = dict(signal.texts)
-        lines += [f"    {line}" for line in _lines(signal, index)]
-    lines += [f"    {line}" for line in _lost_flags(signals)]
-    lines.append(f"    return [{', '.join(f'v{index}' for index in range(len(signals)))}]")
-    exec(compile("\n".join(lines), f"<unpacker of {name}>", "exec"), names)  # noqa: S102  text made here, from checked plans
-    return names["unpack"]  # type: ignore[return-value]
+    rows = [_row(signal) for signal in signals]
+    lost = _lost_flags(signals)
+
+    def unpack(bits: int) -> list[Value]:
+        values = [value_of(bits >> at & mask) for at, mask, value_of in rows]
+        for flags, mask, codes in lost:
+            if bits & mask == codes:
+                for flag in flags:
+                    values[flag] = None
+        return values
+
+    return unpack
 
 
-def _lost_flags(signals: Sequence[SignalPlan]) -> list[str]:
-    """A flag has no code for not available: it is that where all values of the same ESC's frame that have one say so, in its message."""
-    groups: dict[tuple[int | None, Group], tuple[list[str], list[str]]] = {}
+def _row(signal: SignalPlan) -> tuple[int, int, Callable[[int], Value]]:
+    """Where a signal's raw value stands, the mask of its length, and the function from it to the value."""
+    value_of = _value_of(signal)
+    if signal.length <= _TABLE_BITS:
+        value_of = tuple(value_of(raw) for raw in range(1 << signal.length)).__getitem__
+    pieces = [(piece.at, (1 << piece.width) - 1, piece.shift) for piece in signal.pieces]
+    if len(pieces) == 1:
+        ((at, mask, _),) = pieces
+        return at, mask, value_of
+
+    def value_of_pieces(bits: int) -> Value:
+        raw = 0
+        for at, mask, shift in pieces:
+            raw |= (bits >> at & mask) << shift
+        return value_of(raw)
+
+    return 0, -1, value_of_pieces
+
+
+def _value_of(signal: SignalPlan) -> Callable[[int], Value]:
+    """A function from a signal's raw value, without its sign, to its value."""
+    if _is_flag(signal):
+        return int
+    # a code amid the values counts as the code: the packer sends no value that looks like it
+    codes = tuple(sorted({signal.not_available, signal.error}))
+    if signal.is_float:
+        return partial(
+            float_value,
+            length=signal.length,
+            codes=codes,
+            factor=float(signal.factor),
+            offset=float(signal.offset),
+        )
+    modulus = 1 << signal.length
+    if signal.numbers is not None:
+        texts = {raw % modulus: text for raw, text in signal.texts.items() if raw not in codes}
+        return texts.get
+    least_negative = modulus >> 1 if signal.signed else modulus
+    common = signal.factor.denominator * signal.offset.denominator
+    factor, offset = int(signal.factor * common), int(signal.offset * common)
+
+    def number(raw: int) -> Value:
+        """The float nearest to the exact decimal, which prints as it stands in the DBC; an int where all are whole."""
+        if raw >= least_negative:
+            raw -= modulus
+        if raw in codes:
+            return None
+        scaled = raw * factor + offset
+        return scaled if common == 1 else scaled / common
+
+    return number
+
+
+def _lost_flags(signals: Sequence[SignalPlan]) -> list[tuple[list[int], int, int]]:
+    """Flags that are not available where a frame has these bits under this mask.
+
+    A flag has no code for not available: it is that where all values of the same ESC's frame that have one say so, in its message.
+    """
+    groups: dict[tuple[int | None, Group], tuple[list[int], list[SignalPlan]]] = {}
     for index, signal in enumerate(signals):
         source = signal.source
         if source is None or source.group not in (Group.LIVE, Group.INFO) or source.optional:
             continue
         flags, others = groups.setdefault((signal.esc, source.group), ([], []))
         if _is_flag(signal):
-            flags.append(f"v{index}")
+            flags.append(index)
         elif signal.is_float or not signal.low <= signal.not_available <= signal.high:
-            raw = " | ".join(_piece(piece.shift, piece.width, piece.at) for piece in signal.pieces)
-            others.append(f"({raw}) == {signal.not_available & (1 << signal.length) - 1}")
-    lines = []
-    for flags, others in groups.values():
-        if flags and others:
-            lines.append(f"if {' and '.join(others)}:")
-            lines.append(f"    {' = '.join(flags)} = None")
-    return lines
+            others.append(signal)
+    return [
+        (
+            flags,
+            sum(place(signal.pieces, -1) for signal in others),
+            sum(place(signal.pieces, signal.not_available) for signal in others),
+        )
+        for flags, others in groups.values()
+        if flags and others
+    ]
 
 
 def _is_flag(signal: SignalPlan) -> bool:
@@ -174,66 +245,16 @@ def float_value(
     return None if raw != raw else raw * factor + offset
 
 
-def _lines(signal: SignalPlan, index: int) -> list[str]:
-    v = f"v{index}"
-    raw = " | ".join(_piece(piece.shift, piece.width, piece.at) for piece in signal.pieces)
-    if signal.is_float:
-        codes = tuple(sorted({signal.not_available, signal.error}))
-        return [
-            f"{v} = float_value({raw}, {signal.length}, {codes}, {float(signal.factor)!r}, {float(signal.offset)!r})"
-        ]
-    if _is_flag(signal):
-        return [f"{v} = {raw}"]
-    lines = [f"{v} = {raw}"]
-    if signal.signed:
-        lines.append(f"if {v} >= {1 << signal.length - 1}: {v} -= {1 << signal.length}")
-    # a code amid the values counts as the code: the packer sends no value that looks like it
-    codes = tuple(sorted({signal.not_available, signal.error}))
-    if signal.numbers is not None:
-        lines.append(f"{v} = None if {v} in {codes} else texts{index}.get({v})")
-        return lines
-    scaled = _scaled(v, signal.factor, signal.offset)
-    lines.append(f"{v} = None if {v} in {codes} else {scaled}")
-    return lines
-
-
-def _piece(shift: int, width: int, at: int) -> str:
-    part = f"(bits >> {at} & {(1 << width) - 1:#x})"
-    return f"{part} << {shift}" if shift else part
-
-
-def _scaled(v: str, factor: Fraction, offset: Fraction) -> str:
-    """The float nearest to the exact decimal, which prints as it stands in the DBC; an int where all are whole."""
-    common = factor.denominator * offset.denominator
-    a, b = int(factor * common), int(offset * common)
-    text = v if a == 1 else f"{v} * {a}"
-    text = text if not b else f"{text} + {b}"
-    return text if common == 1 else f"({text}) / {common}"
-
-
-def _number(signal: SignalPlan) -> Callable[[int], int]:
-    return lambda bits: take(signal.pieces, bits)
-
-
 def _column(signal: SignalPlan, plan: MessagePlan, key: int) -> Column:
     assert signal.source is not None
+    texts: tuple[tuple[int, str], ...] = ()
+    digits = None
     if signal.is_float:
-        ends = sorted(raw * float(signal.factor) + float(signal.offset) for raw in signal.limits)
-        return Column(
-            signal.name,
-            signal.unit,
-            plan.name,
-            key,
-            signal.source.name,
-            signal.esc,
-            (),
-            None,
-            ends[0],
-            ends[1],
-        )
-    texts = tuple(sorted(signal.texts.items())) if signal.numbers is not None else ()
-    ends = sorted(float(raw * signal.factor + signal.offset) for raw in (signal.low, signal.high))
-    digits = max(_digits(signal.factor), _digits(signal.offset))
+        ends = [raw * float(signal.factor) + float(signal.offset) for raw in signal.limits]
+    else:
+        ends = [float(raw * signal.factor + signal.offset) for raw in (signal.low, signal.high)]
+        digits = max(_digits(signal.factor), _digits(signal.offset))
+        texts = tuple(sorted(signal.texts.items())) if signal.numbers is not None else ()
     return Column(
         signal.name,
         signal.unit,
@@ -243,8 +264,8 @@ def _column(signal: SignalPlan, plan: MessagePlan, key: int) -> Column:
         signal.esc,
         texts,
         digits,
-        ends[0],
-        ends[1],
+        low=min(ends),
+        high=max(ends),
     )
 
 

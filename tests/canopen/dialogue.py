@@ -100,7 +100,8 @@ def info(**fields: int) -> bytes:
 class Bench:
     """A gateway with ``nodes`` ESCs and nodes, node-IDs 1, 2, … and serial numbers 77, 78, …, whose time is turned by hand.
 
-    ``changes`` are made to the shipped EDS. ``settings`` are further fields of every NodeSettings, ``escs`` those of EscSettings.
+    ``changes`` are made to the shipped EDS. ``settings`` are further fields of every NodeSettings, ``escs`` those of EscSettings, or
+    the ESCs themselves.
     """
 
     def __init__(
@@ -112,12 +113,16 @@ class Bench:
         stored: Sequence[Stored] | None = None,
         node_ids: Sequence[int] | None = None,
         layout: Layout = EMPTY,
-        escs: Mapping[str, Any] | None = None,
+        escs: Mapping[str, Any] | Sequence[EscSettings] = (),
         boot: bool = True,
         **settings: Any,
     ) -> None:
-        node_ids = range(1, nodes + 1) if node_ids is None else node_ids
-        base = tuple(EscSettings(f"esc{n}", **(escs or {})) for n in range(len(node_ids)))
+        if escs and not isinstance(escs, Mapping):
+            base, nodes = tuple(escs), len(escs)
+            node_ids = node_ids or range(1, nodes + 1)
+        else:
+            node_ids = range(1, nodes + 1) if node_ids is None else node_ids
+            base = tuple(EscSettings(f"esc{n}", **dict(escs)) for n in range(len(node_ids)))
         self._arguments = {
             "changes": changes,
             "eds": eds,

@@ -1,8 +1,10 @@
 """The shipped EDS as text, and with other keys or further objects, as an EDS editor leaves it."""
 
 import re
-from collections.abc import Mapping
+import subprocess
+import sys
 from configparser import RawConfigParser
+from pathlib import Path
 
 from kontronik_can_gw.config.keys import shipped
 
@@ -42,47 +44,16 @@ def with_object(source: str, index: int, content: str) -> str:
 
 def device_info(text: str) -> dict[str, int]:
     """The numbers of [DeviceInfo], by their keys in lower case."""
-    section = _parsed(text)["DeviceInfo"]
+    parser = RawConfigParser()
+    parser.read_string(text)
+    section = parser["DeviceInfo"]
     return {key: int(value, 0) for key, value in section.items() if re.match("-?[0-9]", value)}
 
 
-def lint(text: str) -> list[str]:
-    """What CiA 306 wants and a gateway does not need to run: lists, counts and mappings that agree with the objects."""
-    parsed = _parsed(text)
-    objects = {int(name, 16): parsed[name] for name in parsed if re.fullmatch("[0-9A-F]{4}", name)}
-    mandatory = {0x1000, 0x1001, 0x1018}
-    own = {index for index in objects if 0x2000 <= index < 0x6000}
-    lists = {
-        "MandatoryObjects": mandatory,
-        "OptionalObjects": set(objects) - mandatory - own,
-        "ManufacturerObjects": own,
-    }
-    found = []
-    for name, indices in lists.items():
-        listed = {key: value for key, value in parsed[name].items() if key != "supportedobjects"}
-        count = int(parsed[name]["SupportedObjects"], 0)
-        if sorted(listed, key=int) != [str(number) for number in range(1, count + 1)]:
-            found.append(f"[{name}] is not numbered 1 to {count}")
-        if sorted(int(value, 0) for value in listed.values()) != sorted(indices):
-            found.append(f"[{name}] has other objects")
-    for index, section in objects.items():
-        subs = [name for name in parsed if name.startswith(f"{index:04X}sub")]
-        if int(section.get("SubNumber", "0"), 0) != len(subs):
-            found.append(f"[{index:04X}] SubNumber")
-    if device_info(text)["nroftxpdo"] != sum(0x1800 <= index < 0x1A00 for index in objects):
-        found.append("[DeviceInfo] NrOfTXPDO")
-    mapped = [name for name in parsed if not _may_be_mapped(parsed[name])]
-    return found + [f"[{name}] PDOMapping" for name in mapped]
-
-
-def _may_be_mapped(section: Mapping[str, str]) -> bool:
-    if not int(section.get("PDOMapping", "0"), 0):
-        return True
-    has_length = int(section["DataType"], 0) not in (0x09, 0x0A, 0x0B, 0x0F)
-    return has_length and section["AccessType"] != "wo"
-
-
-def _parsed(text: str) -> RawConfigParser:
-    parser = RawConfigParser()
-    parser.read_string(text)
-    return parser
+def dcfchk(file: Path, node_id: int) -> str:
+    """What dcf-tools' checker of CiA 306 finds; empty for nothing. Without a node-ID it cannot take $NODEID."""
+    program = "from dcf.cli import main; main()"
+    command = [sys.executable, "-c", program, "-p", "-n", str(node_id), str(file)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (run.returncode == 0) == (not run.stderr)
+    return run.stderr

@@ -6,7 +6,9 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import dialogue
 import pytest
+from cantools.database.can import Database
 from cantools.database.namedsignalvalue import NamedSignalValue
 from dbc_rules import ENUMS, RULES, parse
 from eds_text import SHIPPED as EDS_TEXT
@@ -19,8 +21,6 @@ from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
-from kontronik_can_gw.canopen.node_settings import NodeSettings
-from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
@@ -39,63 +39,67 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway import Gateway
-from kontronik_can_gw.signals.plan import Layout
 
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_canopen.dbc"
-EDS = reader.load(EDS_TEXT.encode(), "kontronik_esc.eds")
 ONE = (EscSettings("esc1"),)
 PAIR = (EscSettings("left"), EscSettings("right_r", pole_pairs=7, gear=Fraction(5, 2)))
 NA = "NotAvailable"
 
 
-def setup(
-    escs: Sequence[EscSettings],
-    node_ids: Sequence[int] = (),
-    stored: Sequence[Stored] = (),
-    eds: Eds = EDS,
-) -> CanopenSetup:
-    ids = node_ids or range(1, len(escs) + 1)
-    return CanopenSetup(
-        eds, tuple(NodeSettings(i, serial=i) for i in ids), tuple(stored) or (Stored(),) * len(escs)
-    )
-
-
-def written(of: CanopenSetup, escs: Sequence[EscSettings]) -> str:
-    settings = of.esc_settings(escs)
-    text = dbc_text(canopen_dbc.database(of.nodes(settings), settings))
+def described(bench: dialogue.Bench) -> str:
+    """The DBC of the nodes as they are at this moment."""
+    assert bench.gateway.nodes is not None
+    settings = [esc.settings for esc in bench.gateway.escs]
+    text = dbc_text(canopen_dbc.database(bench.gateway.nodes, settings))
     assert text.isascii()
     return text
 
 
-class Bench:
+def written(escs: Sequence[EscSettings] = ONE, **more: Any) -> str:
+    return described(dialogue.Bench(escs=escs, **more))
+
+
+def remap(
+    bench: dialogue.Bench,
+    pdo: int,
+    cob_id: int,
+    objects: Sequence[int],
+    node: int = 1,
+    kind: int = 254,
+) -> None:
+    """The procedure of CiA 301 for another mapping; ``objects`` as mapping entries."""
+    writes = [(0x1800 + pdo, 1, 0xC0000000 | cob_id, 4), (0x1A00 + pdo, 0, 0, 1)]
+    writes += [(0x1A00 + pdo, sub, entry, 4) for sub, entry in enumerate(objects, 1)]
+    writes += [(0x1A00 + pdo, 0, len(objects), 1), (0x1800 + pdo, 2, kind, 1)]
+    writes += [(0x1800 + pdo, 1, 0x40000000 | cob_id, 4)]
+    for index, sub, value, size in writes:
+        assert bench.write(index, sub, value, node, size) is None
+
+
+class Bench(dialogue.Bench):
     """A gateway with simulated ESCs on its lines; each frame is decoded at once and held against the telemetry of that moment."""
 
     def __init__(
-        self, of: CanopenSetup, escs: Sequence[EscSettings], simulated: Sequence[EscOptions] = ()
+        self,
+        escs: Sequence[EscSettings] = ONE,
+        simulated: Sequence[EscOptions] = (),
+        **more: Any,
     ) -> None:
-        self.setup = of
-        self.escs = of.esc_settings(escs)
-        self.gateway = Gateway(self.escs, Layout("", "", ()), 0, canopen=of)
-        assert self.gateway.nodes is not None
-        self.nodes = self.gateway.nodes
+        self.database: Database | None = None
+        self.seen: dict[str, list[dict[str, Any]]] = {}
+        """Message name to what was decoded, in order."""
         options = simulated or (EscOptions(),) * len(escs)
         self.simulators = [
             SimulatedEsc(option, seed=n, start_ns=MS) for n, option in enumerate(options)
         ]
         self.prefixes = [esc_prefix(esc.name) if len(escs) > 1 else "" for esc in escs]
-        self.database = read(written(of, escs))
-        self.seen: dict[str, list[dict[str, Any]]] = {}
-        """Message name to what was decoded, in order."""
-        self.gateway.start(0)
+        super().__init__(escs=escs, boot=False, **more)
+        self.describe_anew()
+        for frame in self.take():
+            self.decode(frame)
 
     def describe_anew(self) -> None:
-        """The DBC of the nodes as they are at this moment."""
-        self.database = read(dbc_text(canopen_dbc.database(self.nodes, self.escs)))
-
-    def operational(self, now: int) -> None:
-        self.gateway.receive_frame(CanFrame(0, b"\x01\x00"), now, now)
-        self.take()
+        self.database = read(described(self))
 
     def run(self, until: int) -> None:
         events = sorted(
@@ -104,34 +108,29 @@ class Bench:
             for sent in simulator.frames_until(until)
         )
         for when, esc, wire in events:
-            self.until(when)
-            self.gateway.receive_bytes(esc, wire, when, when)
-            self.take()
-        self.until(until)
+            self.pass_time(when)
+            self.uart(wire, esc)
+        self.pass_time(until)
 
-    def until(self, when: int) -> None:
-        while (due := self.gateway.next_deadline()) <= when:
-            self.gateway.advance(due)
-            self.take()
+    def _collect(self) -> None:
+        before = len(self.heard)
+        super()._collect()
+        if self.database is not None:
+            for _, frame in self.heard[before:]:
+                self.decode(frame)
 
-    def take(self) -> None:
-        for sent in self.gateway.take_frames():
-            if 0x580 <= sent.can_id < 0x600 or sent.can_id == 0x7E4:
-                continue
-            message = self.database.get_message_by_frame_id(sent.can_id)
-            assert len(sent.data) == message.length, message.name
-            decoded: Any = message.decode(sent.data)
-            values = {
-                k: str(v) if isinstance(v, NamedSignalValue) else v for k, v in decoded.items()
-            }
-            self.seen.setdefault(message.name, []).append(values)
-            esc = self.of_message(sent.can_id)
-            if "Tpdo" in message.name:
-                self.check(self.gateway.escs[esc], self.prefixes[esc], values)
-
-    def of_message(self, can_id: int) -> int:
-        nodes = enumerate(self.nodes.nodes)
-        return next(n for n, node in nodes if can_id in dict(all_ids(node)))
+    def decode(self, sent: CanFrame) -> None:
+        if 0x580 <= sent.can_id < 0x600 or sent.can_id == 0x7E4:
+            return
+        assert self.database is not None
+        message = self.database.get_message_by_frame_id(sent.can_id)
+        assert len(sent.data) == message.length, message.name
+        decoded: Any = message.decode(sent.data)
+        values = {k: str(v) if isinstance(v, NamedSignalValue) else v for k, v in decoded.items()}
+        self.seen.setdefault(message.name, []).append(values)
+        esc = next(n for n, node in enumerate(self.nodes) if sent.can_id in dict(all_ids(node)))
+        if "Tpdo" in message.name:
+            self.check(self.gateway.escs[esc], self.prefixes[esc], values)
 
     def check(self, esc: EscTelemetry, prefix: str, values: Mapping[str, Any]) -> None:
         known = expected(esc)
@@ -142,37 +141,6 @@ class Bench:
                 assert value == pytest.approx(wanted, abs=1e-9), name
             else:
                 assert value == wanted, name
-
-    def sdo(self, request: str, now: int, node_id: int = 1) -> str:
-        self.gateway.receive_frame(CanFrame(0x600 + node_id, bytes.fromhex(request)), now, now)
-        for esc, stored in self.gateway.take_saves():
-            self.stored = stored
-            self.gateway.saved(esc, None, now)
-        answers = [f for f in self.gateway.take_frames() if f.can_id == 0x580 + node_id]
-        assert len(answers) == 1
-        return answers[0].data.hex()
-
-    def write(
-        self, index: int, sub: int, value: int, size: int, now: int = 2 * MS, node_id: int = 1
-    ) -> None:
-        command = {1: "2f", 2: "2b", 4: "23"}[size]
-        place = f"{index.to_bytes(2, 'little').hex()}{sub:02x}"
-        assert (
-            self.sdo(f"{command}{place}{value.to_bytes(4, 'little').hex()}", now, node_id)
-            == f"60{place}00000000"
-        )
-
-    def remap(
-        self, pdo: int, cob_id: int, objects: Sequence[int], node_id: int = 1, kind: int = 254
-    ) -> None:
-        """The procedure of CiA 301 for another mapping; ``objects`` as mapping entries."""
-        self.write(0x1800 + pdo, 1, 0xC0000000 | cob_id, 4, node_id=node_id)
-        self.write(0x1A00 + pdo, 0, 0, 1, node_id=node_id)
-        for sub, entry in enumerate(objects, 1):
-            self.write(0x1A00 + pdo, sub, entry, 4, node_id=node_id)
-        self.write(0x1A00 + pdo, 0, len(objects), 1, node_id=node_id)
-        self.write(0x1800 + pdo, 2, kind, 1, node_id=node_id)
-        self.write(0x1800 + pdo, 1, 0x40000000 | cob_id, 4, node_id=node_id)
 
 
 def expected(esc: EscTelemetry) -> dict[str, Any]:
@@ -270,20 +238,9 @@ def test_enumerations_name_every_value_that_can_be_sent() -> None:
     assert sorted(tables["EmergencySource"]) == [*range(32), 255]
     codes = tables["EmergencyCode"]
     design = [
-        0x3220,
-        0x3210,
-        0x2350,
-        0x2351,
-        0xFF04,
-        0x4210,
-        0x5114,
-        0x5115,
-        0x2220,
-        0x4410,
-        0xFF0A,
-        0xFF0B,
-    ]
-    design += [0x1000, 0xFF0D, 0x5000, 0x5530, 0x6010, *range(0xFF11, 0xFF18)]
+        0x3220, 0x3210, 0x2350, 0x2351, 0xFF04, 0x4210, 0x5114, 0x5115, 0x2220, 0x4410, 0xFF0A, 0xFF0B,
+        0x1000, 0xFF0D, 0x5000, 0x5530, 0x6010, *range(0xFF11, 0xFF18),
+    ]  # fmt: skip
     assert [codes[code] for code in design] == [pascal(bit.name) for bit in OperatingError]
     assert set(codes) == {0, *design, *range(0xFF18, 0xFF20)} | {
         error.value[0] for error in GatewayError
@@ -313,8 +270,8 @@ def test_every_frame_of_a_running_node_decodes_to_the_telemetry() -> None:
         ErrorWindow(OperatingError.UNDERVOLTAGE, SECOND, SECOND),
         ErrorWindow(OperatingError.POWER_STAGE_OVERTEMP_WARNING, 3 * SECOND, SECOND),
     )
-    bench = Bench(setup(ONE), ONE, [EscOptions(faults=Faults(errors=errors))])
-    bench.operational(0)
+    bench = Bench(ONE, [EscOptions(faults=Faults(errors=errors))])
+    bench.start()
     bench.run(8 * SECOND)
     count = {name: len(values) for name, values in bench.seen.items()}
     assert set(count) == {message.name for message in bench.database.messages}
@@ -358,8 +315,8 @@ def test_every_frame_of_a_running_node_decodes_to_the_telemetry() -> None:
 
 def test_lost_telemetry_is_not_available_and_told_as_an_emergency() -> None:
     lost = EscOptions(faults=Faults(dropout=Dropout(2 * SECOND, 4 * SECOND)))
-    bench = Bench(setup(ONE), ONE, [lost])
-    bench.operational(0)
+    bench = Bench(ONE, [lost])
+    bench.start()
     bench.run(5 * SECOND)
     states = bench.seen["EscTpdo4"]
     assert [s["LinkState"] for s in states[:1]] == ["NeverSeen"]
@@ -377,16 +334,16 @@ def test_lost_telemetry_is_not_available_and_told_as_an_emergency() -> None:
 
 
 def test_a_jivepro_supplies_no_bec_current() -> None:
-    bench = Bench(setup(ONE), ONE, [EscOptions(device=Device.JIVEPRO)])
-    bench.operational(0)
+    bench = Bench(ONE, [EscOptions(device=Device.JIVEPRO)])
+    bench.start()
     bench.run(3 * SECOND)
     assert bench.seen["EscTpdo3"][-1]["BecCurrent"] == NA
     assert bench.seen["EscTpdo3"][-1]["BecVoltage"] > 4
 
 
 def test_several_escs_have_their_names_in_front() -> None:
-    bench = Bench(setup(PAIR, (5, 9)), PAIR)
-    bench.operational(0)
+    bench = Bench(PAIR, node_ids=(5, 9))
+    bench.start()
     bench.run(3 * SECOND)
     assert set(bench.seen) == {
         f"{prefix}{stem}"
@@ -403,19 +360,19 @@ def test_several_escs_have_their_names_in_front() -> None:
 
 
 def test_what_a_master_mapped_and_stored_is_described_from_the_configuration() -> None:
-    first = Bench(setup(PAIR), PAIR)
+    first = Bench(PAIR)
     # 2001h:1 motor speed, 2001h:3 battery power; 2011h:2, 2011h:7, 2011h:9, 2011h:B, 2011h:3
-    first.remap(4, 0x1A2, [0x20010120, 0x20010320], node_id=2)
-    first.remap(1, 0x282, [0x20110210, 0x20110710, 0x20110908, 0x20110B08, 0x20110310], node_id=2)
-    first.remap(0, 0x182, [0x606C0020, 0x60790020], node_id=2)
-    first.write(0x1801, 5, 400, 2, node_id=2)
-    first.write(0x1017, 0, 250, 2, node_id=2)
-    assert first.sdo("2310100173617665", 3 * MS, 2) == "6010100100000000"
-    stored = first.stored
+    remap(first, 4, 0x1A2, [0x20010120, 0x20010320], node=2)
+    remap(first, 1, 0x282, [0x20110210, 0x20110710, 0x20110908, 0x20110B08, 0x20110310], node=2)
+    remap(first, 0, 0x182, [0x606C0020, 0x60790020], node=2)
+    assert first.write(0x1801, 5, 400, size=2, node=2) is None
+    assert first.write(0x1017, 0, 250, size=2, node=2) is None
+    assert first.write(0x1010, 1, b"save", node=2) is None
+    stored = first.on_disk[1]
     assert stored.communication
     assert encode(stored)
 
-    bench = Bench(setup(PAIR, stored=[Stored(), stored]), PAIR)
+    bench = Bench(PAIR, stored=[Stored(), stored])
     signals = {m.name: {s.name for s in m.signals} for m in bench.database.messages}
     assert signals["RightRTpdo5"] == {"RightRMotorSpeed", "RightRBatteryPower"}
     assert signals["RightRTpdo1"] == {"RightRVelocityActualValue", "RightRDcLinkCircuitVoltage"}
@@ -428,7 +385,7 @@ def test_what_a_master_mapped_and_stored_is_described_from_the_configuration() -
     extremes = bench.database.get_message_by_name("RightRTpdo2")
     assert (extremes.cycle_time, extremes.send_type) == (400, "CyclicAndEvent")
     assert bench.database.get_message_by_name("RightRHeartbeat").cycle_time == 250
-    bench.operational(0)
+    bench.start()
     bench.run(7 * SECOND)
     assert len(bench.seen["RightRTpdo5"]) > 300
     assert max(values["RightRMotorSpeed"] for values in bench.seen["RightRTpdo5"][1:]) > 100
@@ -437,9 +394,9 @@ def test_what_a_master_mapped_and_stored_is_described_from_the_configuration() -
 
 
 def test_a_value_in_two_pdos_has_two_names() -> None:
-    bench = Bench(setup(ONE), ONE)
-    bench.remap(4, 0x501, [0x20000210, 0x20000A08, 0x20000210])
-    bench.remap(5, 0x502, [0x20000E20, 0x20200720])
+    bench = Bench()
+    remap(bench, 4, 0x501, [0x20000210, 0x20000A08, 0x20000210])
+    remap(bench, 5, 0x502, [0x20000E20, 0x20200720])
     bench.describe_anew()
     names = {m.name: [s.name for s in m.signals] for m in bench.database.messages}
     assert names["EscTpdo5"] == ["BatteryVoltage2", "Throttle2Percent", "BatteryVoltage3"]
@@ -453,27 +410,31 @@ def test_a_value_in_two_pdos_has_two_names() -> None:
 
 
 def test_a_word_that_ends_in_bits_without_a_name_keeps_its_length() -> None:
-    bench = Bench(setup(ONE), ONE)
-    bench.write(0x1803, 1, 0xC0000481, 4)
-    bench.remap(4, 0x501, [0x20000F08, 0x20000E20])
+    bench = Bench()
+    assert bench.write(0x1803, 1, 0xC0000481, size=4) is None
+    remap(bench, 4, 0x501, [0x20000F08, 0x20000E20])
     bench.describe_anew()
     assert bench.database.get_message_by_name("EscTpdo5").length == 5
     assert not any(message.name == "EscTpdo4" for message in bench.database.messages)
-    bench.operational(3 * MS)
+    bench.start()
     bench.run(SECOND)
     assert bench.seen["EscTpdo5"][-1]["ProgrammingAllowed"] in (0, 1)
 
 
 def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
-    bench = Bench(setup(ONE), ONE)
-    bench.remap(0, 0x181, [0x20000120], kind=3)
-    bench.remap(1, 0x281, [0x20000410], kind=0)
-    bench.write(0x1802, 1, 0xC0000381, 4)
-    bench.write(0x1803, 5, 0, 2)
-    bench.write(0x1017, 0, 0, 2)
-    bench.write(0x1014, 0, 0x80000081, 4)
+    bench = Bench()
+    remap(bench, 0, 0x181, [0x20000120], kind=3)
+    remap(bench, 1, 0x281, [0x20000410], kind=0)
+    assert bench.write(0x1802, 1, 0xC0000381, size=4) is None
+    assert bench.write(0x1803, 5, 0, size=2) is None
+    assert bench.write(0x1017, 0, 0, size=2) is None
+    assert bench.write(0x1015, 0, 1230, size=2) is None
+    db = parse(described(bench).encode())
+    (emergency,) = [message for message in db.messages if message.id == 0x81]
+    assert db.number("GenMsgDelayTime", emergency) == 123
+    assert bench.write(0x1014, 0, 0x80000081, size=4) is None
     bench.describe_anew()
-    db = parse(dbc_text(bench.database).encode())
+    db = parse(described(bench).encode())
     sent = {m.name: (db.send_type(m), db.number("GenMsgCycleTime", m)) for m in db.messages}
     not_sent = ("None", 0)
     assert sent == {
@@ -507,16 +468,17 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
         (0x2204, 'a "switch"; here\\', 0x01, "1"),
         (0x2205, "Battery voltage 2", 0x10 - 0x0C, "-70000"),
     )
-    bench = Bench(setup(ONE, eds=eds), ONE)
-    bench.remap(0, 0x181, [0x22040001, 0x22000010, 0x22010008, 0x22020020])
-    bench.remap(1, 0x281, [0x22030040])
-    bench.remap(2, 0x381, [0x22050020])
-    bench.write(0x1803, 1, 0xC0000481, 4)
-    bench.describe_anew()
-    bench.gateway.receive_frame(CanFrame(0, b"\x01\x00"), 3 * MS, 3 * MS)
+    bench = dialogue.Bench(eds=eds)
+    remap(bench, 0, 0x181, [0x22040001, 0x22000010, 0x22010008, 0x22020020])
+    remap(bench, 1, 0x281, [0x22030040])
+    remap(bench, 2, 0x381, [0x22050020])
+    assert bench.write(0x1803, 1, 0xC0000481, size=4) is None
+    database = read(described(bench))
+    bench.take()
+    bench.put(0, "01 00")
     decoded: dict[str, Any] = {}
-    for sent in bench.gateway.take_frames():
-        values: Any = bench.database.decode_message(sent.can_id, sent.data)
+    for sent in bench.take():
+        values: Any = database.decode_message(sent.can_id, sent.data)
         decoded |= values
     assert decoded == {
         "ASwitchHere": 1,
@@ -526,7 +488,7 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
         "Big": 0xFFFFFFFFFFFFFFFF,
         "BatteryVoltage2": -70000,
     }
-    text = dbc_text(bench.database)
+    text = described(bench)
     assert "SIG_VALTYPE_ 385 OilPressure : 1;" in text
     assert "a 'switch', here/" in text
     assert "VAL_ 641" not in text
@@ -534,7 +496,7 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
 
 def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
     escs = [EscSettings("port_outer_1"), EscSettings("port_outer_2")]
-    text = written(setup(escs), escs)
+    text = written(escs)
     db = parse(text.encode())
     for rule in ("names_are_unique", "everything_has_one_comment", "every_line_is_understood"):
         assert list(RULES[rule](db)) == []
@@ -549,12 +511,12 @@ def test_one_cob_id_for_two_messages_is_refused_by_name() -> None:
     eds = reader.load(EDS_TEXT.replace("$NODEID+0x80\r", "0xA0\r").encode(), "mine.eds")
     said = r"RightREmergency and LeftEmergency have the same COB-ID 0A0h\. Give one of them another"
     with pytest.raises(UserError, match=said):
-        written(setup(PAIR, eds=eds), PAIR)
+        written(PAIR, eds=eds)
 
 
 def test_the_file_of_many_nodes_keeps_the_rules_and_can_be_written_again() -> None:
     escs = [EscSettings(f"esc{number}") for number in range(1, 9)]
-    text = written(setup(escs), escs)
+    text = written(escs)
     db = parse(text.encode())
     for rule in set(RULES) - OF_THE_OTHER_FILE:
         assert [f for f in RULES[rule](db) if not f.endswith("is longer than 28")] == [], rule
@@ -603,4 +565,4 @@ def test_a_node_that_waits_for_lss_has_no_frames_and_is_warned_of(
         f"Left{stem}" for stem in ("Tpdo1", "Tpdo2", "Tpdo3", "Tpdo4", "Heartbeat", "Emergency")
     }
     assert "Waiting for a node-ID by LSS, so without frames: right_r." in dict(db.comments)[("",)]
-    assert read(written(setup(ONE, (255,)), ONE)).messages == []
+    assert read(written(node_ids=(255,))).messages == []

@@ -23,25 +23,8 @@ TEXTS = (0x09, 0x0F)
 
 LIVE = LiveData(70_000, 2442, -12, 34, 56, 789, 1234, 5678, 1500, -50, 60, -7, 8, 1 << 17, 26, 9)
 INFO = InfoData(
-    1 << 10 | 120,
-    4 << 8 | 17,
-    3,
-    6,
-    100_000,
-    2000,
-    2520,
-    100,
-    200,
-    300,
-    4,
-    5000,
-    99,
-    100,
-    -10,
-    90,
-    -11,
-    50,
-)
+    1 << 10 | 120, 4 << 8 | 17, 3, 6, 100_000, 2000, 2520, 100, 200, 300, 4, 5000, 99, 100, -10, 90, -11, 50,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -76,20 +59,8 @@ def test_every_other_index_is_06020000h(bench: Bench) -> None:
         assert answer[1:3] == index.to_bytes(2, "little")
         codes.add(answer[:1] + answer[3:])
     assert codes == {b"\x80\0" + NO_OBJECT.to_bytes(4, "little")}
-    for index in (
-        0x0000,
-        0x0001,
-        0x1006,
-        0x1200 + 1,
-        0x1400,
-        0x1600,
-        0x1806,
-        0x2003,
-        0x5FFF,
-        0x6000,
-        0xA000,
-        0xFFFF,
-    ):
+    unknown = "0000 0001 1006 1201 1400 1600 1806 2003 5FFF 6000 A000 FFFF"
+    for index in (int(text, 16) for text in unknown.split()):
         assert bench.write(index, 0, 0) == NO_OBJECT
     assert gateway.take_frames() == []
 

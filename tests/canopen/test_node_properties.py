@@ -23,66 +23,20 @@ known_ids = st.sampled_from(
 )
 objects = st.sampled_from(
     [
-        *(
-            0x1000,
-            0x1003,
-            0x1005,
-            0x1008,
-            0x1010,
-            0x1011,
-            0x1014,
-            0x1016,
-            0x1017,
-            0x1019,
-            0x1021,
-            0x1029,
-        ),
-        *(0x1800, 0x1801, 0x1A00, 0x1F80, 0x2000, 0x2020, 0x2100, 0x2101, 0x2102, 0x603F, 0x3000),
+        0x1000, 0x1003, 0x1005, 0x1008, 0x1010, 0x1011, 0x1014, 0x1016, 0x1017, 0x1019, 0x1021, 0x1029,
+        0x1800, 0x1801, 0x1A00, 0x1F80, 0x2000, 0x2020, 0x2100, 0x2101, 0x2102, 0x603F, 0x3000,
     ]
-)
+)  # fmt: skip
 
 
 @st.composite
 def sdo_requests(draw: st.DrawFn) -> CanFrame:
     """Requests that are more than noise: known objects, useful values."""
     command = draw(
-        st.sampled_from(
-            [
-                0x2F,
-                0x2B,
-                0x23,
-                0x21,
-                0x22,
-                0x40,
-                0x60,
-                0x70,
-                0x00,
-                0x10,
-                0x01,
-                0x80,
-                0xA0,
-                0xA4,
-                0xC2,
-                0xC6,
-            ]
-        )
+        st.sampled_from(bytes.fromhex("2F 2B 23 21 22 40 60 70 00 10 01 80 A0 A4 C2 C6"))
     )
-    value = draw(
-        st.one_of(
-            st.binary(min_size=4, max_size=4),
-            st.sampled_from(
-                [
-                    b"save",
-                    b"load",
-                    b"rset",
-                    bytes(4),
-                    b"\x81\x01\0\x40",
-                    b"\x81\x01\0\xc0",
-                    b"\xc8\0\5\0",
-                ]
-            ),
-        )
-    )
+    words = [b"save", b"load", b"rset", bytes(4), b"\x81\1\0\x40", b"\x81\1\0\xc0", b"\xc8\0\5\0"]
+    value = draw(st.one_of(st.binary(min_size=4, max_size=4), st.sampled_from(words)))
     multiplexer = draw(objects).to_bytes(2, "little") + bytes((draw(st.integers(0, 9)),))
     return CanFrame(0x600 + draw(st.integers(1, NODES)), bytes((command,)) + multiplexer + value)
 

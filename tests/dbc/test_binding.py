@@ -10,7 +10,7 @@ import pytest
 from e2e import p01
 from hypothesis import given
 from hypothesis import strategies as st
-from packer_oracle import STATES, Msg, Sig, dbc_text, get, pascal, read
+from packer_oracle import Msg, Sig, dbc_text, get, pascal, read
 
 from kontronik_can_gw.dbc.binding import Binder
 from kontronik_can_gw.dbc.compiler import DbcSettings
@@ -209,19 +209,6 @@ def test_a_constant_in_a_float_is_sent_as_a_float(
 
 
 @pytest.mark.parametrize(
-    ("signal", "raw"),
-    [
-        (Sig("BatteryVoltage", 0, 16, unit="V", factor="0.04"), 1111),  # 1110.5
-        (Sig("BatteryCurrent", 0, 16, signed=True, unit="A", factor="0.2"), -61),  # -61.5
-        (Sig("BatteryCurrent", 0, 16, signed=True, unit="A", factor="-0.2"), 62),  # 61.5
-        (Sig("Throttle", 0, 8, signed=True, unit="%", factor="2"), -3),  # -3.5
-    ],
-)
-def test_a_value_halfway_between_two_steps_goes_to_the_upper_one(signal: Sig, raw: int) -> None:
-    assert raw_of(signal) == raw
-
-
-@pytest.mark.parametrize(
     ("minimum", "maximum", "raw"),
     [
         ("0", "44.42", 4442), ("0", "44.424", 4442), ("0", "44.419", 9), ("44.42", "100", 4442),
@@ -254,50 +241,6 @@ def test_limits_that_lie_between_two_steps_leave_out_what_is_beyond_them(
 
 def state(number: int) -> LiveData:
     return LIVE._replace(operating_state=number)
-
-
-def test_an_enumeration_is_mapped_by_text_to_the_numbers_of_the_dbc() -> None:
-    texts = {200 + n: text for n, text in enumerate(STATES.values())} | {
-        254: "Error",
-        255: "NotAvailable",
-    }
-    for place, number in enumerate(STATES):
-        assert raw_of(Sig("OperatingState", 0, 8, texts=texts), live=state(number)) == 200 + place
-    for number in set(range(256)) - set(STATES):
-        if number < 30 or number > 250:
-            assert raw_of(Sig("OperatingState", 0, 8, texts=texts), live=state(number)) == 254
-
-
-def test_texts_of_an_enumeration_are_compared_without_case_and_underscores() -> None:
-    texts = {1: "SYNC_FORWARD", 2: "syncBackward", 3: "error_selftest", 9: "RpmControl"}
-    for number, raw in ((18, 1), (19, 2), (9, 3), (26, 9)):
-        assert raw_of(Sig("OperatingState", 0, 8, texts=texts), live=state(number)) == raw
-
-
-def test_a_state_that_is_not_listed_is_sent_as_error_else_as_not_available() -> None:
-    assert (
-        raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff", 77: "Error"}), live=state(21))
-        == 77
-    )
-    assert (
-        raw_of(
-            Sig("OperatingState", 0, 8, texts={1: "MotorOff", 88: "NotAvailable"}), live=state(21)
-        )
-        == 88
-    )
-    assert raw_of(Sig("OperatingState", 0, 8, texts={1: "MotorOff"}), live=state(21)) == 255
-
-
-def test_without_texts_of_ours_the_number_itself_is_sent() -> None:
-    assert raw_of(Sig("OperatingState", 0, 8), live=state(21)) == 21
-    assert raw_of(Sig("OperatingState", 0, 8), live=state(5)) == 5
-    assert (
-        raw_of(
-            Sig("OperatingStateRaw", 0, 8, texts={254: "Error", 255: "NotAvailable"}),
-            live=state(99),
-        )
-        == 99
-    )
 
 
 def test_an_enumeration_in_a_float_keeps_its_table() -> None:

