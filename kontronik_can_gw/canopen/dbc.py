@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.canopen.dbc_messages import NodeMessages
 from kontronik_can_gw.canopen.dbc_names import Names
 from kontronik_can_gw.canopen.dbc_rows import LAYOUT_VERSION, Message, dbc_lines
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.dbc.expand import esc_prefix
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

@@ -11,6 +11,7 @@ import os
 import selectors
 import time
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
@@ -22,12 +23,14 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.poller import Handler, Poller
-from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.snapshot import ProgramFacts
 from kontronik_can_gw.runtime.statistics import Statistics
-from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.runtime.recorder import Recorder
+    from kontronik_can_gw.runtime.store import ParameterStore
 
 MIN_HELD_UP_NS = 20 * MS
 """A turn that is later than this, and than ``Transmitter.max_turn_ns``, was held up."""
@@ -48,13 +51,13 @@ class Loop:
         ports: Sequence[str],
         can_config: CanConfig,
         wait_for_devices: bool = False,
-        store: ParameterStore | None = None,
+        store: "ParameterStore | None" = None,
         status_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
         notifier: Notifier | None = None,
         statistics: Statistics | None = None,
         program: ProgramFacts | None = None,
-        recorder: Recorder | None = None,
+        recorder: "Recorder | None" = None,
         poller: Poller | None = None,
     ) -> None:
         self.gateway = gateway

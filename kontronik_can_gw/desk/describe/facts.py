@@ -22,7 +22,6 @@ from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.emergency_codes import GatewayError, code_of_bit, register_of
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
@@ -41,6 +40,7 @@ from kontronik_can_gw.esc.kontronik.states import (
 )
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals.plan import Role, SendType, SignalPlan
 
 FORMAT = "kontronik-can-gw description"
