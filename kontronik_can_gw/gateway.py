@@ -192,7 +192,9 @@ class Gateway:
         """When ``advance`` is to be called at the latest."""
         due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
         for output in self._outputs:
-            due = min(due, output.next_deadline())
+            of_output = output.next_deadline()
+            if of_output < due:
+                due = of_output
         return due
 
     @property
@@ -205,7 +207,7 @@ class Gateway:
         frames: list[CanFrame] = []
         for output in self._outputs:
             if output.frames:
-                frames = frames + output.take() if frames else output.take()
+                frames += output.take()
         return frames
 
     def not_sent(self, now: int) -> None:

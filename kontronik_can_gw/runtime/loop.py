@@ -39,6 +39,8 @@ _WAKES_PER_TIMEOUT = 4
 
 A millisecond sooner, for a wait is rounded up to one.
 """
+_WAKES_PER_TIMEOUT_IN_SILENCE = 2
+"""The same while no ESC sends. Only the first frame after a silence may go early by more, and its successor replaces it."""
 _LAST_SAVE_S = 0.2
 
 
@@ -141,10 +143,10 @@ class Loop:
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
         last, due = self._now, self._next_deadline()
-        wake = last + self.gateway.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
-        pause = min(wake, due) - self._clock()
-        if pause < 0:
-            pause = 0
+        gateway = self.gateway
+        wakes = _WAKES_PER_TIMEOUT if gateway.status.escs_ok else _WAKES_PER_TIMEOUT_IN_SILENCE
+        wake = last + gateway.shortest_timeout_ns // wakes - MS
+        pause = max(min(wake, due) - self._clock(), 0)
         ready = self._poller.wait(pause)
         now = self._poller.now
         late = now - last - pause
@@ -162,7 +164,7 @@ class Loop:
         gateway, can = self.gateway, self.can
         for handler, events in ready:
             handler(now, events)
-        if self._lost or not can.is_idle(now):
+        if self._lost or can.port is None or now >= can.controller.due:
             now = self._reopen(now)
         if gateway.nodes is not None:
             self._saver.save(now)  # first: what it answers belongs to this turn, in a replay too
@@ -237,5 +239,6 @@ class Loop:
         for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
             esc.reopen(now, self._others(esc))
         self.can.reopen(now)
-        self.can.controller.ask_if_due(now)
+        if now >= self.can.controller.due:
+            self.can.ask(now)
         return max(now, self._clock())
