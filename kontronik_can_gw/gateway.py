@@ -4,9 +4,8 @@
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.dbc.output import DbcOutput
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
@@ -14,6 +13,9 @@ from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatu
 from kontronik_can_gw.id_conflicts import Conflict, IdConflicts
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals.plan import Layout
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 
 MakeOutput = Callable[[Sequence[EscTelemetry], GatewayStatus, int], Output]
 """ESCs, gateway and time to an output that begins then."""
@@ -28,7 +30,7 @@ class Gateway:
         layout: Layout,
         now: int,
         silent_on_loss: bool = False,
-        canopen: CanopenSetup | None = None,
+        canopen: "CanopenSetup | None" = None,
         further: Sequence[MakeOutput] = (),
     ) -> None:
         self.escs = [EscTelemetry(settings, now) for settings in escs]
@@ -36,8 +38,7 @@ class Gateway:
         dbc = DbcOutput(layout, self.escs, self.status, now, silent_on_loss)
         self.nodes: Nodes | None = None
         if canopen is not None:
-            ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
-            self.nodes = Nodes(canopen, self.escs, self.status, self._apply, ids)
+            self.nodes = _nodes(canopen, layout, self.escs, self.status, self._apply)
         self._message_bits = dbc.bits
         self._outputs: tuple[Output, ...] = (
             *(() if self.nodes is None else (self.nodes,)),
@@ -191,7 +192,9 @@ class Gateway:
         """When ``advance`` is to be called at the latest."""
         due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
         for output in self._outputs:
-            due = min(due, output.next_deadline())
+            of_output = output.next_deadline()
+            if of_output < due:
+                due = of_output
         return due
 
     @property
@@ -204,7 +207,7 @@ class Gateway:
         frames: list[CanFrame] = []
         for output in self._outputs:
             if output.frames:
-                frames = frames + output.take() if frames else output.take()
+                frames += output.take()
         return frames
 
     def not_sent(self, now: int) -> None:
@@ -266,3 +269,16 @@ class Gateway:
 
     def _shortest_timeout(self) -> int:
         return min(esc.settings.timeout_ns for esc in self.escs)
+
+
+def _nodes(
+    setup: "CanopenSetup",
+    layout: Layout,
+    escs: Sequence[EscTelemetry],
+    status: GatewayStatus,
+    apply: Callable[[int, EscSettings], None],
+) -> "Nodes":
+    from kontronik_can_gw.canopen.nodes import Nodes  # nothing of it is loaded without CANopen
+
+    ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
+    return Nodes(setup, escs, status, apply, ids)

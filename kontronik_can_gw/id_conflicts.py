@@ -50,15 +50,17 @@ class IdConflicts:
         return self._receive_ids
 
     def _follow(self) -> None:
-        routed = [output.receive_ids for output in self._outputs]
-        if len(routed) != len(self._routed) or any(
-            new is not old for new, old in zip(routed, self._routed, strict=True)
-        ):
-            self._routed = routed
-            self._own = {}
-            for output in self._outputs:
-                self._own |= output.own_ids()
-            self._receive_ids = frozenset(self._own).union(*routed)
+        for output, known in zip(self._outputs, self._routed, strict=False):
+            if output.receive_ids is not known:
+                break
+        else:
+            if self._routed:
+                return
+        self._routed = [output.receive_ids for output in self._outputs]
+        self._own = {}
+        for output in self._outputs:
+            self._own |= output.own_ids()
+        self._receive_ids = frozenset(self._own).union(*self._routed)
 
     def first_own_id(self) -> int | None:
         """The lowest id of ours that is of no ESC's node; None without any."""

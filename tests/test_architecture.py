@@ -21,6 +21,7 @@ ORDER = (
     ("frames",),
     ("lean",),
     ("gateway_status",),
+    ("node_state",),
     ("esc",),
     ("output",),
     ("signals",),

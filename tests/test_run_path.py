@@ -147,6 +147,21 @@ def _until_values(peer: socket.socket, esc: PtyEsc) -> None:
     raise AssertionError("no values came")
 
 
+ONLY_WITH = {
+    "canopen": ("kontronik_can_gw.canopen", "kontronik_can_gw.runtime.store"),
+    "[record]": (
+        "kontronik_can_gw.capture.setup",
+        "kontronik_can_gw.runtime.recorder",
+        "kontronik_can_gw.runtime.recorded_gateway",
+    ),
+    "prometheus": (
+        "kontronik_can_gw.runtime.metrics_server",
+        "kontronik_can_gw.runtime.prometheus",
+    ),
+}
+"""Of our own modules, those that are there only where this stands in the configuration."""
+
+
 def surplus(modules: set[str], allowed: set[str]) -> set[str]:
     """Modules that are neither of the standard library nor allowed."""
     libraries = {name.partition(".")[0] for name in modules}
@@ -168,6 +183,8 @@ def test_a_running_gateway_has_what_it_needs_and_no_more(name: str, tmp_path: Pa
     assert "kontronik_can_gw.runtime.loop" in modules
     assert surplus(modules, ALWAYS | further) == set()
     assert [name for name in NEVER if name in modules] == []
+    for key, own in ONLY_WITH.items():
+        assert [module for module in own if (module in modules) != (key in tables)] == []
     if not further & PYTHON_CAN:  # SocketCAN needs none of what python-can brings
         assert modules & {"asyncio", "ssl", "sqlite3", "email"} == set()
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.node import Node

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 from kontronik_can_gw.canopen.dbc_messages import GATEWAY, LOGGER, NodeMessages
 from kontronik_can_gw.canopen.dbc_names import Names
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.dbc.expand import esc_prefix
 from kontronik_can_gw.dbc.rows import Message, Node, Rows
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 LAYOUT_VERSION = "1.0.0"
 _NODES = (

@@ -15,7 +15,6 @@ from kontronik_can_gw.canopen.bound_values import Mapped, message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
 from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
 from kontronik_can_gw.canopen.eds_object import Entry
-from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
@@ -23,6 +22,7 @@ from kontronik_can_gw.dbc.rows import Message, Signal, number
 from kontronik_can_gw.esc.decoder import ErrorBit
 from kontronik_can_gw.esc.telemetry import MS, LinkState
 from kontronik_can_gw.esc.values import Group
+from kontronik_can_gw.node_state import NmtState
 from kontronik_can_gw.signals.plan import SignalPlan
 
 GATEWAY, LOGGER = "KontronikGateway", "Logger"

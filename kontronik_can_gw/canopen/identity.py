@@ -5,9 +5,9 @@ from collections.abc import Callable
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.parameters import Parameters
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 
 class Identity:

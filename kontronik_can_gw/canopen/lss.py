@@ -23,8 +23,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Protocol
 
-UNCONFIGURED = 0xFF
-"""The node-ID of a node that has none."""
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 
 class Service(IntEnum):

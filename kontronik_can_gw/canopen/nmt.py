@@ -5,17 +5,9 @@ from enum import IntEnum
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary
+from kontronik_can_gw.node_state import NmtState
 
 _SELF_START_OFF = 4
-
-
-class NmtState(IntEnum):
-    """As heartbeats report it. ``INITIALISING`` is also that of a node without a node-ID: LSS only."""
-
-    INITIALISING = 0
-    STOPPED = 4
-    OPERATIONAL = 5
-    PRE_OPERATIONAL = 127
 
 
 class Command(IntEnum):

@@ -17,8 +17,8 @@ from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.esc_objects import EscObjects
 from kontronik_can_gw.canopen.heartbeat import Consumer, Producer
 from kontronik_can_gw.canopen.identity import Identity
-from kontronik_can_gw.canopen.lss import UNCONFIGURED, LssSlave
-from kontronik_can_gw.canopen.nmt import Nmt, NmtState
+from kontronik_can_gw.canopen.lss import LssSlave
+from kontronik_can_gw.canopen.nmt import Nmt
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.owner import Owner
 from kontronik_can_gw.canopen.parameters import Parameters
@@ -30,6 +30,7 @@ from kontronik_can_gw.canopen.tpdos import Tpdos
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.output import NEVER
 
 

@@ -15,8 +15,7 @@ from kontronik_can_gw.canopen.cob_ids import (
 )
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
-from kontronik_can_gw.canopen.nmt import NmtState, is_reset_of_all
+from kontronik_can_gw.canopen.nmt import is_reset_of_all
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings, esc_settings, make_dictionary
 from kontronik_can_gw.canopen.reception import FrameTaker
@@ -24,6 +23,7 @@ from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
+from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.output import NEVER, Output, Owner
 
 SettingsChanged = Callable[[int, EscSettings], None]

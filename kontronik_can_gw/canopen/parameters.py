@@ -8,9 +8,9 @@ from functools import partial
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import APPLICATION, COMMUNICATION, VERIFY, Stored
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 SAVE, LOAD = (int.from_bytes(word, "little") for word in (b"save", b"load"))
 CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})

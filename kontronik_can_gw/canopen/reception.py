@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.canopen import nmt
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT, LSS_REQUEST, NMT, SDO_REQUEST
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nmt import Command
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.node import Node

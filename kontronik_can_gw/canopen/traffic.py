@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 
 from kontronik_can_gw.canopen.cob_ids import all_ids
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
+from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals.plan import classic_bits
 
 

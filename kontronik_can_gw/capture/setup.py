@@ -18,10 +18,6 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.canopen.eds import load as eds_of
-from kontronik_can_gw.canopen.node_settings import NodeSettings
-from kontronik_can_gw.canopen.nodes import CanopenSetup
-from kontronik_can_gw.canopen.storage import Stored, decode, encode
 from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.dbc.compiler import DbcSettings
@@ -36,6 +32,9 @@ from kontronik_can_gw.signals.plan import Layout
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
+    from kontronik_can_gw.canopen.node_settings import NodeSettings
+    from kontronik_can_gw.canopen.nodes import CanopenSetup
+
 Header = Mapping[str, Any]
 
 
@@ -49,7 +48,7 @@ class CaptureSetup:
     dbc_settings: DbcSettings
     fd: bool
     silent_on_loss: bool
-    canopen: CanopenSetup | None
+    canopen: "CanopenSetup | None"
     configuration: str = ""
     file: str = ""
 
@@ -65,15 +64,6 @@ class CaptureSetup:
                 "silent_on_loss": self.silent_on_loss,
             }
             dbc |= asdict(self.dbc_settings)
-        canopen: dict[str, Any] | None = None
-        if self.canopen is not None:
-            setup = self.canopen
-            canopen = {
-                "eds": {"file": setup.eds.name, "text": setup.eds.data.decode("latin-1")},
-                "nodes": [asdict(node) for node in setup.settings],
-                "stored": [encode(stored).decode("ascii") for stored in setup.stored],
-                "escs": [_esc_json(esc) for esc in setup.escs],
-            }
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -87,7 +77,7 @@ class CaptureSetup:
             "escs": [_esc_json(esc) for esc in self.escs],
             "ports": list(self.ports),
             "dbc": dbc,
-            "canopen": canopen,
+            "canopen": None if self.canopen is None else _canopen_json(self.canopen),
         }
 
     @classmethod
@@ -120,14 +110,6 @@ class CaptureSetup:
             file = (str(dbc["file"]), dbc["text"].encode("latin-1"))
             settings = _dbc_settings(dbc)
         found = header["canopen"]
-        canopen = None
-        if found is not None:
-            canopen = CanopenSetup(
-                eds_of(found["eds"]["text"].encode("latin-1"), found["eds"]["file"]),
-                tuple(_node(node) for node in found["nodes"]),
-                tuple(_stored(text) for text in found["stored"]),
-                tuple(_esc(esc) for esc in found["escs"]),
-            )
         return cls(
             tuple(_esc(esc) for esc in header["escs"]),
             tuple(map(str, header["ports"])),
@@ -135,7 +117,7 @@ class CaptureSetup:
             settings,
             bool(dbc and dbc["fd"]),
             bool(dbc and dbc["silent_on_loss"]),
-            canopen,
+            None if found is None else _canopen(found),
             str(header["configuration"]),
             str(header["file"]),
         )
@@ -150,6 +132,32 @@ class CaptureSetup:
     def gateway(self, layout: Layout, now: int) -> Gateway:
         """The gateway in its state before the start."""
         return Gateway(self.escs, layout, now, self.silent_on_loss, self.canopen)
+
+
+def _canopen_json(setup: "CanopenSetup") -> dict[str, Any]:
+    from kontronik_can_gw.canopen.storage import encode
+
+    return {
+        "eds": {"file": setup.eds.name, "text": setup.eds.data.decode("latin-1")},
+        "nodes": [
+            asdict(node) for node in setup.settings
+        ],
+        "stored": [encode(stored).decode("ascii") for stored in setup.stored],
+        "escs": [_esc_json(esc) for esc in setup.escs],
+    }
+
+
+def _canopen(found: Mapping[str, Any]) -> "CanopenSetup":
+    from kontronik_can_gw.canopen.eds import load as eds_of
+    from kontronik_can_gw.canopen.nodes import CanopenSetup
+    from kontronik_can_gw.canopen.storage import decode
+
+    return CanopenSetup(
+        eds_of(found["eds"]["text"].encode("latin-1"), found["eds"]["file"]),
+        tuple(_node(node) for node in found["nodes"]),
+        tuple(decode(text.encode("ascii")) for text in found["stored"]),
+        tuple(_esc(esc) for esc in found["escs"]),
+    )
 
 
 def _dbc_settings(found: Mapping[str, Any]) -> DbcSettings:
@@ -232,7 +240,9 @@ def check_state(state: Mapping[str, Any]) -> None:
             _number(state[name], 0, high)
 
 
-def _node(found: Mapping[str, Any]) -> NodeSettings:
+def _node(found: Mapping[str, Any]) -> "NodeSettings":
+    from kontronik_can_gw.canopen.node_settings import NodeSettings
+
     device, vendor = found["device"], found["vendor_id"]
     return NodeSettings(
         _number(found["node_id"], 1, 255),
@@ -245,7 +255,3 @@ def _node(found: Mapping[str, Any]) -> NodeSettings:
         _text(found["version"], 100),
         None if device is None else _number(device, 0, 0xFFFF),
     )
-
-
-def _stored(text: str) -> Stored:
-    return decode(text.encode("ascii"))

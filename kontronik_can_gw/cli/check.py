@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kontronik_can_gw.canopen.cob_ids import all_ids
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
@@ -17,6 +16,7 @@ from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.keys import as_toml
 from kontronik_can_gw.dbc.loss import is_mute, reporter
 from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
 

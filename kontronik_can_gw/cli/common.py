@@ -8,19 +8,22 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
 from kontronik_can_gw.config.assemble import Loaded, load_configuration
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
-from kontronik_can_gw.runtime.store import ParameterStore
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.canopen.nodes import CanopenSetup
+    from kontronik_can_gw.runtime.store import ParameterStore
 
 log = logging.getLogger("kontronik_can_gw")
 
 
-def load_all(path: Path, store: Callable[[Path], ParameterStore] | None = None) -> Loaded:
+def load_all(path: Path, store: "Callable[[Path], ParameterStore] | None" = None) -> Loaded:
     """Load a configuration as ``load_configuration`` does, and print its warnings."""
     loaded = load_configuration(path, store)
     for warning in (*loaded.layout.warnings, *loaded.warnings):
@@ -90,7 +93,7 @@ def _has_terminal() -> bool:
     return True
 
 
-def canopen_of(loaded: Loaded) -> CanopenSetup:
+def canopen_of(loaded: Loaded) -> "CanopenSetup":
     """The CANopen setup of a configuration. UserError where it has no nodes."""
     if loaded.canopen is None:
         raise UserError(

@@ -17,12 +17,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.canopen import cob_ids, nmt
-from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.node_state import NmtState
 
 if TYPE_CHECKING:
     import can

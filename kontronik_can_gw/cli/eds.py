@@ -7,7 +7,6 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.canopen.dcf import dcf
 from kontronik_can_gw.canopen.dictionary import Value
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
@@ -16,6 +15,7 @@ from kontronik_can_gw.cli.common import canopen_of, load_all, write_output
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 _STATES_AND_COMMANDS = frozenset(
     {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, VERIFY, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE}

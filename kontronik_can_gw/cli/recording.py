@@ -30,13 +30,12 @@ def in_words(config: Config, folder: Path) -> str:
     return words
 
 
-def recorder_of(config: Config, given: Path | None) -> Recorder | None:
-    """The recorder; None if nothing is recorded."""
+def recorder_of(config: Config, given: Path | None) -> Recorder:
+    """The recorder, of a configuration or command line that names a folder."""
     record = config.record
     folder = record_folder(config, given)
-    if folder is None:
-        return None
-    return Recorder(
+    assert folder is not None
+    recorder = Recorder(
         RecordSettings(
             folder,
             record.part_mb * _MB,
@@ -45,6 +44,8 @@ def recorder_of(config: Config, given: Path | None) -> Recorder | None:
             record.min_free_mb * _MB,
         )
     )
+    recorder.words = in_words(config, folder)
+    return recorder
 
 
 def setup_of(loaded: Loaded) -> CaptureSetup:

@@ -182,11 +182,11 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
 
 
 def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
-    from kontronik_can_gw.canopen.lss import UNCONFIGURED
     from kontronik_can_gw.cli.common import say
     from kontronik_can_gw.config.keys import CanConfig
     from kontronik_can_gw.desk.recordings.inputs import CaptureInput
     from kontronik_can_gw.desk.recordings.marking import Marker
+    from kontronik_can_gw.node_state import UNCONFIGURED
     from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
     from kontronik_can_gw.runtime.open_can import check_interface, open_can
     from kontronik_can_gw.signals.unpacker import SignalReader

@@ -16,7 +16,10 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import SECOND
 
 if TYPE_CHECKING:
+    from kontronik_can_gw.gateway import Gateway
     from kontronik_can_gw.runtime.loop import Loop
+    from kontronik_can_gw.runtime.recorder import Recorder
+    from kontronik_can_gw.runtime.store import ParameterStore
     from kontronik_can_gw.runtime.systemd import Notifier
 
 log = logging.getLogger("kontronik_can_gw")
@@ -114,16 +117,11 @@ class _Run:
 
     def _opened(self) -> "Loop":
         """The loop with everything open. The parsed DBC is freed at the end of this method."""
-        from kontronik_can_gw.cli.recording import in_words, record_folder, recorder_of, setup_of
-        from kontronik_can_gw.gateway import Gateway
         from kontronik_can_gw.runtime import realtime
         from kontronik_can_gw.runtime.loop import Loop
-        from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
-        from kontronik_can_gw.runtime.recorder import state_of
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
-        from kontronik_can_gw.runtime.store import ParameterStore
 
-        loaded = load_all(self._file, ParameterStore)
+        loaded = load_all(self._file, _parameter_store)
         if loaded.canopen is not None:
             gc.collect()  # the nodes that were built to be checked leave their memory to those that run
         config = loaded.config
@@ -136,11 +134,7 @@ class _Run:
                 if not wait:
                     raise
                 log.error("%s Running without.", error)  # late frames are better than none
-        silent = config.dbc.on_loss == "silent"
-        created_ns = time.monotonic_ns()
-        parts = (loaded.escs, loaded.layout, created_ns, silent, loaded.canopen)
-        recorder = recorder_of(config, self._record)
-        gateway = Gateway(*parts) if recorder is None else RecordedGateway(recorder.put, *parts)
+        gateway, recorder = self._gateway(loaded)
         try:
             statistics = Statistics(
                 config.statistics_path or default_file(), config.statistics.address
@@ -163,13 +157,6 @@ class _Run:
         )
         # first, because a damaged file is moved aside by now and must be reported
         _say_parameters(loaded)
-        folder = record_folder(config, self._record)
-        if recorder is not None and folder is not None:
-            recorder.words = in_words(config, folder)
-            recorder.header = setup_of(loaded).header() | {
-                "created_ns": created_ns,
-                "state": state_of(gateway),
-            }
         loop.open()
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
@@ -177,6 +164,33 @@ class _Run:
         if self._stopping:  # a signal came before the loop existed
             loop.stop()
         return loop
+
+    def _gateway(self, loaded: Loaded) -> "tuple[Gateway, Recorder | None]":
+        """The gateway, and what records it; what only a recorder needs is not loaded without one."""
+        from kontronik_can_gw.gateway import Gateway
+
+        config, now = loaded.config, time.monotonic_ns()
+        silent = config.dbc.on_loss == "silent"
+        parts = (loaded.escs, loaded.layout, now, silent, loaded.canopen)
+        if self._record is None and config.record.directory is None:
+            return Gateway(*parts), None
+        from kontronik_can_gw.cli.recording import recorder_of, setup_of
+        from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+        from kontronik_can_gw.runtime.recorder import state_of
+
+        recorder = recorder_of(config, self._record)
+        gateway = RecordedGateway(recorder.put, *parts)
+        recorder.header = setup_of(loaded).header() | {
+            "created_ns": now,
+            "state": state_of(gateway),
+        }
+        return gateway, recorder
+
+
+def _parameter_store(folder: Path) -> "ParameterStore":
+    from kontronik_can_gw.runtime.store import ParameterStore  # not loaded without CANopen
+
+    return ParameterStore(folder)
 
 
 def settle_memory() -> None:

@@ -7,30 +7,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.check import without_objects
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
-from kontronik_can_gw.canopen.nodes import CanopenSetup
-from kontronik_can_gw.canopen.traffic import bits_per_second, cob_ids
 from kontronik_can_gw.config.keys import Config, EscConfig, examine
-from kontronik_can_gw.config.nodes import (
-    load_of_stored,
-    parameter_folder,
-    plain_setup,
-    read_stored,
-    with_stored,
-)
 from kontronik_can_gw.dbc.loss import unreported
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.prepare import check_load, prepare
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.open_can import check_interface
-from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
+
+    from kontronik_can_gw.canopen.nodes import CanopenSetup
+    from kontronik_can_gw.runtime.store import ParameterStore
 
 
 @contextmanager
@@ -65,16 +57,18 @@ class Loaded:
     """The settings in effect: configuration, then parameters that a master stored."""
     database: "Database | None"
     layout: Layout
-    canopen: CanopenSetup | None
+    canopen: "CanopenSetup | None"
     damaged: tuple[tuple[int, str], ...]
     """ESCs whose stored parameters cannot be read, and why."""
-    store: ParameterStore | None
+    store: "ParameterStore | None"
     warnings: tuple[str, ...] = ()
     dbc: bytes = b""
     """The DBC file as it was read."""
 
 
-def load_configuration(path: Path, store: Callable[[Path], ParameterStore] | None = None) -> Loaded:
+def load_configuration(
+    path: Path, store: "Callable[[Path], ParameterStore] | None" = None
+) -> Loaded:
     """Load a configuration and the files that it names. UserError with every mistake.
 
     ``store`` makes the parameter store of a running gateway; None: stored parameters are only read.
@@ -88,9 +82,11 @@ def load_configuration(path: Path, store: Callable[[Path], ParameterStore] | Non
         with collecting(problems):
             assemble(without_clashing_escs(config))
         raise UserError(*problems)
-    return assemble(
-        config, store(parameter_folder(config)) if store and config.canopen.enabled else None
-    )
+    if store is None or not config.canopen.enabled:
+        return assemble(config)
+    from kontronik_can_gw.config.nodes import parameter_folder
+
+    return assemble(config, store(parameter_folder(config)))
 
 
 def check_devices(config: Config) -> None:
@@ -112,7 +108,7 @@ def check_devices(config: Config) -> None:
         raise UserError(*problems)
 
 
-def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
+def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     """The objects made from a configuration. Without a store its files are only read.
 
     A faulty configuration, DBC or EDS is refused. Stored parameters that do not fit them are ignored with a warning.
@@ -124,14 +120,14 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
     ignored: list[str] = []
     taken: dict[int, str] = {}
     bits = 0.0
-    if config.canopen.enabled:
+    if config.canopen.enabled:  # what only nodes need is not loaded without them
+        from kontronik_can_gw.config import nodes
+
         with collecting(problems):
-            plain = plain_setup(config)
-            nodes = plain.nodes(plain.esc_settings(config.escs))
-            taken, bits = cob_ids(nodes.nodes), bits_per_second(nodes.nodes)
-            ignored += [f"{plain.eds.name}: {line}" for line in without_objects(nodes)]
+            plain = nodes.plain_setup(config)
+            taken, bits, ignored = nodes.needs(plain, plain.esc_settings(config.escs))
         if plain is not None and not problems:
-            kept = read_stored(config, store)
+            kept = nodes.read_stored(config, store)
             escs = replace(plain, stored=tuple(kept.stored)).esc_settings(config.escs)
     database, layout, dbc = None, Layout("", "", ()), b""
     if config.dbc.enabled:
@@ -149,13 +145,13 @@ def assemble(config: Config, store: ParameterStore | None = None) -> Loaded:
         foreign = {
             message.can_id: message.name for message in layout.messages if not message.extended
         }
-        canopen, given_way = with_stored(plain, kept.stored, config, escs, foreign)
+        canopen, given_way = nodes.with_stored(plain, kept.stored, config, escs, foreign)
         if canopen is not plain:
-            bits = bits_per_second(canopen.nodes(escs).nodes)
+            _, bits, _ = nodes.needs(canopen, escs)
         warnings += [
             *given_way,
             *kept.warnings,
-            *load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits),
+            *nodes.load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits),
         ]
     damaged = () if kept is None else tuple(kept.damaged)
     mute = unreported(layout, config.dbc.on_loss == "silent")

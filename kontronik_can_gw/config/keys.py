@@ -16,7 +16,6 @@ from pathlib import Path
 from posixpath import normpath
 from typing import Any, TypeVar, cast
 
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.dbc import send_types
 from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.names import normalize
@@ -24,6 +23,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import device_names, protocol_named, protocol_names
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals import units
 
 T = TypeVar("T")

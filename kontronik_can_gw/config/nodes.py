@@ -9,19 +9,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.canopen.check import check_eds
+from kontronik_can_gw.canopen.check import check_eds, without_objects
 from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 from kontronik_can_gw.canopen.storage import Stored, decode
+from kontronik_can_gw.canopen.traffic import bits_per_second, cob_ids
 from kontronik_can_gw.config.keys import Config, shipped
 from kontronik_can_gw.dbc.prepare import WARN_LOAD
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings
+from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number, state_folder
 from kontronik_can_gw.runtime.store import ParameterStore, parameter_file
 from kontronik_can_gw.signals.plan import Layout, classic_bits
@@ -87,6 +88,15 @@ def plain_setup(config: Config) -> CanopenSetup:
     return CanopenSetup(
         load_eds(config), tuple(settings), (Stored(),) * len(settings), tuple(config.escs)
     )
+
+
+def needs(
+    setup: CanopenSetup, escs: Sequence[EscSettings]
+) -> tuple[dict[int, str], float, list[str]]:
+    """COB-IDs of the nodes and what each is for, what they need of the bus in bit/s, and warnings for objects that the EDS lacks."""
+    made = setup.nodes(escs)
+    lacks = [f"{setup.eds.name}: {line}" for line in without_objects(made)]
+    return cob_ids(made.nodes), bits_per_second(made.nodes), lacks
 
 
 def read_stored(config: Config, store: ParameterStore | None) -> Kept:

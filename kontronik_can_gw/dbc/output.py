@@ -7,7 +7,7 @@ from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
-from kontronik_can_gw.output import NEVER, Output, Owner
+from kontronik_can_gw.output import Output, Owner
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
@@ -38,6 +38,7 @@ class _Message:
         "fd",
         "is_free",
         "is_paged",
+        "is_plain",
         "last",
         "length",
         "on_change",
@@ -77,6 +78,8 @@ class _Message:
         )
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
+        # sending it leaves nothing to note, and its bits are its data
+        self.is_plain = not self.on_change and not self.alive_modulus and self.crc_at is None
         self.triggers = Event.NONE
         if self.by_event or self.on_change:
             for pace in plan.paces:
@@ -139,9 +142,9 @@ class DbcOutput(Output):
     def stop(self, now: int) -> None:
         """The last word, without regard to the minimum distance of messages."""
         for index, message in self._changed_of_gateway(now):
-            self._send(index, now)
+            self._send(index, message, now)
             while message.pending:
-                self._send(index, now)
+                self._send(index, message, now)
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         if state is before:
@@ -169,8 +172,9 @@ class DbcOutput(Output):
         for index, message in enumerate(self._messages):
             message.last.clear()
             if not message.plan.cycle_ns:
-                message.pending = list(range(len(message.pages)))
-                self._request(index, now)
+                if not message.is_free:
+                    message.pending = list(range(len(message.pages)))
+                self._request(index, message, now)
 
     def bits(self, index: int, now: int, page: int | None) -> int:
         """What a message would hold now, alive counter and CRC 0."""
@@ -178,25 +182,26 @@ class DbcOutput(Output):
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
-        state, request, send = self._escs[esc], self._schedule.request, self._send
+        state = self._escs[esc]
         up = state.live is not None
-        gone = not up or (events & Event.INFO and state.info is None)
         for index, message in self._listeners[esc][up][events]:
-            if message.by_event:
-                if gone and len(message.pages) > 1:  # no further event will bring the other pages
-                    message.pending = list(range(len(message.pages)))
-            elif not self._note_changes(message, now):
-                continue
-            if message.is_free or request(index, now):
-                send(index, now)
+            if not message.by_event:
+                if not self._note_changes(message, now):
+                    continue
+            elif message.is_paged and (not up or (events & Event.INFO and state.info is None)):
+                message.pending = list(
+                    range(len(message.pages))
+                )  # no further event will bring them
+            if message.is_free or self._schedule.request(index, now):
+                self._send(index, message, now)
 
     def on_gateway_change(self, now: int, each_second: bool = False) -> None:
         """Messages with the gateway's own values that are sent by event or on change follow.
 
         ``each_second``: only its counters went on, which is news for messages that have no cycle.
         """
-        for index, _ in self._changed_of_gateway(now, each_second):
-            self._request(index, now)
+        for index, message in self._changed_of_gateway(now, each_second):
+            self._request(index, message, now)
 
     def _changed_of_gateway(
         self, now: int, each_second: bool = False
@@ -216,15 +221,14 @@ class DbcOutput(Output):
                     message.pending.append(message.page)
                 message.page = (message.page + 1) % len(message.pages)
             if cyclic or message.by_event or message.pending or self._note_changes(message, now):
-                self._send(index, now)
+                self._send(index, message, now)
 
     def next_deadline(self) -> int:
-        due = self._schedule.next_deadline()
-        return NEVER if due is None else due
+        return self._schedule.next_deadline()
 
-    def _request(self, index: int, now: int) -> None:
+    def _request(self, index: int, message: _Message, now: int) -> None:
         if self._schedule.request(index, now):
-            self._send(index, now)
+            self._send(index, message, now)
 
     def _note_changes(self, message: _Message, now: int) -> bool:
         """True if a page differs from what was sent of it last; with several pages those that do are pending."""
@@ -239,32 +243,18 @@ class DbcOutput(Output):
         message.pending += [place for place in changed if place not in message.pending]
         return bool(changed)
 
-    def _send(self, index: int, now: int) -> None:
-        message = self._messages[index]
+    def _send(self, index: int, message: _Message, now: int) -> None:
         if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
             message.pending.clear()
             return
         place = page = 0
-        if message.pending:
-            place = message.pending.pop(0)
+        if message.is_paged:
+            place = self._next_place(message)
             page = message.pages[place]
-        elif message.is_paged:
-            place = message.page
-            page = message.pages[place]
-            message.page = (place + 1) % len(message.pages)
-        alive = message.alive
-        data = message.pack(self._escs, self._gateway, now, alive, page).to_bytes(
-            message.length, "little"
-        )
-        if message.alive_modulus:
-            message.alive = (alive + 1) % message.alive_modulus
-        if message.on_change:
-            message.last[message.plan.pages[place]] = message.pack(
-                self._escs, self._gateway, now, 0, page
-            )
-        if message.crc_at is not None:
-            at = message.crc_at
-            data = data[:at] + bytes((e2e.crc(data, at, message.plan.data_id),)) + data[at + 1 :]
+        bits = message.pack(self._escs, self._gateway, now, message.alive, page)
+        data = bits.to_bytes(message.length, "little")
+        if not message.is_plain:
+            data = self._finish(message, data, place, now)
         self.frames.append(
             _new(
                 CanFrame, (message.can_id, data, message.extended, message.fd, place, False, False)
@@ -272,5 +262,28 @@ class DbcOutput(Output):
         )
         if not message.is_free:
             self._schedule.sent(index, now)
-            if message.pending:
+            if not message.is_paged:
+                message.pending.clear()
+            elif message.pending:
                 self._schedule.wait(index, now)
+
+    def _next_place(self, message: _Message) -> int:
+        """The place of the page to send: the oldest pending one, else that whose turn it is."""
+        if message.pending:
+            return message.pending.pop(0)
+        place = message.page
+        message.page = (place + 1) % len(message.pages)
+        return place
+
+    def _finish(self, message: _Message, data: bytes, place: int, now: int) -> bytes:
+        """The data with its CRC; the alive counter goes on, and what was sent is noted for a message that is sent on change."""
+        if message.alive_modulus:
+            message.alive = (message.alive + 1) % message.alive_modulus
+        if message.on_change:
+            message.last[message.plan.pages[place]] = message.pack(
+                self._escs, self._gateway, now, 0, message.pages[place]
+            )
+        if message.crc_at is None:
+            return data
+        at = message.crc_at
+        return data[:at] + bytes((e2e.crc(data, at, message.plan.data_id),)) + data[at + 1 :]

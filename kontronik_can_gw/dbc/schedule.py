@@ -7,9 +7,10 @@ Pure: ``request`` asks whether a message may be sent now, ``due`` returns the me
 import heapq
 from collections.abc import Sequence
 
+from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.signals.plan import MessagePlan
 
-_NEVER = -(1 << 62)
+_LONG_AGO = -(1 << 62)
 
 
 MIN_DISTANCE_NS = 1_000_000
@@ -22,7 +23,7 @@ class Schedule:
     def __init__(self, plans: Sequence[MessagePlan], now: int) -> None:
         self._cycle = [plan.cycle_ns for plan in plans]
         self._delay = [plan.delay_ns for plan in plans]
-        self._last = [_NEVER] * len(plans)
+        self._last = [_LONG_AGO] * len(plans)
         self._deferred = [False] * len(plans)
         self._cycle_deferred = [False] * len(plans)
         self._heap = [
@@ -54,8 +55,10 @@ class Schedule:
 
         A late call skips missed cycles: it never returns a message twice.
         """
-        found: dict[int, bool] = {}
         heap = self._heap
+        if not heap or heap[0][0] > now:
+            return []
+        found: dict[int, bool] = {}
         while heap and heap[0][0] <= now:
             when, index, is_deferred = heap[0]
             if is_deferred:
@@ -77,9 +80,9 @@ class Schedule:
                     self._cycle_deferred[index] = True
         return list(found.items())
 
-    def next_deadline(self) -> int | None:
-        """When ``due`` will return a message; None for never."""
-        return self._heap[0][0] if self._heap else None
+    def next_deadline(self) -> int:
+        """When ``due`` will return a message; NEVER for never."""
+        return self._heap[0][0] if self._heap else NEVER
 
     def _defer(self, index: int, until: int) -> None:
         if not self._deferred[index]:

@@ -18,7 +18,7 @@ RESTARTED_NS = SECOND
 
 
 class CanController:
-    """What is known of an interface's controller. ``due``: when ``ask_if_due`` has something to do.
+    """What is known of an interface's controller. ``due``: when it is to be asked.
 
     ``facts``: what the kernel reported last; None where it reports nothing of this interface.
     """
@@ -55,10 +55,6 @@ class CanController:
         if self._monitor is not None:
             self._monitor.ask()
             self.due = now + (ASK_OFF_NS if self.is_off else ASK_NS)
-
-    def ask_if_due(self, now: int) -> None:
-        if now >= self.due:
-            self.ask(now)
 
     def take(self) -> list[LinkFacts]:
         """What the kernel has reported since the last call, oldest first."""

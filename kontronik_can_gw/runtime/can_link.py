@@ -67,7 +67,7 @@ class CanLink:
 
     @property
     def due(self) -> int:
-        """When ``reopen``, ``transmit`` or, in bus-off, the controller's ``ask_if_due`` has something to do.
+        """When ``reopen``, ``transmit`` or, in bus-off, the controller's ``ask`` has something to do.
 
         Otherwise the controller is asked when the loop comes round: it need not be woken for that.
         """
@@ -75,10 +75,6 @@ class CanLink:
         if self.controller.is_off and self.controller.due < due:
             due = self.controller.due
         return due if retry is None or due < retry else retry
-
-    def is_idle(self, now: int) -> bool:
-        """True where neither ``reopen`` nor the controller's ``ask_if_due`` has something to do."""
-        return self.port is not None and now < self.controller.due
 
     @property
     def is_open(self) -> bool:
@@ -177,6 +173,11 @@ class CanLink:
         self.controller.ask(now)  # it may be there again already
 
     # --- what comes
+
+    def ask(self, now: int) -> None:
+        """Learn from the kernel how the interface is; it answers at once, so that the loop need not be woken for that."""
+        self.controller.ask(now)
+        self.hear(now)
 
     def hear(self, now: int, _events: int = 0) -> None:
         """The kernel has reported something of the interface."""

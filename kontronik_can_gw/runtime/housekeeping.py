@@ -3,18 +3,17 @@
 import logging
 import time
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
-from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.runtime.can_link import CanLink
 from kontronik_can_gw.runtime.conflict_log import log_conflicts
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
-from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     ProgramFacts,
@@ -24,6 +23,9 @@ from kontronik_can_gw.runtime.snapshot import (
 )
 from kontronik_can_gw.runtime.statistics import Statistics
 from kontronik_can_gw.runtime.systemd import Notifier
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.runtime.recorder import Recorder
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -48,7 +50,7 @@ class Housekeeping:
         *,
         notifier: Notifier,
         statistics: Statistics,
-        recorder: Recorder | None,
+        recorder: "Recorder | None",
         program: ProgramFacts,
         status_ns: int,
     ) -> None:

@@ -2,9 +2,9 @@
 
 import logging
 
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
 

@@ -11,6 +11,7 @@ import os
 import selectors
 import time
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
@@ -22,12 +23,14 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.poller import Handler, Poller
-from kontronik_can_gw.runtime.recorder import Recorder
 from kontronik_can_gw.runtime.snapshot import ProgramFacts
 from kontronik_can_gw.runtime.statistics import Statistics
-from kontronik_can_gw.runtime.store import ParameterStore
 from kontronik_can_gw.runtime.systemd import Notifier
 from kontronik_can_gw.runtime.usb_adapters import Identity
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.runtime.recorder import Recorder
+    from kontronik_can_gw.runtime.store import ParameterStore
 
 MIN_HELD_UP_NS = 20 * MS
 """A turn that is later than this, and than ``Transmitter.max_turn_ns``, was held up."""
@@ -36,6 +39,8 @@ _WAKES_PER_TIMEOUT = 4
 
 A millisecond sooner, for a wait is rounded up to one.
 """
+_WAKES_PER_TIMEOUT_IN_SILENCE = 2
+"""The same while no ESC sends. Only the first frame after a silence may go early by more, and its successor replaces it."""
 _LAST_SAVE_S = 0.2
 
 
@@ -48,13 +53,13 @@ class Loop:
         ports: Sequence[str],
         can_config: CanConfig,
         wait_for_devices: bool = False,
-        store: ParameterStore | None = None,
+        store: "ParameterStore | None" = None,
         status_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
         notifier: Notifier | None = None,
         statistics: Statistics | None = None,
         program: ProgramFacts | None = None,
-        recorder: Recorder | None = None,
+        recorder: "Recorder | None" = None,
         poller: Poller | None = None,
     ) -> None:
         self.gateway = gateway
@@ -138,10 +143,10 @@ class Loop:
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
         last, due = self._now, self._next_deadline()
-        wake = last + self.gateway.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
-        pause = min(wake, due) - self._clock()
-        if pause < 0:
-            pause = 0
+        gateway = self.gateway
+        wakes = _WAKES_PER_TIMEOUT if gateway.status.escs_ok else _WAKES_PER_TIMEOUT_IN_SILENCE
+        wake = last + gateway.shortest_timeout_ns // wakes - MS
+        pause = max(min(wake, due) - self._clock(), 0)
         ready = self._poller.wait(pause)
         now = self._poller.now
         late = now - last - pause
@@ -159,7 +164,7 @@ class Loop:
         gateway, can = self.gateway, self.can
         for handler, events in ready:
             handler(now, events)
-        if self._lost or not can.is_idle(now):
+        if self._lost or can.port is None or now >= can.controller.due:
             now = self._reopen(now)
         if gateway.nodes is not None:
             self._saver.save(now)  # first: what it answers belongs to this turn, in a replay too
@@ -234,5 +239,6 @@ class Loop:
         for esc in [esc for esc in self._lost if now >= esc.due] if self._lost else ():
             esc.reopen(now, self._others(esc))
         self.can.reopen(now)
-        self.can.controller.ask_if_due(now)
+        if now >= self.can.controller.due:
+            self.can.ask(now)
         return max(now, self._clock())

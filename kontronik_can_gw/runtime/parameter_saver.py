@@ -3,12 +3,15 @@
 import logging
 from collections import deque
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.snapshot import StoreFacts
-from kontronik_can_gw.runtime.store import ParameterStore
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.canopen.storage import Stored
+    from kontronik_can_gw.runtime.store import ParameterStore
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -17,7 +20,7 @@ class ParameterSaver:
     """Hands savings to the store's thread, in their order; ``store`` None: each is answered with an error."""
 
     def __init__(
-        self, gateway: Gateway, escs: Sequence[EscPort], store: ParameterStore | None
+        self, gateway: Gateway, escs: Sequence[EscPort], store: "ParameterStore | None"
     ) -> None:
         self._gateway = gateway
         self._escs = escs
@@ -28,8 +31,11 @@ class ParameterSaver:
 
     def save(self, now: int) -> None:
         """Hand over what is to be stored; while the disk has not taken what came before, it waits."""
-        if saves := self._gateway.take_saves():
-            self._waiting += saves
+        self._waiting += self._gateway.take_saves()
+        if not self._waiting:
+            return
+        from kontronik_can_gw.canopen.storage import encode  # only nodes have something to store
+
         while self._waiting:
             index, stored = self._waiting[0]
             name = self._escs[index].name

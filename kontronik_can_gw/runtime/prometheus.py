@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.esc.kontronik.states import ErrorBit, OperatingError, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState
+from kontronik_can_gw.node_state import NmtState
 from kontronik_can_gw.runtime.snapshot import name_in_words
 
 _PREFIX = "kontronik_"

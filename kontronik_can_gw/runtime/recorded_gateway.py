@@ -1,14 +1,17 @@
 """A gateway whose every call is handed to a recorder: played again in their order they give the same frames (capture/replay.py)."""
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
-from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.capture.format import COUNTERS, Kind, counters_data, frame_data, number_data
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.signals.plan import Layout
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.canopen.nodes import CanopenSetup
 
 Put = Callable[[int, int, int, bytes, int, int | None], None]
 """(time, kind, ESC's index, data, flags, time of arrival), as the fields of ``capture.Entry``."""
@@ -24,7 +27,7 @@ class RecordedGateway(Gateway):
         layout: Layout,
         now: int,
         silent_on_loss: bool = False,
-        canopen: CanopenSetup | None = None,
+        canopen: "CanopenSetup | None" = None,
     ) -> None:
         super().__init__(escs, layout, now, silent_on_loss, canopen)
         self._put = put

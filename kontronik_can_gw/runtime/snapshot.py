@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.esc.decoder import Data, EscProtocol, Severity, bit_texts
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, SECOND, EscTelemetry
 from kontronik_can_gw.esc.values import VALUES, Group, Value, physical, steps, steps_of, values_of
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import RecorderFacts

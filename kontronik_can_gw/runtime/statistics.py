@@ -260,7 +260,6 @@ class _StatusFile:
             if not stat.S_ISREG(self._path.lstat().st_mode):
                 # /dev/null would be gone, for everybody
                 raise OSError(errno.EINVAL, "what is there is no plain file")
-        self._temporary.unlink(missing_ok=True)
         fd = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         try:
             os.fchmod(fd, 0o644)

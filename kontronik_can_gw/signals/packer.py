@@ -5,7 +5,6 @@ available its NotAvailable code; nothing wraps, nothing is clipped. Bit 0 of the
 """
 
 import math
-import re
 import struct
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -15,7 +14,6 @@ from kontronik_can_gw.esc.values import Divisor, Kind, Value
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
-_PLAIN_VALUE = re.compile(r"reading\[\d+\]|x")
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
 
 
@@ -211,11 +209,7 @@ def _value(signal: SignalPlan, steps: str) -> str:
         unfit.append(f"== {signal.not_available}")
     if not unfit:
         return value
-    name = "v"
-    if _PLAIN_VALUE.fullmatch(value):
-        name = first = value
-    else:
-        first = f"(v := {value})"
+    name, first = ("x", "x") if value == "x" else ("v", f"(v := {value})")
     tests = " or ".join([f"{first} {unfit[0]}", *(f"{name} {test}" for test in unfit[1:])])
     return f"{signal.error} if {tests} else {name}"
 

@@ -122,7 +122,8 @@ class Bench:
             node_ids = node_ids or range(1, nodes + 1)
         else:
             node_ids = range(1, nodes + 1) if node_ids is None else node_ids
-            base = tuple(EscSettings(f"esc{n}", **dict(escs)) for n in range(len(node_ids)))
+            same = dict(escs) if isinstance(escs, Mapping) else {}
+            base = tuple(EscSettings(f"esc{n}", **same) for n in range(len(node_ids)))
         self._arguments = {
             "changes": changes,
             "eds": eds,

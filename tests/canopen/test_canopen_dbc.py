@@ -8,7 +8,6 @@ from typing import Any
 
 import dialogue
 import pytest
-from cantools.database.can import Database
 from cantools.database.namedsignalvalue import NamedSignalValue
 from dbc_rules import ENUMS, RULES, parse
 from eds_text import SHIPPED as EDS_TEXT
@@ -85,7 +84,7 @@ class Bench(dialogue.Bench):
         simulated: Sequence[EscOptions] = (),
         **more: Any,
     ) -> None:
-        self.database: Database | None = None
+        self.database: Any = None
         self.seen: dict[str, list[dict[str, Any]]] = {}
         """Message name to what was decoded, in order."""
         options = simulated or (EscOptions(),) * len(escs)

@@ -2,7 +2,6 @@
 
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import GATEWAY, LINK
 from kontronik_can_gw.canopen.storage import Stored
@@ -10,6 +9,7 @@ from kontronik_can_gw.canopen.traffic import frames_per_second
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.transmit_queue import TransmitQueue
 
 LINK_STATUS = LINK << 16 | 0x0108

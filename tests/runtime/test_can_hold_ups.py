@@ -5,12 +5,12 @@ from collections.abc import Iterable, Iterator
 import pytest
 from wire_world import World, loop_in, run
 
-from kontronik_can_gw.canopen.nmt import NmtState
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayState
+from kontronik_can_gw.node_state import NmtState
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.transmit_queue import Sent
 

@@ -103,7 +103,8 @@ class Bench:
             self.clock = self.now
             self.can.hear(self.now)
             self.can.reopen(self.now)
-            self.can.controller.ask_if_due(self.now)
+            if self.now >= self.can.controller.due:
+                self.can.ask(self.now)
             self.gateway.advance(self.now)
             self.can.follow_ids()
             self.can.transmit(self.now)

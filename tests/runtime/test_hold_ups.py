@@ -14,6 +14,7 @@ from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.signals.plan import Layout
 
 NS_PER_BYTE = KONTRONIK.byte_ns
 
@@ -163,17 +164,28 @@ def test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true(
         assert stops or between <= timeout // 4
 
 
-def test_the_loop_looks_at_its_ports_four_times_within_the_shortest_time_out_whatever_a_master_makes_of_it(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(("sends", "looks"), [(True, 4), (False, 2)])
+def test_the_loop_looks_at_its_ports_several_times_within_the_shortest_time_out_whatever_a_master_makes_of_it(
+    monkeypatch: pytest.MonkeyPatch, sends: bool, looks: int
 ) -> None:
+    """Four times while an ESC sends; in silence, when the first frame alone may go early, twice. No message wakes it besides."""
     world = World(2)
-    loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=SECOND), EscSettings("esc2"))
+    escs = (EscSettings("esc1", timeout_ns=SECOND), EscSettings("esc2"))
+    loop = loop_in(world, monkeypatch, escs, Layout("", "", ()))
+    loop.open()
+    loop.begin()
     for timeout in (SECOND, 60 * MS, 20 * MS, 400 * MS):
         loop.gateway._apply(0, EscSettings("esc1", timeout_ns=timeout))
+        shortest = min(timeout, 250 * MS)
+        end = world.now + 2 * SECOND
+        if sends:
+            world.wires[0].stream(world.now, end, shortest * 6 // 10)
+            run(loop, world, world.now + 10 * MS)
         world.looks.clear()
-        run(loop, world, world.now + 2 * SECOND)
+        run(loop, world, end)
+        assert loop.gateway.status.escs_ok == sends
         longest = max(b - a for a, b in zip(world.looks, world.looks[1:], strict=False))
-        assert longest <= min(timeout, 250 * MS) // 4
+        assert shortest // (looks + 2) < longest <= shortest // looks
     loop.close()
 
 

@@ -12,7 +12,6 @@ from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
-from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.objects import BINDINGS
@@ -21,6 +20,7 @@ from kontronik_can_gw.desk.describe.parts import Facts, error, number
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
+from kontronik_can_gw.node_state import UNCONFIGURED
 
 BY_GATEWAY = 0xFF
 """Byte 3 of an emergency that is no error bit of the ESC."""
