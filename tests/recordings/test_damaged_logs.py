@@ -4,8 +4,10 @@ Nothing raises but RunError.
 """
 
 import random
+import struct
 from pathlib import Path
 
+import can
 import pytest
 from log_files import SUFFIX, Item, at_wall, read_log, some_frames, write_log
 
@@ -95,6 +97,27 @@ def test_a_damaged_container_costs_only_itself(tmp_path: Path) -> None:
         # the objects over both borders go too
         assert len(found) >= len(items) - per_container - 2, index
         assert found[-1] == items[-1]
+
+
+@pytest.mark.parametrize("kind", [1, 8])  # a frame, and an object of which python-can makes none
+def test_an_object_of_size_0_costs_only_itself(tmp_path: Path, kind: int) -> None:
+    """python-can alone reads it for ever."""
+    items = at_wall(some_frames(30))
+    path = tmp_path / "log.blf"
+    with can.BLFWriter(path, compression_level=0) as writer:
+        for time_ns, frame, received in items:
+            writer.on_message_received(
+                can.Message(
+                    time_ns / 1e9, frame.can_id, frame.extended, data=frame.data, is_rx=received
+                )
+            )
+    content = bytearray(path.read_bytes())
+    tenth = _containers(bytes(content))[10]  # the first is the container
+    content[tenth + 8 : tenth + 16] = struct.pack("<LL", 0, kind)
+    path.write_bytes(content)
+    found, damage = read_log(path)
+    assert [item[1] for item in found] == [item[1] for item in items[:9] + items[10:]]
+    assert damage == ["frames are damaged in the container at offset 144"]
 
 
 @pytest.mark.parametrize("format_", [*OWN, "mf4"])
