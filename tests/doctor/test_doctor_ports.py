@@ -16,7 +16,7 @@ from kontronik_can_gw.desk.doctor.service import unit_of
 
 OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR
 BY_ID = "/dev/serial/by-id/usb-FTDI_A1234-port0"
-GOOD = Line(touched=True, even_parity=True, counts=True)
+GOOD = Line(even_parity=True, counts=True)
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 RUN = ("python3", "-m", "kontronik_can_gw", "run")
 USB0, AMA0, S0 = "/dev/ttyUSB0", "/dev/ttyAMA0", "/dev/ttyS0"
