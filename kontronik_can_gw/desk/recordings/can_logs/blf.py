@@ -9,8 +9,7 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
-from datetime import UTC, datetime
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from kontronik_can_gw.desk.recordings.can_logs.record import (
     OLDEST_WALL_S,
@@ -22,8 +21,10 @@ from kontronik_can_gw.desk.recordings.can_logs.record import (
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.lean import without_asammdf
 
-_FILE_HEADER = struct.Struct("<4sL8xQQLL8H8H")
-_FILE_HEADER_SIZE = 144
+if TYPE_CHECKING:
+    from can import BLFReader
+
+_FILE_HEADER_SIZE, _MIN_FILE_HEADER = 144, 72
 _BASE = struct.Struct("<4sHHLL")
 """Signature, header size, header version, object size, object type."""
 _CONTAINER = struct.Struct("<H6xL4x")
@@ -55,12 +56,13 @@ class BlfReader:
         self.wall_start_ns: int | None = None
         self._first = self._full = 0
         head = file.read(_FILE_HEADER_SIZE)
-        if len(head) >= _FILE_HEADER.size and head.startswith(b"LOGG"):
-            fields = _FILE_HEADER.unpack_from(head)
-            self._full = fields[2] if fields[2] <= _LARGEST_FILE else 0
-            self.wall_start_ns = system_time_ns(fields[6:14])
-            is_size = _FILE_HEADER.size <= fields[1] <= _BLOCK
-            self._first = fields[1] if is_size else _FILE_HEADER_SIZE
+        if len(head) >= _MIN_FILE_HEADER and head.startswith(b"LOGG"):
+            header = _library_reader(head)
+            self._full = header.file_size if header.file_size <= _LARGEST_FILE else 0
+            if header.start_timestamp >= OLDEST_WALL_S:
+                self.wall_start_ns = round(header.start_timestamp * 1000) * 1_000_000
+            size = int.from_bytes(head[4:8], "little")
+            self._first = size if _MIN_FILE_HEADER <= size <= _BLOCK else _FILE_HEADER_SIZE
         self._end = file.seek(0, io.SEEK_END)
         file.seek(0)
 
@@ -181,13 +183,11 @@ class BlfReader:
 
     def _frames(self, objects: list[bytes], offset: int) -> Iterator[LogFrame]:
         """The frames of objects of the container at ``offset``, by python-can."""
-        with without_asammdf():
-            from can import BLFReader
         content = b"".join(objects)
         size = _BASE.size + _CONTAINER.size + len(content)
         head = _BASE.pack(_SIGNATURE, _BASE.size, 1, size, _LOG_CONTAINER)
         container = head + _CONTAINER.pack(_NOT_COMPRESSED, len(content)) + content
-        for message in BLFReader(io.BytesIO(_EMPTY_FILE + container)):
+        for message in _library_reader(_EMPTY_FILE + container):
             can_id, extended, fd = message.arbitration_id, message.is_extended_id, message.is_fd
             channel = message.channel
             assert isinstance(channel, int)
@@ -207,6 +207,12 @@ class BlfReader:
         note = f"frames are damaged in the container at offset {offset}"
         if note not in self._damage.notes[-1:]:
             self._damage.notes.append(note)
+
+
+def _library_reader(content: bytes) -> "BLFReader":
+    with without_asammdf():
+        from can import BLFReader
+    return BLFReader(io.BytesIO(content))
 
 
 def _unpacked(method: int, packed: bytes, is_cut: bool) -> tuple[bytes | None, int | None]:
@@ -235,14 +241,3 @@ def _fits(data: bytes, after: int, following: int) -> bool:
         or data.startswith(_SIGNATURE, after)
         or following == len(data)
     )
-
-
-def system_time_ns(fields: tuple[int, ...]) -> int | None:
-    """Unix time in ns of a SYSTEMTIME (UTC, as python-can writes it); None where it is none."""
-    year, month, _, day, hour, minute, second, ms = fields
-    try:
-        moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-    except ValueError:
-        return None
-    seconds = int(moment.timestamp())
-    return seconds * SECOND_NS + min(ms, 999) * 1_000_000 if seconds >= OLDEST_WALL_S else None

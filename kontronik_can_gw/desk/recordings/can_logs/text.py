@@ -108,7 +108,7 @@ class CandumpReader:
         for number, line in lines_of(self._file):
             match = whole(line)
             if match is None and (shown := CANDUMP_SCREEN_LINE.fullmatch(line)) is not None:
-                match = whole(_as_logged(*shown.groups()))
+                match = whole(_as_logged(shown))
                 if match is None or (match[7] is None and len(match[6]) != 2 * int(shown[6])):
                     damage.line(number)
                     continue
@@ -143,28 +143,14 @@ class CandumpReader:
             )
 
 
-def _as_logged(
-    seconds: bytes,
-    fraction: bytes,
-    name: bytes,
-    direction: bytes | None,
-    can_id: bytes,
-    length: bytes,
-    data: bytes | None,
-    remote: bytes | None,
-) -> bytes:
+def _as_logged(shown: "re.Match[bytes]") -> bytes:
     """The line of a log for one of the screen."""
-    content = (
-        b"R" if remote else (b"#1" if len(length) == 2 else b"") + b"".join((data or b"").split())
-    )
-    return b"(%b.%b) %b %b#%b%b" % (
-        seconds,
-        fraction,
-        name,
-        can_id,
-        content,
-        b" " + direction[:1] if direction else b"",
-    )
+    seconds, fraction, name, direction, can_id, length, data, remote = shown.groups()
+    content = b"R"
+    if remote is None:
+        content = (b"#1" if len(length) == 2 else b"") + b"".join(data.split())
+    end = b" " + direction[:1] if direction else b""
+    return b"(%b.%b) %b %b#%b%b" % (seconds, fraction, name, can_id, content, end)
 
 
 class AscReader:
