@@ -99,21 +99,27 @@ def test_a_damaged_container_costs_only_itself(tmp_path: Path) -> None:
         assert found[-1] == items[-1]
 
 
-@pytest.mark.parametrize("kind", [1, 8])  # a frame, and an object of which python-can makes none
-def test_an_object_of_size_0_costs_only_itself(tmp_path: Path, kind: int) -> None:
-    """python-can alone reads it for ever."""
+@pytest.mark.parametrize(
+    ("place", "bits"),
+    [
+        pytest.param(8, struct.pack("<LL", 0, 1), id="a frame of size 0"),
+        pytest.param(8, struct.pack("<LL", 0, 8), id="another object of size 0"),
+        pytest.param(35, b"\x10", id="a DLC of 16"),
+        pytest.param(39, b"\x40", id="an id of 31 bits"),
+    ],
+)
+def test_a_damaged_object_costs_only_itself(tmp_path: Path, place: int, bits: bytes) -> None:
+    """python-can alone reads one of size 0 for ever, and takes the last two for frames."""
     items = at_wall(some_frames(30))
     path = tmp_path / "log.blf"
     with can.BLFWriter(path, compression_level=0) as writer:
         for time_ns, frame, received in items:
-            writer.on_message_received(
-                can.Message(
-                    time_ns / 1e9, frame.can_id, frame.extended, data=frame.data, is_rx=received
-                )
-            )
+            message = can.Message(time_ns / 1e9, frame.can_id, frame.extended, data=frame.data)
+            message.is_rx = received
+            writer.on_message_received(message)
     content = bytearray(path.read_bytes())
-    tenth = _containers(bytes(content))[10]  # the first is the container
-    content[tenth + 8 : tenth + 16] = struct.pack("<LL", 0, kind)
+    at = _containers(bytes(content))[10] + place  # the first is the container
+    content[at : at + len(bits)] = bits
     path.write_bytes(content)
     found, damage = read_log(path)
     assert [item[1] for item in found] == [item[1] for item in items[:9] + items[10:]]

@@ -34,6 +34,8 @@ _LOG_CONTAINER = 10
 _ERROR_FRAMES = (2, 73)
 _MIN_SIZES = {1: 16, 86: 16, 100: 84, 101: 40}
 """Bytes after the headers that python-can reads of CAN_MESSAGE, CAN_MESSAGE2, CAN_FD_MESSAGE and CAN_FD_MESSAGE_64."""
+_CLASSIC = (1, 86)
+_NO_ID, _MAX_DLC = 0x60000000, 15
 _HEADER_SIZES = {1: 32, 2: 40}
 """Bytes of the headers in front of them, by the headers' version."""
 _LAST_KIND = 255
@@ -176,7 +178,10 @@ class BlfReader:
                 position = following
                 continue
             if kind in _MIN_SIZES:
-                objects.append(data[found:after])
+                if _has_impossible_bits(data, found + _HEADER_SIZES[version], kind):
+                    self._damaged(offset)
+                else:
+                    objects.append(data[found:after])
             elif kind in _ERROR_FRAMES:
                 self._damage.skip("error frames")
             position = after
@@ -231,6 +236,12 @@ def _unpacked(method: int, packed: bytes, is_cut: bool) -> tuple[bytes | None, i
     if unpacker.eof:
         return content, len(unpacker.unused_data)
     return (content if is_cut else None), None
+
+
+def _has_impossible_bits(data: bytes, at: int, kind: int) -> bool:
+    """True where a frame's id or DLC has bits that none has, which python-can leaves out."""
+    can_id = int.from_bytes(data[at + 4 : at + 8], "little")
+    return bool(can_id & _NO_ID) or (kind in _CLASSIC and data[at + 3] > _MAX_DLC)
 
 
 def _fits(data: bytes, after: int, following: int) -> bool:
