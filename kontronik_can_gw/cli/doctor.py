@@ -68,25 +68,20 @@ def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
 
     unit = unit_of(system, str(path.absolute()))
     about = Findings("Configuration")
-    found: list[Finding] = []
-    code = 0
     config, loaded, refused = _load(path, unit)
     if refused is not None:
-        code = refused.exit_code
+        command = "" if config is None else f"kontronik-can-gw check -c {path}"
         for problem in refused.problems:
-            about.error(
-                "config", problem, "", "" if config is None else f"kontronik-can-gw check -c {path}"
-            )
+            about.say("config", "mistake", problem=problem, command=command)
+    found = about.found
     if config is not None:
         _configuration(system, about, config, loaded, unit)
-        found += about.found
         for esc in config.esc:
             found += check_port(system, esc.name, esc.port, unit, look)
         found += check_can(system, config.can)
-    else:
-        found += about.found
     found += check_machine(system, unit)
-    return found, code or int(count(found, Severity.ERROR) > 0)
+    code = int(count(found, Severity.ERROR) > 0)
+    return found, code if refused is None else refused.exit_code
 
 
 def _load(path: Path, unit: "Unit | None") -> tuple[Config | None, Loaded | None, UserError | None]:
@@ -110,20 +105,25 @@ def _configuration(
 
     if loaded is not None:
         _outputs(findings, config, loaded)
+        _warnings(findings, config, loaded)
     files = [Path(config.file)]
-    files += [config.dbc_path] if config.dbc.enabled and config.dbc.file != SHIPPED else []
-    files += [config.eds_path] if config.canopen.enabled and config.canopen.eds != SHIPPED else []
+    if config.dbc.enabled and config.dbc.file != SHIPPED:
+        files.append(config.dbc_path)
+    if config.canopen.enabled and config.canopen.eds != SHIPPED:
+        files.append(config.eds_path)
     for file in files:
-        check_readable(system, findings, "config.readable", str(file.absolute()), unit)
+        check_readable(system, findings, str(file.absolute()), unit)
+
+    def check(name: str, what: str, folder: Path, reserve: int = 0) -> None:
+        path = str(folder.absolute())
+        check_folder(system, findings, f"config.{name}", what, path, unit, reserve)
+
     if config.canopen.enabled:
-        folder = str(parameter_folder(config).absolute())
-        check_folder(system, findings, "config.store", "stored parameters", folder, unit)
+        check("store", "stored parameters", parameter_folder(config))
     if (captures := record_folder(config)) is not None:
-        folder, reserve = str(captures.absolute()), config.record.min_free_mb * 1_000_000
-        check_folder(system, findings, "config.record", "captures", folder, unit, reserve)
+        check("record", "captures", captures, config.record.min_free_mb * 1_000_000)
     if config.statistics_path is not None:
-        folder = str(config.statistics_path.absolute().parent)
-        check_folder(system, findings, "config.statistics", "statistics", folder, unit)
+        check("statistics", "statistics", config.statistics_path.absolute().parent)
 
 
 def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
@@ -133,34 +133,24 @@ def _outputs(findings: Findings, config: Config, loaded: Loaded) -> None:
     if config.dbc.enabled:
         words.append(f"{len(loaded.layout.messages)} messages of {config.dbc_path.name}")
     if loaded.canopen is not None:
-        nodes = loaded.canopen.nodes(loaded.escs)
-        words.append(
-            f"{len(nodes.nodes)} CANopen node{'s' * (number > 1)} of {config.eds_path.name}"
-        )
-        load += bits_per_second(nodes.nodes) / config.can.bitrate
-    findings.ok("config", f"{config.file}: {', '.join(words)}")
-    findings.ok(
-        "config.bus_load", f"needs {load:.1%} of {config.can.bitrate // 1000} kbit/s at most"
-    )
-    damaged = {
-        f"{loaded.escs[esc].name}: stored parameters: {reason}": esc
-        for esc, reason in loaded.damaged
-    }
+        nodes = loaded.canopen.nodes(loaded.escs).nodes
+        words.append(f"{len(nodes)} CANopen node{'s' * (number > 1)} of {config.eds_path.name}")
+        load += bits_per_second(nodes) / config.can.bitrate
+    findings.say("config", "ok", file=config.file, outputs=", ".join(words))
+    findings.say("config.bus_load", "ok", load=load, kilobits=config.can.bitrate // 1000)
+
+
+def _warnings(findings: Findings, config: Config, loaded: Loaded) -> None:
+    damaged = {}
+    for esc, reason in loaded.damaged:
+        name = loaded.escs[esc].name
+        damaged[f"{name}: stored parameters: {reason}"] = name
     for warning in (*loaded.layout.warnings, *loaded.warnings):
         if warning not in damaged:
-            findings.warning("config.warning", warning)
-    for text, esc in damaged.items():
-        if os.access(parameter_file(parameter_folder(config), loaded.escs[esc].name), os.R_OK):
-            remedy = (
-                "The gateway runs on defaults. Let the master store them anew, or restore the file"
-            )
-            findings.warning("config.parameters", text, remedy)
-        else:
-            findings.note(
-                "config.parameters",
-                text,
-                "Only the gateway's user and root can: run doctor with sudo",
-            )
+            findings.say("config.warning", "any", warning=warning)
+    for damage, name in damaged.items():
+        is_open = os.access(parameter_file(parameter_folder(config), name), os.R_OK)
+        findings.say("config.parameters", "damaged" if is_open else "closed", damage=damage)
 
 
 class _Piece(NamedTuple):

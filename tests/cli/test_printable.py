@@ -16,7 +16,7 @@ from kontronik_can_gw.cli.common import write_output
 from kontronik_can_gw.cli.doctor import _show
 from kontronik_can_gw.cli.status import Piece, _rich
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.doctor.findings import Findings
+from kontronik_can_gw.desk.doctor.findings import Finding, Severity
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.log_writer import BackgroundHandler
@@ -78,11 +78,10 @@ def test_screens(style: str) -> None:
 
 @pytest.mark.parametrize("is_terminal", [True, False])
 def test_findings_of_doctor(is_terminal: bool) -> None:
-    findings = Findings(EVIL)
-    findings.error("x", EVIL, EVIL, EVIL)
+    found = [Finding(EVIL, "x", Severity.ERROR, EVIL, EVIL, EVIL)]
     out = Terminal() if is_terminal else io.StringIO()
     with redirect_stdout(out):
-        _show(findings.found)
+        _show(found)
     text = re.sub(r"\x1b\[[\d;]*m", "", out.text() if isinstance(out, Terminal) else out.getvalue())
     assert is_clean(text)
     assert text.count("fake") == 4

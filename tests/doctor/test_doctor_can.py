@@ -101,6 +101,8 @@ DOWN = {"flags": ["NOARP"]}
             "transmit 128, receive 7",
         ),
         (info(state="ERROR-PASSIVE"), PLAIN, "can.state", WARNING, ""),
+        (info(state="ERROR-WARNING"), PLAIN, "can.state", WARNING, "its warning limit"),
+        (info(state="SLEEPING"), PLAIN, "can.state", WARNING, UP),
         (info(state="BUS-OFF"), PLAIN, "can.state", ERROR, ""),
         (
             info(ctrlmode=["LISTEN-ONLY", "BERR-REPORTING"]),
@@ -109,6 +111,8 @@ DOWN = {"flags": ["NOARP"]}
             ERROR,
             "listen-only off",
         ),
+        (info(ctrlmode=["LOOPBACK"]), PLAIN, "can.mode", ERROR, "loopback off"),
+        (info(bittiming={"bitrate": 0}), PLAIN, "can.bitrate", ERROR, "no bit rate is set"),
         (info(ctrlmode=["ONE-SHOT"]), PLAIN, "can.mode", WARNING, "one-shot off"),
         ({}, FD, "can.fd", ERROR, "dbitrate 2000000 fd on"),
         (
@@ -161,6 +165,23 @@ def test_a_missing_interface_is_reported_with_those_there_are(tree: Tree) -> Non
     assert only(check_can(tree, PLAIN), "can.exists").remedy == "Set can.channel: can1"
 
 
+def test_a_virtual_interface_is_noted_and_has_commands_of_its_own(tree: Tree) -> None:
+    change = {"flags": ["NOARP"], "linkinfo": {"info_kind": "vcan"}}
+    interface(tree, merged(controller(), change))
+    findings = check_can(tree, FD)
+    assert grave(findings) == {"can.exists": NOTE, "can.up": ERROR, "can.fd": ERROR}
+    assert only(findings, "can.up").command == "sudo ip link set can0 up"
+    assert only(findings, "can.fd").command.endswith("sudo ip link set can0 mtu 72 up")
+
+
+def test_what_is_no_can_interface_and_no_driver_is_reported(tree: Tree) -> None:
+    interface(tree, merged(controller(), {"link_type": "ether"}))
+    found = only(check_can(tree, PLAIN), "can.exists")
+    assert (found.severity, found.text) == (ERROR, "can0 is no CAN interface")
+    found = only(check_can(tree, CanConfig(interface="nosuch")), "can.driver")
+    assert (found.severity, found.remedy) == (ERROR, "Install what it names")
+
+
 def test_slcan_cannot_restart_and_is_not_asked_to(tree: Tree) -> None:
     """The kernel's slcan driver: fixed rates, no bit timing, no restart."""
     change = info(
@@ -175,6 +196,10 @@ def test_slcan_cannot_restart_and_is_not_asked_to(tree: Tree) -> None:
     assert grave(findings) == {"can.restart": NOTE}
     assert "restart-ms" not in only(findings, "can.restart").command
     assert only(findings, "can.bitrate").severity is OK
+    merged(change, info(state="BUS-OFF"))
+    interface(tree, merged(controller(), change), hardware=False)
+    off = only(check_can(tree, PLAIN), "can.state")
+    assert off.command == "sudo ip link set can0 down; sudo ip link set can0 up"
 
 
 @pytest.mark.parametrize("shown", [None, "[]", "Device does not exist.", '[{"linkinfo": []}]'])

@@ -36,7 +36,6 @@ def test_nothing_is_written_and_no_echo_stays(terminal: tuple[int, int, str]) ->
     master, slave, name = terminal
     found = look(name, alone=True)
     assert found.trouble is None
-    assert found.touched
     assert found.even_parity is False, "a pseudo terminal has none"
     os.write(master, b"KODL\r\n")
     assert received(master) == b""
@@ -51,7 +50,6 @@ def test_a_port_that_somebody_may_have_set_up_is_not_touched(
     before = termios.tcgetattr(slave)
     found = look(name, alone=False)
     assert found.even_parity is None
-    assert not found.touched
     assert termios.tcgetattr(slave) == before
 
 

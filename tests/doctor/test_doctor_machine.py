@@ -42,7 +42,7 @@ def folder(tree: Tree, name: str = STORE, config: str = CONFIG) -> Finding:
 
 def readable(tree: Tree, file: str = CONFIG) -> list[Finding]:
     findings = Findings("Configuration")
-    check_readable(tree, findings, "config.readable", file, unit_of(tree, file))
+    check_readable(tree, findings, file, unit_of(tree, file))
     return findings.found
 
 
@@ -83,6 +83,7 @@ def test_a_good_machine_has_nothing_but_ok(tree: Tree) -> None:
             "machine.power",
             NOTE,
         ),
+        ({f"{HWMON}/hwmon1/name": "rpi_volt"}, "machine.power", OK),
     ],
 )
 def test_what_is_not_as_it_should_be_is_reported(
@@ -91,6 +92,10 @@ def test_what_is_not_as_it_should_be_is_reported(
     for name, text in files.items():
         tree.file(name, f"{text}\n")
     assert only(machine(tree), check).severity is severity
+
+
+def test_a_clock_that_was_never_set_is_noted(tree: Tree) -> None:
+    assert only(machine(tree, 1970), "machine.clock").severity is NOTE
 
 
 # --- the service
@@ -118,6 +123,16 @@ def test_how_the_service_fares_is_reported(
     found = only(machine(tree), "machine.service")
     assert found.severity is severity
     assert word in found.command
+    assert "machine.service_enabled" not in grave(machine(tree))
+
+
+def test_a_service_that_does_not_start_with_the_machine_is_noted(tree: Tree) -> None:
+    tree.systemd(UnitFileState="disabled")
+    found = only(machine(tree), "machine.service_enabled")
+    assert (found.severity, found.command) == (
+        NOTE,
+        "sudo systemctl enable kontronik-can-gw.service",
+    )
 
 
 @pytest.mark.parametrize("mode", [None, 0o755])

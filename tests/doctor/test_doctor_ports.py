@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from kontronik_can_gw.desk.doctor.service import unit_of
 
 OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR
 BY_ID = "/dev/serial/by-id/usb-FTDI_A1234-port0"
-GOOD = Line(touched=True, even_parity=True, counts=True)
+GOOD = Line(even_parity=True, counts=True)
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 RUN = ("python3", "-m", "kontronik_can_gw", "run")
 USB0, AMA0, S0 = "/dev/ttyUSB0", "/dev/ttyAMA0", "/dev/ttyS0"
@@ -103,6 +104,11 @@ DEVICES = file(
         ),
         (ftdi, "/dev/ttyUSB7", False, "port.exists", ERROR, BY_ID),
         (all_of(), USB0, False, "port.exists", ERROR, "Plug in the adapter"),
+        (all_of(), AMA0, False, "port.exists", ERROR, "enable_uart=1"),
+        (
+            all_of(ftdi, lambda t: shutil.rmtree(t.path("/dev/serial"))),
+            *(USB0, True, "port.name", WARNING, "systemctl status systemd-udevd"),
+        ),
         (file("/dev/notes", "x"), "/dev/notes", False, "port.exists", ERROR, ""),
         (
             device("/dev/pts/3", (136, 3), 0o620, 5),
@@ -149,7 +155,25 @@ DEVICES = file(
             ),
             *(BY_ID, True, "port.device_kind", ERROR, "DeviceAllow=char-ttyUSB rw"),
         ),
+        (
+            all_of(ftdi, systemd(SupplementaryGroups="")),
+            *(BY_ID, True, "port.permission", ERROR, "usermod -aG dialout kontronik-can-gw"),
+        ),
+        (
+            all_of(ftdi, device(USB0, (188, 0), 0o600, 0), systemd()),
+            *(BY_ID, True, "port.permission", ERROR, "chmod g+rw"),
+        ),
+        (
+            all_of(
+                ftdi, device(USB0, (188, 0), 0o600, 0), closed(BY_ID), process(*RUN, opens=[USB0])
+            ),
+            *(BY_ID, False, "port.permission", NOTE, "chmod g+rw"),
+        ),
         # what else is on it
+        (
+            all_of(ftdi, process("/usr/bin/brltty")),
+            *(BY_ID, True, "port.brltty", WARNING, "apt remove brltty"),
+        ),
         (
             all_of(
                 uart("ttyAMA0"), process("/sbin/agetty", "115200", "ttyAMA0", "vt220", opens=[AMA0])

@@ -51,34 +51,20 @@ class NotRecovered(AssertionError):
     """The gateway did not come back in time."""
 
 
-class Gateway:
-    """``kontronik-can-gw run`` as its own process, with a prefix (``setpriv``) and an environment if need be.
+class LoggedProcess:
+    """A program as its own process, and what it has logged so far."""
 
-    (Like GatewayProcess of the vcan tests, without the libraries that those import: emulated, they cost seconds.)
-    """
-
-    def __init__(self, config: Path, prefix: Sequence[str], environment: Mapping[str, str]) -> None:
-        command = [
-            *AHEAD,
-            *prefix,
-            sys.executable,
-            "-m",
-            "kontronik_can_gw",
-            "run",
-            "-c",
-            str(config),
-            "--wait",
-        ]
-        self.started_ns = time.monotonic_ns()
+    def __init__(
+        self, command: Sequence[str], environment: Mapping[str, str] | None = None
+    ) -> None:
         self.process = subprocess.Popen(
             command,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
-            env={**os.environ, **environment},
+            env={**os.environ, **(environment or {})},
         )
         self.lines: list[str] = []
-        """What it has logged so far."""
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -92,12 +78,25 @@ class Gateway:
         return "\n".join(self.lines)
 
     def kill(self) -> None:
+        """End it, however it fares."""
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
-        self._reader.join(2)
+        self._reader.join(60)
         if self.process.stderr and not self.process.stderr.closed:
             self.process.stderr.close()
+
+
+class Gateway(LoggedProcess):
+    """``kontronik-can-gw run`` with a prefix (``setpriv``) and an environment if need be.
+
+    (Like GatewayProcess of the vcan tests, without the libraries that those import: emulated, they cost seconds.)
+    """
+
+    def __init__(self, config: Path, prefix: Sequence[str], environment: Mapping[str, str]) -> None:
+        program = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), "--wait"]
+        self.started_ns = time.monotonic_ns()
+        super().__init__([*AHEAD, *prefix, *program], environment)
 
     @property
     def alive(self) -> bool:

@@ -4,8 +4,10 @@ Nothing raises but RunError.
 """
 
 import random
+import struct
 from pathlib import Path
 
+import can
 import pytest
 from log_files import SUFFIX, Item, at_wall, read_log, some_frames, write_log
 
@@ -95,6 +97,33 @@ def test_a_damaged_container_costs_only_itself(tmp_path: Path) -> None:
         # the objects over both borders go too
         assert len(found) >= len(items) - per_container - 2, index
         assert found[-1] == items[-1]
+
+
+@pytest.mark.parametrize(
+    ("place", "bits"),
+    [
+        pytest.param(8, struct.pack("<LL", 0, 1), id="a frame of size 0"),
+        pytest.param(8, struct.pack("<LL", 0, 8), id="another object of size 0"),
+        pytest.param(35, b"\x10", id="a DLC of 16"),
+        pytest.param(39, b"\x40", id="an id of 31 bits"),
+    ],
+)
+def test_a_damaged_object_costs_only_itself(tmp_path: Path, place: int, bits: bytes) -> None:
+    """python-can alone reads one of size 0 for ever, and takes the last two for frames."""
+    items = at_wall(some_frames(30))
+    path = tmp_path / "log.blf"
+    with can.BLFWriter(path, compression_level=0) as writer:
+        for time_ns, frame, received in items:
+            message = can.Message(time_ns / 1e9, frame.can_id, frame.extended, data=frame.data)
+            message.is_rx = received
+            writer.on_message_received(message)
+    content = bytearray(path.read_bytes())
+    at = _containers(bytes(content))[10] + place  # the first is the container
+    content[at : at + len(bits)] = bits
+    path.write_bytes(content)
+    found, damage = read_log(path)
+    assert [item[1] for item in found] == [item[1] for item in items[:9] + items[10:]]
+    assert damage == ["frames are damaged in the container at offset 144"]
 
 
 @pytest.mark.parametrize("format_", [*OWN, "mf4"])

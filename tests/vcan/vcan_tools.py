@@ -22,7 +22,7 @@ import canopen
 from bus_watch import SECOND, BusWatch
 from encoding import Identity
 from feeder import CURRENT, SPEED
-from harness import PtyPort
+from harness import LoggedProcess, PtyPort
 from signals import table_of_configuration
 
 from kontronik_can_gw.config.keys import shipped
@@ -53,26 +53,13 @@ def wait_for(condition: Callable[[], object], what: object) -> None:
         time.sleep(0.005)
 
 
-class GatewayProcess:
+class GatewayProcess(LoggedProcess):
     """``kontronik-can-gw run`` as its own process."""
 
     def __init__(self, config: Path, *options: str) -> None:
-        command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), *options]
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        super().__init__(
+            [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), *options]
         )
-        self.lines: list[str] = []
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stderr
-        for line in self.process.stderr:
-            self.lines.append(line.rstrip())
-
-    @property
-    def log(self) -> str:
-        return "\n".join(self.lines)
 
     def wait_for_line(self, text: str) -> None:
         """Wait until a log line holds ``text``."""
@@ -97,13 +84,6 @@ class GatewayProcess:
         """Send a signal and wait for the exit code."""
         self.process.send_signal(signal_number)
         return self.wait()
-
-    def kill(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.wait()
-        if self.process.stderr:
-            self.process.stderr.close()
 
 
 class Recorded(NamedTuple):

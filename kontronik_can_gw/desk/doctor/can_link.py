@@ -11,6 +11,7 @@ _CAN_TYPE = 280
 """ARPHRD_CAN"""
 _UP = 1
 _ABILITIES = ("bus_off", "error_passive", "restarts", "arbitration_lost", "bus_error")
+_LOSSES = ("rx_errors", "rx_dropped", "rx_over_errors", "tx_errors", "tx_dropped", "tx_over_errors")
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,8 @@ class Link:
 
 def can_interfaces(system: System) -> list[str]:
     """Names of all CAN interfaces."""
-    return [
-        name
-        for name in system.names("/sys/class/net")
-        if system.number(f"/sys/class/net/{name}/type") == _CAN_TYPE
-    ]
+    names = system.names("/sys/class/net")
+    return [name for name in names if system.number(f"/sys/class/net/{name}/type") == _CAN_TYPE]
 
 
 def link_of(system: System, name: str) -> Link | None:
@@ -58,24 +56,24 @@ def link_of(system: System, name: str) -> Link | None:
     shown = system.run("ip", "-json", "-details", "-statistics", "link", "show", "dev", name)
     try:
         found = json.loads(shown or "")[0]
-        return _from_ip(found, slcan=not system.exists(f"{folder}/device"))
+        return _from_ip(found, has_device=system.exists(f"{folder}/device"))
     except (ValueError, LookupError, TypeError, AttributeError):
         return _from_sys(system, folder)
 
 
-def _from_ip(found: Mapping[str, Any], slcan: bool) -> Link:
+def _from_ip(found: Mapping[str, Any], has_device: bool) -> Link:
     info = found.get("linkinfo", {})
     data = info.get("info_data", {})
     kind = info.get("info_kind")
-    timing, counters = data.get("bittiming", {}), data.get("berr_counter")
+    timing, data_timing = data.get("bittiming", {}), data.get("data_bittiming", {})
+    counters, sample_point = data.get("berr_counter"), timing.get("sample_point")
     events = {**data, **info.get("info_xstats", {})}
-    statistics = {
-        f"{way}_{name}": int(number)
-        for way, numbers in found.get("stats64", {}).items()
-        for name, number in numbers.items()
-        if name in ("errors", "dropped", "over_errors")
+    numbers = {
+        f"{way}_{name}": number
+        for way, of_one_way in found.get("stats64", {}).items()
+        for name, number in of_one_way.items()
     }
-    sample_point = timing.get("sample_point")
+    unset = 0 if kind == "can" else None
     return Link(
         is_can=found.get("link_type") == "can",
         up="UP" in found.get("flags", ()),
@@ -83,25 +81,22 @@ def _from_ip(found: Mapping[str, Any], slcan: bool) -> Link:
         mtu=int(found.get("mtu", 16)),
         queue_length=found.get("txqlen"),
         # a driver with fixed rates only, as slcan, has no further timing
-        bitrate=timing.get("bitrate", data.get("bittiming_bitrate", 0 if kind == "can" else None)),
-        data_bitrate=data.get("data_bittiming", {}).get(
-            "bitrate", data.get("data_bittiming_bitrate")
-        ),
+        bitrate=timing.get("bitrate", data.get("bittiming_bitrate", unset)),
+        data_bitrate=data_timing.get("bitrate", data.get("data_bittiming_bitrate")),
         sample_point=float(sample_point) if sample_point else None,
-        restart_ms=data.get("restart_ms", 0 if kind == "can" else None),
-        can_restart=not (slcan and kind == "can"),
+        restart_ms=data.get("restart_ms", unset),
+        can_restart=has_device or kind != "can",
         state=data.get("state"),
         error_counters=(int(counters["tx"]), int(counters["rx"])) if counters else None,
         modes=tuple(data.get("ctrlmode", ())),
         termination=data.get("termination"),
         events={name: int(events[name]) for name in _ABILITIES if name in events},
-        statistics=statistics,
+        statistics={name: int(numbers[name]) for name in _LOSSES if name in numbers},
     )
 
 
 def _from_sys(system: System, folder: str) -> Link:
-    names = ("rx_errors", "rx_dropped", "rx_over_errors", "tx_errors", "tx_dropped")
-    numbers = {name: system.number(f"{folder}/statistics/{name}") for name in names}
+    numbers = {name: system.number(f"{folder}/statistics/{name}") for name in _LOSSES}
     return Link(
         is_can=system.number(f"{folder}/type") == _CAN_TYPE,
         up=bool((system.number(f"{folder}/flags") or 0) & _UP),

@@ -1,8 +1,11 @@
-"""Findings of checks with severity and remedy."""
+"""Findings of checks with severity and remedy, worded in checks.toml."""
 
+import tomllib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 FORMAT = 1
@@ -31,29 +34,29 @@ class Finding:
     command: str = ""
 
 
-class Findings:
-    """Collects the findings of one group."""
+@cache
+def wordings() -> dict[str, dict[str, list[str]]]:
+    """By check and case: severity, text, remedy, command; the last two may be missing."""
+    return tomllib.loads(Path(__file__).with_name("checks.toml").read_text(encoding="utf-8"))
 
-    def __init__(self, group: str) -> None:
+
+class Findings:
+    """Collects the findings of one group. ``values``: for the wording of each of them."""
+
+    def __init__(self, group: str, **values: object) -> None:
         self.group = group
         self.found: list[Finding] = []
+        self._values = values
 
-    def ok(self, check: str, text: str) -> None:
-        self.add(Severity.OK, check, text)
+    def say(self, check: str, case: str, **values: object) -> None:
+        """Add a case of checks.toml under the name of its check."""
+        self.say_as(check, check, case, **values)
 
-    def note(self, check: str, text: str, remedy: str = "", command: str = "") -> None:
-        self.add(Severity.NOTE, check, text, remedy, command)
-
-    def warning(self, check: str, text: str, remedy: str = "", command: str = "") -> None:
-        self.add(Severity.WARNING, check, text, remedy, command)
-
-    def error(self, check: str, text: str, remedy: str = "", command: str = "") -> None:
-        self.add(Severity.ERROR, check, text, remedy, command)
-
-    def add(
-        self, severity: Severity, check: str, text: str, remedy: str = "", command: str = ""
-    ) -> None:
-        self.found.append(Finding(self.group, check, severity, text, remedy, command))
+    def say_as(self, name: str, check: str, case: str, **values: object) -> None:
+        """Add a case of a check that stands for several under another name."""
+        severity, *texts = wordings()[check][case]
+        filled = [text.format(**{**self._values, **values}) for text in texts]
+        self.found.append(Finding(self.group, name, Severity(severity), *filled))
 
 
 def count(findings: Iterable[Finding], severity: Severity) -> int:
@@ -71,15 +74,5 @@ def document(
         "exit_code": exit_code,
         "errors": count(findings, Severity.ERROR),
         "warnings": count(findings, Severity.WARNING),
-        "findings": [
-            {
-                "group": finding.group,
-                "check": finding.check,
-                "severity": finding.severity.value,
-                "text": finding.text,
-                "remedy": finding.remedy,
-                "command": finding.command,
-            }
-            for finding in findings
-        ],
+        "findings": [asdict(finding) for finding in findings],
     }

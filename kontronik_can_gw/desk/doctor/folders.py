@@ -5,47 +5,30 @@ from stat import S_ISDIR
 
 from kontronik_can_gw.desk.doctor.findings import Findings
 from kontronik_can_gw.desk.doctor.service import Unit
-from kontronik_can_gw.desk.doctor.system import System
+from kontronik_can_gw.desk.doctor.system import FileSystem, System
 
 _MIN_BYTES = 64 * 1024
 _LOW_BYTES = 16 * 1024 * 1024
-
-
 _HOMES = ("/home", "~root", "/run/user")
+_READ, _WRITE_AND_ENTER, _ENTER = 4, 3, 1
 
 
-def check_readable(
-    system: System, findings: Findings, check: str, file: str, unit: Unit | None
-) -> None:
+def check_readable(system: System, findings: Findings, file: str, unit: Unit | None) -> None:
     """Check that the service can read a file. No finding without a service."""
     if unit is None or unit.user is None:
         return
-    who = unit.user
-    if unit.hides_homes and any(
-        PurePath(file).is_relative_to(Path(home).expanduser()) for home in _HOMES
-    ):
-        text = f"{file}: {unit.name} sees no home folders (ProtectHome)"
-        findings.error(check, text, "Move it:", f"sudo mv {file} /etc/kontronik-can-gw/")
+    path, user = PurePath(file), unit.user.name
+    if unit.hides_homes and any(path.is_relative_to(Path(home).expanduser()) for home in _HOMES):
+        findings.say("config.readable", "home", file=file, unit=unit.name)
         return
-    status = system.status(file)
-    for folder in PurePath(file).parents:
+    for folder in path.parents:
         at = system.status(str(folder))
-        if at is not None and not who.may(at, 1):
-            text = f"{file}: the service's user {who.name} may not enter {folder}"
-            findings.error(
-                check,
-                text,
-                "Keep the configuration in /etc/kontronik-can-gw, or:",
-                f"sudo chmod o+x {folder}",
-            )
+        if at is not None and not unit.user.may(at, _ENTER):
+            findings.say("config.readable", "enter", file=file, user=user, folder=folder)
             return
-    if status is not None and not who.may(status, 4):
-        findings.error(
-            check,
-            f"{file}: the service's user {who.name} may not read it",
-            "",
-            f"sudo chmod o+r {file}",
-        )
+    status = system.status(file)
+    if status is not None and not unit.user.may(status, _READ):
+        findings.say("config.readable", "read", file=file, user=user)
 
 
 def check_folder(
@@ -64,70 +47,50 @@ def check_folder(
     there = folder
     while there != "/" and not system.exists(there):
         there = str(PurePath(there).parent)
-    made = "" if there == folder else ", will be made"
+    left = system.file_system(there)
+
+    def say(case: str, **values: object) -> None:
+        findings.say_as(check, "config.folder", case, **values, **where)
+
+    where: dict[str, object] = {"what": what, "folder": folder, "there": there}
+    where["made"] = "" if there == folder else ", will be made"
+    where["user"] = system.user.name
+    if unit is not None:
+        where |= {"unit": unit.name, "state": unit.state_folder}
+        if unit.user is not None:
+            where["user"] = unit.user.name
+    case = _unusable(system, there, left) or _access(system, folder, there, unit)
+    say(case)
+    if case not in ("ok", "by_systemd", "gateway") or left is None:
+        return
+    if left.free_bytes < reserve:
+        say("reserve", free=left.free_bytes // 1_000_000, reserve=reserve // 1_000_000)
+    elif left.free_bytes < _LOW_BYTES:
+        say("low", free=left.free_bytes // 1024)
+
+
+def _unusable(system: System, there: str, left: FileSystem | None) -> str | None:
+    """Why nobody can write in a folder that is there; None where somebody can."""
     status = system.status(there)
     if status is not None and not S_ISDIR(status.st_mode):
-        findings.error(
-            check,
-            f"{what}: {folder}: {there} is a file, not a folder",
-            "Choose another folder:",
-            f"ls -l {there}",
-        )
-        return
-    left = system.file_system(there)
+        return "file"
     if left is not None and left.read_only:
-        text = f"{what}: {folder}: the file system is read-only"
-        findings.error(
-            check, text, "Make it writable, or choose another folder:", f"findmnt --target {there}"
-        )
-        return
+        return "read_only"
     if left is not None and (left.free_bytes < _MIN_BYTES or left.free_files == 0):
-        text = f"{what}: {folder}: the file system is full"
-        findings.error(check, text, "Make room:", f"df -h {there}; df -i {there}")
-        return
-    kept_by_systemd = unit is not None and PurePath(folder).is_relative_to(unit.state_folder)
-    owner = unit.user if unit is not None else None
-    if kept_by_systemd or (system.exists(folder) and status is None):
-        findings.ok(check, f"{what}: {folder}, made by systemd for the service")
-    elif unit is not None and owner is not None:
-        allowed = not unit.strict or any(
-            PurePath(folder).is_relative_to(path) for path in unit.writable
-        )
-        if status is None or not owner.may(status, 3):
-            findings.error(
-                check,
-                f"{what}: {folder}: the service's user {owner.name} may not write there",
-                f"Leave it out of the configuration ({unit.state_folder} is taken then), or:",
-                f"sudo mkdir -p {folder} && sudo chown {owner.name} {folder}",
-            )
-            return
-        if not allowed:
-            findings.error(
-                check,
-                f"{what}: {folder}: is read-only for {unit.name} (ProtectSystem=strict)",
-                f"Leave it out of the configuration ({unit.state_folder} is taken then), or add ReadWritePaths={folder}:",
-                f"sudo systemctl edit {unit.name}",
-            )
-            return
-        findings.ok(check, f"{what}: {folder}{made}")
-    elif not system.may_fill(there) and any(process.is_gateway for process in system.processes):
-        findings.note(
-            check,
-            f"{what}: {folder}: {system.user.name} may not write there; perhaps the gateway that runs may",
-        )
-    elif not system.may_fill(there):
-        findings.error(
-            check,
-            f"{what}: {folder}: {system.user.name} may not write in {there}",
-            "Run doctor as the user that runs the gateway, or:",
-            f"sudo mkdir -p {folder} && sudo chown {system.user.name} {folder}",
-        )
-        return
-    else:
-        findings.ok(check, f"{what}: {folder}{made}")
-    if left is not None and left.free_bytes < reserve:
-        text = f"{what}: {left.free_bytes // 1_000_000} MB are free in {there}: nothing is written with less than {reserve // 1_000_000} MB"
-        findings.error(check, text, "Make room:", f"df -h {there}")
-    elif left is not None and left.free_bytes < _LOW_BYTES:
-        text = f"{what}: only {left.free_bytes // 1024} kB are free in {there}"
-        findings.warning(check, text, "Make room:", f"df -h {there}")
+        return "full"
+    return None
+
+
+def _access(system: System, folder: str, there: str, unit: Unit | None) -> str:
+    """Whether the gateway may write in a folder, of which ``there`` exists."""
+    status = system.status(there)
+    if unit is not None and PurePath(folder).is_relative_to(unit.state_folder):
+        return "by_systemd"
+    if unit is not None and unit.user is not None:
+        if status is None or not unit.user.may(status, _WRITE_AND_ENTER):
+            return "service"
+        allowed = any(PurePath(folder).is_relative_to(path) for path in unit.writable)
+        return "ok" if allowed or not unit.strict else "strict"
+    if system.may_fill(there):
+        return "ok"
+    return "gateway" if any(process.is_gateway for process in system.processes) else "closed"

@@ -16,8 +16,6 @@ from dataclasses import dataclass, field
 _GET_COUNTS, _COUNTS = 0x545D, struct.Struct("=20i")
 _COUNTERS = {6: "framing", 8: "parity", 7: "overrun", 9: "break", 10: "buffer overrun"}
 """Indices in struct serial_icounter_struct."""
-_GET_SERIAL, _SERIAL_SIZE, _FLAGS_AT, _LOW_LATENCY = 0x541E, 128, 16, 1 << 13
-"""Index of flags in struct serial_struct."""
 _STICKY_PARITY = 0o10000000000
 
 
@@ -29,9 +27,7 @@ class Line:
     """Why the port could not be opened."""
     busy: bool = False
     """True if it could not be opened because another program has it exclusively."""
-    touched: bool = False
     even_parity: bool | None = None
-    low_latency: bool | None = None
     errors: Mapping[str, int] = field(default_factory=dict)
     """Line errors since the driver was loaded, by kind; empty where it does not count."""
     counts: bool = False
@@ -46,13 +42,7 @@ def look(path: str, alone: bool) -> Line:
     try:
         parity = _try_even_parity(fd, alone)
         errors = _line_errors(fd)
-        return Line(
-            touched=parity is not None,
-            even_parity=parity,
-            low_latency=_low_latency(fd),
-            errors=errors or {},
-            counts=errors is not None,
-        )
+        return Line(even_parity=parity, errors=errors or {}, counts=errors is not None)
     except termios.error as error:
         return Line(f"is not a working serial port ({error.args[-1]})")
     finally:
@@ -89,13 +79,3 @@ def _line_errors(fd: int) -> dict[str, int] | None:
     except OSError:
         return None
     return {name: counts[place] for place, name in _COUNTERS.items() if counts[place]}
-
-
-def _low_latency(fd: int) -> bool | None:
-    """State of the driver's low-latency flag; None where it has none."""
-    try:
-        found = fcntl.ioctl(fd, _GET_SERIAL, bytes(_SERIAL_SIZE))
-    except OSError:
-        return None
-    (flags,) = struct.unpack_from("=i", found, _FLAGS_AT)
-    return bool(flags & _LOW_LATENCY)

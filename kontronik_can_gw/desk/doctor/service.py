@@ -77,39 +77,26 @@ def unit_of(system: System, config: str) -> Unit | None:
 
 def check_service(system: System, findings: Findings, unit: Unit | None) -> None:
     """Check whether it is installed, enabled and running, and how often it was restarted."""
-    if not system.has_systemd:
-        findings.note(
-            "machine.service",
-            "systemd does not run here; the gateway must be started by other means",
-        )
-        return
     if unit is None:
-        findings.note(
-            "machine.service",
-            "not installed as a service",
-            "",
-            "sudo kontronik-can-gw service install",
-        )
+        findings.say("machine.service", "none" if system.has_systemd else "no_systemd")
         return
-    log = f"journalctl -u {unit.name} -n 50"
+    case = "ok"
     if unit.state == "failed":
-        findings.error(
-            "machine.service", f"{unit.name} has failed ({unit.detail})", "Its log says why:", log
-        )
+        case = "failed"
     elif unit.state not in ("active", "reloading"):
-        state = f"{unit.name} is {unit.state} ({unit.detail})"
-        findings.note("machine.service", state, "", f"sudo systemctl start {unit.name}")
+        case = "stopped"
     elif unit.restarts:
-        text = f"{unit.name} is active; systemd has restarted it {unit.restarts} times"
-        findings.warning("machine.service", text, "Its log says why:", log)
-    else:
-        findings.ok("machine.service", f"{unit.name} is active")
+        case = "restarted"
+    findings.say(
+        "machine.service",
+        case,
+        unit=unit.name,
+        detail=unit.detail,
+        state=unit.state,
+        restarts=unit.restarts,
+    )
     folder = system.status(str(SYSTEM_FOLDER))
     if folder is None or (unit.user is not None and not unit.user.may(folder, 7)):
-        text = f"{SYSTEM_FOLDER}, where gateways lock node-IDs, is not there or not the service's"
-        findings.warning(
-            "machine.locks", text, "", f"sudo systemd-tmpfiles --create /etc/tmpfiles.d/{NAME}.conf"
-        )
+        findings.say("machine.locks", "none", folder=SYSTEM_FOLDER)
     if not unit.enabled:
-        text = f"{unit.name} does not start when the machine does"
-        findings.note("machine.service_enabled", text, "", f"sudo systemctl enable {unit.name}")
+        findings.say("machine.service_enabled", "no", unit=unit.name)

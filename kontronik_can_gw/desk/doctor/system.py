@@ -166,31 +166,27 @@ class System:
 
     def user_named(self, name: str, more_groups: tuple[str, ...] = ()) -> User | None:
         """A user by name, with the groups from the system and ``more_groups``; None where there is none."""
-        for line in (self.text("/etc/passwd") or "").splitlines():
-            words = line.split(":")
-            if words[0] == name and len(words) > 3 and words[2].isdigit() and words[3].isdigit():
-                return User(
-                    name,
-                    int(words[2]),
-                    frozenset({int(words[3]), *self._groups(name, more_groups)}),
-                )
+        for words in self._colons("/etc/passwd"):
+            if words[0] == name and words[2].isdigit() and words[3].isdigit():
+                groups = self._groups(name, more_groups) | {int(words[3])}
+                return User(name, int(words[2]), groups)
         return None
 
     def dynamic_user(self, name: str, groups: tuple[str, ...]) -> User:
         """A user that systemd creates when the service starts (DynamicUser)."""
-        return User(name, -1, frozenset(self._groups(name, groups)))
+        return User(name, -1, self._groups(name, groups))
 
-    def _groups(self, user: str, more: tuple[str, ...]) -> list[int]:
-        found = []
-        for line in (self.text("/etc/group") or "").splitlines():
-            words = line.split(":")
-            if (
-                len(words) > 3
-                and words[2].isdigit()
-                and (words[0] in more or user in words[3].split(","))
-            ):
-                found.append(int(words[2]))
-        return found
+    def _groups(self, user: str, more: tuple[str, ...]) -> frozenset[int]:
+        return frozenset(
+            int(words[2])
+            for words in self._colons("/etc/group")
+            if words[2].isdigit() and (words[0] in more or user in words[3].split(","))
+        )
+
+    def _colons(self, file: str) -> list[list[str]]:
+        """The lines of a file with four or more columns between colons."""
+        lines = [line.split(":") for line in (self.text(file) or "").splitlines()]
+        return [words for words in lines if len(words) > 3]
 
     def group_name(self, gid: int) -> str:
         try:
@@ -230,9 +226,9 @@ class System:
                 status = self.status(f"{folder}/{number}")
                 if status and stat.S_ISCHR(status.st_mode) and status.st_rdev == device.st_rdev:
                     found[process.pid] = process
-        for pid in self._lockers(device) - set(found) - {os.getpid()}:
-            known = next((process for process in self.processes if process.pid == pid), None)
-            found[pid] = known or Process(pid, "a program that we may not see")
+        known = {process.pid: process for process in self.processes}
+        for pid in self._lockers(device) - {os.getpid()}:
+            found[pid] = known.get(pid) or Process(pid, "a program that we may not see")
         return [found[pid] for pid in sorted(found)], complete
 
     def _lockers(self, file: os.stat_result) -> set[int]:

@@ -1,14 +1,15 @@
-"""Reader of Vector BLF files. A damaged container or object is left out, up to the next one that can be read.
+"""Reader of Vector BLF files: containers, damage and advance are followed here, python-can reads the frames.
 
 A BLF file is a header ``LOGG`` and containers ``LOBJ``, each with zlib-compressed objects ``LOBJ``, which may go on in the next container.
-No specification is public; the structures are those of python-can (and of Tobias Lorenz' vector_blf).
+python-can ends at the first damage and reads an object of size 0 for ever (its issue 1584): it is given only objects whose
+bounds have been checked.
 """
 
+import io
 import struct
 import zlib
-from collections.abc import Generator, Iterator
-from datetime import UTC, datetime
-from typing import BinaryIO
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, BinaryIO
 
 from kontronik_can_gw.desk.recordings.can_logs.record import (
     OLDEST_WALL_S,
@@ -18,37 +19,34 @@ from kontronik_can_gw.desk.recordings.can_logs.record import (
     is_possible,
 )
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.lean import without_asammdf
 
-_FILE_HEADER = struct.Struct("<4sL8xQQLL8H8H")
-_FILE_HEADER_SIZE = 144
+if TYPE_CHECKING:
+    from can import BLFReader
+
+_FILE_HEADER_SIZE, _MIN_FILE_HEADER = 144, 72
 _BASE = struct.Struct("<4sHHLL")
 """Signature, header size, header version, object size, object type."""
-_OBJECT = struct.Struct("<LHHQ")
-"""Flags, client index, object version, time stamp."""
 _CONTAINER = struct.Struct("<H6xL4x")
 """Compression (0 none, 2 zlib), size uncompressed."""
-_MESSAGE = struct.Struct("<HBBL8s")
-_FD_MESSAGE = struct.Struct("<HBBLLBBB5x64s")
-_FD_MESSAGE_64 = struct.Struct("<BBBBLLLLLLLHBBL")
-_CAN_MESSAGE, _CAN_ERROR, _LOG_CONTAINER, _CAN_ERROR_EXT = 1, 2, 10, 73
-_CAN_MESSAGE2, _CAN_FD_MESSAGE, _CAN_FD_MESSAGE_64 = 86, 100, 101
-_FRAMES = (_CAN_MESSAGE, _CAN_MESSAGE2, _CAN_FD_MESSAGE, _CAN_FD_MESSAGE_64)
-_MIN_SIZES = {
-    _CAN_MESSAGE: _MESSAGE.size,
-    _CAN_MESSAGE2: _MESSAGE.size,
-    _CAN_FD_MESSAGE: _FD_MESSAGE.size,
-    _CAN_FD_MESSAGE_64: _FD_MESSAGE_64.size,
-}
+_NOT_COMPRESSED, _ZLIB = 0, 2
+_LOG_CONTAINER = 10
+_ERROR_FRAMES = (2, 73)
+_MIN_SIZES = {1: 16, 86: 16, 100: 84, 101: 40}
+"""Bytes after the headers that python-can reads of CAN_MESSAGE, CAN_MESSAGE2, CAN_FD_MESSAGE and CAN_FD_MESSAGE_64."""
+_CLASSIC = (1, 86)
+_NO_ID, _MAX_DLC = 0x60000000, 15
+_HEADER_SIZES = {1: 32, 2: 40}
+"""Bytes of the headers in front of them, by the headers' version."""
 _LAST_KIND = 255
 _LARGEST_CONTAINER = 1 << 26
 _LARGEST_FILE = 1 << 48
 _LARGEST_OBJECT = 1 << 20
 _PADDING = 8
 """Bytes that may lie between two objects, and one more."""
-_EXTENDED = 0x80000000
-_ID_MASK = 0x1FFFFFFF
-_REMOTE, _TX, _EDL = 0x80, 0x01, 0x01
+_BLOCK = 1 << 16
 _SIGNATURE = b"LOBJ"
+_EMPTY_FILE = struct.pack("<4sL", b"LOGG", _FILE_HEADER_SIZE).ljust(_FILE_HEADER_SIZE, b"\0")
 
 
 class BlfReader:
@@ -60,26 +58,27 @@ class BlfReader:
         self.wall_start_ns: int | None = None
         self._first = self._full = 0
         head = file.read(_FILE_HEADER_SIZE)
-        if len(head) >= _FILE_HEADER.size:
-            fields = _FILE_HEADER.unpack_from(head)
-            if fields[0] == b"LOGG":
-                self._full = fields[2] if fields[2] <= _LARGEST_FILE else 0
-                self.wall_start_ns = system_time_ns(fields[6:14])
-                self._first = (
-                    fields[1] if _FILE_HEADER.size <= fields[1] <= 1 << 16 else _FILE_HEADER_SIZE
-                )
+        if len(head) >= _MIN_FILE_HEADER and head.startswith(b"LOGG"):
+            header = _library_reader(head)
+            self._full = header.file_size if header.file_size <= _LARGEST_FILE else 0
+            if header.start_timestamp >= OLDEST_WALL_S:
+                self.wall_start_ns = round(header.start_timestamp * 1000) * 1_000_000
+            size = int.from_bytes(head[4:8], "little")
+            self._first = size if _MIN_FILE_HEADER <= size <= _BLOCK else _FILE_HEADER_SIZE
+        self._end = file.seek(0, io.SEEK_END)
         file.seek(0)
 
     def __iter__(self) -> Iterator[LogFrame]:
         tail = b""
         follows = self._first
         for offset, end, content in self._containers():
-            whole = 0 <= offset - follows < _PADDING
-            if tail and not whole:
+            is_next = 0 <= offset - follows < _PADDING
+            if tail and not is_next:
                 self._damage.notes.append(f"an object is cut off before offset {offset}")
                 tail = b""
             data = tail + content
-            done = yield from self._objects(data, offset, whole or offset == self._first)
+            objects, done = self._objects(data, offset, is_next or offset == self._first)
+            yield from self._frames(objects, offset)
             tail = data[done:]
             follows = end
         if tail.strip(b"\0"):
@@ -87,23 +86,14 @@ class BlfReader:
 
     def _containers(self) -> Iterator[tuple[int, int, bytes]]:
         """Offset, end and content of each container that can be read, in order; what lies between is reported as damage."""
-        file, damage = self._file, self._damage
-        file.seek(0, 2)
-        end = file.tell()
+        end, damage = self._end, self._damage
         if self._full > end:
             damage.notes.append(f"the file is cut off: {end} of its {self._full} bytes are there")
-        position = self._first
-        lost = position
+        position = lost = self._first
         while position < end:
-            file.seek(position)
-            head = file.read(_BASE.size)
-            found = None
-            if len(head) == _BASE.size:
-                signature, _, _, size, kind = _BASE.unpack(head)
-                if signature == _SIGNATURE and _BASE.size <= size <= _LARGEST_CONTAINER:
-                    found = self._container(head, position, size, kind, end)
+            found = self._container(position)
             if found is None:
-                position = self._next_signature(position + 1, end)
+                position = self._next_signature(position + 1)
                 continue
             if position - lost >= _PADDING or lost == 0:
                 damage.stretch(lost, position)
@@ -113,160 +103,145 @@ class BlfReader:
         if end - lost >= _PADDING:
             damage.stretch(lost, end)
 
-    def _container(
-        self, head: bytes, position: int, size: int, kind: int, end: int
-    ) -> tuple[bytes, int] | None:
-        """The content of what stands at ``position``, and where it ends; None where it cannot be read."""
-        body = self._file.read(min(size, end - position) - _BASE.size)
-        is_cut = position + size > end
-        after = min(position + size, end)
+    def _container(self, position: int) -> tuple[bytes, int] | None:
+        """The content of the container at ``position``, and where it ends; None where it cannot be read."""
+        self._file.seek(position)
+        head = self._file.read(_BASE.size)
+        if len(head) < _BASE.size:
+            return None
+        signature, _, _, size, kind = _BASE.unpack(head)
+        if signature != _SIGNATURE or not _BASE.size <= size <= _LARGEST_CONTAINER:
+            return None
+        after = min(position + size, self._end)
+        body = self._file.read(after - position - _BASE.size)
+        is_cut = position + size > self._end
         if kind != _LOG_CONTAINER:
             if is_cut or kind > _LAST_KIND:
                 return None
             # an object that is in no container is read as one that is
-            return (head + body if kind in _FRAMES else b""), after
+            return (head + body if kind in _MIN_SIZES else b""), after
         if len(body) < _CONTAINER.size:
             return None
         method, full = _CONTAINER.unpack_from(body)
-        packed = body[_CONTAINER.size :]
-        if method == 0:
-            if is_cut and _SIGNATURE not in packed:
-                return None
-            content = packed
-        elif method == 2:
-            unpacker = zlib.decompressobj()
-            try:
-                content = unpacker.decompress(packed, _LARGEST_CONTAINER)
-            except zlib.error:
-                return None
-            if unpacker.eof:
-                is_cut = False
-                if len(unpacker.unused_data) >= _PADDING:
-                    # its length is wrong, what follows is not lost
-                    after -= len(unpacker.unused_data)
-                    self._damage.notes.append(
-                        f"the length of the container at offset {position} is wrong"
-                    )
-            elif not is_cut:
-                return None
-        else:
+        content, unused = _unpacked(method, body[_CONTAINER.size :], is_cut)
+        if content is None:
             return None
-        if is_cut:
+        if unused is None:
             self._damage.notes.append(
                 f"the last container, at offset {position}, is cut off: {len(content)} of its {full} bytes are there"
             )
+        elif unused >= _PADDING:
+            after -= unused  # its length is wrong, what follows is not lost
+            self._damage.notes.append(f"the length of the container at offset {position} is wrong")
         return content, after
 
-    def _next_signature(self, start: int, end: int) -> int:
-        """Where the next LOBJ stands; ``end`` if nowhere."""
-        file = self._file
-        block = 1 << 16
-        while start < end:
-            file.seek(start)
-            data = file.read(block + 3)
-            found = data.find(_SIGNATURE)
+    def _next_signature(self, start: int) -> int:
+        """Where the next LOBJ stands; the file's end if nowhere."""
+        while start < self._end:
+            self._file.seek(start)
+            found = self._file.read(_BLOCK + len(_SIGNATURE) - 1).find(_SIGNATURE)
             if found >= 0:
                 return start + found
-            start += block
-        return end
+            start += _BLOCK
+        return self._end
 
-    def _objects(
-        self, data: bytes, offset: int, from_start: bool
-    ) -> Generator[LogFrame, None, int]:
-        """The frames in a container's content; returns how far it came. ``from_start``: the first byte begins an object."""
+    def _objects(self, data: bytes, offset: int, from_start: bool) -> tuple[list[bytes], int]:
+        """The objects of frames in a container's content whose bounds are sound, and how far it came.
+
+        ``from_start``: the first byte begins an object.
+        """
+        objects: list[bytes] = []
         position, end = 0, len(data)
         while True:
             found = data.find(_SIGNATURE, position, position + _PADDING)
             if found < 0:
-                if position + _PADDING > end and from_start:
-                    return min(position, end)
+                if from_start and position + _PADDING > end:
+                    return objects, min(position, end)
                 if from_start:
                     self._damaged(offset)
                 found = data.find(_SIGNATURE, position)
                 if found < 0:
-                    return end
+                    return objects, end
             from_start = True
-            position = found
             if found + _BASE.size > end:
-                return found
-            _, header_size, version, size, kind = _BASE.unpack_from(data, found)
+                return objects, found
+            _, _, version, size, kind = _BASE.unpack_from(data, found)
             after = found + size
-            following = data.find(_SIGNATURE, found + 4)
+            following = data.find(_SIGNATURE, found + len(_SIGNATURE))
             if following < 0:
                 following = end
             if after > end and following == end and size <= _LARGEST_OBJECT:
-                return found  # it goes on in the next container
-            if (
-                size < _BASE.size
-                or version not in (1, 2)
-                or kind > _LAST_KIND
-                or not _fits(data, after, following)
-            ):
+                return objects, found  # it goes on in the next container
+            least = _HEADER_SIZES.get(version, size + 1) + _MIN_SIZES.get(kind, 0)
+            if size < least or kind > _LAST_KIND or not _fits(data, after, following):
                 self._damaged(offset)
                 position = following
                 continue
-            try:
-                frame = self._frame(data, found, header_size, version, size, kind)
-            except struct.error:
+            if kind in _MIN_SIZES:
+                if _has_impossible_bits(data, found + _HEADER_SIZES[version], kind):
+                    self._damaged(offset)
+                else:
+                    objects.append(data[found:after])
+            elif kind in _ERROR_FRAMES:
+                self._damage.skip("error frames")
+            position = after
+
+    def _frames(self, objects: list[bytes], offset: int) -> Iterator[LogFrame]:
+        """The frames of objects of the container at ``offset``, by python-can."""
+        content = b"".join(objects)
+        size = _BASE.size + _CONTAINER.size + len(content)
+        head = _BASE.pack(_SIGNATURE, _BASE.size, 1, size, _LOG_CONTAINER)
+        container = head + _CONTAINER.pack(_NOT_COMPRESSED, len(content)) + content
+        for message in _library_reader(_EMPTY_FILE + container):
+            can_id, extended, fd = message.arbitration_id, message.is_extended_id, message.is_fd
+            channel = message.channel
+            assert isinstance(channel, int)
+            if message.is_remote_frame:
+                self._damage.skip("remote frames")
+            elif not is_possible(can_id, extended, len(message.data), fd):
                 self._damaged(offset)
             else:
-                if frame is not None:
-                    yield frame
-            position = after
+                yield LogFrame(
+                    round(message.timestamp * SECOND_NS),
+                    CanFrame(can_id, bytes(message.data), extended, fd),
+                    message.is_rx,
+                    str(channel + 1),
+                )
 
     def _damaged(self, offset: int) -> None:
         note = f"frames are damaged in the container at offset {offset}"
         if note not in self._damage.notes[-1:]:
             self._damage.notes.append(note)
 
-    def _frame(
-        self, data: bytes, start: int, header_size: int, version: int, size: int, kind: int
-    ) -> LogFrame | None:
-        flags, _, _, stamp = _OBJECT.unpack_from(data, start + _BASE.size)
-        time_ns = stamp * 10_000 if flags == 1 else stamp
-        at = start + _BASE.size + _OBJECT.size + (8 if version == 2 else 0)
-        if start + size < at + _MIN_SIZES.get(kind, 0):
-            raise struct.error
-        if kind in (_CAN_MESSAGE, _CAN_MESSAGE2):
-            channel, bits, length, can_id, content = _MESSAGE.unpack_from(data, at)
-            remote, received, fd = bits & _REMOTE, not bits & _TX, False
-            if 8 < length < 16:  # a raw DLC; it means 8 bytes
-                length = 8
-        elif kind == _CAN_FD_MESSAGE:
-            channel, bits, _, can_id, _, _, fd_flags, length, content = _FD_MESSAGE.unpack_from(
-                data, at
-            )
-            remote, received, fd = bits & _REMOTE, not bits & _TX, bool(fd_flags & _EDL)
-        elif kind == _CAN_FD_MESSAGE_64:
-            fields = _FD_MESSAGE_64.unpack_from(data, at)
-            channel, length, can_id, fd_flags, direction, more = (
-                fields[0],
-                fields[2],
-                fields[4],
-                fields[6],
-                fields[12],
-                fields[13],
-            )
-            remote, received, fd = fd_flags & 0x10, not direction, bool(fd_flags & 0x1000)
-            at += _FD_MESSAGE_64.size
-            held = min(length, (more or size) - header_size - _FD_MESSAGE_64.size)
-            content = data[at : at + max(0, held)].ljust(length, b"\0")
-        else:
-            if kind in (_CAN_ERROR, _CAN_ERROR_EXT):
-                self._damage.skip("error frames")
-            return None
-        if remote:
-            self._damage.skip("remote frames")
-            return None
-        extended = bool(can_id & _EXTENDED)
-        if not is_possible(can_id & ~_EXTENDED, extended, length, fd):
-            raise struct.error
-        return LogFrame(
-            time_ns,
-            CanFrame(can_id & _ID_MASK, content[:length], extended, fd),
-            received,
-            str(channel),
-        )
+
+def _library_reader(content: bytes) -> "BLFReader":
+    with without_asammdf():
+        from can import BLFReader
+    return BLFReader(io.BytesIO(content))
+
+
+def _unpacked(method: int, packed: bytes, is_cut: bool) -> tuple[bytes | None, int | None]:
+    """A container's content, None where it cannot be read, and how many bytes after it are not its own, None where it is cut off."""
+    if method == _NOT_COMPRESSED:
+        if is_cut:
+            return (packed if _SIGNATURE in packed else None), None
+        return packed, 0
+    if method != _ZLIB:
+        return None, 0
+    unpacker = zlib.decompressobj()
+    try:
+        content = unpacker.decompress(packed, _LARGEST_CONTAINER)
+    except zlib.error:
+        return None, 0
+    if unpacker.eof:
+        return content, len(unpacker.unused_data)
+    return (content if is_cut else None), None
+
+
+def _has_impossible_bits(data: bytes, at: int, kind: int) -> bool:
+    """True where a frame's id or DLC has bits that none has, which python-can leaves out."""
+    can_id = int.from_bytes(data[at + 4 : at + 8], "little")
+    return bool(can_id & _NO_ID) or (kind in _CLASSIC and data[at + 3] > _MAX_DLC)
 
 
 def _fits(data: bytes, after: int, following: int) -> bool:
@@ -277,14 +252,3 @@ def _fits(data: bytes, after: int, following: int) -> bool:
         or data.startswith(_SIGNATURE, after)
         or following == len(data)
     )
-
-
-def system_time_ns(fields: tuple[int, ...]) -> int | None:
-    """Unix time in ns of a SYSTEMTIME (UTC, as python-can writes it); None where it is none."""
-    year, month, _, day, hour, minute, second, ms = fields
-    try:
-        moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-    except ValueError:
-        return None
-    seconds = int(moment.timestamp())
-    return seconds * SECOND_NS + min(ms, 999) * 1_000_000 if seconds >= OLDEST_WALL_S else None

@@ -1,9 +1,8 @@
 """A log of CAN frames, whatever its format: its frames in order, as a stream, and an account of what is damaged."""
 
-import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import TYPE_CHECKING, BinaryIO, Self
 
 from kontronik_can_gw.desk.recordings.can_logs.blf import BlfReader
 from kontronik_can_gw.desk.recordings.can_logs.record import SECOND_NS, Damage, LogFrame, Reader
@@ -19,6 +18,9 @@ from kontronik_can_gw.desk.recordings.can_logs.text import (
 from kontronik_can_gw.desk.recordings.can_logs.trc import TRC_HEAD, TRC_LINE, TrcReader
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
+
+if TYPE_CHECKING:
+    from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Reader
 
 FORMATS = ("candump", "asc", "blf", "trc", "mf4")
 SUFFIXES = {
@@ -38,11 +40,23 @@ NAMES = {
     "mf4": "MF4 file",
 }
 """What people call the formats."""
-_HEAD = 1 << 16
+_HEAD, _HEAD_LINES = 1 << 16, 2000
 _FAR = 1 << 20
 """So far into a file whose beginning is damaged something of its format must come."""
 UART_MAGIC = b"KOD"
 """What a telemetry frame begins with."""
+_LOOKS = {
+    "candump": (CANDUMP_LINE.fullmatch, CANDUMP_SCREEN_LINE.fullmatch),
+    "asc": (ASC_HEAD.match, ASC_LINE.match),
+    "trc": (TRC_HEAD.match,),
+}
+"""What finds a line of each text format; one of TRC alone could be another's."""
+_READERS: dict[str, Callable[[BinaryIO, Damage], Reader]] = {
+    "candump": CandumpReader,
+    "asc": AscReader,
+    "trc": TrcReader,
+    "blf": BlfReader,
+}
 _SHORT = 64
 _BACK_NS = 10 * SECOND_NS
 _AHEAD_NS = 86_400 * SECOND_NS
@@ -51,26 +65,15 @@ _AHEAD_NS = 86_400 * SECOND_NS
 
 def log_format(path: Path) -> str | None:
     """The format of a log by its first 64 KiB; by its suffix where they are damaged but more of that comes. None: no log. RunError."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
+    head = _beginning(path, _HEAD)
     if head.startswith(b"LOGG"):
         return "blf"
     if head.startswith((b"MDF     ", b"UnFinMF ")):
         return "mf4"
-    lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 2000)[:2000]
-    for line in lines:
-        if (
-            CANDUMP_LINE.fullmatch(line) is not None
-            or CANDUMP_SCREEN_LINE.fullmatch(line) is not None
-        ):
-            return "candump"
-        if ASC_HEAD.match(line) is not None or ASC_LINE.match(line) is not None:
-            return "asc"
-        if TRC_HEAD.match(line) is not None:
-            return "trc"
+    for line in head.removeprefix(b"\xef\xbb\xbf").split(b"\n", _HEAD_LINES)[:_HEAD_LINES]:
+        for format_, looks_like in _LOOKS.items():
+            if any(look(line) is not None for look in looks_like):
+                return format_
     if b"LOBJ" in head:
         return "blf"
     if UART_MAGIC in head:  # bytes of an ESC, whatever they are called
@@ -78,12 +81,15 @@ def log_format(path: Path) -> str | None:
     called = SUFFIXES.get(path.suffix.lower())
     if called is None or _is_blank(head):
         return called
+    return called if _has_any(called, _beginning(path, _FAR)) else None
+
+
+def _beginning(path: Path, size: int) -> bytes:
     try:
         with path.open("rb") as file:
-            far = file.read(_FAR)
-    except OSError as error:
+            return file.read(size)
+    except (OSError, ValueError) as error:
         raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
-    return called if _has_any(called, far) else None
 
 
 def _is_blank(head: bytes) -> bool:
@@ -99,25 +105,9 @@ def _has_any(format_: str, content: bytes) -> bool:
         return False  # what has no beginning cannot be read
     if format_ == "blf":
         return b"LOBJ" in content
-    looks: dict[str, tuple[re.Pattern[bytes], ...]] = {
-        "candump": (CANDUMP_LINE, CANDUMP_SCREEN_LINE),
-        "asc": (ASC_HEAD, ASC_LINE),
-        "trc": (TRC_HEAD, TRC_LINE),
-    }
-    patterns = looks[format_]
-    return any(
-        any(pattern.match(line) is not None for pattern in patterns)
-        for line in content.split(b"\n")
-        if line[:1] and len(line) <= LONGEST_LINE
-    )
-
-
-_READERS: dict[str, Callable[[BinaryIO, Damage], Reader]] = {
-    "candump": CandumpReader,
-    "asc": AscReader,
-    "trc": TrcReader,
-    "blf": BlfReader,
-}
+    looks = (*_LOOKS[format_], *((TRC_LINE.match,) if format_ == "trc" else ()))
+    lines = [line for line in content.split(b"\n") if 0 < len(line) <= LONGEST_LINE]
+    return any(look(line) is not None for line in lines for look in looks)
 
 
 class CanLog:
@@ -125,6 +115,8 @@ class CanLog:
 
     UserError where it is no log that is known, or a table; RunError where it cannot be opened, or is MF4 and asammdf is missing.
     """
+
+    _mf4: "Mf4Reader | None" = None
 
     def __init__(self, path: Path, channel: str | None = None) -> None:
         self.path = path
@@ -135,18 +127,16 @@ class CanLog:
         self.format = log_format(path) or ""
         if not self.format:
             raise UserError(f"{path}: is no CAN log that is known (candump, ASC, BLF, TRC, MF4).")
-        self._file: BinaryIO | None = None
-        self._mf4 = None
         try:
             self.size = path.stat().st_size
-            if self.format != "mf4":
-                self._file = path.open("rb")
+            self._file = path.open("rb")
         except OSError as error:
             raise RunError(f"{path}: cannot be opened: {_reason(error)}.") from None
         self._reader: Reader
-        if self._file is None:
+        if self.format == "mf4":
             from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Reader
 
+            self._file.close()  # asammdf opens it itself
             self._reader = self._mf4 = Mf4Reader(path, self._damage)
         else:
             self._reader = _READERS[self.format](self._file, self._damage)
@@ -166,7 +156,6 @@ class CanLog:
         """Bytes read so far."""
         if self._mf4 is not None:
             return self._mf4.position
-        assert self._file is not None
         return self.size if self._file.closed else min(self._file.tell(), self.size)
 
     @property
@@ -225,8 +214,7 @@ class CanLog:
 
     def close(self) -> None:
         """Close the file."""
-        if self._file is not None:
-            self._file.close()
+        self._file.close()
         if self._mf4 is not None:
             self._mf4.close()
 

@@ -82,13 +82,9 @@ class Mf4Reader:
                 groups.append(self._frames(index, cycles, names))
                 total += cycles
             elif cycles and _ERRORS in names:
-                self._damage.foreign["error frames"] = (
-                    self._damage.foreign.get("error frames", 0) + cycles
-                )
+                self._damage.skip("error frames", cycles)
             elif cycles and _REMOTES in names:
-                self._damage.foreign["remote frames"] = (
-                    self._damage.foreign.get("remote frames", 0) + cycles
-                )
+                self._damage.skip("remote frames", cycles)
         if not groups:
             self._damage.notes.append("no CAN frames are logged in it (no group CAN_DataFrame)")
         for done, item in enumerate(heapq.merge(*groups, key=lambda item: item.time_ns)):
@@ -98,72 +94,62 @@ class Mf4Reader:
         self.position = self._size
 
     def _frames(self, index: int, cycles: int, names: set[str]) -> Iterator[LogFrame]:
-        import numpy as np
-
+        notes = self._damage.notes
         for start in range(0, cycles, _CHUNK):
             count = min(_CHUNK, cycles - start)
-            columns: dict[str, Any] = {}
-            with quiet():
-                try:
-                    for part in (
-                        "ID",
-                        "DataBytes",
-                        "DataLength",
-                        "IDE",
-                        "Dir",
-                        "EDL",
-                        "BusChannel",
-                    ):
-                        name = f"{_GROUP}.{part}"
-                        if name not in names:
-                            continue
-                        signal = self._mdf.get(
-                            name, group=index, record_offset=start, record_count=count
-                        )
-                        columns[part] = signal.samples
-                        times = signal.timestamps
-                    stamps = np.rint(times * 1e9).astype(np.int64).tolist()
-                    ids = (columns["ID"].astype(np.int64)).tolist()
-                    content = columns["DataBytes"]
-                    if content.dtype.kind in "SO":
-                        # of varying length, without the zeros at its end
-                        size = 64
-                        rows = [bytes(row).ljust(size, b"\0") for row in content]
-                    else:
-                        size = content.shape[1]
-                        rows = [bytes(row) for row in content.astype(np.uint8)]
-                    lengths = (
-                        columns["DataLength"].tolist()
-                        if "DataLength" in columns
-                        else [size] * count
-                    )
-                    extended = (
-                        columns["IDE"].tolist() if "IDE" in columns else [i > 0x7FF for i in ids]
-                    )
-                    channels = (
-                        columns["BusChannel"].tolist() if "BusChannel" in columns else [1] * count
-                    )
-                    received = _received(columns.get("Dir"), count)
-                    fds = columns["EDL"].tolist() if "EDL" in columns else [n > 8 for n in lengths]
-                except Exception as error:  # whatever a damaged file makes of it
-                    self._damage.notes.append(
-                        f"frames {start + 1} to {start + count} are damaged: {_short(error)}"
-                    )
-                    continue
+            which = f"{start + 1} to {start + count}"
+            try:
+                with quiet():
+                    rows = self._rows(index, start, count, names)
+            except Exception as error:  # whatever a damaged file makes of it
+                notes.append(f"frames {which} are damaged: {_short(error)}")
+                continue
             bad = 0
-            for stamp, can_id, data, length, is_extended, channel, is_received, fd in zip(
-                stamps, ids, rows, lengths, extended, channels, received, fds, strict=False
-            ):
+            for stamp, can_id, data, length, extended, fd, received, channel in rows:
                 pure = can_id & 0x1FFFFFFF
-                if not is_possible(pure, bool(is_extended), length, bool(fd)) or length > len(data):
+                if length > len(data) or not is_possible(pure, bool(extended), length, bool(fd)):
                     bad += 1
                     continue
-                frame = CanFrame(pure, data[:length], bool(is_extended), bool(fd))
-                yield LogFrame(stamp, frame, is_received, str(channel))
+                frame = CanFrame(pure, data[:length], bool(extended), bool(fd))
+                yield LogFrame(stamp, frame, received, str(channel))
             if bad:
-                self._damage.notes.append(
-                    f"{bad} frames of {start + 1} to {start + count} are damaged"
-                )
+                notes.append(f"{bad} frames of {which} are damaged")
+
+    def _rows(self, index: int, start: int, count: int, names: set[str]) -> Iterator[Any]:
+        """Time in ns, id, data, length, extended, FD, received and channel of some frames of a group; any error."""
+        import numpy as np
+
+        columns: dict[str, Any] = {}
+        for part in ("ID", "DataBytes", "DataLength", "IDE", "Dir", "EDL", "BusChannel"):
+            name = f"{_GROUP}.{part}"
+            if name in names:
+                signal = self._mdf.get(name, group=index, record_offset=start, record_count=count)
+                columns[part] = signal.samples
+                times = signal.timestamps
+
+        def column(part: str, default: list[Any]) -> list[Any]:
+            return columns[part].tolist() if part in columns else default
+
+        ids = columns["ID"].astype(np.int64).tolist()
+        content = columns["DataBytes"]
+        if content.dtype.kind in "SO":  # of varying length, without the zeros at its end
+            size = 64
+            data = [bytes(row).ljust(size, b"\0") for row in content]
+        else:
+            size = content.shape[1]
+            data = [bytes(row) for row in content.astype(np.uint8)]
+        lengths = column("DataLength", [size] * count)
+        return zip(
+            np.rint(times * 1e9).astype(np.int64).tolist(),
+            ids,
+            data,
+            lengths,
+            column("IDE", [can_id > 0x7FF for can_id in ids]),
+            column("EDL", [length > 8 for length in lengths]),
+            [value in (0, b"Rx", "Rx") for value in column("Dir", [None] * count)],
+            column("BusChannel", [1] * count),
+            strict=False,
+        )
 
     def close(self) -> None:
         """Close the file and asammdf's temporary one."""
@@ -183,21 +169,19 @@ class Mf4Writer:
         self._path = path
         self._provenance = provenance or {}
         self._np = np
-        parts = [
-            ("BusChannel", "<u1"),
-            ("ID", "<u4"),
-            ("IDE", "<u1"),
-            ("DLC", "<u1"),
-            ("DataLength", "<u1"),
-        ]
-        parts += [
-            ("DataBytes", "(64,)u1"),
-            ("Dir", "<u1"),
-            ("EDL", "<u1"),
-            ("BRS", "<u1"),
-            ("ESI", "<u1"),
-        ]
-        self._dtype = np.dtype([(f"{_GROUP}.{name}", kind) for name, kind in parts])
+        kinds = {
+            "BusChannel": "<u1",
+            "ID": "<u4",
+            "IDE": "<u1",
+            "DLC": "<u1",
+            "DataLength": "<u1",
+            "DataBytes": "(64,)u1",
+            "Dir": "<u1",
+            "EDL": "<u1",
+            "BRS": "<u1",
+            "ESI": "<u1",
+        }
+        self._dtype = np.dtype([(f"{_GROUP}.{name}", kind) for name, kind in kinds.items()])
         self._rows: list[tuple[Any, ...]] = []
         self._times: list[float] = []
         self._last = 0
@@ -219,21 +203,9 @@ class Mf4Writer:
         """Add a frame; what is earlier than its predecessor gets that one's time, for a master channel only rises."""
         self._last = max(self._last, time_ns)
         size = len(frame.data)
-        data = frame.data.ljust(64, b"\0")
-        fd = int(frame.fd)
-        row = (
-            1,
-            frame.can_id,
-            int(frame.extended),
-            FD_LENGTHS.index(size),
-            size,
-            data,
-            int(not received),
-            fd,
-            fd,
-            0,
-        )
-        self._rows.append(row)
+        dlc, data = FD_LENGTHS.index(size), frame.data.ljust(64, b"\0")
+        extended, sent, fd = int(frame.extended), int(not received), int(frame.fd)
+        self._rows.append((1, frame.can_id, extended, dlc, size, data, sent, fd, fd, 0))
         self._times.append(self._last / SECOND_NS)
         if len(self._rows) >= _CHUNK:
             self._flush()
@@ -322,12 +294,6 @@ def _set_history_time(file: IO[bytes], time_ns: int) -> None:
         file.seek(address + 40)
         file.write(time_ns.to_bytes(8, "little"))
         address = following
-
-
-def _received(directions: Any, count: int) -> list[bool]:
-    if directions is None:
-        return [False] * count
-    return [value in (0, b"Rx", "Rx") for value in directions.tolist()]
 
 
 def _seconds(moment: datetime, stored_ns: int) -> int:

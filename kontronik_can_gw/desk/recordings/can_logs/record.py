@@ -69,9 +69,9 @@ class Damage:
         if len(self._stretches) <= _SHOWN:
             self._stretches.append([start, end])
 
-    def skip(self, what: str) -> None:
-        """A frame that is whole but none of ours: an error frame, a remote frame."""
-        self.foreign[what] = self.foreign.get(what, 0) + 1
+    def skip(self, what: str, number: int = 1) -> None:
+        """Frames that are whole but no data frames: error frames, remote frames."""
+        self.foreign[what] = self.foreign.get(what, 0) + number
 
     def texts(self) -> list[str]:
         """One line for each kind of damage."""

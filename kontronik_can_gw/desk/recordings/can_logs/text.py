@@ -58,6 +58,21 @@ _ASC_DATE = re.compile(r"\s*(?:date|begin\s+triggerblock)\s+\w+\s+(.+?)\s*$", re
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _GERMAN_MONTHS = {"mär": "mar", "mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
 _RELATIVE = b"relative"
+_ASC_EVENT = re.compile(rb"\s*(\d+)\.(\d{1,9})\s")
+
+
+def head_of(file: BinaryIO) -> Iterator[bytes]:
+    """The first lines, in which a log says what it is."""
+    for _ in range(HEAD_LINES):
+        line = file.readline(LONGEST_LINE)
+        if not line:
+            return
+        yield line
+
+
+def nanoseconds(seconds: bytes, fraction: bytes) -> int:
+    """A time of whole seconds and up to nine decimals."""
+    return int(seconds) * SECOND_NS + int(fraction.ljust(9, b"0"))
 
 
 def lines_of(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
@@ -79,14 +94,12 @@ class CandumpReader:
         self._file = file
         self._damage = damage
         self.wall_start_ns: int | None = None
-        for _, line in zip(
-            range(HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False
-        ):
-            if (
-                match := CANDUMP_LINE.fullmatch(line) or CANDUMP_SCREEN_LINE.fullmatch(line)
-            ) is not None:
-                self.wall_start_ns = 0 if int(match[1]) >= OLDEST_WALL_S else None
-                break
+        heads = (
+            CANDUMP_LINE.fullmatch(x) or CANDUMP_SCREEN_LINE.fullmatch(x) for x in head_of(file)
+        )
+        first = next(filter(None, heads), None)
+        if first is not None and int(first[1]) >= OLDEST_WALL_S:
+            self.wall_start_ns = 0
         file.seek(0)
 
     def __iter__(self) -> Iterator[LogFrame]:
@@ -95,7 +108,7 @@ class CandumpReader:
         for number, line in lines_of(self._file):
             match = whole(line)
             if match is None and (shown := CANDUMP_SCREEN_LINE.fullmatch(line)) is not None:
-                match = whole(_as_logged(*shown.groups()))
+                match = whole(_as_logged(shown))
                 if match is None or (match[7] is None and len(match[6]) != 2 * int(shown[6])):
                     damage.line(number)
                     continue
@@ -124,34 +137,20 @@ class CandumpReader:
             channel = channels.get(name)
             if channel is None:
                 channel = channels[name] = name.decode("ascii")
-            time_ns = int(seconds) * SECOND_NS + int(fraction.ljust(9, b"0"))
+            frame = CanFrame(can_id, data, extended, fd)
             yield LogFrame(
-                time_ns, CanFrame(can_id, data, extended, fd), direction in (b"R", b"r"), channel
+                nanoseconds(seconds, fraction), frame, direction in (b"R", b"r"), channel
             )
 
 
-def _as_logged(
-    seconds: bytes,
-    fraction: bytes,
-    name: bytes,
-    direction: bytes | None,
-    can_id: bytes,
-    length: bytes,
-    data: bytes | None,
-    remote: bytes | None,
-) -> bytes:
+def _as_logged(shown: "re.Match[bytes]") -> bytes:
     """The line of a log for one of the screen."""
-    content = (
-        b"R" if remote else (b"#1" if len(length) == 2 else b"") + b"".join((data or b"").split())
-    )
-    return b"(%b.%b) %b %b#%b%b" % (
-        seconds,
-        fraction,
-        name,
-        can_id,
-        content,
-        b" " + direction[:1] if direction else b"",
-    )
+    seconds, fraction, name, direction, can_id, length, data, remote = shown.groups()
+    content = b"R"
+    if remote is None:
+        content = (b"#1" if len(length) == 2 else b"") + b"".join(data.split())
+    end = b" " + direction[:1] if direction else b""
+    return b"(%b.%b) %b %b#%b%b" % (seconds, fraction, name, can_id, content, end)
 
 
 class AscReader:
@@ -163,9 +162,7 @@ class AscReader:
         self._base = 16
         self._relative = False
         self.wall_start_ns: int | None = None
-        for _, line in zip(
-            range(HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False
-        ):
+        for line in head_of(file):
             if (match := _ASC_BASE.match(line)) is not None:
                 self._base = 10 if match[1].lower() == b"dec" else 16
                 self._relative = (match[2] or b"").lower() == _RELATIVE
@@ -178,7 +175,7 @@ class AscReader:
         file.seek(0)
 
     def __iter__(self) -> Iterator[LogFrame]:
-        damage, base, relative = self._damage, self._base, self._relative
+        damage, relative = self._damage, self._relative
         find, other = ASC_LINE.match, _ASC_OTHER.fullmatch
         now = 0
         for number, line in lines_of(self._file):
@@ -186,50 +183,47 @@ class AscReader:
             if match is None:
                 if other(line) is None:
                     damage.line(number)
-                elif relative and (event := re.match(rb"\s*(\d+)\.(\d{1,9})\s", line)) is not None:
-                    now += int(event[1]) * SECOND_NS + int(event[2].ljust(9, b"0"))
+                elif relative and (event := _ASC_EVENT.match(line)) is not None:
+                    now += nanoseconds(event[1], event[2])
                 continue
-            time_ns = int(match[1]) * SECOND_NS + int(match[2].ljust(9, b"0"))
+            time_ns = nanoseconds(match[1], match[2])
             if relative:
                 time_ns = now = now + time_ns
             if match[19] is not None:
                 damage.skip("error frames")
-                continue
-            if match[9] is not None:
+            elif match[9] is not None or (
+                match[10] is not None and not int(match[17]) and int(match[16], 16)
+            ):
                 damage.skip("remote frames")
-                continue
-            fd = match[10] is not None
-            channel, direction, id_text, x = (
-                (match[10], match[11], match[12], match[13])
-                if fd
-                else (match[3], match[6], match[4], match[5])
-            )
-            try:
-                can_id = int(id_text, base)
-                if fd:
-                    size = int(match[17])
-                    if size == 0 and int(match[16], 16):
-                        damage.skip("remote frames")
-                        continue
-                    words = match[18].split()[:size]
-                else:
-                    size = min(8, int(match[7], base))
-                    words = match[8].split()[:size]
-                data = (
-                    bytes.fromhex(b"".join(words).decode("ascii"))
-                    if base == 16
-                    else bytes(map(int, words))
-                )
-            except ValueError:
+            elif (frame := self._frame(match)) is None:
                 damage.line(number)
-                continue
-            if len(data) != size or not is_possible(can_id, bool(x), size, fd):
-                damage.line(number)
-                continue
-            received = direction.lower() == b"rx"
-            yield LogFrame(
-                time_ns, CanFrame(can_id, data, bool(x), fd), received, channel.decode("ascii")
-            )
+            else:
+                channel, direction = (match[10] or match[3]), (match[11] or match[6])
+                received = direction.lower() == b"rx"
+                yield LogFrame(time_ns, frame, received, channel.decode("ascii"))
+
+    def _frame(self, match: "re.Match[bytes]") -> CanFrame | None:
+        """The frame of a line; None where its numbers are no frame."""
+        base = self._base
+        fd = match[10] is not None
+        try:
+            if fd:
+                id_text, x, content = match[12], match[13], match[18]
+                size = int(match[17])
+            else:
+                id_text, x, content = match[4], match[5], match[8]
+                size = min(8, int(match[7], base))
+            can_id = int(id_text, base)
+            words = content.split()[:size]
+            if base == 16:
+                data = bytes.fromhex(b"".join(words).decode("ascii"))
+            else:
+                data = bytes(map(int, words))
+        except ValueError:
+            return None
+        if len(data) != size or not is_possible(can_id, bool(x), size, fd):
+            return None
+        return CanFrame(can_id, data, bool(x), fd)
 
 
 def asc_time(text: str) -> int | None:

@@ -13,7 +13,7 @@ from kontronik_can_gw.desk.recordings.can_logs.record import (
     LogFrame,
     is_possible,
 )
-from kontronik_can_gw.desk.recordings.can_logs.text import HEAD_LINES, LONGEST_LINE, lines_of
+from kontronik_can_gw.desk.recordings.can_logs.text import head_of, lines_of
 from kontronik_can_gw.frames import CanFrame
 
 TRC_HEAD = re.compile(
@@ -31,8 +31,8 @@ _TRC_COLUMNS = {
     "2.0": "N,O,T,I,d,l,D",
 }
 _TRC_NEWEST = "N,O,T,B,I,d,R,L,D"
-_TRC_FRAMES = {"DT": False, "FD": True, "FB": True, "FE": True, "BI": True}
-_TRC_EVENTS = frozenset(("ST", "EC", "ER", "EV"))
+_TRC_FRAMES = {b"DT": False, b"FD": True, b"FB": True, b"FE": True, b"BI": True}
+_TRC_EVENTS = frozenset((b"ST", b"EC", b"ER", b"EV"))
 _TRC_OLD_EVENTS = frozenset((b"Warng", b"Error", b"ErrCt", b"Event"))
 _TRC_DAY0 = datetime(1899, 12, 30, tzinfo=UTC)
 
@@ -45,9 +45,7 @@ class TrcReader:
         self._damage = damage
         self.wall_start_ns: int | None = None
         version, columns = "", ""
-        for _, line in zip(
-            range(HEAD_LINES), iter(lambda: file.readline(LONGEST_LINE), b""), strict=False
-        ):
+        for line in head_of(file):
             text = line.decode("latin-1").strip()
             if text and not text.startswith(";"):
                 break
@@ -60,64 +58,64 @@ class TrcReader:
                 self.wall_start_ns = _trc_start(value)
         file.seek(0)
         if not columns:
-            columns = _TRC_COLUMNS.get(
-                version, _TRC_NEWEST if version.startswith("2") else _TRC_COLUMNS["1.0"]
-            )
+            newest = _TRC_NEWEST if version.startswith("2") else _TRC_COLUMNS["1.0"]
+            columns = _TRC_COLUMNS.get(version, newest)
         self._columns = [column.strip() for column in columns.split(",")]
+        self._at = {column: index for index, column in enumerate(self._columns)}
 
     def __iter__(self) -> Iterator[LogFrame]:
-        damage = self._damage
-        columns = self._columns
-        at = {column: index for index, column in enumerate(columns)}
-        count = len(columns)
-        has_data = columns[-1:] == ["D"]
-        least = count - 1 if has_data else count
-        o, i = at.get("O", 1), at.get("I", 2)
-        t, d, bus = at.get("T"), at.get("d"), at.get("B")
-        size_at, is_length = (at["l"], True) if "l" in at else (at.get("L", count - 2), False)
+        damage, count = self._damage, len(self._columns)
+        min_count = count - (self._columns[-1] == "D")
         for number, line in lines_of(self._file):
             words = line.split(None, count - 1)
             if not words or words[0][:1] == b";":
                 continue
             try:
-                if len(words) < least:
+                if len(words) < min_count:
                     raise ValueError
-                kind = "DT" if t is None else words[t].decode("ascii")
-                direction = b"" if d is None else words[d]
-                if kind == "RR" or (
-                    t is None and len(words) == count and words[-1].strip().upper() == b"RTR"
-                ):
-                    damage.skip("remote frames")
+                foreign = self._foreign(words)
+                if foreign is not None:
+                    damage.skip(foreign)
                     continue
-                if kind in _TRC_EVENTS or (t is None and direction in _TRC_OLD_EVENTS):
-                    damage.skip("other events")
-                    continue
-                if kind not in _TRC_FRAMES or direction not in (b"", b"Rx", b"Tx"):
-                    raise ValueError
-                id_text = words[i]
-                if id_text == b"FFFFFFFF":
-                    damage.skip("other events")
-                    continue
-                fd = _TRC_FRAMES[kind]
-                milliseconds, _, fraction = words[o].partition(b".")
-                if len(fraction) > 6 or not milliseconds.isdigit():
-                    raise ValueError
-                time_ns = int(milliseconds) * 1_000_000 + int(fraction.ljust(6, b"0"))
-                can_id = int(id_text, 16)
-                extended = len(id_text) > 4
-                size = int(words[size_at])
-                if not is_length:
-                    size = FD_LENGTHS[size]
-                data = bytes.fromhex(words[-1].decode("ascii")) if len(words) == count else b""
-                if len(data) != size or not is_possible(can_id, extended, size, fd):
-                    raise ValueError
-                channel = "1" if bus is None else words[bus].decode("ascii")
-            except (ValueError, IndexError):  # of numbers, texts, lengths
+                item = self._frame(words)
+            except (ValueError, LookupError):  # of numbers, texts, kinds, lengths
                 damage.line(number)
                 continue
-            yield LogFrame(
-                time_ns, CanFrame(can_id, data, extended, fd), direction == b"Rx", channel
-            )
+            yield item
+
+    def _foreign(self, words: list[bytes]) -> str | None:
+        """What a line is that is no data frame; None for one."""
+        at = self._at
+        kind = words[at["T"]] if "T" in at else b""
+        is_whole = len(words) == len(self._columns)
+        if kind == b"RR" or (not kind and is_whole and words[-1].strip().upper() == b"RTR"):
+            return "remote frames"
+        old_kind = words[at["d"]] if "d" in at and not kind else b""
+        if kind in _TRC_EVENTS or old_kind in _TRC_OLD_EVENTS or words[at["I"]] == b"FFFFFFFF":
+            return "other events"
+        return None
+
+    def _frame(self, words: list[bytes]) -> LogFrame:
+        """The frame of a line. ValueError, LookupError."""
+        at = self._at
+        fd = _TRC_FRAMES[words[at["T"]]] if "T" in at else False
+        direction = words[at["d"]] if "d" in at else b""
+        milliseconds, _, fraction = words[at["O"]].partition(b".")
+        if direction not in (b"", b"Rx", b"Tx") or len(fraction) > 6 or not milliseconds.isdigit():
+            raise ValueError
+        id_text = words[at["I"]]
+        can_id, extended = int(id_text, 16), len(id_text) > 4
+        size = int(words[at["l"]]) if "l" in at else FD_LENGTHS[int(words[at["L"]])]
+        is_whole = len(words) == len(self._columns)
+        data = bytes.fromhex(words[-1].decode("ascii")) if is_whole else b""
+        if len(data) != size or not is_possible(can_id, extended, size, fd):
+            raise ValueError
+        return LogFrame(
+            int(milliseconds) * 1_000_000 + int(fraction.ljust(6, b"0")),
+            CanFrame(can_id, data, extended, fd),
+            direction == b"Rx",
+            words[at["B"]].decode("ascii") if "B" in at else "1",
+        )
 
 
 def _trc_start(text: str) -> int | None:

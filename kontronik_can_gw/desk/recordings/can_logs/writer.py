@@ -5,7 +5,7 @@ The same frames give the same bytes: no file says when it was written.
 
 import io
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from can import Message
 
 _MS = 1_000_000
+Write = Callable[[int, CanFrame, bool], None]
 
 
 class CanLogWriter:
@@ -39,38 +40,46 @@ class CanLogWriter:
     ) -> None:
         self.left_out: dict[str, int] = {}
         """Frames that the format does not know, by what they are."""
-        self.frames = 0
-        self.write: Callable[[int, CanFrame, bool], None]
+        self.write: Write
         """Add a frame: its time in ns, the frame, whether it was received."""
-        self._close: Callable[[], None] = lambda: None
-        self._discard: Callable[[], None] = lambda: None
-        if format_ == "mf4":
-            from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Writer
-
-            assert isinstance(file, Path)
-            start_ns = None if wall_start_ns is None else _whole_us(wall_start_ns + first_ns)
-            mf4 = Mf4Writer(file, start_ns, provenance)
-            shift = 0 if start_ns is None else start_ns - (wall_start_ns or 0)
-            self.write = lambda time_ns, frame, received: mf4.write(
-                time_ns - shift, frame, received
-            )
-            self._close, self._discard = mf4.close, mf4.discard
+        self._close: Callable[[], None] = _nothing
+        self._discard: Callable[[], None] = _nothing
+        if isinstance(file, Path):
+            self._mf4(file, wall_start_ns, first_ns, provenance)
             return
-        assert not isinstance(file, Path)
-        self._file = file
         if format_ == "candump":
             self.write = _candump(file, wall_start_ns or 0, channel)
             return
-        # Vector's and PEAK's headers count milliseconds
-        base_ns = (
-            0 if wall_start_ns is None else (wall_start_ns + first_ns) // _MS * _MS - wall_start_ns
-        )
-        start_ns = None if wall_start_ns is None else wall_start_ns + base_ns
-        {"asc": self._asc, "blf": self._blf, "trc": self._trc}[format_](
-            file, base_ns, start_ns, name
-        )
+        base_ns, start_ns = 0, None
+        if wall_start_ns is not None:
+            # Vector's and PEAK's headers count milliseconds
+            start_ns = (wall_start_ns + first_ns) // _MS * _MS
+            base_ns = start_ns - wall_start_ns
+        if format_ == "asc":
+            self._asc(file, base_ns, start_ns)
+        elif format_ == "blf":
+            self._blf(file, base_ns, start_ns)
+        else:
+            self._trc(file, base_ns, start_ns, name)
 
-    def _asc(self, file: IO[bytes], base_ns: int, start_ns: int | None, _name: str) -> None:
+    def _mf4(
+        self,
+        path: Path,
+        wall_start_ns: int | None,
+        first_ns: int,
+        provenance: Mapping[str, str] | None,
+    ) -> None:
+        from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Writer
+
+        start_ns, base_ns = None, 0
+        if wall_start_ns is not None:
+            start_ns = (wall_start_ns + first_ns) // 1000 * 1000
+            base_ns = start_ns - wall_start_ns
+        mf4 = Mf4Writer(path, start_ns, provenance)
+        self.write = lambda time_ns, frame, received: mf4.write(time_ns - base_ns, frame, received)
+        self._close, self._discard = mf4.close, mf4.discard
+
+    def _asc(self, file: IO[bytes], base_ns: int, start_ns: int | None) -> None:
         with without_asammdf():
             from can import ASCWriter
         # python-can's header has the time of writing, and cuts zeros of the milliseconds
@@ -85,24 +94,21 @@ class CanLogWriter:
         writer.header_written = True
         head = f"date {stamp}\nbase hex  timestamps absolute\ninternal events logged\nBegin Triggerblock {stamp}\n"
         text.write(head + f"{0.0: 9.6f} Start of measurement\n")
-        self._through(writer.on_message_received, base_ns)
+        self.write = _through(writer.on_message_received, base_ns)
 
         def close() -> None:
             text.write("End TriggerBlock\n")
             text.detach()
 
-        def discard() -> None:
-            text.detach()
+        self._close, self._discard = close, _detached(text)
 
-        self._close, self._discard = close, discard
-
-    def _blf(self, file: IO[bytes], base_ns: int, start_ns: int | None, _name: str) -> None:
+    def _blf(self, file: IO[bytes], base_ns: int, start_ns: int | None) -> None:
         with without_asammdf():
             from can import BLFWriter
         writer = BLFWriter(file)  # type: ignore[arg-type]
         writer.start_timestamp = 0.0
         # half a nanosecond more: the writer cuts where it should round
-        self._through(writer.on_message_received, base_ns, 0.5)
+        self.write = _through(writer.on_message_received, base_ns, 0.5)
 
         def close() -> None:
             last = writer.stop_timestamp or 0.0
@@ -123,11 +129,8 @@ class CanLogWriter:
         writer.first_timestamp = 0.0
         writer.header_written = True
         writer.file = text
-        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(milliseconds=(start_ns or 0) // _MS)
-        writer.write_header(moment.timestamp())
-        through = writer.on_message_received
-        self._through(through, base_ns)
-        plain = self.write
+        writer.write_header((start_ns or 0) // _MS / 1000)
+        plain = _through(writer.on_message_received, base_ns)
 
         def write(time_ns: int, frame: CanFrame, received: bool) -> None:
             if frame.fd:
@@ -135,32 +138,8 @@ class CanLogWriter:
             else:
                 plain(time_ns, frame, received)
 
-        def detach() -> None:
-            text.detach()
-
         self.write = write
-        self._close, self._discard = detach, detach
-
-    def _through(
-        self, take: "Callable[[Message], None]", base_ns: int, more_ns: float = 0.0
-    ) -> None:
-        """Write by one of python-can's writers. Times go in seconds since ``base_ns``, for which a float is exact enough."""
-        from can import Message
-
-        def write(time_ns: int, frame: CanFrame, received: bool) -> None:
-            take(
-                Message(
-                    (max(time_ns - base_ns, 0) + more_ns) / SECOND_NS,
-                    frame.can_id,
-                    frame.extended,
-                    data=frame.data,
-                    is_fd=frame.fd,
-                    bitrate_switch=frame.fd,
-                    is_rx=received,
-                )
-            )
-
-        self.write = write
+        self._close = self._discard = _detached(text)
 
     def close(self) -> None:
         """Write what is held back, and the end. The file stays open."""
@@ -169,6 +148,39 @@ class CanLogWriter:
     def discard(self) -> None:
         """Release what is held, where the log is not to be kept."""
         self._discard()
+
+
+def _nothing() -> None:
+    pass
+
+
+def _detached(text: io.TextIOWrapper) -> Callable[[], None]:
+    """A function that lets go of the file under a text, and leaves it open."""
+
+    def detach() -> None:
+        text.detach()
+
+    return detach
+
+
+def _through(take: "Callable[[Message], None]", base_ns: int, more_ns: float = 0.0) -> Write:
+    """Writes by one of python-can's writers. Times go in seconds since ``base_ns``, for which a float is exact enough."""
+    from can import Message
+
+    def write(time_ns: int, frame: CanFrame, received: bool) -> None:
+        take(
+            Message(
+                (max(time_ns - base_ns, 0) + more_ns) / SECOND_NS,
+                frame.can_id,
+                frame.extended,
+                data=frame.data,
+                is_fd=frame.fd,
+                bitrate_switch=frame.fd,
+                is_rx=received,
+            )
+        )
+
+    return write
 
 
 class _Unclosed:
@@ -192,9 +204,7 @@ class _Named:
         self.reconfigure = file.reconfigure
 
 
-def _candump(
-    file: IO[bytes], wall_start_ns: int, channel: str
-) -> Callable[[int, CanFrame, bool], None]:
+def _candump(file: IO[bytes], wall_start_ns: int, channel: str) -> Write:
     """As python-can's CanutilsLogWriter writes it, at several times its speed."""
     write = file.write
     half = 500 + wall_start_ns
@@ -209,7 +219,3 @@ def _candump(
         write(line.encode("ascii"))
 
     return one
-
-
-def _whole_us(ns: int) -> int:
-    return ns // 1000 * 1000
