@@ -142,9 +142,7 @@ class _Run:
         recorder = recorder_of(config, self._record)
         gateway = Gateway(*parts) if recorder is None else RecordedGateway(recorder.put, *parts)
         try:
-            statistics = Statistics(
-                config.statistics_path or default_file(), config.statistics.address
-            )
+            statistics = Statistics(config.statistics_path or default_file())
         except UserError:
             if loaded.store is not None:
                 loaded.store.close(0)
