@@ -1,4 +1,4 @@
-"""What MQTT tells of the gateway and of each ESC: their values, errors and states from the receiver's view of the bus. Pure."""
+"""What MQTT publishes of the gateway and of each ESC: values, errors and states, from the receiver's view of the bus. Pure."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
