@@ -69,10 +69,7 @@ CONFIGURATIONS = {
         CANTOOLS | CANOPEN,
     ),
     "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS),
-    "status and Prometheus": (
-        '[statistics]\nfile = "status.json"\nprometheus = "127.0.0.1:{port}"\n',
-        CANTOOLS,
-    ),
+    "status": ('[statistics]\nfile = "status.json"\n', CANTOOLS),
 }
 
 AT_THE_END = """
@@ -94,12 +91,6 @@ atexit.register(write)
 """
 
 
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
-
-
 def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
     """The modules of a gateway with these tables that has sent values of an ESC; ``extra`` is run in it at its start."""
     bus, names = f"kontronik-test-{os.getpid()}-{time.monotonic_ns()}", folder / "names"
@@ -112,7 +103,7 @@ def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
         listener.settimeout(60)
         config = folder / "gateway.toml"
         can = '[can]\ninterface = "socketcan"\nchannel = "lo"\n'
-        config.write_text(f'{can}{tables.format(port=free_port())}[[esc]]\nport = "{esc.path}"\n')
+        config.write_text(f'{can}{tables}[[esc]]\nport = "{esc.path}"\n')
         process = subprocess.Popen(
             [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config)],
             env=os.environ | {"PYTHONPATH": str(folder)},

@@ -139,9 +139,7 @@ def _canopen_json(setup: "CanopenSetup") -> dict[str, Any]:
 
     return {
         "eds": {"file": setup.eds.name, "text": setup.eds.data.decode("latin-1")},
-        "nodes": [
-            asdict(node) for node in setup.settings
-        ],
+        "nodes": [asdict(node) for node in setup.settings],
         "stored": [encode(stored).decode("ascii") for stored in setup.stored],
         "escs": [_esc_json(esc) for esc in setup.escs],
     }

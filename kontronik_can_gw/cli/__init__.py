@@ -38,6 +38,7 @@ COMMANDS = {
     "replay": "play a recording on a CAN bus, on pseudo terminals, or as a log",
     "simulate": "simulate ESCs on pseudo terminals",
     "mqtt": "publish the ESCs' values from the bus to an MQTT broker",
+    "metrics": "serve a gateway's statistics for Prometheus",
     "schema": "print the JSON Schema of the configuration",
     "describe": "what is sent and what it means: messages, objects, errors with remedies",
     "completion": "print the completion script of a shell",

@@ -15,6 +15,11 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "describe",
         "--format man",
     ): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
+    (
+        "service",
+        "--prometheus",
+    ): "Type kontronik-can-gw service install --metrics: a service of its own"
+    " serves /metrics, and the gateway listens on nothing.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
 }
 """Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.

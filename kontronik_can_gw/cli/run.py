@@ -136,9 +136,7 @@ class _Run:
                 log.error("%s Running without.", error)  # late frames are better than none
         gateway, recorder = self._gateway(loaded)
         try:
-            statistics = Statistics(
-                config.statistics_path or default_file(), config.statistics.address
-            )
+            statistics = Statistics(config.statistics_path or default_file())
         except UserError:
             if loaded.store is not None:
                 loaded.store.close(0)

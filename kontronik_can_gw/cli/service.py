@@ -85,14 +85,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the CAN interface (default can0)",
     )
     install_parser.add_argument(
-        "--prometheus",
-        action="store_true",
-        help="allow the service loopback IP, for statistics.prometheus",
-    )
-    install_parser.add_argument(
         "--mqtt",
         action="store_true",
         help="a second service that publishes to the broker of the table [mqtt]",
+    )
+    install_parser.add_argument(
+        "--metrics",
+        action="store_true",
+        help="a service that serves the statistics for Prometheus on 127.0.0.1:9123",
     )
     uninstall_parser.add_argument(
         "--purge",
@@ -154,8 +154,8 @@ def _install(args: argparse.Namespace) -> int:
         files.serial_group(root),
         args.channel,
         args.network,
-        args.prometheus,
         args.mqtt,
+        args.metrics,
     )
     plan = [(file, file.state(root)) for file in files.planned(choices, root)]
     own = root / files.configuration(args.instance)
@@ -177,6 +177,7 @@ def _install(args: argparse.Namespace) -> int:
         if state is not State.SAME:
             files.write(path, file.text)
         say(f"{path}: {state.value}")
+    files.remove_obsolete(root)
     if args.network is not None:
         _remove_examples(root, args.channel)
     if files.read(own) is None:
@@ -208,11 +209,14 @@ def _enable(args: argparse.Namespace, own: Path, live: bool, root: Path) -> int:
         return 0
     _enable_unit(args, unit, live, root, "See: kontronik-can-gw service status")
     if args.mqtt:
-        unit = files.mqtt_unit(args.instance)
+        unit = files.companion("mqtt", args.instance)
         if load(own).mqtt.broker is None:
             say(f"{own}: mqtt.broker is not set. {unit} was not enabled.")
         else:
             _enable_unit(args, unit, live, root, f"See: journalctl -u {unit}")
+    if args.metrics:
+        unit = files.companion("metrics", args.instance)
+        _enable_unit(args, unit, live, root, f"See: journalctl -u {unit}")
     return 0
 
 

@@ -25,6 +25,10 @@ TMPFILES = f"etc/tmpfiles.d/{NAME}.conf"
 NETWORK = "etc/systemd/network"
 WANTS = f"{UNITS}/multi-user.target.wants"
 EXAMPLE = "example"
+COMPANIONS = {"mqtt": "telemetry to MQTT", "metrics": "statistics for Prometheus"}
+"""Services that may be installed beside the gateway's, each with its template of this name."""
+OBSOLETE = tuple(f"{UNITS}/{NAME}{end}.service.d/prometheus.conf" for end in ("", "@"))
+"""Files that earlier versions installed; an install removes them."""
 _NETWORK_PREFIX = f"50-{NAME}-"
 _HEAD = re.compile(rf'# Written by "{NAME} service install" \S+, checksum ([0-9a-f]{{64}})\.')
 _PLACEHOLDER = re.compile(r"@[A-Z]+@")
@@ -70,8 +74,8 @@ class Choices:
     channel: str = "can0"
     bitrate: int | None = None
     """CAN interface; None: the network files are examples only."""
-    prometheus: bool = False
     mqtt: bool = False
+    metrics: bool = False
 
 
 def unit(instance: str | None) -> str:
@@ -79,9 +83,9 @@ def unit(instance: str | None) -> str:
     return f"{NAME}.service" if instance is None else f"{NAME}@{instance}.service"
 
 
-def mqtt_unit(instance: str | None) -> str:
-    """Name of an instance's MQTT service; None: the plain one."""
-    return f"{NAME}-mqtt.service" if instance is None else f"{NAME}-mqtt@{instance}.service"
+def companion(kind: str, instance: str | None) -> str:
+    """Name of the service ("mqtt", "metrics") beside an instance's; None: beside the plain one."""
+    return f"{NAME}-{kind}.service" if instance is None else f"{NAME}-{kind}@{instance}.service"
 
 
 def configuration(instance: str | None) -> str:
@@ -113,21 +117,12 @@ def planned(choices: Choices, root: Path) -> list[PlannedFile]:
         _made(f"{UNITS}/{NAME}@.service", "gateway.service", template),
         _made(f"etc/udev/rules.d/70-{NAME}.rules", "udev.rules", {}),
     ]
-    if choices.prometheus:
-        files += [
-            _made(f"{UNITS}/{NAME}{kind}.service.d/prometheus.conf", "prometheus.conf", {})
-            for kind in ("", "@")
-        ]
-    if choices.mqtt:
-        files += [
-            _made(
-                f"{UNITS}/{NAME}-mqtt{kind}.service", "mqtt.service", words | {"DESCRIPTION": text}
-            )
-            for kind, words, text in (
-                ("", plain, "KONTRONIK ESC telemetry to MQTT"),
-                ("@", template, "KONTRONIK ESC telemetry to MQTT, %i"),
-            )
-        ]
+    chosen = {"mqtt": choices.mqtt, "metrics": choices.metrics}
+    for kind in (kind for kind in COMPANIONS if chosen[kind]):
+        text = f"KONTRONIK ESC {COMPANIONS[kind]}"
+        for end, words, name in (("", plain, text), ("@", template, f"{text}, %i")):
+            path = f"{UNITS}/{NAME}-{kind}{end}.service"
+            files.append(_made(path, f"{kind}.service", words | {"DESCRIPTION": name}))
     for kind in ("network", "link"):
         path = f"{NETWORK}/{_NETWORK_PREFIX}{choices.channel}.{kind}"
         words = {"CHANNEL": choices.channel, "BITRATE": str(choices.bitrate or 500_000), "HOW": ""}
@@ -146,10 +141,8 @@ def installed(root: Path) -> list[Path]:
         TMPFILES,
         f"{UNITS}/{NAME}.service",
         f"{UNITS}/{NAME}@.service",
-        f"{UNITS}/{NAME}.service.d/prometheus.conf",
-        f"{UNITS}/{NAME}@.service.d/prometheus.conf",
-        f"{UNITS}/{NAME}-mqtt.service",
-        f"{UNITS}/{NAME}-mqtt@.service",
+        *OBSOLETE,
+        *(f"{UNITS}/{NAME}-{kind}{end}.service" for kind in COMPANIONS for end in ("", "@")),
         f"etc/udev/rules.d/70-{NAME}.rules",
         *(
             f"{NETWORK}/{_NETWORK_PREFIX}*.{kind}{end}"
@@ -225,6 +218,15 @@ def remove(path: Path) -> None:
     except OSError as error:
         raise RunError(f"{path}: cannot be removed: {error.strerror}") from None
     say(f"{path}: removed")
+
+
+def remove_obsolete(root: Path) -> None:
+    """Remove what earlier versions installed and this one does not, unless it was changed by hand."""
+    for path in (root / place for place in OBSOLETE):
+        if is_ours(read(path) or ""):
+            remove(path)
+            with contextlib.suppress(OSError):  # it holds drop-ins of others
+                path.parent.rmdir()
 
 
 def put_aside(path: Path) -> Path:

@@ -24,7 +24,7 @@ def uninstall(args: argparse.Namespace) -> int:
     if args.instance:
         if args.purge:
             raise UserError("--purge removes everything: not with --instance")
-        units = [files.unit(args.instance), files.mqtt_unit(args.instance)]
+        units = _units(args.instance)
         code = _disable(args, units, [link for link in links if link.name in units], live)
         if live and not args.dry_run:
             _remove_runtime_folders(root, f"{NAME}-{args.instance}")
@@ -38,9 +38,7 @@ def uninstall(args: argparse.Namespace) -> int:
     if not found and not links and not doomed:
         say("nothing is installed")
         return 0
-    _disable(
-        args, [*_running(), files.unit(None), files.mqtt_unit(None)] if live else [], links, live
-    )
+    _disable(args, [*_running(), *_units(None)] if live else [], links, live)
     for path in found:
         _remove_file(path)
     for kind in ("", "@"):
@@ -77,6 +75,11 @@ def _disable(
     return 0
 
 
+def _units(instance: str | None) -> list[str]:
+    """An instance's service and those beside it."""
+    return [files.unit(instance), *(files.companion(kind, instance) for kind in files.COMPANIONS)]
+
+
 def _running() -> list[str]:
     listed = output(
         "systemctl",
@@ -85,7 +88,7 @@ def _running() -> list[str]:
         "--plain",
         "--no-legend",
         f"{NAME}@*.service",
-        f"{NAME}-mqtt@*.service",
+        *(f"{NAME}-{kind}@*.service" for kind in files.COMPANIONS),
     )
     return [line.split()[0] for line in listed.splitlines() if line.strip()]
 

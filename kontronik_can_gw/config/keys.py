@@ -32,9 +32,7 @@ _OWN_OPTIONS = {"interface", "channel", "bitrate", "fd", "data_bitrate"}
 _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _NOT_BLANK = r"\S"
 _TEXT = r"^[^\x00]*[^\x00\s][^\x00]*$"
-_BYTE = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
 _PORT = "(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5][0-9]{4}|[1-9][0-9]{0,3})"
-_LOOPBACK = rf"(localhost|127(\.{_BYTE}){{3}}|\[::1\]):{_PORT}"
 _BROKER = (
     rf"([A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*\])(:{_PORT})?"
 )
@@ -54,7 +52,7 @@ _FORMS = {
 def _key(doc: str, kind: str, default: Any = MISSING, **limits: Any) -> Any:
     """A configuration key. ``limits``: low, high, choices, pattern, values.
 
-    ``kind``: string, integer, number, boolean, ratio, bindings, ids, meanings, names, loopback, broker, topic, level.
+    ``kind``: string, integer, number, boolean, ratio, bindings, ids, meanings, names, broker, topic, level.
     """
     metadata = {"doc": doc, "kind": kind} | limits
     if isinstance(default, dict):
@@ -295,7 +293,7 @@ class RunConfig:
 
 @dataclass(frozen=True)
 class StatisticsConfig:
-    """Statistics for ``kontronik-can-gw status`` and for Prometheus."""
+    """Statistics for ``kontronik-can-gw status`` and ``kontronik-can-gw metrics``."""
 
     file: str | None = _key(
         "JSON file that is replaced each second, relative to this configuration (default: status.json in the service's runtime folder; "
@@ -303,19 +301,6 @@ class StatisticsConfig:
         "string",
         None,
     )
-    prometheus: str | None = _key(
-        "address and port on this machine, as 127.0.0.1:9123, where Prometheus may fetch /metrics (default: nothing listens)",
-        "loopback",
-        None,
-    )
-
-    @property
-    def address(self) -> tuple[str, int] | None:
-        """Address and port to listen on for Prometheus."""
-        if self.prometheus is None:
-            return None
-        host, _, port = self.prometheus.rpartition(":")
-        return {"localhost": "127.0.0.1", "[::1]": "::1"}.get(host, host), int(port)
 
 
 @dataclass(frozen=True)
@@ -478,6 +463,7 @@ _TABLES: dict[str, type[Any]] = {
     "esc": EscConfig,
 }
 REMOVED_KEYS: dict[str, str] = {
+    "statistics.prometheus": "`kontronik-can-gw metrics` serves /metrics, as a service too: `service install --metrics`.",
     "record.can_log": "`kontronik-can-gw convert CAPTURE flight.log` makes the log from a capture.",
 }
 """Table and key of earlier versions, as "record.can_log", and what to do instead, as a sentence.
@@ -693,10 +679,6 @@ def _value(value: Any, f: Field[Any]) -> Any:
     listed = choices(limits)
     if listed and value not in listed:
         raise ValueError(f"{value!r} is none of {', '.join(listed)}.{_nearest(value, listed)}")
-    if limits["kind"] == "loopback" and not re.fullmatch(_LOOPBACK, value):
-        raise ValueError(
-            f"{value!r} is no port on this machine, as 127.0.0.1:9123 or [::1]:9123. The statistics are not for the network."
-        )
     if limits["kind"] in _FORMS:
         shape, form = _FORMS[limits["kind"]]
         if len(value) > _LONGEST_TOPIC or not re.fullmatch(shape, value):
@@ -941,8 +923,6 @@ def _schema_of(f: Field[Any]) -> dict[str, Any]:
             entry |= {"type": "object", "additionalProperties": number}
         case "number":
             entry |= {"type": "number", "minimum": limits["low"], "maximum": limits["high"]}
-        case "loopback":
-            entry |= {"type": "string", "pattern": f"^{_LOOPBACK}$"}
         case "broker" | "topic" | "level" as kind:
             entry |= {
                 "type": "string",

@@ -68,7 +68,7 @@ class Loop:
         self._wait = wait_for_devices
         self._store = store
         self._notifier = notifier or Notifier({})
-        self._statistics = statistics or Statistics(None, None)
+        self._statistics = statistics or Statistics(None)
         self._recorder = recorder
         self._now = 0
         self._node_changes = 0

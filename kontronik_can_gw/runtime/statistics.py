@@ -1,31 +1,26 @@
-"""The gateway's document of itself (snapshot.py), once a second: to a file that is replaced, and for Prometheus.
+"""The gateway's document of itself (snapshot.py), once a second, to a file that is replaced.
 
-What may touch what: everything is called by the loop's thread; only ``_wait``, ``_work``, ``_fail``, ``_end`` and what they call run in the
-worker's. The newest document, the reports and the mark of a write in progress go from one to the other by single assignments and a deque,
-so that no disk and no reader of the statistics, be it slow or hostile, holds the loop up. The worker writes and answers in turn: a disk
-that does not answer holds up Prometheus too, nothing else.
+What may touch what: everything is called by the loop's thread; only ``_work``, ``_fail``, ``_end`` and what they call run in the worker's.
+The newest document, the reports and the mark of a write in progress go from one to the other by single assignments and a deque, so that no
+disk holds the loop up.
 """
 
 import contextlib
 import errno
 import json
 import os
-import selectors
 import stat
 import time
 from collections import deque
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.locks import Locks
 from kontronik_can_gw.runtime.snapshot import STALE_NS, Document, with_rates
 from kontronik_can_gw.runtime.worker import Worker
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.runtime.metrics_server import MetricsServer
 
 PERIOD_NS = SECOND
 _CLOSE_S = 0.2
@@ -45,18 +40,12 @@ def default_file() -> Path | None:
 
 
 class Statistics:
-    """The thread that writes the file and answers Prometheus. RunError at once where the address cannot be had.
+    """The thread that writes the file. Without a file there is no thread, and nothing is wanted."""
 
-    With neither of them there is no thread, and nothing is wanted.
-    """
-
-    def __init__(self, file: Path | None, prometheus: tuple[str, int] | None) -> None:
+    def __init__(self, file: Path | None) -> None:
         self._file = None if file is None else _StatusFile(file)
-        self._server = None if prometheus is None else _server_at(prometheus)
         self._locks = Locks()
         if file is not None and self._locks.hold([f"{os.path.realpath(file)}/statistics/0"]):
-            if self._server is not None:
-                self._server.stop_listening()
             raise RunError(
                 f"statistics.file {file}: another gateway writes it. Give this one its own."
             )
@@ -68,23 +57,13 @@ class Statistics:
         self._writing_since: int | None = None
         self._reported_slow = False
         self._due: int | None = None
-        self._selector: selectors.BaseSelector | None = None
-        self._ready: list[object] = []
-        """What of the server has something to read or to send."""
         self._worker: Worker[None] | None = None
-        if self._file is not None or self._server is not None:
+        if self._file is not None:
             try:
                 self._start()
             except (OSError, RuntimeError) as error:
-                if self._server is not None:
-                    self._server.stop_listening()
                 raise RunError(f"statistics: cannot be begun: {error}") from None
             self._due = 0
-
-    @property
-    def address(self) -> tuple[str, int] | None:
-        """Where Prometheus may ask."""
-        return None if self._server is None else self._server.address
 
     @property
     def due(self) -> int | None:
@@ -125,43 +104,20 @@ class Statistics:
             return
         self._locks.close()
         self._worker.stop(_CLOSE_S)
-        if self._server is not None:
-            self._server.stop_listening()
 
     def _start(self) -> None:
         worker: Worker[None] = Worker(
-            "statistics",
-            self._work,
-            failed=self._fail,
-            wait=self._wait,
-            ended=self._end,
-            capacity=1,
+            "statistics", self._work, failed=self._fail, ended=self._end, capacity=1
         )
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(worker.fileno(), selectors.EVENT_READ)
-        if self._server is not None:
-            self._server.listen(self._selector)
         if not worker.start():
             raise RuntimeError("no thread can be started")
         self._worker = worker
 
-    def _wait(self) -> None:
-        assert self._selector is not None
-        pause = None if self._server is None else self._server.pause_s(time.monotonic_ns())
-        self._ready = [key.fileobj for key, _ in self._selector.select(pause)]
-
     def _work(self, _items: list[None]) -> None:
-        """Answer who asks, and write the newest document."""
-        if self._server is not None:
-            now = time.monotonic_ns()
-            for ready in self._ready:
-                self._server.serve(ready, now)
-            self._server.advance(now)
+        """Write the newest document."""
         document, before = self._newest, self._written
         if document is not None and document is not before:
             self._written = document
-            if self._server is not None:
-                self._server.document = document
             if self._file is not None and self._worker is not None and not self._worker.is_ending:
                 self._write(self._file, with_rates(document, before))
             if self._failed:
@@ -174,10 +130,6 @@ class Statistics:
         self._reports.append(Report(True, f"the statistics fail: {error!r}. Trying again."))
 
     def _end(self) -> None:
-        if self._server is not None:
-            self._server.close()
-        if self._selector is not None:
-            self._selector.close()
         if self._file is not None:
             self._file.remove()
 
@@ -195,12 +147,6 @@ class Statistics:
             self._writing_since = None
         if report is not None:
             self._reports.append(report)
-
-
-def _server_at(address: tuple[str, int]) -> "MetricsServer":
-    from kontronik_can_gw.runtime.metrics_server import MetricsServer
-
-    return MetricsServer(address)
 
 
 _numbers = count()

@@ -4,11 +4,9 @@ import contextlib
 import os
 import subprocess
 import sys
-import threading
-import urllib.request
 from collections.abc import Iterator
 
-from bench_programs import Measured, end, free_port, median, once, start
+from bench_programs import Measured, end, median, once, start
 from live_cpu import CANOPEN, compare, losses
 from registry import Benchmark, Context, Figure, LeftOut, judged
 
@@ -40,44 +38,13 @@ EVERYTHING = f"""{CANOPEN}[record]
 directory = "captures"
 [statistics]
 file = "status.json"
-prometheus = "127.0.0.1:{{port}}"
 """
-"""Recorder, status file, Prometheus, nodes."""
-
-
-@contextlib.contextmanager
-def scraping(port: int) -> Iterator[list[int]]:
-    """Be a Prometheus that asks each second, as from the moment when there is an answer. Gives the lengths of the answers."""
-    sizes: list[int] = []
-    over = threading.Event()
-
-    def ask() -> None:
-        while not over.wait(1):
-            with (
-                contextlib.suppress(OSError),
-                urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=2) as answer,
-            ):
-                sizes.append(len(answer.read()))
-
-    thread = threading.Thread(target=ask)
-    thread.start()
-    try:
-        yield sizes
-    finally:
-        over.set()
-        thread.join()
+"""Recorder, status file, nodes."""
 
 
 def full(context: Context) -> list[Figure]:
-    """8 ESCs with recorder, status file, a Prometheus that asks, CANopen nodes and a master that polls them."""
-    runs = []
-    for _ in range(context.rounds):
-        port = free_port()
-        everything = EVERYTHING.format(port=port)
-        with scraping(port) as sizes:
-            runs.append(once(context, "ours", 8, "--sdo", config=everything))
-        if not sizes:
-            raise RuntimeError("Prometheus got no answer")
+    """8 ESCs with recorder, status file, CANopen nodes and a master that polls them."""
+    runs = [once(context, "ours", 8, "--sdo", config=EVERYTHING) for _ in range(context.rounds)]
     context.data["runs"] = [run.result for run in runs]
     asked = sum(run.result["sdo_sent"] for run in runs)
     answered = sum(run.result["sdo_answers"] for run in runs)

@@ -10,7 +10,7 @@ import time
 import uuid
 from pathlib import Path
 
-from bench_programs import STANDIN, config_text, end, free_port, median, running, start
+from bench_programs import STANDIN, config_text, end, median, running, start
 from registry import ROOT, Benchmark, Context, Figure, judged
 
 from kontronik_can_gw.desk.pty import PtyEsc
@@ -21,7 +21,7 @@ CANOPEN = '[canopen]\nenabled = true\nnode_id = 1\nstore = "{folder}/store"\n'
 EVERYTHING = (
     CANOPEN
     + '[record]\ndirectory = "{folder}/captures"\n'
-    + '[statistics]\nfile = "{folder}/status.json"\nprometheus = "127.0.0.1:{port}"\n'
+    + '[statistics]\nfile = "{folder}/status.json"\n'
 )
 _PATIENCE_S = 20.0
 _EXTENDED = 0x80000000
@@ -118,14 +118,14 @@ def memory(context: Context) -> list[Figure]:
         "64 ESCs": (64, ""),
         "1 ESC, CANopen": (1, CANOPEN),
         "8 ESCs, CANopen": (8, CANOPEN),
-        "1 ESC, CANopen, recorder, Prometheus": (1, EVERYTHING),
+        "1 ESC, CANopen, recorder": (1, EVERYTHING),
     }
     seconds = 0.5 if context.quick else 3.0
     found: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory(prefix="kontronik-bench-") as made:
         dbc = many_escs_dbc(Path(made))
         for case, (escs, config) in cases.items():
-            text = config.format(folder=made, port=free_port())
+            text = config.format(folder=made)
             with running(context, "ours", escs, seconds=seconds, dbc=dbc, config=text) as (
                 feeder,
                 gateway,
@@ -156,7 +156,5 @@ BENCHMARKS = [
         "from the start of the command to its first CAN frame: 1 and 8 ESCs, CANopen",
         start_up,
     ),
-    Benchmark(
-        "memory", "RSS, PSS and USS with 1 to 64 ESCs, CANopen, recorder, Prometheus", memory
-    ),
+    Benchmark("memory", "RSS, PSS and USS with 1 to 64 ESCs, CANopen, recorder", memory),
 ]

@@ -37,7 +37,7 @@ DEFAULTS: dict[str, dict[str, object]] = {
     "canopen": {"enabled": False, "node_id": 1, "eds": "shipped", "vendor_id": None, "serial": None}
     | {"self_start": False, "read_only": False, "cia402_mirrors": True, "store": None},
     "run": {"wait_for_devices": False, "realtime_priority": None},
-    "statistics": {"file": None, "prometheus": None},
+    "statistics": {"file": None},
     "record": {"directory": None, "part_mb": 64, "part_minutes": 60, "keep_mb": 0, "min_free_mb": 100},
     "mqtt": dict.fromkeys(("broker", "ca_file", "cert_file", "key_file", "username", "password_file"), None)
     | {"tls": False, "gateway": None, "topic": "kontronik", "rate": 1.0, "retain": False, "discovery": None},
@@ -152,11 +152,6 @@ REFUSED: list[tuple[str, str, str, list[Any]]] = [
     *((*place, "is not a text", ["", "  ", "\n", 7, True, ["x"], {}]) for place in STRINGS),
     *((*place, "is not true or false", [0, 1, "true", [], {}]) for place in BOOLEANS),
     *((table, "node_id", "128 is outside 1..127 and not 255", [128]) for table in ("canopen", "esc")),
-    ("statistics", "prometheus", "is no port on this machine", [
-        *("0.0.0.0:9123", "192.168.1.5:9123", "[::]:9123", "::1:9123", ":9123", "9123", "127.0.0.1", "127.0.0.1:0"),
-        *("127.0.0.1:65536", "127.0.0.1:09123", "127.0.0.256:9123", "127.1:9123", "localhost.example:9123", "*:9123"),
-        *("127.0.0.1:9123\n", "127.0.0.1:9123 ", "http://127.0.0.1:9123", "128.0.0.1:9123", "[::1%lo]:9123")]),
-    ("statistics", "prometheus", "is not a text", [9123]),
     ("mqtt", "broker", "is not a broker, as broker.example, 192.168.1.5:1883 or [fe80::1]:1883", [
         *("mqtt://a", "a:0", "a:65536", "a b", "::1", "a/b", "u@a", "-a", "a:", ":1883", "a\n")]),
     *(("mqtt", key, "is not the beginning of topics", [
@@ -217,12 +212,6 @@ def test_some_values_mean_others() -> None:
         assert taken("esc", "gear", number) == Fraction(str(number))
     assert taken("dbc", "messages", ["Motor_*", "X"]) == ("Motor_*", "X")
     assert parse(tables("esc", "telemetry_timeout_ms", 20), "a.toml").escs[0].timeout_ns == 20 * MS
-    addresses = {"127.0.0.1:9123": ("127.0.0.1", 9123), "127.255.0.9:1": ("127.255.0.9", 1)}
-    addresses |= {"localhost:65535": ("127.0.0.1", 65_535), "[::1]:9123": ("::1", 9123)}
-    for place, address in addresses.items():
-        assert (
-            parse(tables("statistics", "prometheus", place), "a.toml").statistics.address == address
-        )
 
 
 @pytest.mark.parametrize(
@@ -707,11 +696,6 @@ _RIGHT: dict[tuple[str, str], st.SearchStrategy[Any]] = {
     ),
     ("dbc", "units"): st.dictionaries(
         _TEXT, st.sampled_from(["V", "degC", "1/min", "-"]), max_size=3
-    ),
-    ("statistics", "prometheus"): st.builds(
-        lambda host, port: f"{host}:{port}",
-        st.sampled_from(["127.0.0.1", "localhost", "[::1]", "127.255.3.200"]),
-        st.integers(1, 65_535),
     ),
     ("mqtt", "broker"): st.sampled_from(
         ["broker", "192.168.1.5", "a.b-c.example:1", "[::1]:65535", "[fe80::1]", "x_y"]

@@ -30,9 +30,7 @@ def test_each_mistake_is_one_line_with_the_remedy(
 
 def test_without_the_library_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [
-        name
-        for name in sys.modules
-        if name.startswith(("paho", "kontronik_can_gw.desk.mqtt.client"))
+        name for name in sys.modules if name.startswith(("paho", "kontronik_can_gw.desk.mqtt"))
     ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "paho", None)

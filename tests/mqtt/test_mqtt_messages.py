@@ -13,16 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of
 
-from kontronik_can_gw.desk.mqtt.messages import (
-    IDENTITY_NS,
-    MAX_CHANGES,
-    MIN_PAUSE_NS,
-    Message,
-    Publisher,
-    Topics,
-    entity,
-    is_ours,
-)
+from kontronik_can_gw.desk.mqtt.discovery import entity, is_ours
+from kontronik_can_gw.desk.mqtt.messages import IDENTITY_NS, MAX_CHANGES, MIN_PAUSE_NS, Publisher
+from kontronik_can_gw.desk.mqtt.topics import Message, Topics
+from kontronik_can_gw.desk.mqtt.values import KIND_OF_STATE
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,
     ErrorWindow,
@@ -146,6 +140,10 @@ def test_errors_have_name_severity_and_meaning_and_make_a_problem() -> None:
     assert named["power_stage_overtemp_warning"] == ("warning", "power stage hot")
     assert [error["name"] for error in found["selftest"]] == ["test_undervoltage"]
     assert found["problem"] is True
+
+
+def test_each_operating_state_has_one_kind() -> None:
+    assert set(KIND_OF_STATE) == set(OperatingState)
 
 
 # --- when

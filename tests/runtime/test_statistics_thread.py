@@ -96,7 +96,7 @@ def file(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def statistics(file: Path) -> Iterator[Statistics]:
-    made = Statistics(file, None)
+    made = Statistics(file)
     yield made
     made.close()
 
@@ -113,7 +113,7 @@ def test_a_document_is_wanted_at_once_and_then_once_a_second(
 
 def test_the_file_is_readable_for_all_whole_and_alone(file: Path) -> None:
     (file.parent / ".status.json.4711.tmp").write_text('{"half')  # of a process that was killed
-    statistics = Statistics(file, None)
+    statistics = Statistics(file)
     put(statistics, file, 1)
     put(statistics, file, 3)
     assert stat.S_IMODE(file.stat().st_mode) == 0o644
@@ -185,7 +185,7 @@ def test_the_end_removes_the_file_ends_the_thread_and_closes_what_was_opened(fil
 
     before, threads = descriptors(), threading.active_count()
     for _ in range(5):
-        statistics = Statistics(file, ("127.0.0.1", 0))
+        statistics = Statistics(file)
         put(statistics, file, 1)
         statistics.close()
         assert os.listdir(file.parent) == []
@@ -197,11 +197,11 @@ def test_the_end_removes_the_file_ends_the_thread_and_closes_what_was_opened(fil
 
 
 def test_a_file_that_another_gateway_writes_is_refused(file: Path) -> None:
-    first = Statistics(file, None)
+    first = Statistics(file)
     with pytest.raises(RunError, match="another gateway writes it"):
-        Statistics(file, None)
+        Statistics(file)
     first.close()
-    Statistics(file, None).close()
+    Statistics(file).close()
 
 
 def test_a_file_that_became_another_gateways_is_left_alone(
@@ -209,10 +209,10 @@ def test_a_file_that_became_another_gateways_is_left_alone(
 ) -> None:
     # as of gateways in different network namespaces
     monkeypatch.setattr(Locks, "hold", lambda _self, _names: [])
-    first = Statistics(file, None)
+    first = Statistics(file)
     put(first, file, 1)
     # whose thread removes what others left half: first must not be writing then
-    second = Statistics(file, None)
+    second = Statistics(file)
     put(second, file, 2)
     first.close()
     assert number_in(file) == 2
@@ -222,7 +222,7 @@ def test_a_file_that_became_another_gateways_is_left_alone(
 
 def test_a_folder_that_is_missing_is_told_once_and_the_file_comes_with_it(tmp_path: Path) -> None:
     file = tmp_path / "run" / "status.json"
-    statistics = Statistics(file, None)
+    statistics = Statistics(file)
     statistics.publish(numbered(1))
     (report,) = reports(statistics, 1)
     statistics.publish(numbered(2))
@@ -263,7 +263,7 @@ def test_a_full_disk_leaves_the_old_document_and_no_half_one(
 def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
     target = tmp_path / "device"
     os.mkfifo(target)
-    statistics = Statistics(target, None)
+    statistics = Statistics(target)
     statistics.publish(numbered(1))
     (report,) = reports(statistics, 1)
     assert report.begins and "no plain file" in report.text
@@ -273,7 +273,7 @@ def test_what_is_no_plain_file_is_not_replaced(tmp_path: Path) -> None:
 
 def test_all_signals_are_blocked_in_the_thread_and_in_no_other(file: Path) -> None:
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    statistics = Statistics(file, None)
+    statistics = Statistics(file)
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before
     thread = next(thread for thread in threading.enumerate() if thread.name == "statistics")
     status = Path(f"/proc/self/task/{thread.native_id}/status").read_text(encoding="ascii")

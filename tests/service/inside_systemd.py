@@ -15,6 +15,7 @@ import struct
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,23 @@ def entries() -> list[dict[str, Any]]:
         json.loads(line)
         for line in run("journalctl", "-u", UNIT, "-o", "json", "--no-pager")["out"].splitlines()
     ]
+
+
+def fetched() -> str:
+    """What Prometheus would get, as soon as it is answered; empty without an answer."""
+    run("ip", "link", "set", "lo", "up")
+    found: list[str] = []
+
+    def ask() -> bool:
+        with (
+            contextlib.suppress(OSError),
+            urllib.request.urlopen("http://127.0.0.1:9123/metrics", timeout=5) as answer,
+        ):
+            found.append(answer.read().decode())
+        return bool(found)
+
+    until(ask)
+    return "".join(found)
 
 
 def main(folder: Path) -> None:
@@ -148,7 +166,7 @@ def trial(facts: Facts) -> None:
     os.mknod(FORBIDDEN, 0o666 | stat.S_IFCHR, os.makedev(1, 11))  # all may open it, but the service
     os.chmod(FORBIDDEN, 0o666)
     facts["probe"] = probed()
-    facts["probe with prometheus"] = service("install", "--prometheus"), probed()
+    facts["metrics"] = service("install", "--metrics", "--now"), fetched(), probed()
     facts["log"] = [[entry.get("PRIORITY"), entry.get("MESSAGE")] for entry in entries()]
     facts["network"] = service("install", "--network", "500000", "--channel", "vcan1"), networkd()
 

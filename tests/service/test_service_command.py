@@ -1,5 +1,6 @@
 """``service`` as a command: staged files, round trips, what people changed, wrong uses; status with stand-ins for systemd's tools."""
 
+import hashlib
 import json
 import os
 import sys
@@ -79,7 +80,7 @@ def test_a_staged_install_writes_files_that_all_may_read(root: Path) -> None:
 
 
 def test_uninstall_removes_what_install_wrote_and_keeps_the_configuration(root: Path) -> None:
-    install(root, "--prometheus", "--network", 500_000)
+    install(root, "--metrics", "--mqtt", "--network", 500_000)
     edit(root)
     install(root)
     assert run("service", "uninstall", "--root", root).code == 0
@@ -109,6 +110,34 @@ def test_an_edited_configuration_is_kept_and_enabled(root: Path) -> None:
     assert install(root).code == 0
     run("service", "uninstall", "--root", root)
     assert not link.is_symlink()
+
+
+def test_an_install_removes_what_an_earlier_version_left(root: Path) -> None:
+    """0.5.0's drop-in lets the gateway use IP, which it no longer needs."""
+    body = "[Service]\nIPAddressAllow=localhost\n"
+    checksum = hashlib.sha256(body.encode()).hexdigest()
+    head = f'# Written by "kontronik-can-gw service install" 0.5.0, checksum {checksum}.'
+    ours, changed = (
+        root / UNITS / f"kontronik-can-gw{end}.service.d/prometheus.conf" for end in ("", "@")
+    )
+    for file, text in ((ours, body), (changed, body + "# by hand\n")):
+        file.parent.mkdir(parents=True)
+        file.write_text(f"{head}\n{text}")
+    assert f"{ours}: removed" in install(root).err
+    assert not ours.parent.exists()
+    assert changed.exists()
+
+
+def test_metrics_are_a_service_of_their_own(root: Path) -> None:
+    install(root, "--metrics")
+    edit(root)
+    assert "kontronik-can-gw-metrics.service is enabled" in install(root, "--metrics").err
+    unit = root / UNITS / "kontronik-can-gw-metrics.service"
+    assert f"ExecStart={EXECUTABLE} metrics -c /etc/" in unit.read_text()
+    link = root / UNITS / "multi-user.target.wants/kontronik-can-gw-metrics.service"
+    assert link.is_symlink()
+    run("service", "uninstall", "--root", root)
+    assert not unit.exists() and not link.is_symlink()
 
 
 def test_an_instance_has_its_own_configuration_and_goes_alone(root: Path) -> None:

@@ -198,10 +198,11 @@ def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> 
     assert [name for name, error in refused.items() if error not in probe[name]] == []
 
 
-def test_loopback_ip_is_allowed_on_request(facts: Facts) -> None:
-    done, probe = facts["probe with prometheus"]
+def test_metrics_are_served_and_the_gateway_still_has_no_ip(facts: Facts) -> None:
+    done, text, probe = facts["metrics"]
     assert done["code"] == 0
-    assert probe == facts["probe"] | {"internet": "works"}
+    assert "kontronik_gateway_escs 1.0" in text
+    assert probe == facts["probe"]
 
 
 def test_networkd_understands_the_network_file(facts: Facts) -> None:

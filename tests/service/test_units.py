@@ -14,6 +14,9 @@ from kontronik_can_gw.cli.service_files import Choices, PlannedFile, planned
 from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
+BESIDE = tuple(
+    f"kontronik-can-gw-{kind}{end}.service" for kind in ("mqtt", "metrics") for end in ("", "@")
+)
 ENABLE = "no systemd-analyze on this machine: sudo apt-get install systemd"
 MAX_EXPOSED = 2.0
 
@@ -29,16 +32,15 @@ def files(root: Path, **more: Any) -> dict[str, PlannedFile]:
     }
 
 
-def units(folder: Path, prometheus: bool = False) -> list[Path]:
-    """The units with their drop-ins in a folder, the template as an instance."""
-    for file in planned(Choices("/bin/true", False, "dialout", prometheus=prometheus), folder):
+def units(folder: Path, beside: bool = False) -> list[Path]:
+    """The gateway's units in a folder, or those of the services beside it; the template as an instance."""
+    choices = Choices("/bin/true", False, "dialout", mqtt=beside, metrics=beside)
+    for file in planned(choices, folder):
         if "/system/" in file.path:
-            path = folder / file.path.partition("/system/")[2].replace(
-                "gw@.service", "gw@left.service"
-            )
+            path = folder / file.path.partition("/system/")[2].replace("@.service", "@left.service")
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(file.text)
-    return [folder / name.replace("@", "@left") for name in NAMES]
+    return [folder / name.replace("@", "@left") for name in (BESIDE if beside else NAMES)]
 
 
 def settings(text: str) -> dict[str, list[str]]:
@@ -67,9 +69,9 @@ def analyze(*words: str) -> "subprocess.CompletedProcess[str]":
 # --- by systemd's tools
 
 
-@pytest.mark.parametrize("prometheus", [False, True])
-def test_systemd_finds_nothing_to_complain_about(tmp_path: Path, prometheus: bool) -> None:
-    for unit in units(tmp_path, prometheus):
+@pytest.mark.parametrize("beside", [False, True])
+def test_systemd_finds_nothing_to_complain_about(tmp_path: Path, beside: bool) -> None:
+    for unit in units(tmp_path, beside):
         done = analyze("verify", "--man=no", str(unit))
         ours = [
             line
@@ -85,9 +87,9 @@ def test_verify_would_have_found_a_mistake(tmp_path: Path) -> None:
     assert "RestartSecs" in analyze("verify", "--man=no", str(unit)).stderr
 
 
-@pytest.mark.parametrize("prometheus", [False, True])
-def test_the_service_is_hardly_exposed(tmp_path: Path, prometheus: bool) -> None:
-    for unit in units(tmp_path, prometheus):
+@pytest.mark.parametrize("beside", [False, True])
+def test_the_service_is_hardly_exposed(tmp_path: Path, beside: bool) -> None:
+    for unit in units(tmp_path, beside):
         done = analyze("security", "--offline=true", "--no-pager", str(unit))
         found = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
         assert found, done.stdout + done.stderr
@@ -132,12 +134,17 @@ def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet
     assert {name: unit[name] for name in SETTINGS} == SETTINGS
     never = ("ExecStartPre", "RestartPrevent", "ExecCondition", "Condition")
     assert not [name for name in unit if name.startswith(never)]
-    assert "prometheus.conf" not in made
-    loopback = settings(files(tmp_path, prometheus=True)["prometheus.conf"].text)
-    assert loopback == {
-        "RestrictAddressFamilies": ["AF_INET AF_INET6"],
-        "IPAddressAllow": ["localhost"],
-    }
+
+
+def test_metrics_are_for_this_machine_only(tmp_path: Path) -> None:
+    made = files(tmp_path, metrics=True)
+    for name, configuration in (("", "gateway"), ("@", "%i")):
+        unit = settings(made[f"kontronik-can-gw-metrics{name}.service"].text)
+        assert unit["ExecStart"] == [
+            f"/bin/true metrics -c /etc/kontronik-can-gw/{configuration}.toml --listen ${{LISTEN}}"
+        ]
+        assert unit["Environment"] == ["LISTEN=127.0.0.1:9123"]
+        assert (unit["IPAddressDeny"], unit["IPAddressAllow"]) == (["any"], ["localhost"])
 
 
 def test_it_may_open_serial_ports_and_nothing_else(tmp_path: Path) -> None:
@@ -170,7 +177,7 @@ def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it(tmp_path: Pa
 
 def test_nothing_is_left_to_be_filled_in(tmp_path: Path) -> None:
     for bitrate in (None, 250_000):
-        for file in files(tmp_path, bitrate=bitrate, prometheus=True).values():
+        for file in files(tmp_path, bitrate=bitrate, mqtt=True, metrics=True).values():
             assert not re.search(r"@[A-Z]+@", file.text)
 
 

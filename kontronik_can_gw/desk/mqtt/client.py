@@ -1,316 +1,51 @@
-"""The MQTT client: a thread that connects to a broker, publishes, and reconnects for ever.
+"""Publishes through paho, whose own thread connects, sends, and connects again for ever with growing pauses.
 
-The queue is bounded: only the newest message of each topic waits, and it is handed to the connection only when that has sent the previous
-ones. Lasting messages are published again after each reconnection. Any thread may call ``offer`` and ``stop`` and read the properties;
-everything else, including paho's client, belongs to the client's thread. A broker that does not answer blocks only this thread.
+Of each topic one message at most is with paho, and the newest waits here: a slow or missing broker makes nothing pile up and delays nobody.
+Lasting messages are published again after each reconnection. Everything but paho's callbacks belongs to the thread that calls ``turn``.
 """
 
 import contextlib
 import logging
-import os
 import random
-import select
 import socket
-import ssl
-import stat
+import sys
 import threading
 import time
-from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+
+from kontronik_can_gw.desk.mqtt.broker import (
+    Broker,
+    failure,
+    password,
+    refusal,
+    show_certificate,
+    tls_context,
+)
+from kontronik_can_gw.desk.mqtt.topics import OFFLINE, ONLINE, Message
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.fault_log import FaultLog
-from kontronik_can_gw.runtime.retry import Retry
 
-LONGEST_PAUSE_NS = 30 * SECOND
-"""Maximum time between two attempts to connect."""
 KEEPALIVE_S = 15
 """The broker publishes the last will after 1.5 times this without a packet."""
-CONNECT_S = 5.0
-TAKEN_OVER_PAUSE_NS = 60 * SECOND
-"""Two programs with one client id disconnect each other; the pause keeps this from happening many times a second."""
-SLOW_NS = 2 * SECOND
+_CONNECT_S = 5.0
 _SEND_BUFFER = 1 << 15
-_MAX_UNACKNOWLEDGED = 10
+_MIN_PAUSE_S, _MAX_PAUSE_S = 1, 30
+"""Time between two attempts to connect; paho doubles it each time."""
+_CONFLICT_PAUSE_S = 60
+"""Two programs with one client id disconnect each other; the pause keeps this from happening each second."""
+SLOW_NS = 2 * SECOND
 _SHORT_NS = 5 * SECOND
 _MAX_SHORT = 3
 """After this number of connections in a row that the broker ended within ``_SHORT_NS`` a client id conflict is assumed."""
-# Reason codes of MQTT 5, to which paho translates those of MQTT 3.
-_UNSUPPORTED_VERSION, _BAD_CLIENT_ID, _TAKEN_OVER = 132, 133, 142
-_NOT_ALLOWED = (134, 135)
-_SAYS_NOTHING = ("Unspecified error", "Normal disconnection", "Success")
-
-log = logging.getLogger("kontronik_can_gw")
-
-
-@dataclass(frozen=True)
-class Broker:
-    """Where to connect and how. TLS files and the password file are read at each connection, since they may be renewed."""
-
-    host: str
-    port: int
-    client_id: str
-    tls: bool = False
-    ca_file: Path | None = None
-    cert_file: Path | None = None
-    key_file: Path | None = None
-    username: str | None = None
-    password_file: Path | None = None
-
-    def __str__(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"MQTT broker {host}:{self.port}"
-
-
-class Offer(NamedTuple):
-    """A message to publish."""
-
-    topic: str
-    payload: bytes
-    qos: int
-    retain: bool
-
-
-class _Refused(Exception):
-    """The broker or its TLS refuses the connection. The text includes the remedy."""
-
-
-class _NoAnswer(_Refused):
-    """The broker closed the connection instead of answering, as old brokers do with an unknown protocol version."""
-
-
-class _KnowsOnlyMqtt3(Exception):
-    """The broker does not support MQTT 5; the next attempt uses 3.1.1."""
-
-
-def check(broker: Broker) -> list[str]:
-    """Check the library and the files, without connecting. Returns warnings; RunError where it cannot work."""
-    try:
-        import paho.mqtt.client as paho
-    except ImportError:
-        paho = None  # type: ignore[assignment]
-    if paho is None or not hasattr(paho, "CallbackAPIVersion"):
-        raise RunError("needs paho-mqtt 2: pip install 'kontronik-can-gw[mqtt]'")
-    warnings = []
-    try:
-        if broker.tls:
-            tls_context(broker)
-        if broker.password_file is not None:
-            password(broker.password_file)
-            if broker.password_file.stat().st_mode & stat.S_IROTH:
-                warnings.append(
-                    f"{broker.password_file}: can be read by everybody on this machine. Run: chmod o= {broker.password_file}"
-                )
-    except _Refused as error:
-        raise RunError(str(error)) from None
-    if broker.password_file is not None and not broker.tls and not _is_loopback(broker.host):
-        warnings.append(
-            f"{broker}: without TLS the password can be read by all on the way. Use --tls."
-        )
-    return warnings
-
-
-def password(file: Path) -> str:
-    """The password in the first line of a file."""
-    try:
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise _Refused(f"{file}: the password cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise _Refused(f"{file}: the password is not text in UTF-8") from None
-    line = text.partition("\n")[0].rstrip("\r")
-    if not line:
-        raise _Refused(f"{file}: has no password on its first line")
-    return line
-
-
-def tls_context(broker: Broker) -> ssl.SSLContext:
-    """TLS 1.2 or newer, with the broker's certificate and name checked."""
-    for what, file in (
-        ("ca_file", broker.ca_file),
-        ("cert_file", broker.cert_file),
-        ("key_file", broker.key_file),
-    ):
-        if file is not None and not os.access(file, os.R_OK):
-            raise _Refused(f"{file}: mqtt.{what} cannot be read")
-    try:
-        context = ssl.create_default_context(
-            cafile=None if broker.ca_file is None else str(broker.ca_file)
-        )
-    except (ssl.SSLError, OSError):
-        raise _Refused(f"{broker.ca_file}: is not a certificate in PEM form") from None
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    if broker.cert_file is not None:
-        try:
-            # a key with a passphrase would ask for it on the terminal
-            context.load_cert_chain(broker.cert_file, broker.key_file, password=lambda: b"")
-        except (ssl.SSLError, OSError):
-            both = f"{broker.cert_file}{'' if broker.key_file is None else f', {broker.key_file}'}"
-            raise _Refused(
-                f"{both}: not a certificate in PEM form with its key (without passphrase)"
-            ) from None
-    return context
-
-
-def _is_loopback(host: str) -> bool:
-    return host in ("localhost", "::1") or host.startswith("127.")
-
-
-class _Link:
-    """One connection, used by one thread. An error that paho raises for malformed packets ends the connection."""
-
-    def __init__(self, broker: Broker, version: int, will_topic: str | None) -> None:
-        import paho.mqtt.client as paho
-        from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
-
-        self.end: Any = None
-        """Reason code of the end of the connection."""
-        self.unacknowledged: set[int] = set()
-        self.received: deque[tuple[str, bytes]] = deque()
-        """Topic and payload of received retained messages."""
-        self._broker = broker
-        self._answer: Any = None
-        protocol = MQTTProtocolVersion.MQTTv5 if version == 5 else MQTTProtocolVersion.MQTTv311
-        self._client = client = paho.Client(
-            CallbackAPIVersion.VERSION2,
-            broker.client_id,
-            protocol=protocol,
-            reconnect_on_failure=False,
-        )
-        client.connect_timeout = CONNECT_S
-        client.on_connect = self._connected
-        client.on_disconnect = self._disconnected
-        client.on_publish = lambda _client, _data, mid, _reason, _properties: (
-            self.unacknowledged.discard(mid)
-        )
-        client.on_subscribe = lambda _client, _data, mid, _reasons, _properties: (
-            self.unacknowledged.discard(mid)
-        )
-        client.on_message = self._message
-        client.on_socket_open = lambda _client, _data, sock: _limit_buffer(sock)
-        if will_topic is not None:
-            client.will_set(will_topic, b"offline", qos=1, retain=True)
-
-    def open(self, stopping: threading.Event, wake: socket.socket | None = None) -> bool:
-        """Connect. False if the process ends meanwhile; raises _Refused, _KnowsOnlyMqtt3, OSError or ValueError on failure."""
-        broker, client = self._broker, self._client
-        if broker.username is not None:
-            client.username_pw_set(
-                broker.username,
-                None if broker.password_file is None else password(broker.password_file),
-            )
-        if broker.tls:
-            client.tls_set_context(tls_context(broker))
-        client.connect(broker.host, broker.port, KEEPALIVE_S)
-        end = time.monotonic() + CONNECT_S
-        while self._answer is None:
-            if stopping.is_set():
-                return False
-            if not self.turn(0.1, wake):
-                break
-            if time.monotonic() > end:
-                raise _Refused("does not answer. Is this the port of an MQTT broker?")
-        if self._answer is None:
-            raise _NoAnswer("closed the connection instead of answering. Does it want TLS (--tls)?")
-        if self._answer.is_failure:
-            raise self._refusal(str(self._answer).lower(), self._answer.value)
-        return True
-
-    def turn(self, seconds: float, wake: socket.socket | None = None) -> bool:
-        """Wait at most ``seconds`` for the broker, ``wake`` or room to send; do what is due. False if the connection has ended."""
-        client = self._client
-        sock = client.socket()
-        if sock is None or self.end is not None:
-            return False
-        pending = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
-        readers = [sock] if wake is None else [sock, wake]
-        try:
-            readable, writable, _ = select.select(
-                readers, [sock] if client.want_write() else [], [], 0 if pending else seconds
-            )
-            if wake in readable and wake is not None:
-                with contextlib.suppress(OSError):
-                    wake.recv(4096)
-            if sock in readable or pending:
-                client.loop_read()
-            if sock in writable:
-                client.loop_write()
-            client.loop_misc()
-        except Exception as error:
-            log.debug("%s: %r", self._broker, error)
-            return False
-        return client.socket() is not None and self.end is None
-
-    @property
-    def has_room(self) -> bool:
-        """True if a message would be sent at once, without waiting for others."""
-        return (
-            self._client.socket() is not None
-            and not self._client.want_write()
-            and len(self.unacknowledged) < _MAX_UNACKNOWLEDGED
-        )
-
-    @property
-    def is_stuck(self) -> bool:
-        """True while the connection accepts no data."""
-        return self._client.want_write()
-
-    def publish(self, offer: Offer) -> None:
-        """Hand a message to the connection."""
-        info = self._client.publish(offer.topic, offer.payload, offer.qos, offer.retain)
-        if offer.qos:
-            # ``info`` is not asked: it raises if the connection was lost meanwhile
-            self.unacknowledged.add(info.mid)
-
-    def subscribe(self, topic: str) -> None:
-        """Subscribe to a topic, to get its retained messages."""
-        _, mid = self._client.subscribe(topic, 1)
-        if mid is not None:
-            self.unacknowledged.add(mid)
-
-    def part(self) -> None:
-        """Send DISCONNECT, so that the broker publishes no last will."""
-        self._client.disconnect()
-        while self._client.want_write() and self.turn(0.05):
-            pass
-
-    def close(self) -> None:
-        """Close the connection without DISCONNECT."""
-        if (sock := self._client.socket()) is not None:
-            with contextlib.suppress(OSError):
-                sock.close()
-
-    def _connected(
-        self, _client: object, _data: object, _flags: object, reason: Any, _properties: object
-    ) -> None:
-        self._answer = reason
-
-    def _disconnected(
-        self, _client: object, _data: object, _flags: object, reason: Any, _properties: object
-    ) -> None:
-        self.end = reason
-
-    def _message(self, _client: object, _data: object, message: Any) -> None:
-        if message.retain:
-            self.received.append((message.topic, message.payload))
-
-    def _refusal(self, text: str, number: int) -> Exception:
-        broker = self._broker
-        if number == _UNSUPPORTED_VERSION:
-            return _KnowsOnlyMqtt3()
-        if number in _NOT_ALLOWED:
-            who = f"user {broker.username!r}" if broker.username else "us without a user name"
-            what = "user name and password" if broker.username else "--username, --password-file"
-            return _Refused(f"refuses {who}: {text}. Check {what}.")
-        if number == _BAD_CLIENT_ID:
-            return _Refused(
-                f"refuses the client id {broker.client_id!r}. Choose another name with --gateway."
-            )
-        return _Refused(f"refuses the connection: {text}")
+_TIMEOUT = "Keep alive timeout"
+"""paho's name for the end of a connection that nothing came over."""
+_ANSWER_S = 10.0
+_SILENCE_S = 1.0
 
 
 class MqttClient:
@@ -318,49 +53,26 @@ class MqttClient:
 
     def __init__(self, broker: Broker, online_topic: str) -> None:
         self.broker = broker
-        self.connected = False
-        self.published = 0
         self.replaced = 0
         """Number of messages that were replaced by a newer one of the same topic before they were sent."""
-        self.failure: BaseException | None = None
-        """The unexpected error that ended the thread."""
-        self._online_topic = online_topic
+        self._lasting = {online_topic: Message(online_topic, ONLINE, True, True)}
+        self._waiting: dict[str, Message] = {}
+        self._handed: dict[str, Any] = {}
+        """paho's record of the newest message of each topic that it was given."""
+        self._offline = Message(online_topic, OFFLINE, True, True)
         self._conditions = FaultLog()
-        self._lock = threading.Lock()
-        self._waiting: OrderedDict[str, Offer] = OrderedDict()
-        self._lasting: OrderedDict[str, Offer] = OrderedDict()
-        self._retry = Retry(LONGEST_PAUSE_NS)
-        self._stopping = threading.Event()
-        self._wake_in, self._wake_out = socket.socketpair()
-        self._wake_in.setblocking(False)
-        self._wake_out.setblocking(False)
-        self._version, self._knows_only_3 = 5, False
-        self._short = 0
-        self._greeted = False
-        self._thread = threading.Thread(target=self._work, name="mqtt", daemon=True)
+        self._stuck_ns: int | None = None
+        self._link = _Link(broker)
+        self._link.client.will_set(online_topic, OFFLINE, qos=1, retain=True)
+        self._served = 0
 
     def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def offer(
-        self, topic: str, payload: bytes, *, lasting: bool = False, retain: bool = False
-    ) -> None:
-        """Queue a message; a pending one of the same topic is replaced. ``lasting``: publish it again after each reconnection."""
-        offer = Offer(topic, payload, 1 if lasting else 0, retain)
-        with self._lock:
-            if lasting:
-                self._lasting[topic] = offer
-            if self._waiting.pop(topic, None) is not None:
-                self.replaced += 1
-            self._waiting[topic] = offer
-        with contextlib.suppress(OSError):  # full: it is awake already
-            self._wake_in.send(b"x")
+        """Start paho's thread."""
+        self._link.begin()
 
     @property
-    def alive(self) -> bool:
-        """False once the thread has ended."""
-        return self._thread.is_alive()
+    def connected(self) -> bool:
+        return self._link.problem == ""
 
     @property
     def problem(self) -> str:
@@ -369,207 +81,251 @@ class MqttClient:
 
     @property
     def waiting(self) -> int:
-        """Number of pending messages."""
-        return len(self._waiting)
+        """Number of messages that are not sent yet."""
+        return len(self._waiting) + sum(not _is_done(info) for info in self._handed.values())
+
+    def offer(self, message: Message) -> None:
+        """Queue a message; a pending one of the same topic is replaced."""
+        if message.lasting:
+            self._lasting[message.topic] = message
+        self.replaced += self._waiting.pop(message.topic, None) is not None
+        self._waiting[message.topic] = message
+
+    def turn(self, now: int) -> None:
+        """Hand over what can be sent, and report faults of the connection. To be called often; never waits."""
+        problem, link = self._link.problem, self._link
+        if problem:
+            self._stuck_ns = None
+            self._conditions.begin("broker", f"{self.broker}: {problem}", now)
+        elif problem == "":
+            if self._served != link.connections:
+                self._greet(link.connections, now)
+            self._hand_over()
+            self._watch(now)
+            if now - link.since_ns > _SHORT_NS:
+                link.lasts()
+        self._conditions.advance(now)
 
     def stop(self, seconds: float) -> None:
         """Publish "offline" and end the connection, within ``seconds``."""
-        self._stopping.set()
-        with contextlib.suppress(OSError):
-            self._wake_in.send(b"x")
-        if self._thread.ident is not None:
-            self._thread.join(seconds)
+        end = time.monotonic() + seconds
+        if self.connected:
+            with contextlib.suppress(ValueError, RuntimeError):
+                self._link.send(self._offline).wait_for_publish(seconds)
+        self._link.end(end - time.monotonic())
 
-    # --- the thread
-
-    def _work(self) -> None:
-        try:
-            while not self._stopping.is_set():
-                self._connection()
-                self._pause()
-        except BaseException as error:  # the main thread reports it
-            self.failure = error
-
-    def _pause(self) -> None:
-        while not self._stopping.is_set():
-            now = time.monotonic_ns()
-            self._conditions.advance(now)
-            if self._retry.due is None or now >= self._retry.due:
-                return
-            self._stopping.wait(min((self._retry.due - now) / SECOND, 1))
-
-    def _connection(self) -> None:
-        """Open and serve one connection until its end."""
-        # a new object, so that nothing of the previous connection is sent again
-        link = _Link(self.broker, self._version, self._online_topic)
-        try:
-            if not link.open(self._stopping, self._wake_out):
-                return
-            began = time.monotonic_ns()
-            self._after_connect()
-            self._run(link)
-            if self._stopping.is_set():
-                self._part(link)
-            else:
-                self._ended(link.end, time.monotonic_ns() - began)
-        except _KnowsOnlyMqtt3:
-            if self._knows_only_3:
-                self._failed("refuses the connection: it knows neither MQTT 5 nor MQTT 3.1.1")
-            self._version, self._knows_only_3 = 3, True
-        except (_Refused, OSError, ValueError) as error:
-            self._failed(_reason(error))
-            if isinstance(error, _NoAnswer) and not self._knows_only_3:
-                self._version = 3 if self._version == 5 else 5
-        finally:
-            self.connected = False
-            link.close()
-
-    def _after_connect(self) -> None:
+    def _greet(self, connections: int, now: int) -> None:
         """Queue all lasting messages before the pending ones."""
-        now = time.monotonic_ns()
-        self.connected = True
-        if self._greeted:
+        if self._served:
             self._conditions.end("broker", f"{self.broker}: connected", now)
         else:
             self._conditions.forget("broker")
-            self._conditions.say(
-                logging.INFO, f"{self.broker}: connected as {self.broker.client_id}"
-            )
-        self._greeted = True
-        with self._lock:
-            first = OrderedDict({self._online_topic: Offer(self._online_topic, b"online", 1, True)})
-            first.update(self._lasting)
-            first.update(self._waiting)
-            self._waiting = first
+            text = f"{self.broker}: connected as {self.broker.client_id}"
+            self._conditions.say(logging.INFO, text)
+        self._served = connections
+        self._waiting = self._lasting | self._waiting
 
-    def _run(self, link: _Link) -> None:
-        """Publish until the connection or the process ends."""
-        began = time.monotonic_ns()
-        stuck: int | None = None
-        while not self._stopping.is_set():
-            while link.has_room and (offer := self._next()) is not None:
-                link.publish(offer)
-                self.published += 1
-            if not link.turn(0.5, self._wake_out):
-                return
-            now = time.monotonic_ns()
-            if now - began > _SHORT_NS:
-                self._retry.succeeded()
-                self._short = 0
-            stuck = (stuck or now) if link.is_stuck else None
-            if stuck is None:
-                self._conditions.end("slow broker", f"{self.broker}: takes messages again", now)
-            elif now - stuck > SLOW_NS:
-                text = f"{self.broker}: takes messages too slowly: only the newest are sent"
-                self._conditions.begin("slow broker", text, now, since=stuck)
-            self._conditions.advance(now)
+    def _hand_over(self) -> None:
+        for topic in list(self._waiting):
+            if topic not in self._handed or _is_done(self._handed[topic]):
+                self._handed[topic] = self._link.send(self._waiting.pop(topic))
 
-    def _next(self) -> Offer | None:
-        with self._lock:
-            return self._waiting.popitem(last=False)[1] if self._waiting else None
+    def _watch(self, now: int) -> None:
+        """Report a broker that takes messages too slowly: one waits for its predecessor, without an end."""
+        if not self._waiting:
+            self._stuck_ns = None
+            self._conditions.end("slow broker", f"{self.broker}: takes messages again", now)
+            return
+        self._stuck_ns = self._stuck_ns or now
+        if now - self._stuck_ns > SLOW_NS:
+            text = f"{self.broker}: takes messages too slowly: only the newest are sent"
+            self._conditions.begin("slow broker", text, now, since=self._stuck_ns)
 
-    def _part(self, link: _Link) -> None:
-        """Publish "offline" and disconnect; ``stop`` limits the time."""
-        link.unacknowledged.clear()
-        link.publish(Offer(self._online_topic, b"offline", 1, True))
-        while link.unacknowledged and link.turn(0.05):
-            pass
-        link.part()
 
-    # --- lost and failed connections
+class _Client(paho.Client):
+    """paho's client, whose thread outlives the errors that paho raises for malformed packets."""
 
-    def _ended(self, end: Any, lasted: int) -> None:
+    def __init__(self, client_id: str, on_malformed: Callable[[Exception], None]) -> None:
+        super().__init__(CallbackAPIVersion.VERSION2, client_id)
+        self.on_malformed = on_malformed
+        self.ended = threading.Event()
+
+    def loop_forever(
+        self, timeout: float = 1.0, retry_first_connection: bool = False
+    ) -> MQTTErrorCode:
+        """Connect and serve until ``disconnect``."""
+        while True:
+            try:
+                code = super().loop_forever(timeout, retry_first_connection)
+                self.ended.set()
+                return code
+            except Exception as error:
+                self.on_malformed(error)
+                if (sock := self.socket()) is not None:
+                    with contextlib.suppress(OSError):
+                        sock.close()  # paho's loop notices it, and connects again
+                time.sleep(_MIN_PAUSE_S)
+
+
+class _Link:
+    """paho's client and thread; what its callbacks find out is left in attributes for the owner to read.
+
+    MQTT 3.1.1, which every broker understands.
+    """
+
+    def __init__(self, broker: Broker) -> None:
+        self.client = client = _Client(broker.client_id, self._malformed)
+        self.problem: str | None = None
+        """Why there is no connection; empty while there is one, None before the first result."""
+        self.connections = 0
+        self.since_ns = 0
+        """Beginning of the newest connection."""
+        self._broker = broker
+        self._answered = False
+        self._short = 0
+        self._stopping = False
+        self._context = tls_context(broker.config) if broker.config.tls else None
+        if self._context is not None:
+            client.tls_set_context(self._context)
+        client.connect_timeout = _CONNECT_S
+        client.on_pre_connect = self._prepare
+        client.on_socket_open = _limit_buffer
+        client.on_connect = self._connected
+        client.on_connect_fail = self._not_connected
+        client.on_disconnect = self._disconnected
+        self._set_pauses(_MIN_PAUSE_S, _MAX_PAUSE_S)
+
+    def begin(self) -> None:
+        """Start paho's thread, which connects."""
+        self.client.connect_async(*self._broker.address, KEEPALIVE_S)
+        self.client.loop_start()
+
+    def send(self, message: Message) -> paho.MQTTMessageInfo:
+        """Hand a message to paho, which queues it."""
+        qos = 1 if message.lasting else 0
+        return self.client.publish(message.topic, message.payload, qos, message.retain)
+
+    def lasts(self) -> None:
+        """The connection is one that holds: no other program has our client id."""
+        if self._short:
+            self._short = 0
+            self._set_pauses(_MIN_PAUSE_S, _MAX_PAUSE_S)
+
+    def end(self, seconds: float) -> None:
+        """Send DISCONNECT, so that the broker publishes no last will, and wait for that."""
+        self._stopping = True
+        if self.client.disconnect() == MQTTErrorCode.MQTT_ERR_SUCCESS:
+            self.client.ended.wait(max(0, seconds))
+
+    # --- paho's thread
+
+    def _prepare(self, *_: object) -> None:
+        """Before each connection: password and certificate may be others now."""
+        config = self._broker.config
+        if config.username is not None:
+            file = config.password_file
+            self.client.username_pw_set(config.username, None if file is None else password(file))
+        if self._context is not None:
+            show_certificate(config, self._context)
+
+    def _connected(
+        self, _client: object, _data: object, _flags: object, reason: Any, _properties: object
+    ) -> None:
+        self._answered = True
+        if reason.is_failure:
+            self.problem = refusal(self._broker, reason)
+            return
+        self.connections += 1
+        self.since_ns = time.monotonic_ns()
+        self.problem = ""
+        if self._stopping:
+            self.client.disconnect()
+
+    def _malformed(self, error: Exception) -> None:
+        self.problem = f"its answer is not MQTT: {error!r}"
+
+    def _not_connected(self, *_: object) -> None:
+        self.problem = failure(sys.exc_info()[1])
+
+    def _disconnected(
+        self, _client: object, _data: object, _flags: object, reason: Any, _properties: object
+    ) -> None:
+        answered, self._answered = self._answered, False
+        is_silent = str(reason) == _TIMEOUT
+        if not answered:
+            closed = "closed the connection instead of answering. Does it want TLS (--tls)?"
+            silent = "does not answer. Is this the port of an MQTT broker?"
+            self.problem = silent if is_silent else closed
+        elif self.problem == "":
+            self._lost(": nothing came any more" if is_silent else "")
+
+    def _lost(self, reason: str) -> None:
         """Handle a connection that the broker or the network ended."""
-        if not self._knows_only_3:
-            self._version = 5
-        if end is not None and end.value == _TAKEN_OVER:
-            self._taken_over(f"another program took over the client id {self.broker.client_id!r}")
-            return
+        lasted = time.monotonic_ns() - self.since_ns
         self._short = self._short + 1 if lasted < _SHORT_NS else 0
-        if self._short >= _MAX_SHORT:
-            who = f"maybe another program uses the client id {self.broker.client_id!r}"
-            self._taken_over(f"ends each connection at once: {who}")
+        if self._short < _MAX_SHORT:
+            self.problem = f"the connection was lost{reason}"
             return
-        known = "" if end is None or str(end) in _SAYS_NOTHING else f": {str(end).lower()}"
-        self._failed(f"the connection was lost{known}")
-
-    def _taken_over(self, what: str) -> None:
-        self._failed(f"{what}. Give each gateway a name of its own (--gateway).")
-        self._retry.due = time.monotonic_ns() + random.randrange(
-            TAKEN_OVER_PAUSE_NS // 2, TAKEN_OVER_PAUSE_NS
+        self.problem = (
+            "ends each connection at once: maybe another program uses the client id "
+            f"{self._broker.client_id!r}. Give each gateway a name of its own (--gateway)."
         )
+        self._set_pauses(_CONFLICT_PAUSE_S // 2, _CONFLICT_PAUSE_S)
 
-    def _failed(self, reason: str) -> None:
-        now = time.monotonic_ns()
-        pause = self._retry.failed(now) - now
-        # random, so that the gateways of a fleet do not reconnect at the same time
-        self._retry.due = now + random.randrange(pause * 3 // 4, pause * 5 // 4)
-        if not self._stopping.is_set():
-            self._conditions.begin("broker", f"{self.broker}: {reason}", now)
+    def _set_pauses(self, low: float, high: float) -> None:
+        """Set the first and the longest pause between attempts; that is random, for the sake of a broker of many gateways."""
+        longest = random.uniform(max(low, high / 2), high)
+        self.client.reconnect_delay_set(low, longest)  # type: ignore[arg-type]
+
+
+def _is_done(info: paho.MQTTMessageInfo) -> bool:
+    """True once paho has sent a message (QoS 1: once the broker has it), or has given it up."""
+    try:
+        return info.is_published()
+    except (ValueError, RuntimeError):  # it could not be queued, or the connection was lost
+        return True
+
+
+def _limit_buffer(_client: object, _data: object, sock: Any) -> None:
+    """Keep the kernel's buffer small, since data in it cannot be replaced by newer, and send without delay."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def remove(
     broker: Broker, filters: Iterable[str], wanted: Callable[[str, bytes], bool]
 ) -> list[str]:
     """Clear the retained messages that match ``filters`` and are ``wanted``; return their topics. RunError on failure."""
-    link = _Link(broker, 5, None)
+    link = _Link(broker)
+    found: dict[str, bytes] = {}
+    news, answered = threading.Event(), threading.Event()
+
+    def take(_client: object, _data: object, message: paho.MQTTMessage) -> None:
+        if message.retain:
+            found[message.topic] = bytes(message.payload)
+            news.set()
+
+    link.client.on_message = take
+    link.client.on_subscribe = lambda *_: answered.set()
+    link.begin()
     try:
-        try:
-            link.open(threading.Event())
-        except _KnowsOnlyMqtt3:
-            link = _Link(broker, 3, None)
-            link.open(threading.Event())
-        for topic in filters:
-            link.subscribe(topic)
-        _settle(link)
-        found = sorted(
-            topic for topic, payload in set(link.received) if payload and wanted(topic, payload)
-        )
-        for topic in found:
-            while not link.has_room and link.turn(0.05):
-                pass
-            link.publish(Offer(topic, b"", 1, True))
-        _settle(link, 0)
-        link.part()
-    except (_Refused, OSError, ValueError) as error:
-        raise RunError(f"{broker}: {_reason(error)}") from None
+        _wait(broker, link, lambda: link.problem == "")
+        link.client.subscribe([(topic, 1) for topic in filters])
+        _wait(broker, link, answered.is_set)
+        while news.wait(_SILENCE_S):
+            news.clear()
+        topics = sorted(t for t, payload in found.items() if payload and wanted(t, payload))
+        sent = [link.send(Message(topic, b"", True, True)) for topic in topics]
+        _wait(broker, link, lambda: all(map(_is_done, sent)))
     finally:
-        link.close()
-    return found
+        link.end(_SILENCE_S)
+    return topics
 
 
-def _settle(link: _Link, silence_s: float = 0.5) -> None:
-    """Wait until everything is acknowledged and no message has come for a while."""
-    end = time.monotonic() + 2 * CONNECT_S
-    quiet, known = time.monotonic(), len(link.received)
-    while link.unacknowledged or time.monotonic() - quiet < silence_s:
-        if not link.turn(0.05) or time.monotonic() > end:
-            raise _Refused("the connection was lost" if link.end is not None else "does not answer")
-        if link.unacknowledged or len(link.received) != known:
-            quiet, known = time.monotonic(), len(link.received)
-
-
-def _reason(error: Exception) -> str:
-    """Why connecting failed, with the remedy."""
-    if isinstance(error, _Refused):
-        return str(error)
-    if isinstance(error, ssl.SSLCertVerificationError):
-        what = (error.verify_message or "it cannot be checked").rstrip(".")
-        return f"its certificate is not accepted: {what}. Check --ca-file, and that --broker is the name in the certificate."
-    if isinstance(error, ssl.SSLError):
-        return f"TLS failed: {(error.reason or str(error)).lower().replace('_', ' ')}. Is this the port for TLS?"
-    if isinstance(error, socket.gaierror):
-        return "the host's name is not known. Check --broker and the network."
-    if isinstance(error, TimeoutError):
-        return "does not answer. Check --broker, the network and firewalls."
-    if isinstance(error, ConnectionRefusedError):
-        return "connection refused. Does it run, and is the port right?"
-    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return text[:1].lower() + text[1:]
-
-
-def _limit_buffer(sock: Any) -> None:
-    """Keep the kernel's buffer small, since data in it cannot be replaced by newer, and send without delay."""
-    with contextlib.suppress(OSError, AttributeError):
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+def _wait(broker: Broker, link: _Link, condition: Callable[[], bool]) -> None:
+    """RunError if the condition does not come, with what is known of the connection."""
+    end = time.monotonic() + _ANSWER_S
+    while not condition():
+        if link.problem not in (None, "") or time.monotonic() > end:
+            raise RunError(f"{broker}: {link.problem or 'does not answer'}")
+        time.sleep(0.01)

@@ -1,16 +1,17 @@
-"""The text for Prometheus, read back by another's parser: names, types, base units, and nothing that is not available."""
+"""The metrics as Prometheus reads them: names, types, base units, and nothing that is not available."""
 
 import re
 from typing import Any
 
 import pytest
-from prometheus_client import Metric
+from prometheus_client import CollectorRegistry, Metric, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from statistics_bench import Bench, with_nodes
 
+from kontronik_can_gw.desk.metrics import families as made
+from kontronik_can_gw.desk.metrics_server import Collected
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
-from kontronik_can_gw.runtime.prometheus import metrics
 from kontronik_can_gw.runtime.snapshot import CanFacts, PortFacts, StoreFacts
 
 UNITS: tuple[str, ...] = (
@@ -26,6 +27,12 @@ UNITS: tuple[str, ...] = (
     "hertz",
 )
 UNITS += ("revolutions_per_second",)
+
+
+def metrics(document: dict[str, Any]) -> str:
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(Collected(made(document, 0.5)))
+    return generate_latest(registry).decode()
 
 
 def families(document: dict[str, Any]) -> dict[str, Metric]:
@@ -166,7 +173,6 @@ def test_texts_with_quotes_backslashes_and_line_ends_are_read_back(
     document: dict[str, Any],
 ) -> None:
     channel = 'a"b\\c\nd\\n µ'
-    made = document | {"can": document["can"] | {"channel": channel}, "version": "\udcff"}
-    (sample,) = families(made)["kontronik_can_info"].samples
+    odd = document | {"can": document["can"] | {"channel": channel}, "version": "\udcff"}
+    (sample,) = families(odd)["kontronik_can_info"].samples
     assert sample.labels == {"interface": "socketcan", "channel": channel}
-    metrics(made).encode()

@@ -1,0 +1,123 @@
+"""Serves the metrics of one gateway's status file on a loopback address, by prometheus_client and the standard library's WSGI server."""
+
+import errno
+import json
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, make_server
+
+from prometheus_client import CollectorRegistry, Metric, make_wsgi_app
+from prometheus_client.exposition import ThreadingWSGIServer
+
+from kontronik_can_gw.desk.metrics import families
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
+
+REQUEST_S = 5
+"""Maximum time that a client may take for its request."""
+_MAX_FILE = 1 << 22
+_LOOPBACK = re.compile(r"(localhost|127(\.[0-9]{1,3}){3}|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
+
+
+class NoMetrics(Exception):
+    """The status file says nothing of now; the text says why."""
+
+
+class Collected:
+    """Metrics that are made already, as prometheus_client takes them."""
+
+    def __init__(self, metrics: list[Metric]) -> None:
+        self._metrics = metrics
+
+    def collect(self) -> list[Metric]:
+        return self._metrics
+
+
+def metrics_of(file: Path, now: int) -> list[Metric]:
+    """The metrics of a status file at ``now`` (monotonic). NoMetrics where it is missing, stale or damaged."""
+    try:
+        with file.open("rb") as opened:
+            document = json.loads(opened.read(_MAX_FILE))
+        if (document["program"], document["format"]) != (PROGRAM, FORMAT):
+            raise NoMetrics(f"{file}: is of another version of {PROGRAM}, or of another program")
+        age = now - document["monotonic_ns"]
+        if not -STALE_NS <= age <= STALE_NS:  # a file of before a reboot is newer than now
+            raise NoMetrics(f"{file}: the gateway does not answer since {abs(age) // SECOND} s")
+        return families(document, max(0, age) / SECOND)
+    except FileNotFoundError:
+        raise NoMetrics(f"{file}: there is no such file: the gateway does not run") from None
+    except OSError as error:
+        raise NoMetrics(f"{file}: cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise NoMetrics(f"{file}: is not a whole statistics file of {PROGRAM}") from None
+
+
+class _Server(ThreadingWSGIServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that ends early or never comes to an end is no fault of ours."""
+
+
+class _Server6(_Server):
+    address_family = socket.AF_INET6
+
+
+class _Handler(WSGIRequestHandler):
+    timeout = REQUEST_S
+
+    def log_message(self, *_: object) -> None:
+        """A log of all requests is of no use."""
+
+
+class MetricsServer:
+    """Answers until ``close``. RunError with one clear line where it cannot listen."""
+
+    def __init__(
+        self, file: Path, host: str, port: int, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._file, self._clock = file, clock
+        where = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        try:
+            kind = _Server6 if ":" in host else _Server
+            self._server = make_server(host, port, self._answer, kind, _Handler)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                reason = "another program listens there. End it, or choose another port."
+            else:
+                reason = f"cannot be listened to: {error.strerror}. Choose another address."
+            raise RunError(f"--listen {where}: {reason}") from None
+        self.port: int = self._server.server_port
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End, and give the address back."""
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _answer(self, environ: dict[str, Any], start: Callable[..., Any]) -> Iterable[bytes]:
+        """The metrics, or the reason why there are none. A WSGI application."""
+        if _LOOPBACK.fullmatch(environ.get("HTTP_HOST", "")) is None:
+            # no web page may have a browser ask (DNS rebinding)
+            text = "only for this machine: the Host header must name localhost"
+            return _refusal("403 Forbidden", text, start)
+        if environ["REQUEST_METHOD"] != "GET" or environ["PATH_INFO"] not in ("/", "/metrics"):
+            return _refusal("404 Not Found", "there is only GET /metrics", start)
+        try:
+            found = metrics_of(self._file, self._clock())
+        except NoMetrics as reason:
+            return _refusal("503 Service Unavailable", str(reason), start)
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(Collected(found))
+        answer: Iterable[bytes] = make_wsgi_app(registry)(environ, start)
+        return answer
+
+
+def _refusal(status: str, text: str, start: Callable[..., Any]) -> list[bytes]:
+    start(status, [("Content-Type", "text/plain; charset=utf-8")])
+    return [f"{text}\n".encode(errors="replace")]
