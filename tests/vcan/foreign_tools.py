@@ -26,16 +26,27 @@ def need(there: bool, what: str) -> None:
         pytest.skip(f"{what} is not installed: run tests/foreign/install.sh")
 
 
-def zencan(interface: str, command: str, seconds: float = 120) -> str:
-    """What zencan-cli prints for one command. It exits with 0 even when it reports an error."""
-    run = subprocess.run(
-        [str(ZENCAN), interface, "-c", command],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=seconds,
-    )
-    return run.stdout.strip()
+class Zencan:
+    """zencan-cli on an interface. It waits 150 ms for an answer, by a clock that is slower for it."""
+
+    def __init__(self, interface: str, folder: Path) -> None:
+        need(ZENCAN.exists(), "zencan-cli")
+        self._interface = interface
+        self._clock = folder / "slow_clock.so"
+        command = ["cc", "-shared", "-fPIC", "-o", str(self._clock), str(FOREIGN / "slow_clock.c")]
+        subprocess.run(command, check=True)
+
+    def __call__(self, command: str, slower: int = 200) -> str:
+        """What it prints for one command. It exits with 0 even when it reports an error."""
+        run = subprocess.run(
+            [str(ZENCAN), self._interface, "-c", command],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=4 * LIMIT_S,
+            env=os.environ | {"LD_PRELOAD": str(self._clock), "SLOWER": str(slower)},
+        )
+        return run.stdout.strip()
 
 
 class Refused(Exception):

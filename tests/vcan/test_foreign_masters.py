@@ -15,13 +15,12 @@ from typing import cast
 import pytest
 from foreign_tools import (
     NODE_CANOPEN,
-    ZENCAN,
     NodeMaster,
     Refused,
+    Zencan,
     has_tshark,
     need,
     tshark,
-    zencan,
 )
 from vcan_tools import Bench, Candump, GatewayProcess, bench, wait_for
 
@@ -90,19 +89,18 @@ def sent_speeds(run: Bench, index: int = 0) -> set[tuple[int, int, int]]:
 
 
 @pytest.fixture
-def zencan_there() -> None:
-    need(ZENCAN.exists(), "zencan-cli")
+def zencan(vcan: str, tmp_path_factory: pytest.TempPathFactory) -> Zencan:
+    return Zencan(vcan, tmp_path_factory.mktemp("clock"))
 
 
-@pytest.mark.usefixtures("zencan_there")
 def test_zencan_scans_reads_writes_and_stores(
-    vcan: str, start_gateway: Start, tmp_path: Path
+    vcan: str, zencan: Zencan, start_gateway: Start, tmp_path: Path
 ) -> None:
     with bench(EscOptions(), EscOptions()) as run, Candump(vcan) as dump:
         start_nodes(vcan, start_gateway, run, tmp_path, 5)
         wait_for(lambda: len(dump.of(0x705)) >= 2 and len(dump.of(0x706)) >= 2, "heartbeats")
 
-        found = zencan(vcan, "scan")
+        found = zencan("scan", slower=20)  # it waits for a dozen that are not there
         assert re.findall(r"^Node (\d+):", found, re.MULTILINE) == ["5", "6"], found
         for serial in (SERIAL, SERIAL + 1):
             identity = (
@@ -113,7 +111,7 @@ def test_zencan_scans_reads_writes_and_stores(
         assert "Unknown" not in re.sub("Unknown State", "", found), found
 
         def read(index: int, sub: int, kind: str, node: int = 5) -> str:
-            return zencan(vcan, f"read {node} {index:#x} {sub} {kind}").removeprefix("Value: ")
+            return zencan(f"read {node} {index:#x} {sub} {kind}").removeprefix("Value: ")
 
         assert read(0x1008, 0, "utf8") == "KONTRONIK ESC gateway"  # segmented
         assert read(0x2101, 1, "u8") == "5"
@@ -122,7 +120,7 @@ def test_zencan_scans_reads_writes_and_stores(
         assert int(read(0x2000, 12, "i8")) in {data.power_stage_temperature for data in run.live(0)}
 
         def refusal(command: str) -> str:
-            said = zencan(vcan, command)
+            said = zencan(command)
             assert re.search("[Ee]rror", said), said
             return said.rsplit(" ", 1)[1]
 
@@ -134,15 +132,15 @@ def test_zencan_scans_reads_writes_and_stores(
         assert refusal("write 5 0x2100 1 u8 101") == "ValueTooHigh"
         assert refusal("write 5 0x2100 1 u16 7") == "DataTypeMismatchLengthHigh"
 
-        assert zencan(vcan, "write 5 0x2100 1 u8 14") == "Wrote 1 bytes"
+        assert zencan("write 5 0x2100 1 u8 14") == "Wrote 1 bytes"
         assert read(0x2100, 1, "u8") == "14"
         assert read(0x2100, 1, "u8", node=6) == "7"  # the other node's is its own
         # zencan 0.0.5 has the letters of the signature in the wrong order ("evas"): nothing may be stored
         assert refusal("save-objects 5") == "CantStore"
         assert not list(tmp_path.rglob("*.params")), "stored without the signature"
-        assert zencan(vcan, f"write 5 0x1010 1 u32 {SAVE}") == "Wrote 4 bytes"
+        assert zencan(f"write 5 0x1010 1 u32 {SAVE}") == "Wrote 4 bytes"
         assert list(tmp_path.rglob("*")), "nothing was stored"
-        zencan(vcan, "nmt reset-app 5")
+        zencan("nmt reset-app 5")
         wait_for(
             lambda: len([f for f in dump.of(0x705) if f.data == b"\0"]) == 2, "a second boot-up"
         )
@@ -150,9 +148,8 @@ def test_zencan_scans_reads_writes_and_stores(
         assert len([f for f in dump.of(0x706) if f.data == b"\0"]) == 1  # the other was not reset
 
 
-@pytest.mark.usefixtures("zencan_there")
 def test_zencan_switches_states_and_remaps_a_pdo(
-    vcan: str, start_gateway: Start, tmp_path: Path
+    vcan: str, zencan: Zencan, start_gateway: Start, tmp_path: Path
 ) -> None:
     new = tmp_path / "remap.toml"
     new.write_text("""
@@ -178,9 +175,9 @@ def test_zencan_switches_states_and_remaps_a_pdo(
         wait_for(lambda: len(dump.of(0x709)) >= 2, "a heartbeat")
         assert [frame.data[0] for frame in dump.of(0x709)][:2] == [BOOT_UP, PRE_OPERATIONAL]
 
-        assert zencan(vcan, f"load-config 9 {new}") == ""  # it only says what failed
+        assert zencan(f"load-config 9 {new}") == ""  # it only says what failed
         wait_for(lambda: len(dump.of(0x709)) >= 10, "heartbeats each 100 ms")
-        seen = zencan(vcan, "scan-pdo-config 9")
+        seen = zencan("scan-pdo-config 9")
         blocks = re.split(r"TPDO\d:", seen)[1:]
         assert len(blocks) == 6, seen
         assert "valid=true, COB=Std(0x189), transmission_type=254" in blocks[0], seen
@@ -195,12 +192,12 @@ def test_zencan_switches_states_and_remaps_a_pdo(
         assert not [frame for frame in list(dump.frames) if frame.can_id in pdo_ids], (
             "a PDO while PRE-OPERATIONAL"
         )
-        zencan(vcan, "nmt start 9")
+        zencan("nmt start 9")
         wait_for(lambda: last_state() == OPERATIONAL, "OPERATIONAL")
         wait_for(lambda: len(dump.of(0x2F0)) >= 20 and len(dump.of(0x189)) >= 20, "PDOs")
-        zencan(vcan, "nmt stop all")
+        zencan("nmt stop all")
         wait_for(lambda: last_state() == STOPPED, "STOPPED")
-        assert "Timeout" in zencan(vcan, "read 9 0x1000 0")
+        assert "Timeout" in zencan("read 9 0x1000 0", slower=1)
         count = len([frame for frame in list(dump.frames) if frame.can_id in pdo_ids])
         before = len(dump.of(0x709))
         wait_for(lambda: len(dump.of(0x709)) >= before + 5, "heartbeats while STOPPED")
@@ -212,9 +209,9 @@ def test_zencan_switches_states_and_remaps_a_pdo(
             s[:2] for s in wanted
         }
 
-        zencan(vcan, "nmt reset-comms 9")
+        zencan("nmt reset-comms 9")
         wait_for(lambda: last_state() == PRE_OPERATIONAL, "PRE-OPERATIONAL")
-        assert zencan(vcan, "read 9 0x1017 0 u16") == "Value: 1000"  # not stored: the default again
+        assert zencan("read 9 0x1017 0 u16") == "Value: 1000"  # not stored: the default again
 
 
 # --- canopen for node
