@@ -63,6 +63,11 @@ def output(*words: str) -> str:
     return run(*words).stdout
 
 
+def show_property(unit: str, name: str) -> str:
+    """A property of a unit, as systemctl shows it."""
+    return output("systemctl", "show", "--value", "--property", name, unit).strip()
+
+
 def call(*words: str) -> None:
     """Call a tool. RunError with its output where it fails."""
     done = run(*words)

@@ -9,8 +9,13 @@ from pathlib import Path
 from kontronik_can_gw.cli import service_files as files
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.service_files import NAME, WANTS
-from kontronik_can_gw.cli.service_machine import call, check_rights, output, run
-from kontronik_can_gw.cli.service_status import properties
+from kontronik_can_gw.cli.service_machine import (
+    call,
+    check_rights,
+    output,
+    run,
+    show_property,
+)
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.runtime.locks import is_held
 
@@ -67,7 +72,7 @@ def _disable(
     for unit in dict.fromkeys(units) if live else ():
         if args.dry_run:
             print(f"systemctl disable --now {unit}")
-        elif properties(unit).get("LoadState") == "loaded":
+        elif show_property(unit, "LoadState") == "loaded":
             call("systemctl", "disable", "--now", unit)
             run("systemctl", "reset-failed", unit)
             say(f"{unit}: stopped and disabled")
