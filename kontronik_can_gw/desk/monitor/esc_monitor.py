@@ -28,7 +28,7 @@ from kontronik_can_gw.signals.unpacker import Value
 
 _WORKING = ("ok", "degraded")
 _BELIEVED = 2
-_SUMMARIES = {
+SUMMARIES = {
     OperatingError.OPERATING_ERROR_FOUND.text,
     OperatingError.OPERATING_WARNING_FOUND.text,
 }
@@ -177,11 +177,11 @@ class EscMonitor:
     def alarms(self) -> list[Active]:
         """The active bits to show: without those that are no alarm, and without a summary of bits that are shown anyway."""
         alarms = [active for active in self.active if active.name not in _NO_ALARM]
-        plain = {active.severity for active in alarms if active.name not in _SUMMARIES}
+        plain = {active.severity for active in alarms if active.name not in SUMMARIES}
         return [
             active
             for active in alarms
-            if active.name not in _SUMMARIES or active.severity not in plain
+            if active.name not in SUMMARIES or active.severity not in plain
         ]
 
     def document(self) -> dict[str, Any]:

@@ -6,9 +6,14 @@ from typing import NamedTuple
 
 from rich.text import Text
 
+from kontronik_can_gw.esc.kontronik.states import Severity
 from kontronik_can_gw.printable import printable
 
 GOOD, POOR, BAD, FAINT, TITLE = "green", "yellow", "bold red", "dim", "bold"
+
+LINKS = {"ok": GOOD, "degraded": POOR, "-": FAINT}
+"""Styles of link states; any other is bad."""
+_SEVERITIES = {Severity.ERROR: BAD, Severity.WARNING: POOR, Severity.STATUS: ""}
 
 Part = str | tuple[str, str] | Text
 """Text without a style, text with a style of rich, or a finished part of a line."""
@@ -82,6 +87,29 @@ def cut(lines: list[Text], height: int | None, rest: str) -> list[Text]:
     return [*lines[: max(0, height - 1)], line((more, FAINT))][: max(0, height)]
 
 
+class Alarm(NamedTuple):
+    """Something wrong, in words, and what to do."""
+
+    severity: Severity
+    text: str
+    remedy: str = ""
+
+
+def alarm_lines(alarms: Sequence[Alarm], width: int | None, room: int | None) -> list[Text]:
+    """Errors before warnings, with remedies where there is room."""
+    found = sorted(alarms, key=lambda alarm: list(_SEVERITIES).index(alarm.severity))
+    lines: list[Text] = []
+    for with_remedy in (True, False):
+        lines = []
+        for severity, text, remedy in found:
+            lines += wrapped(text, _SEVERITIES[severity], width)
+            if remedy and with_remedy:
+                lines += wrapped(f"  -> {remedy}", "", width)
+        if room is None or len(lines) <= room:
+            break
+    return cut(lines, room, "lines more of errors and warnings")
+
+
 def number(value: float | None, digits: int = 0) -> str:
     """A formatted value in groups of three digits; a dash where it is not available."""
     return "-" if value is None else f"{value:,.{digits}f}".replace(",", " ")
@@ -97,6 +125,13 @@ def duration(seconds: float) -> str:
     if whole < 48 * 3600:
         return f"{whole // 3600} h {whole // 60 % 60} min"
     return f"{whole // 86_400} days {whole // 3600 % 24} h"
+
+
+def age_text(milliseconds: float | None) -> str:
+    """The age of data."""
+    if milliseconds is None:
+        return "-"
+    return f"{milliseconds:.0f} ms" if milliseconds < 10_000 else duration(milliseconds / 1000)
 
 
 def compact(count: float | None) -> str:

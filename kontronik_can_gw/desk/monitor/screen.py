@@ -11,11 +11,15 @@ from kontronik_can_gw.desk.monitor.lines import (
     BAD,
     FAINT,
     GOOD,
+    LINKS,
     POOR,
     TITLE,
     UNICODE,
+    Alarm,
     Glyphs,
     Part,
+    age_text,
+    alarm_lines,
     compact,
     cut,
     duration,
@@ -35,8 +39,6 @@ from kontronik_can_gw.printable import printable
 _MARKED = "bold black on yellow"
 _MARKS = {"": TITLE, "!": "bold yellow", "!!": BAD}
 """Styles of what is marked; the marks are for displays without colour."""
-_SEVERITIES = {Severity.ERROR: BAD, Severity.WARNING: POOR, Severity.STATUS: ""}
-_LINKS = {"ok": GOOD, "degraded": POOR, "-": FAINT}
 _TROUBLES = {
     "neverseen": "no telemetry yet: is the ESC powered, its cable plugged in?",
     "searching": "bytes come but no telemetry: right port? Does the ESC send KONTRONIK telemetry?",
@@ -183,7 +185,7 @@ def _link(esc: EscMonitor) -> str:
 def _link_part(esc: EscMonitor) -> Part:
     link, rate = _link(esc), esc.number("frame_rate")
     text = link if rate is None or link != "ok" else f"ok {rate:.0f} Hz"
-    return text, _LINKS.get(link, BAD)
+    return text, LINKS.get(link, BAD)
 
 
 def _name_part(esc: EscMonitor) -> Part:
@@ -234,32 +236,24 @@ def sparkline(esc: EscMonitor, quantity: Quantity, width: int, glyphs: Glyphs) -
 
 
 def _alarm_lines(escs: Sequence[EscMonitor], size: tuple[int, int], named: bool) -> list[Text]:
-    """Errors and warnings of the ESCs, errors first, with remedies where there is room."""
+    """Errors and warnings of the ESCs."""
     width, room = size
-    found: list[tuple[Severity, str, str]] = []
+    found: list[Alarm] = []
     for esc in escs:
         name = f"{esc.name} " if named else ""
         if trouble := _trouble(esc):
-            found.append((Severity.ERROR, f"{name}LINK: {trouble}", ""))
+            found.append(Alarm(Severity.ERROR, f"{name}LINK: {trouble}"))
         elif normalize(esc.link or "") == "degraded":
-            text = f"{name}LINK: degraded, frames are damaged: look at cable and ground"
-            found.append((Severity.WARNING, text, ""))
+            text = f"{name}LINK: degraded, frames are damaged"
+            found.append(Alarm(Severity.WARNING, text, "Look at cable and ground."))
         for active in esc.alarms:
             kind = {Severity.STATUS: "note"}.get(active.severity, active.severity.value.upper())
-            found.append((active.severity, f"{name}{kind}: {active.meaning}", active.remedy))
-    found.sort(key=lambda each: list(_SEVERITIES).index(each[0]))
-    lines: list[Text] = []
-    for with_remedy in (True, False):
-        lines = []
-        for severity, text, remedy in found:
-            lines += wrapped(text, _SEVERITIES[severity], width)
-            lines += wrapped(f"  -> {remedy}", "", width) if remedy and with_remedy else []
-        if len(lines) <= room:
-            break
-    if not found:
-        known = any(esc.state is not None for esc in escs)
-        lines = [line(("no errors, no warnings", GOOD) if known else ("errors: -", FAINT))]
-    return cut(lines, room, "lines more of errors and warnings")
+            text = f"{name}{kind}: {active.meaning}"
+            found.append(Alarm(active.severity, text, active.remedy))
+    if found:
+        return alarm_lines(found, width, room)
+    known = any(esc.state is not None for esc in escs)
+    return [line(("no errors, no warnings", GOOD) if known else ("errors: -", FAINT))][:room]
 
 
 # --- one ESC, all ESCs
@@ -271,7 +265,7 @@ def _page(esc: EscMonitor, size: tuple[int, int], glyphs: Glyphs) -> list[Text]:
     age, cells = esc.number("data_age"), esc.number("cell_count")
     head = line(_name_part(esc), "  ", _state_part(esc), "  link ", _link_part(esc))
     if age is not None:
-        head.append(f", age {f'{age:.0f} ms' if age < 10_000 else duration(age / 1000)}")
+        head.append(f", age {age_text(age)}")
     device = line((esc.device or "-", FAINT), (f", {cells:.0f} cells" if cells else "", FAINT))
     if esc.has("crc_errors", "dropped_bytes"):
         crc, dropped = compact(esc.number("crc_errors")), compact(esc.number("dropped_bytes"))

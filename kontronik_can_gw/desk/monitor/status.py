@@ -9,20 +9,26 @@ from typing import Any
 
 from rich.text import Text
 
+from kontronik_can_gw.desk.monitor.esc_monitor import SUMMARIES
 from kontronik_can_gw.desk.monitor.lines import (
     BAD,
     FAINT,
     GOOD,
+    LINKS,
     POOR,
+    Alarm,
     Part,
+    age_text,
+    alarm_lines,
     compact,
     cut,
     duration,
     line,
+    number,
     table,
     wrapped,
 )
-from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
+from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError, Severity
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS, pid_namespace, start_ticks
@@ -32,15 +38,12 @@ _LARGEST_FILE = 1 << 22
 _FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
 _MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """What a document with values of another type raises."""
-_SUMMARY_BITS = {
-    OperatingError.OPERATING_ERROR_FOUND.text,
-    OperatingError.OPERATING_WARNING_FOUND.text,
-}
-_MEANINGS = {bit.text: bit.meaning for bits in (OperatingError, SelfTestError) for bit in bits}
+_BITS = {bit.text: bit for bits in (OperatingError, SelfTestError) for bit in bits}
 _CAN_STYLES = {"error-active": GOOD, "unknown": "", "error-warning": POOR, "error-passive": POOR}
-_LINK_STYLES = {"ok": GOOD, "degraded": POOR}
-_COLUMNS = ("ESC", "link", "Hz", "age ms", "V", "A", "1/min", "°C", "CRC", "line", "lost")
-_WIDTHS = (3, 10, 3, 6, 5, 6, 6, 3, 5, 4, 4)
+_MAX_ALARM_LINES = 6
+"""On a live display."""
+_COLUMNS = ("ESC", "link", "Hz", "age", "V", "A", "1/min", "°C", "CRC", "line", "lost")
+_WIDTHS = (3, 10, 3, 5, 5, 6, 6, 3, 5, 4, 4)
 
 Document = Mapping[str, Any]
 
@@ -184,8 +187,7 @@ def _lines(seen: Seen, document: Document, width: int | None) -> tuple[list[Text
     lines += [*_can_lines(document), line(), *_esc_lines(document, width)]
     for trouble in seen.troubles:
         lines += wrapped(trouble, BAD, width)
-    for text, style in _errors(document):
-        lines += wrapped(text, style, width)
+    lines += alarm_lines(_alarms(document), width, None if width is None else _MAX_ALARM_LINES)
     lines += _node_lines(document, width)
     if (store := document["store"]) and store["waiting"] > 0:
         lines.append(line((f"{store['waiting']} parameters wait for the disk", POOR)))
@@ -239,23 +241,20 @@ def _esc_lines(document: Document, width: int | None) -> list[Text]:
     rows: list[list[Part]] = [[(head, FAINT) for head in _COLUMNS]]
     for esc in document["escs"]:
         values, counters = esc["values"], esc["counters"]
-        age = _number(esc["data_age_ms"], 0)
-        if len(age) > _WIDTHS[3] - 1:
-            age = duration(esc["data_age_ms"] / 1000).replace(" ", "")
         line_errors = sum(esc["port"]["line_errors"].values()) or counters["line_errors"]
         rows.append(
             [
                 esc["name"][:12],
                 (
                     esc["link"].replace("-", " ")[:10],
-                    _LINK_STYLES.get(esc["link"], "") if esc["fresh"] else BAD,
+                    LINKS.get(esc["link"], "") if esc["fresh"] else BAD,
                 ),
-                _number(esc["frame_rate_hz"], 0),
-                age,
-                _number(values["battery_voltage"], 2),
-                _number(values["battery_current"], 1),
-                _number(values["motor_speed"], 0),
-                _number(values["power_stage_temperature"], 0),
+                number(esc["frame_rate_hz"], 0),
+                age_text(esc["data_age_ms"]),
+                number(values["battery_voltage"], 2),
+                number(values["battery_current"], 1),
+                number(values["motor_speed"], 0),
+                number(values["power_stage_temperature"], 0),
                 compact(counters["crc_errors"]),
                 compact(line_errors),
                 compact(esc["losses"]),
@@ -264,37 +263,31 @@ def _esc_lines(document: Document, width: int | None) -> list[Text]:
     return table(rows, width, 2, _WIDTHS)
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _errors(document: Document) -> Iterator[tuple[str, str]]:
-    """Errors that the ESCs report, in words, with their style."""
-    shown = (
-        ("errors", "error", BAD),
-        ("selftest_errors", "self-test error", BAD),
-        ("warnings", "warning", POOR),
-    )
+def _alarms(document: Document) -> list[Alarm]:
+    """Errors and warnings that the ESCs report."""
+    found = []
     for esc in document["escs"]:
-        for key, what, style in shown:
-            found = esc[key] or []
-            found = [name for name in found if name not in _SUMMARY_BITS] or found
-            if found:
-                texts = "; ".join(_MEANINGS.get(name, name) for name in found)
-                yield f"{esc['name']} {what}: {texts}", style
+        for key in ("errors", "selftest_errors", "warnings"):
+            names = esc[key] or []
+            for name in [each for each in names if each not in SUMMARIES] or names:
+                bit = _BITS.get(name)
+                severity = Severity.WARNING if key == "warnings" else Severity.ERROR
+                text = f"{esc['name']} {severity.value.upper()}: {bit.meaning if bit else name}"
+                found.append(Alarm(severity, text, bit.remedy if bit else ""))
+    return found
 
 
 def _node_lines(document: Document, width: int | None) -> list[Text]:
     """The CANopen nodes with their PDOs per second, as many in a line as fit."""
     rates = (document.get("rates") or {}).get("pdos_per_s", [])
     texts = []
-    for number, node in enumerate(document["nodes"]):
+    for at, node in enumerate(document["nodes"]):
         state = "waits for LSS"
         if node["node_id"] is not None:
-            rate = f", {rates[number]:.0f}/s" if number < len(rates) else ""
+            rate = f", {rates[at]:.0f}/s" if at < len(rates) else ""
             state = f"node {node['node_id']} {node['state']}{rate}"
         texts.append(f"{node['esc']}: {state}")
     longest = max(map(len, texts), default=0) + 2
     count = max(1, ((width or 80) + 2) // longest)
-    rows = [texts[at : at + count] for at in range(0, len(texts), count)]
+    rows = [texts[first : first + count] for first in range(0, len(texts), count)]
     return [line("".join(text.ljust(longest) for text in row).rstrip()) for row in rows]
