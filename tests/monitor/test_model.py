@@ -164,6 +164,12 @@ def test_errors_have_their_meaning_and_come_first() -> None:
     assert esc.alarms[0].remedy == OperatingError.UNDERVOLTAGE.remedy
 
 
+def test_infinity_of_a_float_signal_is_no_value() -> None:
+    (esc,) = Monitor(ONE).escs
+    assert esc.converted("battery_voltage", float("inf")) is None
+    assert esc.converted("battery_voltage", 22.5) == 22.5
+
+
 USERS_DBC = """VERSION ""
 
 NS_ :

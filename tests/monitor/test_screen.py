@@ -110,6 +110,8 @@ def test_a_sparkline_shows_seconds_between_the_extremes_and_gaps(glyphs: Glyphs)
     shown = sparkline(monitor.escs[0], quantity, 4, glyphs).plain
     assert (shown[:3], shown[3] in glyphs.levels[1:-1]) == (f"{low} {high}", True)
     assert sparkline(monitor.escs[0], quantity, 0, glyphs).plain == ""
+    track.history.extend([-1e308, 1e308])
+    assert sparkline(monitor.escs[0], quantity, 2, glyphs).plain == 2 * low
 
 
 def test_a_value_that_is_not_available_is_a_dash() -> None:

@@ -4,6 +4,7 @@ Values are addressed by the names of sources (values.py), not of signals, so any
 that is not available is None, never an old one.
 """
 
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple
@@ -100,11 +101,12 @@ class EscMonitor:
         return None if column is None else self.converted(source, self._view.values[column])
 
     def converted(self, source: str, value: Value) -> Value:
-        """A signal's value in the unit of its source."""
-        factor = self._factors[source]
-        if factor is None or value is None or isinstance(value, str):
+        """A signal's value in the unit of its source; infinity, which a float signal can hold, is none."""
+        if value is None or isinstance(value, str):
             return value
-        return round(value * factor[0] + factor[1], 9)
+        if (factor := self._factors[source]) is not None:
+            value = round(value * factor[0] + factor[1], 9)
+        return value if math.isfinite(value) else None
 
     def number(self, source: str) -> float | None:
         """The value of a numeric source. The cell voltage is computed if the DBC has none and the number of cells is known."""

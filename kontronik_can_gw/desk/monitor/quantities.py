@@ -47,8 +47,8 @@ QUANTITIES = (
     Quantity("motor_current", "motor current", "A", 1, "A motor"),
     Quantity("peak_current", "peak current", "A", 1, "A peak"),
     Quantity("energy_used", "energy", "Wh", 1, "Wh"),
-    Quantity("output_speed", "output speed", "1/min", 0),
-    Quantity("electrical_speed", "electrical speed", "1/min", 0),
+    Quantity("output_speed", "output speed", "1/min", 0, "1/min"),
+    Quantity("electrical_speed", "electrical speed", "1/min", 0, "1/min"),
     Quantity("bec_voltage", "BEC voltage", "V", 2),
     Quantity("bec_current", "BEC current", "A", 2),
 )

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import inf
 
 from rich.text import Text
 
@@ -46,6 +47,7 @@ _TROUBLES = {
 }
 _FILLERS = {"from", "for", "target", "during", "operation"}
 _STATE_WIDTH = 16
+_CURRENT = next(q for q in QUANTITIES if q.source == "battery_current")
 _PAGE_WIDTHS = (16, 5, 8, 8, 8)
 """Minimum widths of a page's columns: name, unit, value, minimum, maximum."""
 _MAX_ALARM_LINES = 6
@@ -91,7 +93,7 @@ def plain_lines(monitor: Monitor) -> Iterator[str]:
         parts = [
             f"{mark}{monitor.watched_s:6.1f} s  {esc.name}  link {_link(esc)}  state {_state(esc)}"
         ]
-        for quantity in QUANTITIES[:4]:
+        for quantity in _columns([esc])[:4]:
             value = number(esc.number(quantity.source), quantity.digits)
             parts.append(f"{quantity.source} {value} {quantity.unit}")
         parts += [f"{active.severity.value.upper()} {active.meaning}" for active in esc.alarms]
@@ -229,7 +231,7 @@ def sparkline(esc: EscMonitor, quantity: Quantity, width: int, glyphs: Glyphs) -
         if value is None:  # not available
             made.append(" ")
             continue
-        step = round((value - low) / span * (len(glyphs.levels) - 1)) if span else 0
+        step = round((value - low) / span * (len(glyphs.levels) - 1)) if 0 < span < inf else 0
         mark = quantity.mark(value)
         made.append(glyphs.levels[step], _MARKS[mark] if mark else "cyan")
     return made
@@ -297,10 +299,17 @@ def _page(esc: EscMonitor, size: tuple[int, int], glyphs: Glyphs) -> list[Text]:
     return lines + _alarm_lines([esc], (width, height - len(lines)), False)
 
 
+def _columns(escs: Sequence[EscMonitor]) -> list[Quantity]:
+    """The values in the table: those of the DBC, with one speed, in front."""
+    found = [q for q in QUANTITIES if q.head and any(esc.has(q.source) for esc in escs)]
+    speeds = [q for q in found if q.unit == "1/min"]
+    return [*speeds[:1], *[q for q in found if q not in speeds]]
+
+
 def _all_escs(escs: Sequence[EscMonitor], size: tuple[int, int], glyphs: Glyphs) -> list[Text]:
     """The table of all ESCs: values, and below them extremes where there is room."""
     width, height = size
-    shown = [q for q in QUANTITIES if q.head and any(esc.has(q.source) for esc in escs)]
+    shown = _columns(escs)
     is_tall = 2 * len(escs) + 4 <= height
     heads = [q.head.replace("degC", glyphs.degree) for q in shown]
     rows: list[list[Part]] = [[(head, FAINT) for head in ("ESC", "state", *heads)]]
@@ -316,8 +325,7 @@ def _all_escs(escs: Sequence[EscMonitor], size: tuple[int, int], glyphs: Glyphs)
                 _end_part(track.low if q.falls else track.high, q)
                 for q, track in zip(shown, tracks, strict=True)
             ]
-            current = next(q for q in QUANTITIES if q.source == "battery_current")
-            history = sparkline(esc, current, _STATE_WIDTH, glyphs)
+            history = sparkline(esc, _CURRENT, _STATE_WIDTH, glyphs)
             rows.append([_link_part(esc), history, *extreme])
     lines = table(rows, width, 2, (9, _STATE_WIDTH, 7, *[5] * len(shown)))
     lines = cut(lines, max(2, height - 2), "lines more: enlarge the terminal, or n")
