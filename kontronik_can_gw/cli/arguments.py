@@ -15,6 +15,18 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "describe",
         "--format man",
     ): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
+    (
+        "service",
+        "--dry-run",
+    ): "Give --root DIR: the files are written below DIR and nothing else is done.",
+    (
+        "service",
+        "--print",
+    ): "Give --root DIR: the files are written below DIR and nothing else is done.",
+    (
+        "service",
+        "--force",
+    ): "Leave it out: a file that was changed by hand stays. Remove it to have it written anew.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
 }
 """Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.

@@ -5,7 +5,7 @@ import argparse
 from kontronik_can_gw.cli import service_files as files
 from kontronik_can_gw.cli import show
 from kontronik_can_gw.cli.service_files import NAME
-from kontronik_can_gw.cli.service_machine import check_systemd, output, run, show_property
+from kontronik_can_gw.cli.service_machine import check_systemd, listed, run, show_property
 
 NOT_RUNNING = 3
 """Exit code for "not running", as of systemctl."""
@@ -20,10 +20,8 @@ def status(args: argparse.Namespace) -> int:
 
 def _known_units() -> list[str]:
     """The plain service unless only instances are in use, and the instances."""
-    words = ("--all", "--plain", "--no-legend", f"{NAME}@*.service")
-    listed = output("systemctl", "list-units", *words)
-    enabled = output("systemctl", "list-unit-files", "--plain", "--no-legend", words[-1])
-    names = {line.split()[0] for line in f"{listed}\n{enabled}".splitlines() if line.strip()}
+    pattern = f"{NAME}@*.service"
+    names = {name for verb in ("list-units", "list-unit-files") for name in listed(verb, pattern)}
     instances = sorted(names - {f"{NAME}@.service"})
     plain = files.unit(None)
     unused = show_property(plain, "ActiveState") == "inactive"

@@ -10,6 +10,7 @@ from command_line import Done, run
 
 from kontronik_can_gw.cli import service_machine
 from kontronik_can_gw.cli.service_files import is_ours
+from kontronik_can_gw.errors import UserError
 
 UNITS = "etc/systemd/system"
 CONFIGURATION = "etc/kontronik-can-gw/gateway.toml"
@@ -48,13 +49,17 @@ def edit(root: Path, name: str = CONFIGURATION) -> None:
     (root / name).write_text('[[esc]]\nport = "/dev/esc_left"\n')
 
 
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    """A root folder with the program in it."""
-    program = tmp_path / "image" / EXECUTABLE.lstrip("/")
+def written(program: Path) -> Path:
     program.parent.mkdir(parents=True)
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
+    return program
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A root folder with the program in it."""
+    written(tmp_path / "image" / EXECUTABLE.lstrip("/"))
     return tmp_path / "image"
 
 
@@ -143,38 +148,31 @@ def test_a_faulty_configuration_is_reported_and_not_enabled(root: Path) -> None:
     assert install(root, "--now").code == 1
 
 
-def test_an_older_file_of_ours_is_replaced_without_a_word_of_force(root: Path) -> None:
+def test_an_older_file_of_ours_is_replaced(root: Path) -> None:
     install(root, "--network", 250_000)
     network = root / "etc/systemd/network/50-kontronik-can-gw-can0.network"
     assert "BitRate=250000" in network.read_text()
-    assert (
-        "was written by another version or with other options"
-        in install(root, "--network", 500_000).err
-    )
+    assert f"{network}: replaced\n" in install(root, "--network", 500_000).err
     assert "BitRate=500000" in network.read_text()
     assert not list(network.parent.glob("*.bak"))
 
 
-def test_what_was_changed_by_hand_is_refused_then_kept_aside(root: Path) -> None:
-    install(root)
-    unit = root / UNITS / "kontronik-can-gw.service"
-    unit.write_text(unit.read_text().replace("Nice=-10", "Nice=0"))
-    mine = unit.read_text()
-    assert "kontronik-can-gw.service: was changed by hand. --force replaces it" in the_line(
-        install(root), 2
-    )
-    assert unit.read_text() == mine
-    assert install(root, "--force").code == 0
-    assert unit.with_name("kontronik-can-gw.service.bak").read_text() == mine
-    assert is_ours(unit.read_text())
-
-
-def test_a_foreign_file_is_never_taken_for_ours(root: Path) -> None:
+def test_what_was_changed_by_hand_and_what_is_not_ours_stays(root: Path) -> None:
+    rules = root / "etc/udev/rules.d/70-kontronik-can-gw.rules"
     unit = root / UNITS / "kontronik-can-gw.service"
     unit.parent.mkdir(parents=True)
     unit.write_text("[Service]\nExecStart=/bin/true\n")
-    assert "--force replaces it" in the_line(install(root), 2)
-    assert added(root) == [f"{UNITS}/kontronik-can-gw.service"]
+    install(root)
+    rules.write_text(rules.read_text() + "# mine\n")
+    done = install(root)
+    assert done.code == 0
+    for path in (rules, unit):
+        assert f"{path}: kept, it was changed by hand. Remove it" in done.err
+    assert rules.read_text().endswith("# mine\n")
+    assert unit.read_text() == "[Service]\nExecStart=/bin/true\n"
+    rules.unlink()
+    assert f"{rules}: new\n" in install(root).err
+    assert is_ours(rules.read_text())
 
 
 def test_an_active_network_file_takes_the_place_of_its_example(root: Path) -> None:
@@ -230,18 +228,10 @@ def test_a_folder_that_cannot_be_written_is_one_line(root: Path) -> None:
     assert "cannot be" in the_line(install(root), 1)
 
 
-@pytest.mark.parametrize("option", ["--dry-run", "--print"])
-def test_a_dry_run_shows_everything_and_does_nothing(root: Path, option: str) -> None:
-    done = install(root, option)
-    assert (done.code, added(root)) == (0, [])
-    heads = [line for line in done.out.splitlines() if line.startswith("#####")]
-    assert sorted(line.split(":")[0].split("image/")[1] for line in heads) == sorted(FILES)
-    assert "\nCapabilityBoundingSet=\n" in done.out
-    install(root)
-    before = added(root)
-    gone = run("service", "uninstall", "--root", root, "--dry-run", "--purge").out.splitlines()
-    assert len(gone) == len(FILES)
-    assert added(root) == before
+@pytest.mark.parametrize("option", ["--dry-run", "--print", "--force"])
+def test_a_removed_option_says_what_to_do(root: Path, option: str) -> None:
+    assert f"{option}: was removed. " in the_line(install(root, option), 2)
+    assert added(root) == []
 
 
 # --- wrong uses
@@ -258,7 +248,7 @@ def test_a_dry_run_shows_everything_and_does_nothing(root: Path, option: str) ->
         (["install", "--network", "5000000"], "'5000000' is not a bit rate in bit/s"),
         (["install", "--channel", "can 0"], "'can 0' is not the name of an interface"),
         (["status", "-n", "many"], "'many' is not a number of lines"),
-        (["uninstall", "--force"], "unrecognized arguments: --force"),
+        (["uninstall", "--now"], "unrecognized arguments: --now"),
     ],
 )
 def test_a_wrong_use_is_reported_in_the_last_line(words: list[str], said: str) -> None:
@@ -296,13 +286,11 @@ def test_without_root_it_is_refused(
 
 
 def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path) -> None:
-    """Only shown: a dry run on this machine, with a program in a closed folder."""
-    program = tmp_path / "closed" / "kontronik-can-gw"
-    program.parent.mkdir(mode=0o700)
-    program.write_text("#!/bin/sh\n")
-    program.chmod(0o755)
-    done = run("service", "install", "--dry-run", "--executable", program)
-    said = the_line(done, 2)
+    program = written(tmp_path / "closed" / "kontronik-can-gw")
+    program.parent.chmod(0o700)
+    with pytest.raises(UserError) as refused:
+        service_machine.check_executable(str(program), Path("/"))
+    said = str(refused.value)
     assert "the service has a /tmp of its own" in said or "is closed to others" in said
 
 
