@@ -80,7 +80,7 @@ def table(
 
 
 def cut(lines: list[Text], height: int | None, rest: str) -> list[Text]:
-    """The lines that fit; the last one says how many more there are, and ``rest`` of them."""
+    """The lines that fit; the last one counts those left out, followed by the text ``rest``."""
     if height is None or len(lines) <= height:
         return lines
     more = f"... and {len(lines) - height + 1} {rest}"
