@@ -20,6 +20,18 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "--prometheus",
     ): "Type kontronik-can-gw service install --metrics: a service of its own"
     " serves /metrics, and the gateway listens on nothing.",
+    (
+        "service",
+        "--dry-run",
+    ): "Give --root DIR: the files are written below DIR and nothing else is done.",
+    (
+        "service",
+        "--print",
+    ): "Give --root DIR: the files are written below DIR and nothing else is done.",
+    (
+        "service",
+        "--force",
+    ): "Leave it out: a file that was changed by hand stays. Remove it to have it written anew.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
 }
 """Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.

@@ -5,21 +5,17 @@ Without --root it works on this machine, as root, and calls systemd's tools; wit
 
 import argparse
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 from kontronik_can_gw.cli import service_files as files
 from kontronik_can_gw.cli.common import say
-from kontronik_can_gw.cli.service_files import NAME, WANTS, Choices, State
+from kontronik_can_gw.cli.service_files import NAME, WANTS, Choices
 from kontronik_can_gw.cli.service_machine import (
     call,
     check_executable,
     check_rights,
-    make_lock_folder,
-    make_user,
     own_executable,
-    reload_devices,
-    reload_network,
+    reload,
 )
 from kontronik_can_gw.cli.service_removal import uninstall
 from kontronik_can_gw.cli.service_status import status
@@ -32,7 +28,7 @@ _CHANNEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "install and uninstall need root, except with --root or --dry-run, and print what they do. "
+        "install and uninstall need root, except with --root, and print what they do. "
         "Exit code: 0 done, 1 something failed, 2 wrong usage; of status 0 running, 3 not running."
     )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
@@ -59,17 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="DIR",
             help="only write below DIR, as for a disk image; call no tools",
         )
-        sub.add_argument(
-            "--dry-run", "--print", action="store_true", help="only show what would be done"
-        )
     install_parser.add_argument("--now", action="store_true", help="start it too, or restart it")
     install_parser.add_argument(
         "--executable", metavar="PATH", help="the program (default: this one)"
-    )
-    install_parser.add_argument(
-        "--force",
-        action="store_true",
-        help="replace files that were changed by hand; they are kept as .bak",
     )
     install_parser.add_argument(
         "--network",
@@ -145,8 +133,7 @@ def _lines(text: str) -> int:
 def _install(args: argparse.Namespace) -> int:
     live = args.root is None
     root = Path("/") if live else args.root
-    if not args.dry_run:
-        check_rights(live, root, "install")
+    check_rights(live, root, "install")
     executable = args.executable or own_executable()
     choices = Choices(
         executable,
@@ -157,39 +144,20 @@ def _install(args: argparse.Namespace) -> int:
         args.mqtt,
         args.metrics,
     )
-    plan = [(file, file.state(root)) for file in files.planned(choices, root)]
+    plan = files.planned(choices, root)
     own = root / files.configuration(args.instance)
-    files.check_inside(root, [*(root / file.path for file, _ in plan), own, root / WANTS / "x"])
-    if args.dry_run:
-        return _show(plan, root, args)
-    changed = [root / file.path for file, state in plan if state is State.CHANGED]
-    if changed and not args.force:
-        raise UserError(
-            *(
-                f"{path}: was changed by hand. --force replaces it and keeps it as {path.name}.bak."
-                for path in changed
-            )
-        )
-    for file, state in plan:
-        path = root / file.path
-        if state is State.CHANGED:
-            files.put_aside(path)
-        if state is not State.SAME:
-            files.write(path, file.text)
-        say(f"{path}: {state.value}")
+    files.check_inside(root, [*(root / file.path for file in plan), own, root / WANTS / "x"])
+    for file in plan:
+        say(f"{root / file.path}: {file.put(root)}")
     files.remove_obsolete(root)
     if args.network is not None:
-        _remove_examples(root, args.channel)
+        for path in (root / files.NETWORK).glob(f"*{NAME}-{args.channel}.*.{files.EXAMPLE}"):
+            files.remove(path)  # an active file replaces it
     if files.read(own) is None:
         files.write(own, _example())
         say(f"{own}: new, an example")
     if live:
-        make_user(choices.group)
-        make_lock_folder()
-        call("systemctl", "daemon-reload")
-        reload_devices()
-        if args.network is not None:
-            reload_network(args.channel)
+        reload(None if args.network is None else args.channel)
     return _enable(args, own, live, root)
 
 
@@ -222,15 +190,10 @@ def _enable(args: argparse.Namespace, own: Path, live: bool, root: Path) -> int:
 
 def _enable_unit(args: argparse.Namespace, unit: str, live: bool, root: Path, then: str) -> None:
     if not live:
-        link = root / WANTS / unit
         template = f"{unit.partition('@')[0]}@.service"
-        target = f"/{files.UNITS}/{unit if args.instance is None else template}"
-        try:
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.unlink(missing_ok=True)
-            link.symlink_to(target)
-        except OSError as error:
-            raise RunError(f"{link}: cannot be made: {error.strerror}") from None
+        files.link(
+            root / WANTS / unit, f"/{files.UNITS}/{unit if args.instance is None else template}"
+        )
         say(f"{unit} is enabled")
         return
     call("systemctl", "enable", unit)
@@ -256,31 +219,5 @@ def _not_ready(own: Path) -> list[str]:
     return []
 
 
-def _show(
-    plan: Sequence[tuple[files.PlannedFile, State]], root: Path, args: argparse.Namespace
-) -> int:
-    for file, state in plan:
-        print(f"##### {root / file.path}: {state.value}")
-        print(file.text)
-    own = root / files.configuration(args.instance)
-    print(f"##### {own}: {'new, an example' if files.read(own) is None else 'kept'}")
-    if args.root is None:
-        print(
-            f"##### user {NAME}; systemctl daemon-reload; systemctl enable {files.unit(args.instance)}",
-            end="",
-        )
-        print(f"; systemctl restart {files.unit(args.instance)}" if args.now else "")
-    return 0
-
-
 def _example() -> str:
     return (Path(__file__).parent.parent / "example.toml").read_text(encoding="utf-8")
-
-
-def _remove_examples(root: Path, channel: str) -> None:
-    """Remove the examples that active network files replace."""
-    for path in files.installed(root):
-        if path.name.endswith(f"-{channel}.network.{files.EXAMPLE}") or path.name.endswith(
-            f"-{channel}.link.{files.EXAMPLE}"
-        ):
-            files.remove(path)

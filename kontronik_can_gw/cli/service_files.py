@@ -3,14 +3,13 @@
 The first line of each holds a checksum of the rest, which shows later changes.
 """
 
-import contextlib
 import hashlib
 import os
 import re
-import tempfile
-from collections.abc import Iterable
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 
 from kontronik_can_gw import __version__
@@ -36,15 +35,6 @@ _SERIAL_GROUPS = ("dialout", "uucp")
 """Groups that own serial ports, on Debian and on Arch."""
 
 
-class State(Enum):
-    """State of a file's place."""
-
-    MISSING = "new"
-    SAME = "as it is"
-    OURS = "replaced: was written by another version or with other options"
-    CHANGED = "replaced: was changed by hand, kept as .bak"
-
-
 @dataclass(frozen=True)
 class PlannedFile:
     """A file below the root, with its text."""
@@ -52,14 +42,16 @@ class PlannedFile:
     path: str
     text: str
 
-    def state(self, root: Path) -> State:
-        """Compare with the present file. RunError where it cannot be read."""
-        found = read(root / self.path)
-        if found is None:
-            return State.MISSING
+    def put(self, root: Path) -> str:
+        """Write the file and return what was done; one that was changed by hand stays."""
+        path = root / self.path
+        found = read(path)
         if found == self.text:
-            return State.SAME
-        return State.OURS if is_ours(found) else State.CHANGED
+            return "as it is"
+        if found is not None and not is_ours(found):
+            return "kept, it was changed by hand. Remove it to have it written anew"
+        write(path, self.text)
+        return "new" if found is None else "replaced"
 
 
 @dataclass(frozen=True)
@@ -136,21 +128,12 @@ def planned(choices: Choices, root: Path) -> list[PlannedFile]:
 
 def installed(root: Path) -> list[Path]:
     """Every existing file that an install may have written."""
-    patterns = (
-        SYSUSERS,
-        TMPFILES,
-        f"{UNITS}/{NAME}.service",
-        f"{UNITS}/{NAME}@.service",
-        *OBSOLETE,
-        *(f"{UNITS}/{NAME}-{kind}{end}.service" for kind in COMPANIONS for end in ("", "@")),
-        f"etc/udev/rules.d/70-{NAME}.rules",
-        *(
-            f"{NETWORK}/{_NETWORK_PREFIX}*.{kind}{end}"
-            for kind in ("network", "link")
-            for end in ("", f".{EXAMPLE}")
-        ),
-    )
-    return [path for pattern in patterns for path in sorted(root.glob(pattern))]
+    patterns = {
+        file.path
+        for bitrate in (None, 0)
+        for file in planned(Choices("", False, "", "*", bitrate, True, True), root)
+    }
+    return sorted(path for pattern in {*patterns, *OBSOLETE} for path in root.glob(pattern))
 
 
 def serial_group(root: Path) -> str:
@@ -172,35 +155,46 @@ def is_ours(text: str) -> bool:
     return found is not None and found[1] == _checksum(body)
 
 
+@contextmanager
+def _attempt(path: Path, what: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise RunError(f"{path}: cannot be {what}: {error.strerror}") from None
+
+
 def read(path: Path) -> str | None:
     """The text of a file; None where it does not exist."""
-    try:
-        return path.read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+    with _attempt(path, "read"):
+        try:
+            return path.read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError:
+            return None
 
 
 def write(path: Path, text: str) -> None:
     """Write a world-readable file and its folders, atomically."""
-    beside: Path | None = None
-    try:
+    beside = path.with_name(f".{NAME}.{path.name}")
+    with _attempt(path, "written"):
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
-        with tempfile.NamedTemporaryFile(
-            "w", dir=path.parent, prefix=f".{NAME}.", delete=False, encoding="utf-8"
-        ) as file:
-            beside = Path(file.name)
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.chmod(0o644)
-        beside.replace(path)
-    except OSError as error:
-        if beside is not None:
-            with contextlib.suppress(OSError):
-                beside.unlink()
-        raise RunError(f"{path}: cannot be written: {error.strerror}") from None
+        try:
+            beside.unlink(missing_ok=True)
+            with beside.open("x", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            beside.chmod(0o644)
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
+
+
+def link(path: Path, target: str) -> None:
+    """Make a symbolic link, in place of an older one."""
+    with _attempt(path, "made"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        path.symlink_to(target)
 
 
 def check_inside(root: Path, paths: Iterable[Path]) -> None:
@@ -212,11 +206,12 @@ def check_inside(root: Path, paths: Iterable[Path]) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a symbolic link and print it. RunError on failure."""
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be removed: {error.strerror}") from None
+    """Remove a file, a symbolic link or a folder, and print it."""
+    with _attempt(path, "removed"):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
     say(f"{path}: removed")
 
 
@@ -225,18 +220,14 @@ def remove_obsolete(root: Path) -> None:
     for path in (root / place for place in OBSOLETE):
         if is_ours(read(path) or ""):
             remove(path)
-            with contextlib.suppress(OSError):  # it holds drop-ins of others
+            with suppress(OSError):  # it holds drop-ins of others
                 path.parent.rmdir()
 
 
 def put_aside(path: Path) -> Path:
     """Rename a file to .bak, replacing an older one."""
-    kept = path.with_name(path.name + ".bak")
-    try:
-        path.replace(kept)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be renamed: {error.strerror}") from None
-    return kept
+    with _attempt(path, "renamed"):
+        return path.replace(path.with_name(path.name + ".bak"))
 
 
 def _home(visible: bool) -> str:

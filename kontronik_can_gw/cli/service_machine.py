@@ -28,9 +28,7 @@ def check_rights(live: bool, root: Path, action: str) -> None:
         return
     check_systemd()
     if os.geteuid() != 0:
-        raise RunError(
-            f"only root may do that: sudo {own_executable()} service {action} ... (--dry-run shows what would be done)"
-        )
+        raise RunError(f"only root may do that: sudo {own_executable()} service {action} ...")
 
 
 def check_systemd() -> None:
@@ -63,6 +61,17 @@ def output(*words: str) -> str:
     return run(*words).stdout
 
 
+def show_property(unit: str, name: str) -> str:
+    """A property of a unit, as systemctl shows it."""
+    return output("systemctl", "show", "--value", "--property", name, unit).strip()
+
+
+def listed(verb: str, *patterns: str) -> list[str]:
+    """Names of the units that ``list-units`` or ``list-unit-files`` has."""
+    lines = output("systemctl", verb, "--all", "--plain", "--no-legend", *patterns).splitlines()
+    return [line.split()[0] for line in lines if line.strip()]
+
+
 def call(*words: str) -> None:
     """Call a tool. RunError with its output where it fails."""
     done = run(*words)
@@ -73,42 +82,19 @@ def call(*words: str) -> None:
         raise RunError(f"`{' '.join(words)}` failed: {said[0]}")
 
 
-def make_user(group: str) -> None:
-    import pwd
-
-    if shutil.which("systemd-sysusers"):
-        call("systemd-sysusers", f"/{SYSUSERS}")
+def reload(channel: str | None) -> None:
+    """Make user and lock folder and apply units, udev rules and, with a channel, network files."""
+    call("systemd-sysusers", f"/{SYSUSERS}")
+    call("systemd-tmpfiles", "--create", f"/{TMPFILES}")
+    call("systemctl", "daemon-reload")
+    if shutil.which("udevadm"):
+        call("udevadm", "control", "--reload")
+        call("udevadm", "trigger", "--action=change", "--subsystem-match=tty")
     else:
-        with contextlib.suppress(KeyError):
-            pwd.getpwnam(NAME)
-            return
-        nowhere = ("--no-create-home", "--home-dir", "/", "--shell", "/usr/sbin/nologin")
-        call("useradd", "--system", "--user-group", *nowhere, "--groups", group, NAME)
-    try:
-        pwd.getpwnam(NAME)
-    except KeyError:
-        raise RunError(
-            f"user {NAME}: could not be made. By hand: sudo useradd --system --groups {group} {NAME}"
-        ) from None
-
-
-def make_lock_folder() -> None:
-    """Create the lock folder now; after the next start of the machine systemd does it."""
-    if shutil.which("systemd-tmpfiles"):
-        call("systemd-tmpfiles", "--create", f"/{TMPFILES}")
-
-
-def reload_devices() -> None:
-    """Apply the udev rules to devices that are plugged in already."""
-    if shutil.which("udevadm") is None:
         say("no udevadm here: the udev rules act after the next start")
+    if channel is None:
         return
-    call("udevadm", "control", "--reload")
-    call("udevadm", "trigger", "--action=change", "--subsystem-match=tty")
-
-
-def reload_network(channel: str) -> None:
-    if output("systemctl", "is-active", "systemd-networkd.service").strip() == "active":
+    if show_property("systemd-networkd.service", "ActiveState") == "active":
         call("networkctl", "reload")
     else:
         say(

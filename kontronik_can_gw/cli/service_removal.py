@@ -9,43 +9,48 @@ from pathlib import Path
 from kontronik_can_gw.cli import service_files as files
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.service_files import NAME, WANTS
-from kontronik_can_gw.cli.service_machine import call, check_rights, output, run
-from kontronik_can_gw.cli.service_status import properties
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.cli.service_machine import (
+    call,
+    check_rights,
+    listed,
+    run,
+    show_property,
+)
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.locks import is_held
+
+_ENDS = tuple(f"-{kind}" for kind in files.COMPANIONS)
 
 
 def uninstall(args: argparse.Namespace) -> int:
     live = args.root is None
     root = Path("/") if live else args.root
-    if not args.dry_run:
-        check_rights(live, root, "uninstall")
+    check_rights(live, root, "uninstall")
     links = sorted((root / WANTS).glob(f"{NAME}*.service"))
     if args.instance:
         if args.purge:
             raise UserError("--purge removes everything: not with --instance")
         units = _units(args.instance)
-        code = _disable(args, units, [link for link in links if link.name in units], live)
-        if live and not args.dry_run:
+        _disable(units, [link for link in links if link.name in units], live)
+        if live:
             _remove_runtime_folders(root, f"{NAME}-{args.instance}")
-        return code
+        return 0
     found = files.installed(root)
     doomed = _kept_data(root) if args.purge else []
-    if args.dry_run:
-        for path in (*links, *found, *doomed):
-            print(f"remove {path}")
-        return 0
     if not found and not links and not doomed:
         say("nothing is installed")
         return 0
-    _disable(args, [*_running(), *_units(None)] if live else [], links, live)
+    units = _units(None)
+    if live:
+        units += listed("list-units", *(f"{NAME}{kind}@*.service" for kind in ("", *_ENDS)))
+    _disable(units, links, live)
     for path in found:
         _remove_file(path)
     for kind in ("", "@"):
         with contextlib.suppress(OSError):  # missing, or it holds drop-ins of others
             (root / files.UNITS / f"{NAME}{kind}.service.d").rmdir()
     for path in doomed:
-        _remove_tree(path)
+        files.remove(path)
     if live:
         _remove_runtime_folders(root, f"{NAME}*")
         call("systemctl", "daemon-reload")
@@ -59,38 +64,20 @@ def uninstall(args: argparse.Namespace) -> int:
     return 0
 
 
-def _disable(
-    args: argparse.Namespace, units: Sequence[str], links: Sequence[Path], live: bool
-) -> int:
-    for unit in dict.fromkeys(units) if live else ():
-        if args.dry_run:
-            print(f"systemctl disable --now {unit}")
-        elif properties(unit).get("LoadState") == "loaded":
-            call("systemctl", "disable", "--now", unit)
-            run("systemctl", "reset-failed", unit)
-            say(f"{unit}: stopped and disabled")
-    for link in () if args.dry_run else links:
-        if link.is_symlink():
-            files.remove(link)
-    return 0
-
-
 def _units(instance: str | None) -> list[str]:
     """An instance's service and those beside it."""
     return [files.unit(instance), *(files.companion(kind, instance) for kind in files.COMPANIONS)]
 
 
-def _running() -> list[str]:
-    listed = output(
-        "systemctl",
-        "list-units",
-        "--all",
-        "--plain",
-        "--no-legend",
-        f"{NAME}@*.service",
-        *(f"{NAME}-{kind}@*.service" for kind in files.COMPANIONS),
-    )
-    return [line.split()[0] for line in listed.splitlines() if line.strip()]
+def _disable(units: Sequence[str], links: Sequence[Path], live: bool) -> None:
+    for unit in dict.fromkeys(units) if live else ():
+        if show_property(unit, "LoadState") == "loaded":
+            call("systemctl", "disable", "--now", unit)
+            run("systemctl", "reset-failed", unit)
+            say(f"{unit}: stopped and disabled")
+    for link in links:
+        if link.is_symlink():
+            files.remove(link)
 
 
 def _kept_data(root: Path) -> list[Path]:
@@ -116,11 +103,3 @@ def _remove_file(path: Path) -> None:
         files.remove(path)
     else:
         say(f"{path}: was changed by hand, kept as {files.put_aside(path).name}")
-
-
-def _remove_tree(path: Path) -> None:
-    try:
-        shutil.rmtree(path)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be removed: {error.strerror or error}") from None
-    say(f"{path}: removed")

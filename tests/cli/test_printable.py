@@ -14,9 +14,9 @@ from rich.console import Console
 from kontronik_can_gw.cli import main, say, show
 from kontronik_can_gw.cli.common import write_output
 from kontronik_can_gw.cli.doctor import _show
-from kontronik_can_gw.cli.status import Piece, _rich
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.doctor.findings import Finding, Severity
+from kontronik_can_gw.desk.monitor.lines import line
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.log_writer import BackgroundHandler
@@ -71,7 +71,7 @@ def test_talk_lines_and_errors(capsys: pytest.CaptureFixture[str]) -> None:
 def test_screens(style: str) -> None:
     terminal = Terminal()
     Console(file=terminal, force_terminal=True, color_system=None, width=99).print(
-        _rich([Piece(EVIL, style)])
+        line((EVIL, style))
     )
     assert re.sub(r"\x1b\[\d*m", "", terminal.text()).rstrip("\n") == SHOWN
 

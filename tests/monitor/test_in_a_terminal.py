@@ -90,6 +90,8 @@ def test_values_move_and_keys_are_obeyed(terminal: Terminal, tmp_path: Path) -> 
     terminal.until(lambda lines: lines[3] != before, "another speed")
     terminal.tmux("send-keys", "3")
     terminal.until(lambda lines: "esc3" in lines[1] and "esc4" not in "".join(lines), "one ESC")
+    terminal.tmux("send-keys", "n")
+    terminal.until(lambda lines: "esc4" in lines[1], "the next ESC")
     terminal.tmux("send-keys", "a")
     terminal.until(lambda lines: lines[1].startswith("ESC"), "all")
     terminal.tmux("send-keys", "Space")

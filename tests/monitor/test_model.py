@@ -13,6 +13,7 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.desk.monitor.quantities import HISTORY_S
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError, Severity
@@ -65,13 +66,13 @@ def test_extremes_and_availability_hold_for_any_values(values: list[int | None])
         assert esc.number("battery_current") == (
             None if current is None else pytest.approx(current)
         )
-        spread = esc.spreads["battery_current"]
+        track = esc.tracks["battery_current"]
         if sent:
-            assert [spread.low, spread.high] == pytest.approx([min(sent), max(sent)])
+            assert [track.low, track.high] == pytest.approx([min(sent), max(sent)])
         else:
-            assert (spread.low, spread.high) == (None, None)
+            assert (track.low, track.high) == (None, None)
     monitor.reset()
-    assert (esc.spreads["battery_current"].low, esc.spreads["battery_current"].high) == (None, None)
+    assert (track.low, track.high, list(track.history)) == (None, None, [])
 
 
 @given(
@@ -86,7 +87,7 @@ def test_any_frames_are_borne(
 ) -> None:
     """Foreign ids, short data, any bits; times that jump."""
     monitor = Monitor(ONE)
-    ids = sorted(key for key in monitor.keys)
+    ids = sorted(key for key in monitor.view.reader.keys)
     for number, content, known in frames:
         can_id = ids[number % len(ids)] if known else number
         now = data.draw(st.integers(0, 10 * SECOND_NS))
@@ -98,9 +99,10 @@ def test_any_frames_are_borne(
                 esc.value(source) is None or not isinstance(esc.value(source), bool)
                 for source in esc.units
             )
-            for spread in esc.spreads.values():
-                assert (spread.low is None) == (spread.high is None)
-                assert spread.low is None or spread.high is None or spread.low <= spread.high
+            for track in esc.tracks.values():
+                assert (track.low is None) == (track.high is None)
+                assert track.low is None or track.high is None or track.low <= track.high
+                assert len(track.history) <= HISTORY_S
 
 
 def test_nothing_old_is_shown_when_frames_stay_away() -> None:
@@ -114,7 +116,18 @@ def test_nothing_old_is_shown_when_frames_stay_away() -> None:
     assert (esc.state, esc.link, esc.device, esc.active) == (None, None, "", [])
     assert (monitor.gateway_state, monitor.can_state) == (None, None)
     assert monitor.silent_ns >= 5 * SECOND_NS
-    assert esc.spreads["battery_voltage"].high is not None, "extremes stay"
+    assert esc.tracks["battery_voltage"].high is not None, "extremes stay"
+
+
+def test_the_history_has_a_value_each_second_and_none_while_it_is_not_available() -> None:
+    """The line is silent from 3.5 s on; the values end with the time-out of telemetry."""
+    monitor = watched(ONE, flight(ONE, 6, until=3.5), 7.05)
+    history = list(monitor.escs[0].tracks["battery_voltage"].history)
+    assert len(history) == 7
+    assert all(value is not None and 20 < value < 26 for value in history[:3])
+    assert history[4:] == [None] * 3
+    monitor.advance(10_000 * SECOND_NS)
+    assert list(monitor.escs[0].tracks["battery_voltage"].history) == [None] * HISTORY_S
 
 
 def test_a_link_is_not_lost_beside_a_value_because_its_message_comes_later() -> None:
@@ -148,6 +161,13 @@ def test_errors_have_their_meaning_and_come_first() -> None:
         ("power_stage_overtemp_warning", Severity.WARNING),
     ]
     assert esc.alarms[0].meaning == OperatingError.UNDERVOLTAGE.meaning
+    assert esc.alarms[0].remedy == OperatingError.UNDERVOLTAGE.remedy
+
+
+def test_infinity_of_a_float_signal_is_no_value() -> None:
+    (esc,) = Monitor(ONE).escs
+    assert esc.converted("battery_voltage", float("inf")) is None
+    assert esc.converted("battery_voltage", 22.5) == 22.5
 
 
 USERS_DBC = """VERSION ""
@@ -204,7 +224,7 @@ def test_a_users_dbc_with_other_names_and_units_shows_the_same(users: BusLayout)
     assert esc.number("battery_voltage") == 22.2
     assert esc.number("mean_cell_voltage") == pytest.approx(3.7)
     assert esc.number("power_stage_temperature") == pytest.approx(60.05)
-    assert esc.spreads["battery_voltage"].low == 22.2
+    assert esc.tracks["battery_voltage"].low == 22.2
     assert esc.state == "RPMControl"
     assert [(active.name, active.severity) for active in esc.alarms] == [
         ("undervoltage", Severity.ERROR),

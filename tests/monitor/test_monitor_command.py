@@ -13,10 +13,10 @@ from capture_bench import Bench, made
 from command_line import Done, run, written
 from simulated_bus import Clock, capture_file, flight, layout_of, write_log
 
-from kontronik_can_gw.cli import monitor, monitor_screen
-from kontronik_can_gw.cli.monitor import Recording
+from kontronik_can_gw.cli import monitor
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.monitor import model as model
+from kontronik_can_gw.desk.monitor import esc_monitor, model, screen, sources, terminal, watch
+from kontronik_can_gw.desk.monitor.sources import Recording
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions, SimulatedEsc
 from kontronik_can_gw.runtime import bus_listener
@@ -28,7 +28,8 @@ ONE = layout_of(["esc1"])
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(monitor, "time", clock)
+    for module in (sources, watch):
+        monkeypatch.setattr(module, "time", clock)
     return clock
 
 
@@ -54,7 +55,7 @@ def document(done: Done) -> dict[str, Any]:
 def test_nothing_in_the_monitor_can_send() -> None:
     """The way to the bus has no method to send with, and its sources call none."""
     assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
-    for module in (monitor, monitor_screen, model, bus_listener):
+    for module in (monitor, esc_monitor, model, screen, sources, terminal, watch, bus_listener):
         for node in ast.walk(ast.parse(inspect.getsource(module))):
             if isinstance(node, ast.Attribute):
                 assert "send" not in node.attr, f"{module.__name__}:{node.lineno}"
@@ -127,7 +128,7 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
     assert all(
         -1e-6 <= when - 100 - (now - first) / SECOND_NS / speed <= 0.11 for when, now in taken
     )
-    assert "END OF FILE" in recording.where().progress
+    assert "END OF FILE" in recording.progress
 
 
 # --- mistakes

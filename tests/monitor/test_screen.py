@@ -8,18 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_bus import Timed, flight, layout_of, with_errors
 
-from kontronik_can_gw.cli.monitor_screen import (
-    UNICODE,
-    Choice,
-    Where,
-    number,
-    screen,
-)
+from kontronik_can_gw.desk.monitor.lines import ASCII, UNICODE, Glyphs, number
 from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.desk.monitor.quantities import QUANTITIES
+from kontronik_can_gw.desk.monitor.screen import Choice, screen, sparkline
+from kontronik_can_gw.desk.monitor.sources import Source
+from kontronik_can_gw.desk.monitor.watch import obey
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 
-LIVE = Where("can0", hints=("Is the gateway running?",))
+
+def source_of(monitor: Monitor, name: str = "can0", problem: str = "") -> Source:
+    made = Source(name, monitor.bus)
+    made.problem, made.hints = problem, ("Is the gateway running?",)
+    return made
 
 
 KINDS = ["good", "errors", "lost", "silent", "replay", "none"]
@@ -46,22 +48,28 @@ def seen(count: int, kind: str = "good") -> Monitor:
 
 
 def texts(
-    monitor: Monitor, size: tuple[int, int], where: Where = LIVE, choice: Choice | None = None
+    monitor: Monitor,
+    size: tuple[int, int],
+    source: Source | None = None,
+    choice: Choice | None = None,
 ) -> list[str]:
     """The words alone."""
-    lines = screen(monitor, where, size, choice or Choice(), UNICODE)
-    return ["".join(piece.text for piece in line).rstrip() for line in lines]
+    lines = screen(monitor, source or source_of(monitor), size, choice or Choice(), UNICODE)
+    return [line.plain.rstrip() for line in lines]
 
 
 @given(
     st.tuples(st.integers(1, 150), st.integers(1, 60)), st.sampled_from([1, 2, 8]), st.sampled_from(KINDS),
-    st.integers(-3, 9), st.none() | st.integers(0, 9),
+    st.text("npa0129 x", max_size=5),
 )  # fmt: skip
 @settings(max_examples=30, deadline=None)
-def test_any_size_page_and_choice_is_borne(
-    size: tuple[int, int], count: int, kind: str, page: int, esc: int | None
+def test_any_size_and_keys_are_borne(
+    size: tuple[int, int], count: int, kind: str, keys: str
 ) -> None:
-    lines = texts(seen(count, kind), size, choice=Choice(page, esc))
+    monitor, choice = seen(count, kind), Choice()
+    for key in keys:
+        obey(key, source_of(monitor), monitor, choice)
+    lines = texts(monitor, size, choice=choice)
     assert len(lines) <= max(4, size[1])
     assert max(map(len, lines)) <= max(20, size[0])
 
@@ -73,19 +81,37 @@ def test_what_matters_is_never_cut(size: tuple[int, int], count: int) -> None:
     whole = "\n".join(lines)
     for esc in monitor.escs:
         assert esc.name in whole
-        for source, digits in (
-            ("motor_speed", 0),
-            ("battery_voltage", 2),
-            ("battery_current", 1),
-            ("power_stage_temperature", 0),
-        ):
-            assert re.search(
-                rf"(?<![\d.]){re.escape(number(esc.number(source), digits))}(?![\d.])", whole
-            ), source
+        for quantity in QUANTITIES[:4]:
+            value = number(esc.number(quantity.source), quantity.digits)
+            assert re.search(rf"(?<![\d.]){re.escape(value)}(?![\d.])", whole), quantity.source
     assert whole.count("spool up") + whole.count("RPM control") == count
     assert "…" not in whole
     assert "ERROR: battery voltage too low" in whole
     assert "ERROR: BEC current too high" in whole
+
+
+def test_errors_stand_with_their_remedies_where_there_is_room() -> None:
+    monitor, first = seen(8, "errors"), "-> Stop soon. Charge or check"
+    assert first in "\n".join(texts(monitor, (80, 40)))
+    assert first in "\n".join(texts(monitor, (80, 24), choice=Choice(0)))
+    assert first not in "\n".join(texts(monitor, (80, 24), choice=Choice(1)))
+    assert first not in "\n".join(texts(monitor, (80, 14)))
+
+
+@pytest.mark.parametrize("glyphs", [UNICODE, ASCII])
+def test_a_sparkline_shows_seconds_between_the_extremes_and_gaps(glyphs: Glyphs) -> None:
+    monitor = Monitor(seen(1).bus)
+    track = monitor.escs[0].tracks["battery_voltage"]
+    track.history.extend([0.0, 20.0, None, 24.0, 22.0])
+    track.take(20.0)
+    track.take(24.0)
+    quantity = next(each for each in QUANTITIES if each.source == "battery_voltage")
+    low, high = glyphs.levels[0], glyphs.levels[-1]
+    shown = sparkline(monitor.escs[0], quantity, 4, glyphs).plain
+    assert (shown[:3], shown[3] in glyphs.levels[1:-1]) == (f"{low} {high}", True)
+    assert sparkline(monitor.escs[0], quantity, 0, glyphs).plain == ""
+    track.history.extend([-1e308, 1e308])
+    assert sparkline(monitor.escs[0], quantity, 2, glyphs).plain == 2 * low
 
 
 def test_a_value_that_is_not_available_is_a_dash() -> None:
@@ -98,8 +124,8 @@ def test_a_value_that_is_not_available_is_a_dash() -> None:
 
 
 def test_a_name_with_control_characters_does_not_reach_the_terminal() -> None:
-    where = LIVE._replace(name="can0\x1b[2J", problem="bad\x1b]0;x\x07 thing")
-    assert "".join(texts(seen(1), (80, 24), where)).isprintable()
+    source = source_of(seen(1), "can0\x1b[2J", "bad\x1b]0;x\x07 thing")
+    assert "".join(texts(seen(1), (80, 24), source)).isprintable()
 
 
 @pytest.mark.parametrize(

@@ -22,11 +22,10 @@ from hypothesis import strategies as st
 from statistics_bench import Bench, with_nodes
 
 from kontronik_can_gw.cli import status
-from kontronik_can_gw.cli.status import (
+from kontronik_can_gw.desk.monitor.status import (
     HEALTHY,
     NOT_RUNNING,
     TROUBLE,
-    Node,
     Seen,
     judge,
     look_at,
@@ -40,6 +39,7 @@ from kontronik_can_gw.runtime.snapshot import (
     PortFacts,
     ProgramFacts,
     StoreFacts,
+    pid_namespace,
     program_facts,
 )
 
@@ -59,11 +59,13 @@ def heard(
 
 
 def judged(document: Document, later: int = 0, alive: bool = True) -> Seen:
-    return judge(Path("status.json"), Node(document), document["monotonic_ns"] + later, alive)
+    if not alive:
+        document["process"] |= {"pid": 1 << 22, "pid_namespace": pid_namespace()}  # no such process
+    return judge(Path("status.json"), document, document["monotonic_ns"] + later)
 
 
 def words(seen: Seen, size: tuple[int, int] | None = None) -> str:
-    return "\n".join("".join(piece.text for piece in line) for line in screen(seen, size))
+    return "\n".join(line.plain for line in screen(seen, size))
 
 
 def shell(*arguments: object) -> tuple[object, str, str]:
@@ -376,10 +378,12 @@ def test_no_document_makes_anything_but_lines(
             for key in place[:-1]:
                 at = at[key]
             at[place[-1]] = value
-    seen = judge(Path("x"), Node(document), WHOLE["monotonic_ns"], alive)
+    if not alive:
+        document["monotonic_ns"] = -(10**12)
+    seen = judge(Path("x"), document, WHOLE["monotonic_ns"])
     assert seen.code in (HEALTHY, TROUBLE, NOT_RUNNING)
     for size in (None, (80, 22), (20, 5)):
-        screen(seen, size)
+        assert all(line.plain.isprintable() for line in screen(seen, size))
 
 
 # --- the process
@@ -418,7 +422,7 @@ def test_on_a_terminal_it_is_live_and_ends_by_a_signal_with_0_and_the_cursor_sho
                 text += os.read(master, 65536).decode("utf-8", "replace")
 
     try:
-        until("Ctrl-C ends.")
+        until("Ctrl-C ends")
         document["monotonic_ns"] -= 100 * SECOND
         file.write_text(json.dumps(document), encoding="utf-8")
         until("does not answer since")

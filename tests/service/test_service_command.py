@@ -1,4 +1,4 @@
-"""``service`` as a command: staged files, round trips, what people changed, wrong uses; status with stand-ins for systemd's tools."""
+"""``service`` as a command: staged files, round trips, what people changed, wrong uses; status with a stand-in for systemctl."""
 
 import hashlib
 import json
@@ -11,6 +11,7 @@ from command_line import Done, run
 
 from kontronik_can_gw.cli import service_machine
 from kontronik_can_gw.cli.service_files import is_ours
+from kontronik_can_gw.errors import UserError
 
 UNITS = "etc/systemd/system"
 CONFIGURATION = "etc/kontronik-can-gw/gateway.toml"
@@ -49,13 +50,17 @@ def edit(root: Path, name: str = CONFIGURATION) -> None:
     (root / name).write_text('[[esc]]\nport = "/dev/esc_left"\n')
 
 
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    """A root folder with the program in it."""
-    program = tmp_path / "image" / EXECUTABLE.lstrip("/")
+def written(program: Path) -> Path:
     program.parent.mkdir(parents=True)
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
+    return program
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A root folder with the program in it."""
+    written(tmp_path / "image" / EXECUTABLE.lstrip("/"))
     return tmp_path / "image"
 
 
@@ -172,38 +177,31 @@ def test_a_faulty_configuration_is_reported_and_not_enabled(root: Path) -> None:
     assert install(root, "--now").code == 1
 
 
-def test_an_older_file_of_ours_is_replaced_without_a_word_of_force(root: Path) -> None:
+def test_an_older_file_of_ours_is_replaced(root: Path) -> None:
     install(root, "--network", 250_000)
     network = root / "etc/systemd/network/50-kontronik-can-gw-can0.network"
     assert "BitRate=250000" in network.read_text()
-    assert (
-        "was written by another version or with other options"
-        in install(root, "--network", 500_000).err
-    )
+    assert f"{network}: replaced\n" in install(root, "--network", 500_000).err
     assert "BitRate=500000" in network.read_text()
     assert not list(network.parent.glob("*.bak"))
 
 
-def test_what_was_changed_by_hand_is_refused_then_kept_aside(root: Path) -> None:
-    install(root)
-    unit = root / UNITS / "kontronik-can-gw.service"
-    unit.write_text(unit.read_text().replace("Nice=-10", "Nice=0"))
-    mine = unit.read_text()
-    assert "kontronik-can-gw.service: was changed by hand. --force replaces it" in the_line(
-        install(root), 2
-    )
-    assert unit.read_text() == mine
-    assert install(root, "--force").code == 0
-    assert unit.with_name("kontronik-can-gw.service.bak").read_text() == mine
-    assert is_ours(unit.read_text())
-
-
-def test_a_foreign_file_is_never_taken_for_ours(root: Path) -> None:
+def test_what_was_changed_by_hand_and_what_is_not_ours_stays(root: Path) -> None:
+    rules = root / "etc/udev/rules.d/70-kontronik-can-gw.rules"
     unit = root / UNITS / "kontronik-can-gw.service"
     unit.parent.mkdir(parents=True)
     unit.write_text("[Service]\nExecStart=/bin/true\n")
-    assert "--force replaces it" in the_line(install(root), 2)
-    assert added(root) == [f"{UNITS}/kontronik-can-gw.service"]
+    install(root)
+    rules.write_text(rules.read_text() + "# mine\n")
+    done = install(root)
+    assert done.code == 0
+    for path in (rules, unit):
+        assert f"{path}: kept, it was changed by hand. Remove it" in done.err
+    assert rules.read_text().endswith("# mine\n")
+    assert unit.read_text() == "[Service]\nExecStart=/bin/true\n"
+    rules.unlink()
+    assert f"{rules}: new\n" in install(root).err
+    assert is_ours(rules.read_text())
 
 
 def test_an_active_network_file_takes_the_place_of_its_example(root: Path) -> None:
@@ -259,18 +257,10 @@ def test_a_folder_that_cannot_be_written_is_one_line(root: Path) -> None:
     assert "cannot be" in the_line(install(root), 1)
 
 
-@pytest.mark.parametrize("option", ["--dry-run", "--print"])
-def test_a_dry_run_shows_everything_and_does_nothing(root: Path, option: str) -> None:
-    done = install(root, option)
-    assert (done.code, added(root)) == (0, [])
-    heads = [line for line in done.out.splitlines() if line.startswith("#####")]
-    assert sorted(line.split(":")[0].split("image/")[1] for line in heads) == sorted(FILES)
-    assert "\nCapabilityBoundingSet=\n" in done.out
-    install(root)
-    before = added(root)
-    gone = run("service", "uninstall", "--root", root, "--dry-run", "--purge").out.splitlines()
-    assert len(gone) == len(FILES)
-    assert added(root) == before
+@pytest.mark.parametrize("option", ["--dry-run", "--print", "--force"])
+def test_a_removed_option_says_what_to_do(root: Path, option: str) -> None:
+    assert f"{option}: was removed. " in the_line(install(root, option), 2)
+    assert added(root) == []
 
 
 # --- wrong uses
@@ -287,7 +277,7 @@ def test_a_dry_run_shows_everything_and_does_nothing(root: Path, option: str) ->
         (["install", "--network", "5000000"], "'5000000' is not a bit rate in bit/s"),
         (["install", "--channel", "can 0"], "'can 0' is not the name of an interface"),
         (["status", "-n", "many"], "'many' is not a number of lines"),
-        (["uninstall", "--force"], "unrecognized arguments: --force"),
+        (["uninstall", "--now"], "unrecognized arguments: --now"),
     ],
 )
 def test_a_wrong_use_is_reported_in_the_last_line(words: list[str], said: str) -> None:
@@ -325,17 +315,15 @@ def test_without_root_it_is_refused(
 
 
 def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path) -> None:
-    """Only shown: a dry run on this machine, with a program in a closed folder."""
-    program = tmp_path / "closed" / "kontronik-can-gw"
-    program.parent.mkdir(mode=0o700)
-    program.write_text("#!/bin/sh\n")
-    program.chmod(0o755)
-    done = run("service", "install", "--dry-run", "--executable", program)
-    said = the_line(done, 2)
+    program = written(tmp_path / "closed" / "kontronik-can-gw")
+    program.parent.chmod(0o700)
+    with pytest.raises(UserError) as refused:
+        service_machine.check_executable(str(program), Path("/"))
+    said = str(refused.value)
     assert "the service has a /tmp of its own" in said or "is closed to others" in said
 
 
-# --- status, with stand-ins for systemctl and journalctl
+# --- status, with a stand-in for systemctl
 
 
 def test_closed_folders_on_the_way_are_found(tmp_path: Path) -> None:
@@ -354,112 +342,48 @@ def test_closed_folders_on_the_way_are_found(tmp_path: Path) -> None:
 
 SYSTEMCTL = """#!{python}
 import json, sys
-said = json.load(open({file!r}))
-words = sys.argv[1:]
-if words[0] == "show":
-    for name, value in said["units"].get(words[-1], {{"LoadState": "not-found", "ActiveState": "inactive"}}).items():
-        print(f"{{name}}={{value}}")
-elif words[0] == "list-units":
-    for name in said["units"]:
-        if "@" in name:
-            print(name, "loaded active running x")
+units = json.load(open({file!r}))
+verb, unit = sys.argv[1], sys.argv[-1]
+if verb == "show":
+    print(units.get(unit, {{"LoadState": "not-found"}}).get(sys.argv[4], ""))
+elif verb == "list-units":
+    print("\\n".join(f"{{name}} loaded" for name in units if "@" in name))
+elif verb == "status":
+    print(f"{{unit}} has {{sys.argv[5]}} lines of log\\033[31m")
 """
-JOURNALCTL = """#!{python}
-import json
-for entry in json.load(open({file!r}))["log"]:
-    print(entry if isinstance(entry, str) else json.dumps(entry))
-"""
-RUNNING = {
-    "LoadState": "loaded",
-    "ActiveState": "active",
-    "SubState": "running",
-    "StateChangeTimestamp": "Sat 2026-11-21 15:52:40 UTC",
-    "UnitFileState": "enabled",
-    "StatusText": "esc1: telemetry ok",
-    "MainPID": "107",
-    "NRestarts": "0",
-    "MemoryCurrent": "28311552",
-    "Result": "success",
-    "ExecMainStatus": "0",
-}
-FAILED = RUNNING | {
-    "ActiveState": "activating",
-    "SubState": "auto-restart",
-    "UnitFileState": "disabled",
-    "StatusText": "",
-    "MainPID": "0",
-    "NRestarts": "12",
-    "MemoryCurrent": "18446744073709551615",
-    "Result": "exit-code",
-    "ExecMainStatus": "2",
-}
+RUNNING = {"LoadState": "loaded", "ActiveState": "active", "UnitFileState": "enabled"}
+FAILED = RUNNING | {"ActiveState": "activating", "UnitFileState": "disabled"}
+IDLE = FAILED | {"ActiveState": "inactive"}
+PLAIN = "kontronik-can-gw.service"
+LEFT, RIGHT = "kontronik-can-gw@left.service", "kontronik-can-gw@right.service"
 
 
-def status(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, units: object, log: object, *words: object
-) -> Done:
-    file = folder / "said.json"
-    file.write_text(json.dumps({"units": units, "log": log}))
-    for name, text in (("systemctl", SYSTEMCTL), ("journalctl", JOURNALCTL)):
-        (folder / name).write_text(text.format(python=sys.executable, file=str(file)))
-        (folder / name).chmod(0o755)
-    monkeypatch.setattr(service_machine, "_BOOTED", folder)
-    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("TZ", "UTC")
-    return run("service", "status", *words)
-
-
-def test_status_shows_state_configuration_and_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("units", "words", "code", "heads"),
+    [
+        ({PLAIN: RUNNING}, [], 0, [f"{PLAIN} has 10 lines of log?[31m"]),
+        ({PLAIN: FAILED}, ["-n", 0], 3, [f"{PLAIN} has 0 lines of log?[31m"]),
+        ({}, [], 3, [f"{PLAIN}: not installed. See: kontronik-can-gw service install --help"]),
+        ({PLAIN: IDLE, LEFT: RUNNING, RIGHT: FAILED}, [], 3, [LEFT, RIGHT]),
+        ({PLAIN: RUNNING, LEFT: RUNNING}, [], 0, [PLAIN, LEFT]),
+        ({PLAIN: IDLE, LEFT: RUNNING, RIGHT: FAILED}, ["--instance", "left"], 0, [LEFT]),
+    ],
+)
+def test_status_is_systemds_account_of_the_services_in_use(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    units: dict[str, dict[str, str]],
+    words: list[object],
+    code: int,
+    heads: list[str],
 ) -> None:
-    log = [
-        {
-            "__REALTIME_TIMESTAMP": "1795276360000000",
-            "PRIORITY": "4",
-            "MESSAGE": "esc1: lost\u001b[31m",
-        },
-        "no JSON",
-        {
-            "__REALTIME_TIMESTAMP": "1795276361000000",
-            "PRIORITY": "6",
-            "MESSAGE": [101, 115, 99, 255],
-        },
-        {"MESSAGE": "without time"},
-    ]
-    done = status(tmp_path, monkeypatch, {"kontronik-can-gw.service": RUNNING}, log)
-    assert (done.code, done.err) == (0, "")
+    file, tool = tmp_path / "units.json", tmp_path / "systemctl"
+    file.write_text(json.dumps(units))
+    tool.write_text(SYSTEMCTL.format(python=sys.executable, file=str(file)))
+    tool.chmod(0o755)
+    monkeypatch.setattr(service_machine, "_BOOTED", tmp_path)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    done = run("service", "status", *words)
+    assert (done.code, done.err) == (code, "")
     lines = done.out.splitlines()
-    assert lines[:3] == [
-        "kontronik-can-gw.service: active (running) since Sat 2026-11-21 15:52:40 UTC; starts with the machine",
-        "  says           esc1: telemetry ok",
-        "  process        pid 107, restarted 0 times, 27 MB",
-    ]
-    assert lines[3].startswith("  configuration  /etc/kontronik-can-gw/gateway.toml")
-    assert [line[17:].split("  ", 1)[1] for line in lines[-2:]] == [
-        "warning: esc1: lost?[31m",
-        "esc\ufffd",
-    ]
-
-
-def test_status_of_a_service_that_cannot_start_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done = status(tmp_path, monkeypatch, {"kontronik-can-gw.service": FAILED}, [], "-n", 0)
-    assert done.code == 3
-    lines = done.out.splitlines()
-    assert lines[0].startswith("kontronik-can-gw.service: activating (auto-restart) since ")
-    assert lines[0].endswith("; does not start with the machine")
-    assert lines[1] == "  process        restarted 12 times, last ended by exit-code, status 2"
-
-
-def test_status_of_instances_names_each_and_fails_if_one_is_down(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left, right = "kontronik-can-gw@left.service", "kontronik-can-gw@right.service"
-    idle = RUNNING | {"ActiveState": "inactive", "UnitFileState": "disabled"}
-    units = {"kontronik-can-gw.service": idle, left: RUNNING, right: FAILED}
-    done = status(tmp_path, monkeypatch, units, [])
-    heads = [line.split(":")[0] for line in done.out.splitlines() if not line.startswith(" ")]
-    assert (done.code, heads) == (3, [left, right])
-    assert "configuration  /etc/kontronik-can-gw/left.toml" in done.out
-    assert status(tmp_path, monkeypatch, units, [], "--instance", "left").code == 0
+    assert [line[: len(head)] for line, head in zip(lines, heads, strict=True)] == heads

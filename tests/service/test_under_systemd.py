@@ -157,12 +157,10 @@ def test_several_gateways_run_side_by_side(facts: Facts) -> None:
     talk(facts, "install left")
     done = facts["status of both"]
     assert done["code"] == 0
-    heads = [line for line in done["out"].splitlines() if not line.startswith(" ")]
     assert "esc1: telemetry ok" in done["out"]
-    assert [head.split(" (")[0] for head in heads] == [
-        "kontronik-can-gw.service: active",
-        "kontronik-can-gw@left.service: active",
-    ]
+    assert "kontronik-can-gw.service - KONTRONIK ESC telemetry to CAN\n" in done["out"]
+    assert "kontronik-can-gw@left.service - KONTRONIK ESC telemetry to CAN, left\n" in done["out"]
+    assert done["out"].count("Active: active (running)") == 2
     assert "kontronik-can-gw@left.service: stopped and disabled" in talk(facts, "uninstall left")
     assert facts["left"]["ActiveState"] == "inactive"
     assert facts["left"]["UnitFileState"] == "disabled"

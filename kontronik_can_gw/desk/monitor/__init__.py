@@ -1,1 +1,1 @@
-"""The model of the live screen, fed with CAN frames."""
+"""The screens of monitor, demo and status: one model, one table, one terminal."""

@@ -1,0 +1,163 @@
+"""The demonstration's bus: a simulated ESC on a pseudo terminal, the real gateway, python-can's in-process bus, a CANopen master."""
+
+import contextlib
+import logging
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from kontronik_can_gw.canopen import cob_ids, nmt
+from kontronik_can_gw.config.assemble import assemble
+from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.desk import pty
+from kontronik_can_gw.desk.monitor.sources import Bus, Take
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.kontronik.simulator import (
+    FLIGHT,
+    SECOND_NS,
+    Dropout,
+    ErrorWindow,
+    EscOptions,
+    Faults,
+    SimulatedEsc,
+)
+from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.lean import without_asammdf
+from kontronik_can_gw.node_state import NmtState
+from kontronik_can_gw.runtime.loop import Loop
+
+with without_asammdf():
+    import can
+
+_NODE_ID = 1
+_TPDOS = (0x180, 0x280, 0x380, 0x480)
+_ERRORS = (
+    OperatingError.POWER_STAGE_OVERTEMP_WARNING,
+    OperatingError.BEC_OVERCURRENT,
+    OperatingError.UNDERVOLTAGE,
+    OperatingError.LIMIT_DISCHARGED_CAPACITY,
+)
+
+
+class Master(can.Listener):
+    """A minimal CANopen master: starts the node and notes its state, PDOs and emergencies."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self._state = "no heartbeat yet"
+        self._pdos = 0
+        self._emergency = "none yet"
+
+    def on_message_received(self, msg: can.Message) -> None:
+        data, function = bytes(msg.data), msg.arbitration_id - _NODE_ID
+        if function == cob_ids.HEARTBEAT:
+            state = NmtState(data[0])
+            self._state = state.name.replace("_", "-").lower()
+            if state in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL):
+                start = bytes((nmt.Command.START, _NODE_ID))
+                self._bus.send(
+                    can.Message(arbitration_id=cob_ids.NMT, data=start, is_extended_id=False)
+                )
+        elif function == cob_ids.EMERGENCY:
+            code = int.from_bytes(data[:2], "little")
+            text = next((bit.meaning for bit in OperatingError if bit == data[3]), "of the gateway")
+            self._emergency = f"{code:04X}h {text if code else 'no error any more'}"
+        elif function in _TPDOS:
+            self._pdos += 1
+
+    def line(self) -> str:
+        """One line with everything that the master knows."""
+        return f"CANopen: node {_NODE_ID} {self._state}, {self._pdos} PDOs, EMCY {self._emergency}"
+
+
+class DemoBus(Bus):
+    """The simulated bus as the monitor sees it, with the master's line."""
+
+    def __init__(self, layout: BusLayout, master: Master) -> None:
+        assert layout.config is not None
+        super().__init__(layout, layout.config.can)
+        self.name = "demo"
+        self._master = master
+
+    def pump(self, take: Take, until_s: float) -> None:
+        super().pump(take, until_s)
+        self.note = self._master.line()
+
+
+@contextmanager
+def simulated_bus(seed: int, stop: threading.Event) -> Iterator[DemoBus]:
+    """A bus on which a gateway sends; a failure in it sets ``stop`` and is a RunError at the end."""
+    # the screen shows what the log would
+    logging.getLogger("kontronik_can_gw").addHandler(logging.NullHandler())
+    failures: list[BaseException] = []
+
+    def guarded(work: Callable[[], object]) -> None:
+        try:
+            work()
+        except BaseException as error:
+            failures.append(error)
+            stop.set()
+
+    with contextlib.ExitStack() as stack:
+        esc = stack.enter_context(pty.PtyEsc())
+        layout, loop = _gateway(esc.path, stack.enter_context(tempfile.TemporaryDirectory()))
+        assert layout.config is not None
+        channel = layout.config.can.channel
+        can_bus = stack.enter_context(can.Bus(interface="virtual", channel=channel))
+        master = Master(can_bus)
+        notifier = can.Notifier(can_bus, [master], timeout=0.1)
+        bus = stack.enter_context(DemoBus(layout, master))
+        loop.open()
+        flight = [(_flight(seed), esc)]
+        works: tuple[Callable[[], object], ...] = (
+            loop.run,
+            lambda: pty.run(flight, stop=stop.is_set),
+        )
+        threads = [threading.Thread(target=guarded, args=(work,), daemon=True) for work in works]
+        for thread in threads:
+            thread.start()
+        try:
+            yield bus
+        finally:
+            stop.set()
+            loop.stop()
+            for thread in threads:
+                thread.join(2)
+            notifier.stop()
+        if failures:
+            raise RunError(f"the demonstration failed: {failures[0]!r}")
+        if esc.received:
+            raise RunError(
+                f"the gateway sent {esc.received} bytes to the ESC; it must never send any"
+            )
+
+
+def _gateway(port: str, store: str) -> tuple[BusLayout, Loop]:
+    tables = {
+        "can": {"interface": "virtual", "channel": f"demo-{os.getpid()}"},
+        "canopen": {"enabled": True, "store": store},
+        "esc": [{"port": port, "pole_pairs": 7, "gear": 9.8}],
+    }
+    loaded = assemble(parse(tables, "demo"))
+    assert loaded.database is not None
+    gateway = Gateway(loaded.escs, loaded.layout, time.monotonic_ns(), canopen=loaded.canopen)
+    layout = BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
+    return layout, Loop(gateway, [port], loaded.config.can)
+
+
+def _flight(seed: int) -> SimulatedEsc:
+    """A short flight, again and again, with noise, damaged frames, silences and errors."""
+    errors = tuple(
+        ErrorWindow(_ERRORS[n % len(_ERRORS)], (6 + 13 * n) * SECOND_NS, 3 * SECOND_NS)
+        for n in range(1000)
+    )
+    faults = Faults(
+        noise=0.02, flipped_bits=1e-5, dropout=Dropout(SECOND_NS, 17 * SECOND_NS), errors=errors
+    )
+    profile = tuple(phase._replace(duration_s=max(1.5, phase.duration_s * 0.4)) for phase in FLIGHT)
+    return SimulatedEsc(EscOptions(profile=profile, faults=faults), seed=seed)

@@ -1,0 +1,164 @@
+"""Where the monitor's frames come from: the CAN bus, to which nothing is sent, or a recording played in real time."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Self
+
+from kontronik_can_gw.config.assemble import check_devices
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.desk.recordings.inputs import Input
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.runtime.bus_listener import BusListener
+from kontronik_can_gw.signals.unpacker import SignalReader
+
+_MAX_LAG_S = 0.5
+_LONGEST_SLEEP_S = 0.05
+
+Take = Callable[[CanFrame, int], None]
+
+
+class Source:
+    """Frames with their time."""
+
+    is_file = False
+    ended = False
+    paused = False
+    problem = ""
+    """One line while no frames can come."""
+    note = ""
+    """One line to show with the values."""
+    hints: tuple[str, ...] = ()
+    """Possible causes where no frame comes."""
+    progress = ""
+
+    def __init__(self, name: str, bus: BusLayout) -> None:
+        self.name = name
+        self.bus = bus
+
+    def pump(self, take: Take, until_s: float) -> None:
+        """Pass on the frames that come until this time of ``time.monotonic``; may return sooner."""
+        raise NotImplementedError
+
+    def now(self) -> int:
+        """The present time on the clock of the frames, in ns."""
+        return time.monotonic_ns()
+
+    def wall_time(self) -> str | None:
+        """Date and time of ``now``; None where not known."""
+        return _iso(datetime.now(UTC))
+
+
+def _iso(wall: datetime) -> str:
+    return wall.astimezone().isoformat(timespec="milliseconds")
+
+
+def can_config(bus: BusLayout, interface: str | None, channel: str | None) -> CanConfig:
+    """The interface to listen on. UserError where it is the port of an ESC, to which nothing may be sent."""
+    if bus.config is None:
+        is_fd = any(message.fd for message in bus.layout.messages)
+        return CanConfig(interface=interface or "socketcan", channel=channel or "can0", fd=is_fd)
+    can = bus.config.can
+    if interface not in (None, can.interface):
+        # options and channel belong to another kind of interface
+        can = replace(can, interface=interface, options={})
+    can = replace(can, channel=channel or can.channel)
+    check_devices(replace(bus.config, can=can))
+    return can
+
+
+class Bus(Source):
+    """Frames from the CAN bus, as context manager."""
+
+    def __init__(self, bus: BusLayout, config: CanConfig) -> None:
+        super().__init__(config.channel, bus)
+        self._listener = BusListener(config, SignalReader(bus.layout).keys)
+        rate = f"{config.bitrate // 1000} kbit/s"
+        if config.interface == "socketcan":
+            rate = f"ip -details link show {config.channel}"
+        self.hints = (
+            "Is the gateway running (kontronik-can-gw status)?",
+            f"Is the bit rate right ({rate})?",
+            "Does the gateway send by another DBC (give -c or --dbc)?",
+        )
+
+    def pump(self, take: Take, until_s: float) -> None:
+        frames = self._listener.receive(max(0.0, until_s - time.monotonic()))
+        self.problem = self._listener.problem
+        now = time.monotonic_ns()
+        for frame in frames:
+            take(frame, now)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._listener.close()
+
+
+class Recording(Source):
+    """Frames from a file, played in real time times ``speed``; ``at_once``: as fast as it can be read."""
+
+    is_file = True
+
+    def __init__(self, opened: Input, speed: float, at_once: bool = False) -> None:
+        super().__init__(Path(opened.name).name, opened.bus)
+        self._input = opened
+        self._speed = speed
+        self._at_once = at_once
+        self._frames = opened.frames()
+        self._next = next(self._frames, None)
+        self._clock = self._first_ns = 0 if self._next is None else self._next.time_ns
+        self._last_pump = time.monotonic()
+        self.ended = self._next is None
+
+    def pump(self, take: Take, until_s: float) -> None:
+        begin = time.monotonic()
+        # a delay is not made up for: a slow reader plays slower than asked for
+        passed = min(begin - self._last_pump, _MAX_LAG_S)
+        self._last_pump = begin
+        if not self.paused and not self.ended:
+            self._clock += round(passed * self._speed * SECOND)
+            self._pass_on(take, until_s)
+        pause = until_s - time.monotonic()
+        if self._next is not None and not self.paused:
+            pause = min(pause, (self._next.time_ns - self._clock) / SECOND / self._speed)
+        if pause > 0 and not self._at_once:
+            time.sleep(min(pause, _LONGEST_SLEEP_S))
+
+    def _pass_on(self, take: Take, until_s: float) -> None:
+        """Pass on what is due, at most until this time."""
+        last = self._clock
+        while self._next is not None and (self._at_once or self._next.time_ns <= self._clock):
+            last = self._next.time_ns
+            take(self._next.frame, last)
+            self._next = next(self._frames, None)
+            if time.monotonic() >= until_s:
+                self._clock = last
+                break
+        if self._next is None:
+            self.ended = True
+            self._clock = last
+
+    def now(self) -> int:
+        return self._clock
+
+    @property
+    def progress(self) -> str:  # type: ignore[override]
+        seconds = (self._clock - self._first_ns) // SECOND
+        parts = [f"{seconds // 60}:{seconds % 60:02}"]
+        if self._speed != 1:
+            parts.append(f"x{self._speed:g}")
+        if self.ended:
+            parts.append("END OF FILE")
+        if self.paused:
+            parts.append("PAUSED")
+        return "  ".join(parts)
+
+    def wall_time(self) -> str | None:
+        wall = self._input.wall_ns(self._clock)
+        return None if wall is None else _iso(datetime.fromtimestamp(wall / SECOND, UTC))
