@@ -16,6 +16,7 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "--format man",
     ): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
+    ("report", "--to"): "Type --until S.",
 }
 """Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.
 

@@ -164,6 +164,9 @@ class Browser:
         self.call("Page.navigate", url=page.resolve().as_uri())
         while not self._loaded:
             self._receive()
+        self.run(
+            "new Promise(d => { const f = () => window.flight ? d(0) : requestAnimationFrame(f); f(); })"
+        )
         self.settle()
 
     def settle(self) -> None:
