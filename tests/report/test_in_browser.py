@@ -135,3 +135,24 @@ def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Pa
         )
         assert len(shown) >= 10
         assert all((text != "–") == is_known for text in shown), (share, shown)
+
+
+def test_a_drag_zooms_all_plots_and_a_click_on_an_event_goes_there(
+    browser: Browser, pages: dict[str, Path]
+) -> None:
+    browser.open(pages["one"])
+    x, y = centre(browser, "speed", 0.25)
+    to_x, _ = centre(browser, "speed", 0.5)
+    browser.mouse("Moved", x, y)
+    browser.mouse("Pressed", x, y, buttons=1)
+    for share in (0.3, 0.7, 1):
+        browser.mouse("Moved", x + share * (to_x - x), y, buttons=1)
+    browser.mouse("Released", to_x, y)
+    browser.settle()
+    assert browser.run("flight.range()") == pytest.approx([15, 30], abs=0.2)
+    near = "flight.plots.filter((p) => p.isNear).map((p) => [p.u.scales.x.min, p.u.scales.x.max])"
+    assert browser.run(near)[0] == browser.run("flight.range()")
+    event = "[...document.querySelectorAll('#events tr')].find((r) => /voltage too low/.test(r.textContent))"
+    browser.run(f"{event}.click()")
+    browser.settle()
+    assert browser.run("flight.range()") == pytest.approx([17.5, 23], abs=0.2)

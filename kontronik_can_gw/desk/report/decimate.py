@@ -32,15 +32,18 @@ class Decimator:
 
     def feed(self, times: Sequence[int], columns: Sequence[Sequence[Number]]) -> None:
         """Take rows as columns; ``times`` in ns, never falling."""
-        for run_begin, run_end, missing in _runs(columns, len(times)):
-            for begin in range(run_begin, run_end, self.rows_in_bucket):
-                end = min(begin + self.rows_in_bucket, run_end)
-                self._begin.append(times[begin])
-                self._end.append(times[end - 1])
-                self._count.append(end - begin)
-                self._missing.append(missing)
-                for ends, values in zip(self._ends, columns, strict=True):
-                    ends.append(_ends_of(values[begin:end]))
+        size = self.rows_in_bucket
+        for begin, end, missing in _runs(columns, len(times)):
+            starts = range(begin, end, size)
+            self._begin += times[begin:end:size]
+            self._end += [times[min(at + size, end) - 1] for at in starts]
+            self._count += [min(size, end - at) for at in starts]
+            self._missing += [missing] * len(starts)
+            for ends, values in zip(self._ends, columns, strict=True):
+                if size == 1:
+                    ends += zip(values[begin:end], values[begin:end], strict=True)
+                else:
+                    ends += [_ends_of(values[at : min(at + size, end)]) for at in starts]
         while self._is_full():
             self._merge()
 

@@ -219,7 +219,7 @@
     const series = spec.series.map((item) => {
       const single = isolated(item.values);
       return {
-        label: (several ? data.escs[item.esc] + " " : "") + spec.lines[item.line],
+        label: [several ? data.escs[item.esc] : "", several && spec.lines.length === 1 ? "" : spec.lines[item.line]].join(" ").trim(),
         stroke: () => tone(item),
         width: several ? WIDTHS[item.line] : 1.6,
         dash: DASHES[dashes(styleOf(item))],
@@ -291,7 +291,7 @@
       ctx.textBaseline = "middle";
       ctx.textAlign = "left";
       const more = drawErrorTexts(u, ratio, textRows);
-      note.textContent = more ? `${more} more errors: zoom in, or see the events` : "";
+      note.textContent = more ? `${more} more: zoom in, or see the events` : "";
       escs.forEach((esc, row) => {
         let name = data.escs[esc];
         while (name.length > 1 && ctx.measureText(name).width > (AXIS - 8) * ratio) name = name.replace(/.…?$/u, "…");
