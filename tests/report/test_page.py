@@ -75,7 +75,7 @@ def test_the_page_asks_for_nothing_and_its_policy_names_what_may_run(flight: Fli
 def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
     flight = flown(3)
     flight.escs[0].name = EVIL
-    flight.escs[0].devices = [(0, EVIL)]
+    flight.escs[0].devices = [EVIL]
     flight.missing.append(EVIL)
     flight.events[0].text = flight.events[0].remedy = EVIL
     html = render(

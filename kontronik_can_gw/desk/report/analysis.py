@@ -37,12 +37,9 @@ _SOURCES = {
 
 def needed_columns(fields: Sequence[Field]) -> list[int]:
     """The fields of a recording that an analysis needs."""
-    known = {(field.source, field.esc) for field in fields}
-    return [
-        index
-        for index, (source, esc) in enumerate((field.source, field.esc) for field in fields)
-        if source in _SOURCES or (source in _FLAGS and (_FLAGS[source], esc) not in known)
-    ]
+    words = {field.source for field in fields} & Errors.WORDS.keys()
+    wanted = _SOURCES | {flag for flag, word in _FLAGS.items() if word not in words}
+    return [index for index, field in enumerate(fields) if field.source in wanted]
 
 
 class Analysis:

@@ -74,8 +74,8 @@ class EscFlight:
     resistance: Resistance | None = None
     gaps: int = 0
     longest_gap_ns: int = 0
-    devices: list[tuple[int, str]] = field(default_factory=list)
-    """Every device seen, in words, and since when; usually one."""
+    devices: list[str] = field(default_factory=list)
+    """Every device seen, in words; usually one."""
     layout: str = ""
     """Of its frames."""
     segments: list[Segment] = field(default_factory=list)

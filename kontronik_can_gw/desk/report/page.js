@@ -56,23 +56,11 @@
 
   // --- the time range and the cursor of all plots
 
-  const follow = (plot) => plot.u.setScale("x", { min: range[0], max: range[1] });
-
-  // Plots far off the screen take the range when they come near: many ESCs would be slow to draw otherwise.
-  const nearness = new IntersectionObserver((entries) => {
-    for (const { target, isIntersecting } of entries) {
-      const plot = plots.find(({ box }) => box === target);
-      plot.isNear = isIntersecting;
-      if (isIntersecting) follow(plot);
-    }
-  }, { rootMargin: "400px" });
-
   function setRange(from, to) {
     const span = Math.min(Math.max(to - from, MIN_SPAN), whole[1] - whole[0]);
     const begin = Math.min(Math.max((from + to - span) / 2, whole[0]), whole[1] - span);
-    const fits = span === to - from && from >= whole[0] && to <= whole[1]; // then not a bit of it is changed
-    range = fits ? [from, to] : [begin, begin + span];
-    plots.filter((plot) => plot.isNear).forEach(follow);
+    range = [begin, begin + span];
+    for (const { u } of plots) u.setScale("x", { min: range[0], max: range[1] });
     showNow();
   }
 
@@ -158,7 +146,7 @@
     figure.id = "plot-" + key;
     byId("plots").append(figure);
     figure.append(box);
-    const plot = { key, box, height, isNear: true, showLines: () => plot.u.redraw(false) };
+    const plot = { key, box, height, showLines: () => plot.u.redraw(false) };
     plot.u = new uPlot({
       width: Math.max(200, box.clientWidth),
       height,
@@ -187,8 +175,6 @@
       },
     }, [data.times, ...columns], box);
     plots.push(plot);
-    follow(plot);
-    nearness.observe(box);
     listen(plot);
     return plot;
   }
@@ -372,7 +358,7 @@
 
   // --- events
 
-  const kindOf = (event) => ({ error: event.severity, state: "state", link: "link", device: "device" }[event.kind]);
+  const kindOf = (event) => (event.kind === "error" ? event.severity : event.kind);
   const MAX_EVENTS = 1000;
 
   function listEvents() {
@@ -436,12 +422,11 @@
   addBand();
   data.plots.forEach(addLines);
   listEvents();
-  showNow();
+  setRange(...whole);
   new ResizeObserver(() => fit()).observe(byId("plots"));
   let wasDark = false;
   addEventListener("beforeprint", () => {
     wasDark = root.classList.contains("dark");
-    plots.forEach(follow);
     setTheme(false);
     fit(680);
   });

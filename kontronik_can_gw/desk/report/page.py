@@ -174,7 +174,7 @@ def _head(flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: i
     if wall_ns is not None:
         facts["Begin"] = wall_clock(wall_ns + flight.start_ns - flight.origin_ns)
     for esc in flight.escs:
-        words, noted = _device(esc, flight.origin_ns), provenance.get(esc.name, "")
+        words, noted = _device(esc), provenance.get(esc.name, "")
         port = noted.rpartition(", at ")[2]
         facts[esc.name] = ", at ".join(filter(None, (words, port))) if words else noted
     if flight.replayed:
@@ -189,17 +189,14 @@ def _head(flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: i
     return f"<dl>{''.join(items)}</dl>"
 
 
-def _device(esc: EscFlight, origin_ns: int) -> str:
-    """The device in a few words; if it was replaced, every device with its time; empty where nothing is known."""
-    words = [
-        f"from {clock(time_ns - origin_ns)}: {text}" if index else text
-        for index, (time_ns, text) in enumerate(esc.devices[:MAX_DEVICES])
-    ]
+def _device(esc: EscFlight) -> str:
+    """The device in a few words; if it was replaced, every device; empty where nothing is known."""
+    words = esc.devices[:MAX_DEVICES]
     if len(esc.devices) > MAX_DEVICES:
         words.append(f"and {len(esc.devices) - MAX_DEVICES} more changes")
-    if len(esc.devices) < 2 and esc.layout:
-        words = [", ".join([*words, f"layout {esc.layout}"])]
-    return "; ".join(words)
+    if len(words) == 1 and esc.layout:
+        words = [f"{words[0]}, layout {esc.layout}"]
+    return ", then ".join(words)
 
 
 def _damage(damage: Sequence[str]) -> str:

@@ -144,12 +144,11 @@ class Device:
             if main is not None and sub is not None:
                 text += f", firmware {main}.{sub}"
             known = self._found.devices
-            if known and known[-1][1] != text:
-                change = f"Device changed from {known[-1][1]} to {text}"
-                now = times[row]
+            if known and known[-1] != text:
+                now, change = times[row], f"Device changed from {known[-1]} to {text}"
                 self._events.add(Event("device", self._esc, now, change, end_ns=now))
-            if (not known or known[-1][1] != text) and len(known) < MAX_EVENTS:
-                known.append((times[row], text))
+            if text not in known[-1:]:
+                known.append(text)
 
 
 class States:
