@@ -13,7 +13,7 @@ from kontronik_can_gw.desk.recordings.fields import Field, column_of
 from kontronik_can_gw.desk.report.decimate import Decimator
 from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Flight
 from kontronik_can_gw.desk.report.ledger import Counter, Ledger, Load
-from kontronik_can_gw.desk.report.quantities import MAXIMA, MINIMA, PLOTS
+from kontronik_can_gw.desk.report.quantities import MAXIMA, MINIMA, PLOTS, SAME_IF_EQUAL
 from kontronik_can_gw.desk.report.trackers import Device, Errors, Events, Link, States
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayState
@@ -106,6 +106,11 @@ class Analysis:
             for key, column in zip(self._drawn, columns, strict=True)
             if any(value is not None for value in column)
         }
+        for same, other in SAME_IF_EQUAL:
+            if all(lines.get((e.index, same)) == lines.get((e.index, other)) for e in self._escs):
+                for esc in self._escs:
+                    lines.pop((esc.index, same), None)
+                    esc.found.maxima.pop(same, None)
         start_ns = self._start_ns or 0
         return Flight(
             origin_ns=start_ns if self._origin_ns is None else self._origin_ns,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.desk.report.flight import EscFlight, Flight, Number
-from kontronik_can_gw.desk.report.quantities import PLOTS, STATE_CLASSES, Plot, class_of
+from kontronik_can_gw.desk.report.quantities import PLOTS, STATE_CLASSES, class_of
 from kontronik_can_gw.desk.report.summary import tables, tiles
 from kontronik_can_gw.desk.report.text import clock, duration, number, wall_clock
 from kontronik_can_gw.desk.report.trackers import state_name
@@ -112,7 +112,7 @@ def _plots(flight: Flight) -> list[dict[str, Any]]:
                 abs(value) for line in lines.values() for value in line if value is not None
             )
             for source in plot.lines
-            if (lines := _lines_of(flight, source)) and not _is_repeated(flight, plot, source)
+            if (lines := _lines_of(flight, source))
         }
         groups = of_like_size(tops)
         for index, sources in enumerate(groups):
@@ -138,14 +138,6 @@ def _plots(flight: Flight) -> list[dict[str, Any]]:
 def _lines_of(flight: Flight, source: str) -> dict[int, list[Number]]:
     """The values of a source by ESC."""
     return {esc: values for (esc, name), values in flight.lines.items() if name == source}
-
-
-def _is_repeated(flight: Flight, plot: Plot, source: str) -> bool:
-    """True for a speed that equals a later one of its plot, as output speed without a gear."""
-    if plot.key != "speed":
-        return False
-    later = list(plot.lines)[list(plot.lines).index(source) + 1 :]
-    return any(_lines_of(flight, source) == _lines_of(flight, other) for other in later)
 
 
 def of_like_size(tops: Mapping[str, float]) -> list[list[str]]:

@@ -71,13 +71,13 @@ def tables(flight: Flight) -> str:
 
 def _numbers(esc: EscFlight, flight: Flight) -> dict[str, Group]:
     """The numbers of an ESC by group."""
-    rest, load, resistance = esc.rest_voltage, esc.load_voltage, esc.resistance
+    rest, load = esc.rest_voltage, esc.load_voltage
     charge = _value(esc.counted.get("consumed_charge"), 0, "mAh")
     if charge and esc.charge_resets:
         charge += f" (the counter began again: {esc.charge_resets})"
     energy = _value(_energy_wh(esc), 1, "Wh")
-    if energy and "energy_used" not in esc.counted:
-        energy += " (power integrated)"
+    if energy and esc.energy_drawn is not None:
+        energy += f" (power integrated: {number(esc.energy_drawn, 2)} Wh)"
     share = 100 * esc.telemetry_ns / max(1, flight.end_ns - flight.start_ns)
     losses, crc_errors, dropped = (
         _value(esc.counted.get(source), 0) for source in ("losses", "crc_errors", "dropped_bytes")
@@ -102,9 +102,7 @@ def _numbers(esc: EscFlight, flight: Flight) -> dict[str, Group]:
             "At rest before the first load": _per_cell(rest, esc),
             "Lowest under load": load and f"{_per_cell(load.value, esc)} {_at(load, flight)}",
             "Sag": None if rest is None or load is None else _per_cell(rest - load.value, esc),
-            "Internal resistance (estimate)": resistance
-            and f"{_bold(number(resistance.value * 1000, 1))} ± {number(resistance.spread * 1000, 1)}"
-            f" mΩ, {resistance.stretches} stretches",
+            "Internal resistance (estimate)": _resistance(esc),
         },
         "Quality of the data": {
             "With telemetry": f"{_value(share, 2, '%')} ({duration(esc.telemetry_ns)})",
@@ -150,3 +148,15 @@ def _per_cell(voltage: float | None, esc: EscFlight) -> str | None:
     if voltage is None or not esc.cells:
         return _value(voltage, 2, "V")
     return f"{_value(voltage / esc.cells, 3, 'V a cell')} ({number(voltage, 2)} V)"
+
+
+def _resistance(esc: EscFlight) -> str | None:
+    if esc.resistance is None:
+        return None
+    value, spread, stretches = (
+        1000 * esc.resistance.value,
+        1000 * esc.resistance.spread,
+        esc.resistance.stretches,
+    )
+    a_cell = f" ({number(value / esc.cells, 2)} mΩ a cell)" if esc.cells else ""
+    return f"{_bold(number(value, 1))} ± {number(spread, 1)} mΩ{a_cell}, {stretches} stretches"
