@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kontronik_can_gw.desk.report.decimate import MIN_POINTS, Decimator
@@ -37,9 +37,6 @@ def assert_gaps_are_kept(
             assert (min(kept), max(kept)) == (min(known), max(known))
 
 
-SPARSE = st.lists(st.tuples(st.integers(0, 3999), st.integers(0, 2)), max_size=60)
-
-
 @given(
     ROWS,
     STEPS,
@@ -65,25 +62,3 @@ def test_gaps_and_extremes_are_kept_however_the_rows_are_cut(
         (a is None) is not (b is None) for one in zip(*rows, strict=True) for a, b in pairwise(one)
     )
     assert len(drawn) <= max(points, MIN_POINTS) + 2 * edges
-
-
-@settings(max_examples=40, deadline=None)
-@given(SPARSE, st.integers(1, 400), st.integers(1, 4000))
-def test_a_single_row_without_a_value_is_a_gap_among_thousands(
-    gaps: list[tuple[int, int]], points: int, chunk: int
-) -> None:
-    """Telemetry that is lost is one row with None: the next comes when it is back, seconds later."""
-    columns: list[list[Number]] = [[(at * step) % 977 for at in range(4000)] for step in (1, 0, 7)]
-    times, now = [], 0
-    rows_lost = {at for at, _ in gaps}
-    for at in range(4000):
-        times.append(now)
-        now += 2_800_000_000 if at in rows_lost else 10_000_000
-    for at, column in gaps:
-        columns[column][at] = None
-    decimator = Decimator(3, points)
-    for at in range(0, 4000, chunk):
-        decimator.feed(times[at : at + chunk], [column[at : at + chunk] for column in columns])
-    found = decimator.finish()
-    assert_gaps_are_kept(list(zip(*columns, strict=True)), times, found)
-    assert len(found[0]) <= max(points, MIN_POINTS) + 4 * len(gaps) + 2
