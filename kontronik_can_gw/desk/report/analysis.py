@@ -5,7 +5,7 @@ holds until the next row; two rows further apart than the time-out have a gap be
 """
 
 from collections.abc import Sequence
-from itertools import chain
+from itertools import chain, pairwise
 from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
@@ -13,7 +13,7 @@ from kontronik_can_gw.desk.recordings.fields import Field, column_of
 from kontronik_can_gw.desk.report.decimate import Decimator
 from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Flight
 from kontronik_can_gw.desk.report.ledger import Counter, Ledger, Load
-from kontronik_can_gw.desk.report.quantities import MAXIMA, MINIMA, PLOTS, SAME_IF_EQUAL
+from kontronik_can_gw.desk.report.quantities import MAXIMA, MINIMA, PLOTS
 from kontronik_can_gw.desk.report.trackers import Device, Errors, Events, Link, States
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayState
@@ -23,6 +23,8 @@ CHUNK = 4096
 """Rows that are processed together."""
 COUNTERS = ("consumed_charge", "energy_used", "losses", "crc_errors", "dropped_bytes")
 SPEEDS = ("electrical_speed", "motor_speed", "output_speed")
+SAME_SPEED = 0.005
+"""Share that the maxima of equal speeds may differ by."""
 LIVE = ("battery_voltage", *SPEEDS, "battery_current", "operating_state_raw", "operating_state")
 """The first of these that there is says whether there is telemetry."""
 _DRAWN = tuple(source for plot in PLOTS for source in plot.lines)
@@ -106,11 +108,10 @@ class Analysis:
             for key, column in zip(self._drawn, columns, strict=True)
             if any(value is not None for value in column)
         }
-        for same, other in SAME_IF_EQUAL:
-            if all(lines.get((e.index, same)) == lines.get((e.index, other)) for e in self._escs):
-                for esc in self._escs:
-                    lines.pop((esc.index, same), None)
-                    esc.found.maxima.pop(same, None)
+        for source in self._equal_speeds():
+            for esc in self._escs:
+                lines.pop((esc.index, source), None)
+                esc.found.maxima.pop(source, None)
         start_ns = self._start_ns or 0
         return Flight(
             origin_ns=start_ns if self._origin_ns is None else self._origin_ns,
@@ -126,6 +127,17 @@ class Analysis:
             rows_in_bucket=self._decimator.rows_in_bucket,
             replayed=self._replayed,
         )
+
+    def _equal_speeds(self) -> list[str]:
+        """Speeds that equal another one for all ESCs: no gear, one pole pair."""
+        found = []
+        for slow, fast in pairwise(("output_speed", "motor_speed", "electrical_speed")):
+            maxima = [esc.found.maxima for esc in self._escs]
+            tops = [(m[slow].value, m[fast].value) for m in maxima if slow in m and fast in m]
+            # in a log they come in different messages, so their maxima may differ a little
+            if tops and all(abs(a - b) <= SAME_SPEED * b for a, b in tops):
+                found.append(slow)
+        return found
 
     def _append(self, time_ns: int, values: Sequence[Value]) -> None:
         self._times.append(time_ns)

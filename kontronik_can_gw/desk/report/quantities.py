@@ -38,8 +38,6 @@ PLOTS = (
     Plot("bec_voltage", "BEC voltage", 3, {"bec_voltage": "BEC voltage"}),
     Plot("bec_current", "BEC current", 3, {"bec_current": "BEC current"}),
 )
-SAME_IF_EQUAL = (("output_speed", "motor_speed"), ("motor_speed", "electrical_speed"))
-"""Pairs of speeds of which the first is left out where they are equal (no gear, one pole pair)."""
 
 MAXIMA = {
     "battery_power": ("Battery power", 0),
