@@ -8,6 +8,7 @@ import pytest
 from report_flights import Row, analysed, analysis_of, column, shipped_bus, simulated
 
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.report import trackers
 from kontronik_can_gw.desk.report.flight import EscFlight, Event, Flight
 from kontronik_can_gw.desk.report.ledger import Battery
 from kontronik_can_gw.esc.kontronik.states import (
@@ -18,6 +19,7 @@ from kontronik_can_gw.esc.kontronik.states import (
 )
 from kontronik_can_gw.esc.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
 from kontronik_can_gw.esc.telemetry import SECOND as S
+from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 GAP_NS = 500_000_000
@@ -268,3 +270,39 @@ def test_rows_far_apart_are_not_joined_even_without_a_row_that_shows_the_loss(po
     assert max(t1 - t0 for t0, t1 in drawn) <= 2 * S
     assert all(t0 // 3_100_000_000 == t1 // 3_100_000_000 for t0, t1 in drawn)
     assert flight.escs[0].gaps == 39
+
+
+def test_words_of_errors_and_the_state_of_the_link_become_events() -> None:
+    events, times = trackers.Events(), [0, 10, 20, 30, 40]
+    programming, unknown = 1 << OperatingError.PROGRAMMING_ALLOWED, 1 << 30
+    errors = trackers.Errors(0, {"operating_errors": 0}, events)
+    words = [programming, programming | unknown, 1, 1, None]
+    errors.take(times, [1, 1, 1, 1, None], {"operating_errors": words})
+    link = trackers.Link(0, EscFlight("esc1"), events)
+    states = ["OK", "DEGRADED", "OK", LinkState.PORT_ERROR, LinkState.PORT_ERROR]
+    link.take(times, [1] * 5, {"link_state": states})
+    assert [(e.begin_ns, e.end_ns, e.text, e.note) for e in events.in_order()] == [
+        (10, 20, "bit 30, unknown to this program", ""),
+        (10, 20, "Link degraded: many bytes are damaged", ""),
+        (20, 40, "battery voltage too low", "until telemetry was lost"),
+        (30, None, "The port of the ESC cannot be used", ""),
+    ]
+
+
+def test_a_device_in_its_place_is_an_event() -> None:
+    found, events = EscFlight("esc1"), trackers.Events()
+    device = trackers.Device(0, found, events)
+    columns = {
+        "device": [None, "KOSMIK", "KOSMIK", None, None],
+        "device_raw": [None, 1, 1, None, 63],
+        "variant": [None, 120, 120, None, 9],
+        "firmware_main": [None, 4, 4, None, None],
+        "firmware_sub": [None, 17, 17, None, None],
+        "layout": ["unknown", "V4", "V4", "V4", None],
+    }
+    device.take([0, 10, 20, 30, 40], columns)
+    assert found.devices == ["KOSMIK 120, firmware 4.17", "device 63 9"]
+    assert found.layout == "V4"
+    (change,) = events.in_order()
+    assert (change.begin_ns, change.end_ns) == (40, 40)
+    assert change.text == "Device changed from KOSMIK 120, firmware 4.17 to device 63 9"

@@ -13,6 +13,7 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import of_like_size, render
+from kontronik_can_gw.desk.report.text import clock, duration, number, wall_clock
 from kontronik_can_gw.esc.telemetry import SECOND as S
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u2028{{data}}"
@@ -141,3 +142,15 @@ def test_what_the_dbc_does_not_have_is_left_out_and_reported(tmp_path: Path) -> 
     assert found.missing == ["BEC current", "BEC voltage"]
     html = render(found, title="x", source="y")
     assert "Not in the DBC, so not here: BEC current, BEC voltage." in html
+
+
+def test_times_and_numbers_in_words() -> None:
+    assert [clock(ns) for ns in (0, 62_540_000_000, 3_661 * S, -1_250 * 10**6)] == [
+        *("0:00.0", "1:02.5", "1:01:01.0", "−0:01.2"),
+    ]
+    assert [duration(ns) for ns in (12_540_000_000, 245 * S, 3_725 * S)] == [
+        *("12.5 s", "4 min 05 s", "1 h 02 min 05 s"),
+    ]
+    assert number(-12345.678, 1) == "−12\u202f345.7"
+    assert wall_clock(1_763_751_137 * S) == "2025-11-21 18:52:17 UTC"
+    assert wall_clock(1 << 90) == f"{(1 << 90) // S} s of Unix time"
