@@ -292,7 +292,7 @@ def test_words_of_errors_and_the_state_of_the_link_become_events() -> None:
 def test_a_device_in_its_place_is_an_event() -> None:
     found, events = EscFlight("esc1"), trackers.Events()
     device = trackers.Device(0, found, events)
-    columns = {
+    columns: dict[str, list[object]] = {
         "device": [None, "KOSMIK", "KOSMIK", None, None],
         "device_raw": [None, 1, 1, None, 63],
         "variant": [None, 120, 120, None, 9],
