@@ -33,6 +33,7 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
         "--force",
     ): "Leave it out: a file that was changed by hand stays. Remove it to have it written anew.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
+    ("report", "--to"): "Type --until S.",
 }
 """Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.
 

@@ -54,57 +54,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
-    parser.add_argument(
-        "input", metavar="IN", help="capture, CAN log or UART bytes; - for standard input"
-    )
+    source = "capture, CAN log or UART bytes; - for standard input"
+    parser.add_argument("input", metavar="IN", help=source)
     parser.add_argument("output", metavar="OUT", help="file to write, or - for standard output")
     parser.add_argument("--to", metavar="FORMAT", choices=FORMATS, help=", ".join(FORMATS))
     parser.add_argument("--force", action="store_true", help="write over OUT if it is there")
     parser.add_argument("-q", "--quiet", action="store_true", help="no summary")
     add_layout_arguments(parser)
     part = parser.add_argument_group("a part of it")
-    part.add_argument(
-        "--from",
-        dest="start",
-        metavar="S",
-        type=seconds_ns,
-        help="from this time after the start, in seconds",
-    )
-    part.add_argument(
-        "--until",
-        dest="end",
-        metavar="S",
-        type=seconds_ns,
-        help="up to this time after the start, in seconds",
-    )
+    for option, dest, word in (("--from", "start", "from"), ("--until", "end", "up to")):
+        text = f"{word} this time after the start, in seconds"
+        part.add_argument(option, dest=dest, metavar="S", type=seconds_ns, help=text)
     part.add_argument("--esc", metavar="NAME", help="only the signals (or bytes) of this ESC")
     table = parser.add_argument_group("tables")
-    table.add_argument(
-        "--signals",
-        metavar="A,B*",
-        type=names,
-        default=[],
-        help="only these signals, in this order; * and ? stand for others",
-    )
-    table.add_argument(
-        "--rate",
-        metavar="HZ",
-        type=rate,
-        help="rows a second at most, the newest of each period",
-    )
-    table.add_argument(
-        "--frames", action="store_true", help="a row for each CAN frame, with its own signals only"
-    )
-    table.add_argument(
-        "--units-line", action="store_true", help="jsonl: a first line with the units"
-    )
-    parser.add_argument(
-        "--live-rate",
-        metavar="HZ",
-        type=rate,
-        default=None,
-        help="live frames a second of plain UART bytes, which have no time (default 100)",
-    )
+    signals = "only these signals, in this order; * and ? stand for others"
+    table.add_argument("--signals", metavar="A,B*", type=names, default=[], help=signals)
+    text = "rows a second at most, the newest of each period"
+    table.add_argument("--rate", metavar="HZ", type=rate, help=text)
+    frames = "a row for each CAN frame, with its own signals only"
+    table.add_argument("--frames", action="store_true", help=frames)
+    units = "jsonl: a first line with the units"
+    table.add_argument("--units-line", action="store_true", help=units)
+    live_rate = "live frames a second of plain UART bytes, which have no time (default 100)"
+    parser.add_argument("--live-rate", metavar="HZ", type=rate, help=live_rate)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -155,10 +127,10 @@ def _convert(args: argparse.Namespace, form: str) -> None:
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.progress import Progress
     from kontronik_can_gw.desk.recordings.convert import Output, reason
-    from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput
     from kontronik_can_gw.errors import RunError, UserError
 
-    source, target = Path(args.input), Path(args.output)
+    source = Path(args.input)
+    target = None if args.output == "-" else Path(args.output)
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     begun = time.monotonic()
     with _opened(args, source, layout) as recording:
@@ -167,42 +139,42 @@ def _convert(args: argparse.Namespace, form: str) -> None:
                 f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
             )
         conversion = _conversion(args, form, recording)
+        name, size = source.name or recording.name, recording.size or None
         try:
-            with (
-                Progress(
-                    source.name or recording.name, recording.size or None, args.output == "-"
-                ) as progress,
-                Output(None if args.output == "-" else target, form) as out,
-            ):
+            with Progress(name, size, target is None) as progress, Output(target, form) as out:
                 summary = conversion(recording, out, progress.reach)
         except BrokenPipeError:
             raise
         except OSError as error:
-            where = "standard output" if args.output == "-" else str(target)
+            where = target or "standard output"
             raise RunError(f"{where}: cannot be written: {reason(error)}.") from None
-        damage = [line for line in recording.damage if line not in recording.notes]
-        if summary is None:
-            raise RunError(*_nothing(args, recording, damage))
-        notes = recording.notes if form in TABLES else []
-        if not args.quiet:
-            if (
-                form in TABLES
-                and not notes
-                and isinstance(recording, CanLogInput)
-                and recording.others
-            ):
-                summary += f", {recording.others} other frames passed over"
-            _say(
-                f"{'standard output' if args.output == '-' else args.output}: {summary}, in {time.monotonic() - begun:.1f} s"
-            )
-            if recording.times_assumed and form != BYTES:
-                _say(
-                    f"times are assumed: {args.live_rate or LIVE_RATE:g} live frames a second (--live-rate)"
-                )
-        for line in notes:
-            _say(f"{args.input}: {line}")
-        for line in damage:
-            _say(f"{args.input}: damaged: {line}")
+        _report(args, form, recording, summary, time.monotonic() - begun)
+
+
+def _report(
+    args: argparse.Namespace, form: str, recording: "Input", summary: str | None, seconds: float
+) -> None:
+    """Say what was written, and what of the recording was not intact. RunError where there was nothing."""
+    from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput
+    from kontronik_can_gw.errors import RunError
+
+    damage = [line for line in recording.damage if line not in recording.notes]
+    if summary is None:
+        raise RunError(*_nothing(args, recording, damage))
+    notes = recording.notes if form in TABLES else []
+    if not args.quiet:
+        others = recording.others if isinstance(recording, CanLogInput) else 0
+        if form in TABLES and not notes and others:
+            summary += f", {others} other frames passed over"
+        where = "standard output" if args.output == "-" else args.output
+        _say(f"{where}: {summary}, in {seconds:.1f} s")
+        if recording.times_assumed and form != BYTES:
+            live_rate = args.live_rate or LIVE_RATE
+            _say(f"times are assumed: {live_rate:g} live frames a second (--live-rate)")
+    for line in notes:
+        _say(f"{args.input}: {line}")
+    for line in damage:
+        _say(f"{args.input}: damaged: {line}")
 
 
 def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None") -> "Input":
@@ -225,7 +197,7 @@ def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Con
         LogConversion,
         TableConversion,
     )
-    from kontronik_can_gw.desk.recordings.tables import Choice, fields_of_frames
+    from kontronik_can_gw.desk.recordings.tables.rows import Choice, fields_of_frames
 
     if form == BYTES:
         return BytesConversion(_esc(args, recording, needed=True) or 0)

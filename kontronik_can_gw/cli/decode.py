@@ -1,6 +1,15 @@
 """``kontronik-can-gw decode``: recorded UART bytes to JSON lines or CSV."""
 
 import argparse
+import json
+import os
+import stat
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TextIO
+
+from kontronik_can_gw.errors import RunError, UserError
 
 EPILOG = """\
 FILE holds the bytes as they came over the UART, nothing else; - is standard input, decoded as it comes.
@@ -28,64 +37,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Decode args.file. RunError where something cannot be opened, read or written."""
-    import os
-    import stat
-    import sys
-    from contextlib import ExitStack
-    from pathlib import Path
-
     from kontronik_can_gw.cli.progress import Progress
     from kontronik_can_gw.desk.recordings import decode
-    from kontronik_can_gw.errors import RunError, UserError
 
     name = "standard input" if args.file == "-" else args.file
+    failure, code = None, 0
     with ExitStack() as stack:
-        try:
-            if args.file == "-":
-                fd = 0
-            else:
-                fd = os.open(args.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOCTTY)
-                stack.callback(os.close, fd)
-            status = os.fstat(fd)
-        except (OSError, ValueError) as error:
-            raise RunError(
-                f"{name}: cannot be opened: {_reason(error)}. Give a file of recorded UART bytes."
-            ) from None
-        if stat.S_ISDIR(status.st_mode):
-            raise RunError(f"{name}: is a directory. Give a file of recorded UART bytes.")
-        is_file = stat.S_ISREG(status.st_mode)
-
-        stats = None
-        if args.stats is not None:
-            try:
-                target = Path(args.stats)
-                if is_file and target.exists() and os.path.samestat(target.stat(), status):
-                    raise UserError(f"--stats {args.stats}: is the input. Give another file.")
-                stats = stack.enter_context(target.open("w", encoding="utf-8"))
-            except (OSError, ValueError) as error:
-                raise RunError(
-                    f"--stats {args.stats}: cannot be written: {_reason(error)}."
-                ) from None
-
-        out = sys.stdout
+        fd, status = _opened(args.file, name, stack)
+        size = status.st_size if stat.S_ISREG(status.st_mode) else None
+        stats = None if args.stats is None else _stats_file(args.stats, status, stack)
+        decoder = decode.Decoder()
 
         def write(text: str) -> None:
-            try:
-                out.write(text)
-                if not is_file or not text:
-                    out.flush()
-            except BrokenPipeError:
-                raise
-            except OSError as error:
-                # what is buffered has nowhere to go
-                os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
-                raise RunError(f"standard output: cannot be written: {_reason(error)}.") from None
+            _write(text, flush=size is None or not text)
 
-        decoder = decode.Decoder()
-        code = 0
-        failure = None
         try:
-            with Progress(name, status.st_size if is_file else None) as progress:
+            with Progress(name, size) as progress:
                 if args.csv:
                     write(decode.csv_header())
                 lines = decode.csv_lines if args.csv else decode.json_lines
@@ -99,18 +66,62 @@ def main(args: argparse.Namespace) -> int:
         write("")
         print(decode.summary(decoder.counters), file=sys.stderr)
         if stats is not None:
-            import json
-
             try:
                 stats.write(json.dumps(decoder.counters.as_dict(), indent=2) + "\n")
                 stats.flush()
             except OSError as error:
-                raise RunError(
-                    f"--stats {args.stats}: cannot be written: {_reason(error)}."
-                ) from None
+                raise _unwritable(f"--stats {args.stats}", error) from None
         if failure is not None:
             raise failure
     return code
+
+
+def _opened(file: str, name: str, stack: ExitStack) -> tuple[int, os.stat_result]:
+    """The input's descriptor, and what it is."""
+    try:
+        fd = 0
+        if file != "-":
+            fd = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOCTTY)
+            stack.callback(os.close, fd)
+        status = os.fstat(fd)
+    except (OSError, ValueError) as error:
+        raise RunError(
+            f"{name}: cannot be opened: {_reason(error)}. Give a file of recorded UART bytes."
+        ) from None
+    if stat.S_ISDIR(status.st_mode):
+        raise RunError(f"{name}: is a directory. Give a file of recorded UART bytes.")
+    return fd, status
+
+
+def _stats_file(file: str, source: os.stat_result, stack: ExitStack) -> TextIO:
+    """The file for the counters; UserError where it is the input."""
+    try:
+        target = Path(file)
+        is_file = stat.S_ISREG(source.st_mode)
+        if is_file and target.exists() and os.path.samestat(target.stat(), source):
+            raise UserError(f"--stats {file}: is the input. Give another file.")
+        return stack.enter_context(target.open("w", encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise _unwritable(f"--stats {file}", error) from None
+
+
+def _write(text: str, *, flush: bool) -> None:
+    """Write to standard output."""
+    out = sys.stdout
+    try:
+        out.write(text)
+        if flush:
+            out.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        # what is buffered has nowhere to go
+        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
+        raise _unwritable("standard output", error) from None
+
+
+def _unwritable(what: str, error: Exception) -> RunError:
+    return RunError(f"{what}: cannot be written: {_reason(error)}.")
 
 
 def _reason(error: Exception) -> str:

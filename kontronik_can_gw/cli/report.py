@@ -4,25 +4,26 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments
 
 if TYPE_CHECKING:
     from kontronik_can_gw.desk.recordings.inputs import Input
-    from kontronik_can_gw.desk.report.analysis import Analysis
+    from kontronik_can_gw.desk.report.flight import Flight
 
 EPILOG = """\
 IN is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
 bytes, or a CAN log (candump, ASC, BLF, TRC, MF4). For a CAN log give the DBC of its frames with -c or --dbc.
 
-The page is one file that needs no network: a summary (energy, charge, extremes with their time, cell voltage sag, quality
-of the data), plots with zoom, the operating states, errors with meaning and remedy. Several ESCs share the plots.
+The page is one file that needs no network: plots with zoom, the operating states, errors with meaning and remedy, and the
+numbers (energy, charge, extremes with their time, cell voltage sag, quality of the data). Several ESCs share the plots.
 Numbers and events are from every row. Lines are reduced to --points points in a way that keeps every peak and every gap.
 The same recording gives the same page, byte for byte. A file that exists is only replaced with --force.
 
 examples:
   kontronik-can-gw report flight.kcap -o flight.html
   kontronik-can-gw report bus.log -c gateway.toml -o climb.html --title "Climb with 6S"
-  kontronik-can-gw report flight.kcap -o part.html --from 60 --to 90
+  kontronik-can-gw report flight.kcap -o part.html --from 60 --until 90
 
 exit codes: 0 done, 1 something cannot be read or written, or has no values; 2 wrong usage, or a file that is no recording
 """
@@ -33,92 +34,55 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
     parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes")
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="FILE",
-        required=True,
-        help="page to write, or - for standard output",
-    )
+    output = "page to write, or - for standard output"
+    parser.add_argument("-o", "--output", metavar="FILE", required=True, help=output)
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
     add_layout_arguments(parser)
-    parser.add_argument(
-        "--points",
-        type=_points,
-        default=20_000,
-        metavar="N",
-        help="points of a line, 100 to 1000000 (default 20000)",
-    )
-    parser.add_argument(
-        "--title", metavar="TEXT", help="the page's title (default: the name of IN)"
-    )
-    parser.add_argument(
-        "--from",
-        dest="start",
-        type=_seconds,
-        metavar="S",
-        help="begin at this time in seconds after the start",
-    )
-    parser.add_argument(
-        "--to",
-        "--until",
-        dest="end",
-        type=_seconds,
-        metavar="S",
-        help="end at this time in seconds after the start",
-    )
+    points = "points of a line, 100 to 1000000 (default 20000)"
+    parser.add_argument("--points", type=_points, default=20_000, metavar="N", help=points)
+    title = "the page's title (default: the name of IN)"
+    parser.add_argument("--title", metavar="TEXT", help=title)
+    for option, dest, word in (("--from", "start", "begin"), ("--until", "end", "end")):
+        text = f"{word} at this time in seconds after the start"
+        seconds = number_from(0, 1e9)
+        parser.add_argument(option, dest=dest, type=seconds, metavar="S", help=text)
 
 
 def main(args: argparse.Namespace) -> int:
     """Report on args.input. UserError for wrong usage, RunError where a file cannot be read or written."""
-
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.common import say, write_output
     from kontronik_can_gw.desk.recordings.inputs import open_input
-    from kontronik_can_gw.desk.report.analysis import Analysis
     from kontronik_can_gw.desk.report.page import render
     from kontronik_can_gw.errors import RunError, UserError
 
     if args.start is not None and args.end is not None and args.end <= args.start:
-        raise UserError(f"--to {args.end:g}: must be greater than --from {args.start:g}")
+        raise UserError(f"--until {args.end:g}: must be greater than --from {args.start:g}")
     source = Path(args.input)
     _check_target(source, args.output, force=args.force)
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     with open_input(source, layout) as recording:
-        window = (args.start, args.end)
-        analysis = Analysis(recording.bus, args.points, window, recording.fields)
-        if not analysis.has_anything:
-            raise UserError(
-                f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
-            )
-        if not _read(recording, analysis, source.name, args.output == "-"):
+        flight = _analysed(recording, args)
+        if flight is None:
+            say("stopped: nothing is written")
             return 130
-        flight = analysis.finish()
+        damage = [f"{args.input}: damaged: {line}" for line in recording.damage]
         if not flight.rows:
-            where = (
-                "in this part of it"
-                if args.start or args.end
-                else "by this DBC. Is -c or --dbc the right one?"
-            )
-            raise RunError(
-                *(f"{args.input}: damaged: {line}" for line in recording.damage),
-                f"{args.input}: no values {where}",
-            )
-        title = args.title if args.title is not None else source.name
-        damage = list(recording.damage)
+            where = "in this part of it"
+            if not args.start and not args.end:
+                where = "by this DBC. Is -c or --dbc the right one?"
+            raise RunError(*damage, f"{args.input}: no values {where}")
         page = render(
             flight,
-            title=title,
+            title=source.name if args.title is None else args.title,
             source=source.name,
             provenance=recording.provenance,
             wall_ns=recording.wall_ns(flight.origin_ns),
-            damage=damage,
+            damage=recording.damage,
         )
         write_output(args.output, page, "utf-8")
-    for line in recording.notes:
-        say(f"{args.input}: {line}", "report")
-    for line in damage:
-        say(f"{args.input}: damaged: {line}", "report")
+    for line in (*(f"{args.input}: {note}" for note in recording.notes), *damage):
+        say(line, "report")
     return 0
 
 
@@ -137,41 +101,36 @@ def _check_target(source: Path, output: str, *, force: bool) -> None:
             if target.is_file() and not force:
                 raise UserError(f"{output}: exists. Give another -o, or --force.")
     except (OSError, ValueError) as error:  # a name too long, or with a null byte
-        raise UserError(
-            f"{output}: cannot be written: {getattr(error, 'strerror', None) or error}."
-        ) from None
+        why = getattr(error, "strerror", None) or error
+        raise UserError(f"{output}: cannot be written: {why}.") from None
 
 
-def _read(recording: "Input", analysis: "Analysis", name: str, data_on_screen: bool) -> bool:
-    """Feed all rows to the analysis; False if the user stopped it."""
-    from kontronik_can_gw.cli.common import say
+def _analysed(recording: "Input", args: argparse.Namespace) -> "Flight | None":
+    """The flight of all rows; None if the user stopped it. UserError where nothing could be shown."""
     from kontronik_can_gw.cli.progress import Progress
+    from kontronik_can_gw.desk.report.analysis import Analysis, needed_columns
+    from kontronik_can_gw.errors import UserError
 
-    take = analysis.take
+    chosen = needed_columns(recording.fields)
+    fields = [recording.fields[index] for index in chosen]
+    analysis = Analysis(recording.bus.escs, fields, args.points, (args.start, args.end))
+    if not analysis.has_anything:
+        raise UserError(
+            f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
+        )
     try:
-        with Progress(name, recording.size or None, data_on_screen) as progress:
-            for count, sample in enumerate(recording.samples()):
-                if not take(sample.time_ns, sample.values):
+        with Progress(recording.name, recording.size or None, args.output == "-") as progress:
+            for count, sample in enumerate(recording.samples(chosen)):
+                if not analysis.take(sample.time_ns, sample.values):
                     break
                 if not count & 1023:
                     progress.reach(recording.position)
     except KeyboardInterrupt:
-        say("stopped: nothing is written")
-        return False
-    return True
+        return None
+    return analysis.finish()
 
 
 def _points(text: str) -> int:
     if not text.isdecimal() or not 100 <= int(text) <= 1_000_000:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of points, 100 to 1000000")
     return int(text)
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1
-    if not 0 <= value < 1e9:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds")
-    return value

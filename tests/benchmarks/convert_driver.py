@@ -22,7 +22,7 @@ from kontronik_can_gw.desk.recordings.convert import (
 )
 from kontronik_can_gw.desk.recordings.inputs import DumpInput
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
-from kontronik_can_gw.desk.recordings.tables import Choice
+from kontronik_can_gw.desk.recordings.tables.rows import Choice
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 
 

@@ -28,11 +28,11 @@ from recordings import (
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
-from kontronik_can_gw.desk.recordings.fields import Kind, distinct
+from kontronik_can_gw.desk.recordings.fields import Field, Kind, Table, distinct
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.samples import RowMaker
-from kontronik_can_gw.desk.recordings.tables import Field, Row, Table, open_table
-from kontronik_can_gw.desk.recordings.tables.rows import Choice, thinned
+from kontronik_can_gw.desk.recordings.tables.rows import Choice, Row, thinned
+from kontronik_can_gw.desk.recordings.tables.writers import open_table
 from kontronik_can_gw.esc.kontronik import LiveData, encode
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings, EscTelemetry

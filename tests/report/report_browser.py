@@ -16,6 +16,10 @@ PROGRAM = (
     or shutil.which("google-chrome")
 )
 MISSING = "no Chromium: apt-get install chromium, or give its path in the variable CHROMIUM"
+OPTIONS = """
+    --headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking
+    --disable-component-update --disable-sync --disable-dev-shm-usage --hide-scrollbars --remote-debugging-pipe
+"""
 _TIMEOUT_S = 60
 
 
@@ -36,28 +40,7 @@ class Browser:
             os.dup2(moved[1], 4)
 
         self._process = subprocess.Popen(
-            [
-                PROGRAM,
-                *(
-                    "--headless",
-                    "--no-sandbox",
-                    "--disable-gpu",
-                    "--disable-quic",
-                    "--no-first-run",
-                ),
-                *(
-                    "--disable-background-networking",
-                    "--disable-component-update",
-                    "--disable-sync",
-                    "--disable-dev-shm-usage",
-                ),
-                *(
-                    "--hide-scrollbars",
-                    "--remote-debugging-pipe",
-                    f"--user-data-dir={profile}",
-                    "about:blank",
-                ),
-            ],
+            [PROGRAM, *OPTIONS.split(), f"--user-data-dir={profile}", "about:blank"],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,
@@ -163,6 +146,9 @@ class Browser:
         self.call("Page.navigate", url=page.resolve().as_uri())
         while not self._loaded:
             self._receive()
+        self.run(
+            "new Promise(d => { const f = () => window.flight ? d(0) : requestAnimationFrame(f); f(); })"
+        )
         self.settle()
 
     def settle(self) -> None:

@@ -1,12 +1,19 @@
 """Simulated flights as inputs of the report: rows as ``open_input`` gives them, made by the real gateway without any file."""
 
+import base64
+import gzip
 import heapq
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 from simulated_bus import layout_of
 
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.samples import fields_of_log
+from kontronik_can_gw.desk.report.analysis import Analysis
+from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway import Gateway
@@ -51,6 +58,29 @@ def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()
         view.expire(now)
         yield now, list(view.values)
         heapq.heapreplace(due, (escs[index].next_ns, index))
+
+
+def analysis_of(
+    bus: BusLayout, points: int = 2000, window: tuple[float | None, float | None] = (None, None)
+) -> Analysis:
+    """An analysis of the rows of a bus."""
+    fields = fields_of_log(SignalReader(bus.layout), bus.escs)
+    return Analysis(bus.escs, fields, points, window)
+
+
+def analysed(analysis: Analysis, rows: Iterable[Row]) -> Flight:
+    """The flight of these rows."""
+    for time_ns, values in rows:
+        if not analysis.take(time_ns, values):
+            break
+    return analysis.finish()
+
+
+def data_of(html: str) -> dict[str, Any]:
+    """The data that a page draws."""
+    packed = html.partition(' id="data">')[2].partition("<")[0]
+    found: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(packed)))
+    return found
 
 
 def column(bus: BusLayout, source: str, esc: int | None = 0) -> int:

@@ -5,16 +5,21 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 import pytest
-from report_flights import Row, column, shipped_bus, simulated
+from report_flights import Row, analysed, analysis_of, column, shipped_bus, simulated
 
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.report.analysis import Analysis
-from kontronik_can_gw.desk.report.fit import ResistanceFit
-from kontronik_can_gw.desk.report.flight import Event, Flight
-from kontronik_can_gw.desk.report.quantities import PLOTS
+from kontronik_can_gw.desk.report import trackers
+from kontronik_can_gw.desk.report.flight import EscFlight, Event, Flight
+from kontronik_can_gw.desk.report.ledger import Battery
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
-from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+)
 from kontronik_can_gw.esc.telemetry import SECOND as S
+from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 GAP_NS = 500_000_000
@@ -31,19 +36,6 @@ FAULTS = Faults(
 OPTIONS = (EscOptions(faults=FAULTS), EscOptions(device=Device.JIVEPRO, max_current=80))
 
 
-def analysed(
-    bus: BusLayout,
-    rows: list[Row],
-    points: int = 2000,
-    window: tuple[float | None, float | None] = (None, None),
-) -> Flight:
-    analysis = Analysis(bus, points, window)
-    for time_ns, values in rows:
-        if not analysis.take(time_ns, values):
-            break
-    return analysis.finish()
-
-
 @pytest.fixture(scope="module")
 def bus() -> BusLayout:
     return shipped_bus("left", "right")
@@ -56,7 +48,7 @@ def rows(bus: BusLayout) -> list[Row]:
 
 @pytest.fixture(scope="module")
 def flight(bus: BusLayout, rows: list[Row]) -> Flight:
-    return analysed(bus, rows)
+    return analysed(analysis_of(bus), rows)
 
 
 def table(bus: BusLayout, rows: list[Row], esc: int, *sources: str) -> pd.DataFrame:
@@ -84,7 +76,7 @@ def test_time_and_energy_are_those_of_pandas(
         "energy_used",
         "consumed_charge",
     )
-    summary = flight.summaries[esc]
+    summary = flight.escs[esc]
     live = data[data.battery_voltage.notna()]
     assert summary.telemetry_ns == live.held.sum()
     turning = live[live.electrical_speed.fillna(0) > 0]
@@ -96,10 +88,9 @@ def test_time_and_energy_are_those_of_pandas(
         (turning.battery_power * turning.held).sum() / turning.held.sum()
     )
     counter = data.energy_used.dropna().to_numpy(float)
-    assert summary.energy_counter == pytest.approx(counter[-1] - counter[0])
-    assert summary.energy == summary.energy_counter
+    assert summary.counted["energy_used"] == pytest.approx(counter[-1] - counter[0])
     assert summary.energy_drawn == pytest.approx(
-        summary.energy_counter, abs=0.4
+        summary.counted["energy_used"], abs=0.4
     )  # the counter knows no rows, and no coarser power
 
 
@@ -111,8 +102,8 @@ def test_charge_goes_on_over_resets(
     counter = data.consumed_charge.dropna().to_numpy(float)
     steps = np.diff(counter)
     expected = steps[steps > 0].sum() + counter[1:][steps < 0].sum()
-    assert flight.summaries[esc].charge == pytest.approx(expected)
-    assert flight.summaries[esc].charge_resets == (steps < 0).sum()
+    assert flight.escs[esc].counted["consumed_charge"] == pytest.approx(expected)
+    assert flight.escs[esc].charge_resets == (steps < 0).sum()
     assert expected > 100
 
 
@@ -120,24 +111,20 @@ def test_charge_goes_on_over_resets(
 def test_extremes_are_those_of_pandas_with_their_time(
     bus: BusLayout, rows: list[Row], flight: Flight, esc: int
 ) -> None:
-    found = flight.summaries[esc].extremes
-    assert {
-        "max battery_power",
-        "max motor_current",
-        "min battery_voltage",
-        "min bec_voltage",
-    } <= found.keys()
-    for key, extreme in found.items():
-        which, source = key.split()
-        data = table(bus, rows, esc, source).dropna()
-        values = data[source].to_numpy(float)
-        at = values.argmax() if which == "max" else values.argmin()
-        assert (extreme.value, extreme.time_ns) == (values[at], data.time_ns.iloc[at]), key
+    found = flight.escs[esc]
+    assert {"battery_power", "motor_current"} <= found.maxima.keys()
+    assert {"battery_voltage", "bec_voltage"} <= found.minima.keys()
+    for extremes, place in ((found.maxima, np.argmax), (found.minima, np.argmin)):
+        for source, extreme in extremes.items():
+            data = table(bus, rows, esc, source).dropna()
+            values = data[source].to_numpy(float)
+            at = place(values)
+            assert (extreme.value, extreme.time_ns) == (values[at], data.time_ns.iloc[at]), source
 
 
 def test_sag_and_resistance(bus: BusLayout, rows: list[Row], flight: Flight) -> None:
     data = table(bus, rows, 1, "battery_voltage", "battery_current").dropna()
-    summary = flight.summaries[1]
+    summary = flight.escs[1]
     loaded = data[data.battery_current >= 5]
     assert summary.load_voltage is not None
     assert summary.load_voltage.value == loaded.battery_voltage.min()
@@ -154,15 +141,17 @@ def test_sag_and_resistance(bus: BusLayout, rows: list[Row], flight: Flight) -> 
 
 def test_the_fit_is_that_of_numpy() -> None:
     random = np.random.default_rng(3)
-    fit = ResistanceFit()
+    esc = EscFlight("esc1")
+    battery = Battery(esc)
     slopes = []
     for stretch in range(7):
         current = random.uniform(0, 80, 200).round(1)
         voltage = (25 - 0.1 * stretch - 0.02 * current + random.normal(0, 0.05, 200)).round(2)
         for i in range(200):
-            fit.take(stretch * 10 * S + i * 50_000_000, float(voltage[i]), float(current[i]))
+            battery.take(stretch * 10 * S + i * 50_000_000, float(voltage[i]), float(current[i]))
         slopes.append(-np.polyfit(current, voltage, 1)[0])
-    found = fit.finish()
+    battery.finish()
+    found = esc.resistance
     assert found is not None
     assert found.value == pytest.approx(np.median(slopes))
     assert found.spread == pytest.approx(
@@ -172,52 +161,48 @@ def test_the_fit_is_that_of_numpy() -> None:
 
 
 def test_errors_begin_and_end_when_they_did(flight: Flight) -> None:
-    def of(name: str, esc: int = 0) -> list[Event]:
-        return [e for e in flight.events if e.kind == "error" and e.name == name and e.esc == esc]
+    def of(text: str, esc: int = 0) -> list[Event]:
+        return [e for e in flight.events if e.kind == "error" and e.text == text and e.esc == esc]
 
     start = flight.origin_ns
-    (warning,) = of("power_stage_overtemp_warning")
+    (warning,) = of("power stage hot")
     assert (warning.begin_ns - start) / S == pytest.approx(18, abs=0.05)
     assert warning.end_ns is not None
     assert (warning.end_ns - start) / S == pytest.approx(23, abs=0.05)
-    assert (warning.severity, warning.text) == ("warning", "power stage hot")
-    (error,) = of("undervoltage")
+    assert warning.severity == "warning"
+    (error,) = of("battery voltage too low")
     assert (error.severity, error.end_ns is not None) == ("error", True)
     # set for ever: it comes again after each loss and with each info frame
-    selftest = of("test_eeprom_size")
+    selftest = of("self-test: EEPROM size")
     assert len(selftest) >= 2
     assert selftest[0].note == "until telemetry was lost"
-    assert selftest[-1].text == "self-test: EEPROM size"
     assert not [e for e in flight.events if e.kind == "error" and e.esc == 1]
-    assert not [e for e in flight.events if e.name == "programming_allowed"]
+    assert not [e for e in flight.events if "programming" in e.text]
 
 
 def test_losses_are_gaps_in_lines_and_events(
     bus: BusLayout, rows: list[Row], flight: Flight
 ) -> None:
-    lost = [e for e in flight.events if e.name == "telemetry_lost"]
+    lost = [e for e in flight.events if e.text == "No telemetry"]
     assert {e.esc for e in lost} == {0}
     assert [round((e.begin_ns - flight.origin_ns) / S, 1) for e in lost] == [29.2, 60.2, 91.2]
-    summary = flight.summaries[0]
+    summary = flight.escs[0]
     assert summary.gaps == 3
     assert summary.longest_gap_ns / S == pytest.approx(1.75, abs=0.05)
-    assert summary.losses == rows[-1][1][column(bus, "losses")] == 3
-    assert (summary.crc_errors or 0) > 0
-    power = next(p for p in flight.plots if PLOTS[p.plot].key == "power")
-    line = next(li for li in power.lines if li.esc == 0)
+    assert summary.counted["losses"] == rows[-1][1][column(bus, "losses")] == 3
+    assert summary.counted["crc_errors"] > 0
+    line = flight.lines[0, "battery_power"]
     for event in lost:
         assert event.end_ns is not None
         inside = [
-            v
-            for t, v in zip(flight.times, line.values, strict=True)
-            if event.begin_ns < t < event.end_ns
+            v for t, v in zip(flight.times, line, strict=True) if event.begin_ns < t < event.end_ns
         ]
         assert None in inside
         assert all(v is None for v in inside[5:-5])
 
 
 def test_a_window_is_cut_out_with_the_times_of_the_whole(bus: BusLayout, rows: list[Row]) -> None:
-    part = analysed(bus, rows, window=(10.0, 20.0))
+    part = analysed(analysis_of(bus, window=(10.0, 20.0)), rows)
     assert part.origin_ns == rows[0][0]
     assert 10 <= (part.start_ns - part.origin_ns) / S < 10.02
     assert 19.98 < (part.end_ns - part.origin_ns) / S <= 20
@@ -230,13 +215,13 @@ def test_counters_that_roll_go_on_and_those_that_begin_again_too() -> None:
     blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
     top = int(SignalReader(bus.layout).columns[at].high)
 
-    def total(*counts: int) -> int | None:
+    def total(*counts: int) -> float | None:
         made = []
         for number, count in enumerate(counts):
             values = list(blank)
             values[at] = count
             made.append((number * 10_000_000, values))
-        return analysed(bus, made).summaries[0].losses
+        return analysed(analysis_of(bus), made).escs[0].counted.get("losses")
 
     assert total(3, 5, 9) == 6
     assert total(top - 1, top, 0, 2) == 4
@@ -246,19 +231,19 @@ def test_counters_that_roll_go_on_and_those_that_begin_again_too() -> None:
 def test_many_events_and_states_stay_bounded() -> None:
     bus = shipped_bus()
     state, flag, live = (
-        column(bus, s) for s in ("operating_state", "undervoltage", "battery_voltage")
+        column(bus, s) for s in ("operating_state_raw", "undervoltage", "battery_voltage")
     )
     blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
-    analysis = Analysis(bus, 1000)
+    analysis = analysis_of(bus, 1000)
     for number in range(30_000):
         values = list(blank)
         values[live], values[flag] = 24.0, number & 1
-        values[state] = ("Forward", "Brake")[number & 1]
+        values[state] = (OperatingState.Forward, OperatingState.Brake)[number & 1]
         analysis.take(number * 10_000_000, values)
     flight = analysis.finish()
-    assert flight.left_out == {"error": 10_000, "state": 25_000}
+    assert flight.left_out == 35_000
     assert len(flight.events) == 10_000
-    assert len(flight.segments[0]) <= 4000
+    assert len(flight.escs[0].segments) <= 4000
     assert len(flight.times) <= 1000
 
 
@@ -268,22 +253,56 @@ def test_rows_far_apart_are_not_joined_even_without_a_row_that_shows_the_loss(po
     bus = shipped_bus()
     live = column(bus, "battery_voltage")
     blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
-    analysis = Analysis(bus, points)
+    analysis = analysis_of(bus, points)
     times = [part * 3_100_000_000 + at * 10_000_000 for part in range(40) for at in range(201)]
     for number, time_ns in enumerate(times):
         values = list(blank)
         values[live] = 20 + number % 7
         analysis.take(time_ns, values)
     flight = analysis.finish()
-    (line,) = [
-        line for plot in flight.plots for line in plot.lines if line.source == "battery_voltage"
-    ]
+    line = flight.lines[0, "battery_voltage"]
     drawn = [
         (t0, t1)
-        for (t0, t1), (a, b) in zip(pairwise(flight.times), pairwise(line.values), strict=True)
+        for (t0, t1), (a, b) in zip(pairwise(flight.times), pairwise(line), strict=True)
         if a is not None and b is not None
     ]
     assert len(drawn) >= 40
     assert max(t1 - t0 for t0, t1 in drawn) <= 2 * S
     assert all(t0 // 3_100_000_000 == t1 // 3_100_000_000 for t0, t1 in drawn)
-    assert flight.summaries[0].gaps == 39
+    assert flight.escs[0].gaps == 39
+
+
+def test_words_of_errors_and_the_state_of_the_link_become_events() -> None:
+    events, times = trackers.Events(), [0, 10, 20, 30, 40]
+    programming, unknown = 1 << OperatingError.PROGRAMMING_ALLOWED, 1 << 30
+    errors = trackers.Errors(0, {"operating_errors": 0}, events)
+    words = [programming, programming | unknown, 1, 1, None]
+    errors.take(times, [1, 1, 1, 1, None], {"operating_errors": words})
+    link = trackers.Link(0, EscFlight("esc1"), events)
+    states = ["OK", "DEGRADED", "OK", LinkState.PORT_ERROR, LinkState.PORT_ERROR]
+    link.take(times, [1] * 5, {"link_state": states})
+    assert [(e.begin_ns, e.end_ns, e.text, e.note) for e in events.in_order()] == [
+        (10, 20, "bit 30, unknown to this program", ""),
+        (10, 20, "Link degraded: many bytes are damaged", ""),
+        (20, 40, "battery voltage too low", "until telemetry was lost"),
+        (30, None, "The port of the ESC cannot be used", ""),
+    ]
+
+
+def test_a_device_in_its_place_is_an_event() -> None:
+    found, events = EscFlight("esc1"), trackers.Events()
+    device = trackers.Device(0, found, events)
+    columns: dict[str, list[object]] = {
+        "device": [None, "KOSMIK", "KOSMIK", None, None],
+        "device_raw": [None, 1, 1, None, 63],
+        "variant": [None, 120, 120, None, 9],
+        "firmware_main": [None, 4, 4, None, None],
+        "firmware_sub": [None, 17, 17, None, None],
+        "layout": ["unknown", "V4", "V4", "V4", None],
+    }
+    device.take([0, 10, 20, 30, 40], columns)
+    assert found.devices == ["KOSMIK 120, firmware 4.17", "device 63 9"]
+    assert found.layout == "V4"
+    (change,) = events.in_order()
+    assert (change.begin_ns, change.end_ns) == (40, 40)
+    assert change.text == "Device changed from KOSMIK 120, firmware 4.17 to device 63 9"

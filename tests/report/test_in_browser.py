@@ -5,12 +5,10 @@ from pathlib import Path
 
 import pytest
 from report_browser import MISSING, PROGRAM, Browser
-from report_flights import shipped_bus, simulated
+from report_flights import analysed, analysis_of, shipped_bus, simulated
 
-from kontronik_can_gw.desk.report.analysis import Analysis
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import render
-from kontronik_can_gw.desk.report.quantities import PLOTS
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.esc.telemetry import SECOND as S
@@ -26,7 +24,8 @@ FAULTS = Faults(
     ),
 )
 # Pixels of a plot's data area that are (nearly) of one colour.
-COUNT = """((key, colour) => {
+COUNT = """((key, name) => {
+  const colour = getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const plot = flight.plots.find((p) => p.key === key), { left, top, width, height } = plot.u.bbox;
   const data = plot.u.ctx.getImageData(left, top, width, height).data;
   const want = [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
@@ -40,12 +39,8 @@ COUNT = """((key, colour) => {
 
 def flown(*names: str) -> Flight:
     bus = shipped_bus(*names)
-    analysis = Analysis(bus, 2000)
-    for time_ns, values in simulated(
-        bus, 60, [EscOptions(faults=FAULTS), EscOptions(max_current=80)]
-    ):
-        analysis.take(time_ns, values)
-    return analysis.finish()
+    options = [EscOptions(faults=FAULTS), EscOptions(max_current=80)]
+    return analysed(analysis_of(bus), simulated(bus, 60, options))
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +93,12 @@ def centre(browser: Browser, key: str, share: float = 0.5) -> tuple[float, float
     return box["x"] + share * box["w"], box["y"] + box["h"] / 2
 
 
+def count(browser: Browser, key: str, colour: str) -> int:
+    """Pixels of a plot that have a colour of page.css."""
+    found: int = browser.run(f"{COUNT}('{key}', '{colour}')")
+    return found
+
+
 @pytest.mark.parametrize(("name", "look"), [("one", "light"), ("two", "dark"), ("two", "phone")])
 def test_every_plot_is_drawn_and_the_page_fits(
     browser: Browser, pages: dict[str, Path], one: Flight, name: str, look: str
@@ -105,18 +106,13 @@ def test_every_plot_is_drawn_and_the_page_fits(
     width, height = (390, 844) if look == "phone" else (1280, 900)
     browser.open(pages[name], width, height, dark=look == "dark", phone=look == "phone")
     keys = browser.run("flight.plots.map((p) => p.key)")
-    assert keys == ["states", *(PLOTS[p.plot].key for p in one.plots)]
-    theme = "dark" if look == "dark" else "light"
+    speeds = ["speed", "speed-1", "speed-2"]
+    assert keys[:5] == ["states", *speeds, "battery_voltage"]
+    assert keys == ["states", *browser.run("flight.data.plots.map((p) => p.key)")]
     for key in keys[1:]:
-        colours = browser.run(
-            f"flight.data.styles.slice(0, {1 if name == 'one' else 2}).map((s) => s.{theme})"
-        )
-        drawn = [browser.run(f"{COUNT}('{key}', '{colour}')") for colour in colours]
+        drawn = [count(browser, key, f"--c{style}") for style in range(1 if name == "one" else 2)]
         assert sum(drawn) > 100, (key, drawn)
-    bands = [
-        browser.run(f"{COUNT}('states', flight.data.classes[{group}].{theme})")
-        for group in (0, 3, 4, 5)
-    ]
+    bands = [count(browser, "states", f"--s{group}") for group in (0, 3, 4, 5)]
     assert min(bands) > 100, bands
     assert browser.run("document.documentElement.scrollWidth") == width
     assert browser.run("window.hit") is None
@@ -135,7 +131,28 @@ def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Pa
         browser.mouse("Moved", x, y)
         browser.settle()
         shown = browser.run(
-            "[...document.querySelectorAll('.legend td')].map((c) => c.textContent)"
+            "[...document.querySelectorAll('.u-series:not(:first-child) .u-value')].map((c) => c.textContent)"
         )
         assert len(shown) >= 10
         assert all((text != "–") == is_known for text in shown), (share, shown)
+
+
+def test_a_drag_zooms_all_plots_and_a_click_on_an_event_goes_there(
+    browser: Browser, pages: dict[str, Path]
+) -> None:
+    browser.open(pages["one"])
+    x, y = centre(browser, "speed", 0.25)
+    to_x, _ = centre(browser, "speed", 0.5)
+    browser.mouse("Moved", x, y)
+    browser.mouse("Pressed", x, y, buttons=1)
+    for share in (0.3, 0.7, 1):
+        browser.mouse("Moved", x + share * (to_x - x), y, buttons=1)
+    browser.mouse("Released", to_x, y)
+    browser.settle()
+    assert browser.run("flight.range()") == pytest.approx([15, 30], abs=0.2)
+    scales = browser.run("flight.plots.map((p) => [p.u.scales.x.min, p.u.scales.x.max])")
+    assert all(scale == browser.run("flight.range()") for scale in scales)
+    event = "[...document.querySelectorAll('#events tr')].find((r) => /voltage too low/.test(r.textContent))"
+    browser.run(f"{event}.click()")
+    browser.settle()
+    assert browser.run("flight.range()") == pytest.approx([17.5, 23], abs=0.2)

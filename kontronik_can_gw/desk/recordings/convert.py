@@ -17,9 +17,8 @@ from typing import IO, TYPE_CHECKING, Protocol, Self
 from kontronik_can_gw.desk.recordings.part_file import PartFile
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.capture.replay import TimedFrame
     from kontronik_can_gw.desk.recordings.inputs import Input
-    from kontronik_can_gw.desk.recordings.tables import Choice
+    from kontronik_can_gw.desk.recordings.tables.rows import Choice
 
 TABLES = ("csv", "jsonl", "parquet", "mf4")
 LOGS = {"candump": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4-log": "mf4"}
@@ -100,7 +99,8 @@ class TableConversion:
     def __call__(
         self, recording: "Input", out: Output, reached: Callable[[int], None]
     ) -> str | None:
-        from kontronik_can_gw.desk.recordings.tables import Rows, open_table
+        from kontronik_can_gw.desk.recordings.tables.rows import Rows
+        from kontronik_can_gw.desk.recordings.tables.writers import open_table
 
         rows = Rows(recording, self.choice, self.by_frame)
         table = rows.table
@@ -134,14 +134,14 @@ class LogConversion:
     ) -> str | None:
         from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
         from kontronik_can_gw.desk.recordings.inputs import CaptureInput
-        from kontronik_can_gw.desk.recordings.tables import first_of
+        from kontronik_can_gw.desk.recordings.tables.rows import cut, first_of
 
         first, frames = first_of(recording.frames())
         if first is None:
             return None
         origin_ns = first.time_ns
         wall_ns = recording.wall_ns(origin_ns)
-        last, frames = first_of(self._cut(frames, origin_ns))
+        last, frames = first_of(cut(frames, self.start_ns, self.end_ns, origin_ns))
         if last is None:
             return None
         begins = last.time_ns - origin_ns
@@ -172,20 +172,6 @@ class LogConversion:
                 f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
             )
         return summary
-
-    def _cut(self, frames: "Iterator[TimedFrame]", origin_ns: int) -> "Iterator[TimedFrame]":
-        from kontronik_can_gw.desk.recordings.tables import DISORDER_NS
-
-        start_ns, end_ns = self.start_ns, self.end_ns
-        for frame in frames:
-            since = frame.time_ns - origin_ns
-            if start_ns is not None and since < start_ns:
-                continue
-            if end_ns is not None and since > end_ns:
-                if since > end_ns + DISORDER_NS:
-                    return
-                continue
-            yield frame
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
-from kontronik_can_gw.desk.report.decimate import Number
-from kontronik_can_gw.desk.report.fit import Resistance
-
+Number = int | float | None
 Kind = Literal["error", "state", "link", "device"]
 
 
@@ -16,24 +14,12 @@ class Extreme(NamedTuple):
     time_ns: int
 
 
-@dataclass(slots=True)
-class Event:
-    """An event with its duration; ``end_ns`` None: it lasts until the end. ``esc`` None: of the gateway."""
+class Resistance(NamedTuple):
+    """A resistance and its spread in ohm; ``stretches``: of how many pieces of the recording."""
 
-    kind: Kind
-    esc: int
-    begin_ns: int
-    end_ns: int | None
-    name: str
-    """Name of the source, or of the state."""
-    text: str
-    """In words."""
-    severity: str = ""
-    remedy: str = ""
-    note: str = ""
-    """How it ended, where that is not obvious."""
-    momentary: bool = False
-    """True for an event without duration."""
+    value: float
+    spread: float
+    stretches: int
 
 
 class Segment(NamedTuple):
@@ -44,76 +30,55 @@ class Segment(NamedTuple):
     state: int
 
 
-@dataclass
-class Summary:
-    """Numbers of one ESC. None: not in the recording."""
+@dataclass(slots=True)
+class Event:
+    """An event of an ESC. ``end_ns`` None: it lasts until the end; equal to ``begin_ns``: it has no length."""
 
+    kind: Kind
+    esc: int
+    begin_ns: int
+    text: str
+    severity: str = "status"
+    remedy: str = ""
+    end_ns: int | None = None
+    note: str = ""
+    """How it ended, where that is not obvious."""
+
+
+@dataclass
+class EscFlight:
+    """What is known of one ESC. None: not in the recording."""
+
+    name: str
     telemetry_ns: int = 0
-    """With telemetry."""
+    """Time with telemetry."""
     turning_ns: int | None = None
     """Time with the motor turning."""
-    energy_counter: float | None = None
-    """Wh, by the source energy_used."""
     energy_drawn: float | None = None
     """Wh, the integral of positive power."""
     energy_returned: float | None = None
     """Wh, returned to the battery."""
-    charge: float | None = None
-    """mAh, from the ESC's counter."""
-    charge_resets: int = 0
     power_turning: float | None = None
     """W, mean while the motor turns."""
-    extremes: dict[str, Extreme] = field(default_factory=dict)
-    """By "max SOURCE" and "min SOURCE"."""
+    counted: dict[str, float] = field(default_factory=dict)
+    """By source: what a counter went up by."""
+    charge_resets: int = 0
+    maxima: dict[str, Extreme] = field(default_factory=dict)
+    """By source."""
+    minima: dict[str, Extreme] = field(default_factory=dict)
     cells: int | None = None
     rest_voltage: float | None = None
     """V of the battery before the first load."""
     load_voltage: Extreme | None = None
     """V of the battery, minimum under load."""
     resistance: Resistance | None = None
-    losses: int | None = None
-    crc_errors: int | None = None
-    dropped_bytes: int | None = None
     gaps: int = 0
     longest_gap_ns: int = 0
-
-    @property
-    def energy(self) -> float | None:
-        """Wh, from the counter; integrated where there is none."""
-        return self.energy_drawn if self.energy_counter is None else self.energy_counter
-
-
-@dataclass
-class Facts:
-    """Device data of an ESC from its info frames, the newest."""
-
-    device: str | None = None
-    variant: int | None = None
-    firmware: str | None = None
-    layout: str | None = None
-    devices: list[tuple[int, str]] = field(default_factory=list)
-    """Every device seen, in words, and since when; usually one."""
-
-
-@dataclass
-class Line:
-    """A line of a plot."""
-
-    esc: int
-    quantity: int
-    """Index in the plot's available quantities."""
-    source: str
-    values: list[Number]
-
-
-@dataclass
-class PlotData:
-    """``plot``: index in PLOTS."""
-
-    plot: int
-    lines: list[Line]
-    labels: list[str]
-    """Titles of the available quantities; a line's ``quantity`` is an index of them."""
+    devices: list[str] = field(default_factory=list)
+    """Every device seen, in words; usually one."""
+    layout: str = ""
+    """Of its frames."""
+    segments: list[Segment] = field(default_factory=list)
 
 
 @dataclass
@@ -125,16 +90,15 @@ class Flight:
     start_ns: int
     end_ns: int
     rows: int
-    names: list[str]
-    summaries: list[Summary]
-    facts: list[Facts]
+    escs: list[EscFlight]
     times: list[int]
-    plots: list[PlotData]
-    segments: list[list[Segment]]
+    """Of the points of all lines."""
+    lines: dict[tuple[int, str], list[Number]]
+    """The points to draw, by ESC and source."""
     events: list[Event]
-    left_out: dict[Kind, int]
-    """Numbers of events that were only counted."""
+    left_out: int
+    """Number of events that were only counted."""
     missing: list[str]
-    """Values that the DBC does not have, in words."""
+    """What the fields do not have, in words."""
     rows_in_bucket: int
-    replayed: bool = False
+    replayed: bool

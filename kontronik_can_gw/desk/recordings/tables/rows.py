@@ -27,6 +27,7 @@ SECOND_NS = 1_000_000_000
 DISORDER_NS = SECOND_NS
 """Frames of several interfaces may stand in a log a little out of order."""
 T = TypeVar("T")
+Timed = TypeVar("Timed", "Row", TimedFrame)
 
 
 class Row(NamedTuple):
@@ -142,7 +143,7 @@ class Rows:
         if origin_ns is None:
             return
         if choice.start_ns is not None or choice.end_ns is not None:
-            items = _cut(items, choice.start_ns, choice.end_ns)
+            items = cut(items, choice.start_ns, choice.end_ns)
         if choice.rate is not None:
             items = thinned(items, choice.rate, (lambda row: row.parts[0]) if by_frame else None)
         first_row, self._rows = first_of(items)
@@ -200,15 +201,19 @@ def _frame_names(reader: SignalReader, choice: Choice) -> dict[int, tuple[str, s
     return found
 
 
-def _cut(rows: Iterator[Row], start_ns: int | None, end_ns: int | None) -> Iterator[Row]:
-    for row in rows:
-        if start_ns is not None and row.time_ns < start_ns:
+def cut(
+    items: Iterator[Timed], start_ns: int | None, end_ns: int | None, origin_ns: int = 0
+) -> Iterator[Timed]:
+    """The items from one time to another, both after ``origin_ns``; ``end_ns`` included."""
+    for item in items:
+        since = item.time_ns - origin_ns
+        if start_ns is not None and since < start_ns:
             continue
-        if end_ns is not None and row.time_ns > end_ns:
-            if row.time_ns > end_ns + DISORDER_NS:
+        if end_ns is not None and since > end_ns:
+            if since > end_ns + DISORDER_NS:
                 return
             continue
-        yield row
+        yield item
 
 
 def thinned(

@@ -9,8 +9,6 @@ from kontronik_can_gw.desk.recordings.fields import Table
 from kontronik_can_gw.desk.recordings.tables.rows import Row
 from kontronik_can_gw.desk.recordings.tables.text import CsvTable, JsonTable
 
-FORMATS = ("csv", "jsonl", "parquet", "mf4")
-
 
 class TableWriter(Protocol):
     """Writes the rows of one table."""
