@@ -1,5 +1,7 @@
 """Errors that a user can correct, each with its exit code. The command line prints them as plain lines, never as a traceback."""
 
+from collections.abc import Iterable
+
 from kontronik_can_gw.printable import printable
 
 
@@ -17,3 +19,15 @@ class RunError(UserError):
     """A port, interface or file failed when it was opened or used (exit code 1)."""
 
     exit_code = 1
+
+
+def did_you_mean(
+    name: str, known: Iterable[str], cutoff: float = 0.6, or_known: bool = False
+) -> str:
+    """A sentence with the known name nearest to a mistyped one, after a blank; without one, empty or all that are known."""
+    from difflib import get_close_matches  # not needed where nothing is wrong
+
+    names = list(known)
+    if near := get_close_matches(name, names, n=1, cutoff=cutoff):
+        return f" Did you mean {near[0]}?"
+    return f" Known: {', '.join(names)}." if or_known else ""

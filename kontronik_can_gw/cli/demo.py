@@ -178,7 +178,7 @@ def main(args: argparse.Namespace) -> int:
         import can
 
     from kontronik_can_gw.config.assemble import assemble
-    from kontronik_can_gw.config.keys import parse
+    from kontronik_can_gw.config.parse import parse
     from kontronik_can_gw.desk.pty import PtyEsc
     from kontronik_can_gw.gateway import Gateway
     from kontronik_can_gw.runtime.loop import Loop

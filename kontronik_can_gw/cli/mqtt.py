@@ -5,14 +5,15 @@ import logging
 import re
 import socket
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
 from kontronik_can_gw.cli.common import logging_to_stderr, say, stopping_on_signals
-from kontronik_can_gw.config.keys import CanConfig, MqttConfig, mqtt_with
+from kontronik_can_gw.config.keys import CanConfig, MqttConfig
+from kontronik_can_gw.config.parse import mqtt_with
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 
@@ -188,20 +189,8 @@ def _settings(args: argparse.Namespace, bus: "BusLayout | None") -> MqttConfig:
             if (value := getattr(table, name)) is not None
         }
         table = replace(table, **files)
-    names = (
-        "broker",
-        "tls",
-        *_FILES,
-        "username",
-        "gateway",
-        "topic",
-        "rate",
-        "retain",
-        "discovery",
-    )
-    options: Mapping[str, Any] = {
-        name: value for name in names if (value := getattr(args, name)) is not None
-    }
+    given = {f.name: getattr(args, f.name) for f in fields(MqttConfig)}
+    options = {name: value for name, value in given.items() if value is not None}
     settings = mqtt_with(table, options)
     if settings.broker is None:
         raise UserError(

@@ -23,7 +23,7 @@ from kontronik_can_gw.cli.service_machine import (
 )
 from kontronik_can_gw.cli.service_removal import uninstall
 from kontronik_can_gw.cli.service_status import status
-from kontronik_can_gw.config.keys import load
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import RunError, UserError
 
 _INSTANCE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}")
@@ -241,7 +241,7 @@ def _not_ready(own: Path) -> list[str]:
     """Why the service must not send yet: its configuration is faulty, or the unedited example."""
     import tomllib
 
-    from kontronik_can_gw.config.keys import parse
+    from kontronik_can_gw.config.parse import parse
 
     try:
         ports = {esc.port for esc in load(own).esc}

@@ -95,7 +95,7 @@ def _show_unit(unit: str, lines: int) -> bool:
 
 
 def _judge(own: Path) -> list[str]:
-    from kontronik_can_gw.config.keys import load
+    from kontronik_can_gw.config.parse import load
 
     try:
         load(own)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
-from kontronik_can_gw.config.keys import load
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.esc.telemetry import MS, SECOND

@@ -11,7 +11,7 @@ from kontronik_can_gw.canopen.check import without_objects
 from kontronik_can_gw.canopen.lss import UNCONFIGURED
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.canopen.traffic import bits_per_second, cob_ids
-from kontronik_can_gw.config.keys import Config, EscConfig, examine
+from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.nodes import (
     load_of_stored,
     parameter_folder,
@@ -19,6 +19,7 @@ from kontronik_can_gw.config.nodes import (
     read_stored,
     with_stored,
 )
+from kontronik_can_gw.config.parse import examine
 from kontronik_can_gw.dbc.loss import unreported
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.prepare import check_load, prepare

@@ -11,7 +11,8 @@ from kontronik_can_gw.esc.values import VALUES, Group, Value
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
-_BY_KEY = {normalize(name): value for name, value in VALUES.items()}
+VALUES_BY_KEY = {normalize(name): value for name, value in VALUES.items()}
+"""Every value by its normalized name."""
 
 
 class Binder:
@@ -27,7 +28,7 @@ class Binder:
 
     def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Value, int | None] | None:
         """The source of a normalized name without a final ``percent``; ``esc`` None: the name has no prefix."""
-        source = _BY_KEY.get(key) or _BY_KEY.get(key.removesuffix("percent"))
+        source = VALUES_BY_KEY.get(key) or VALUES_BY_KEY.get(key.removesuffix("percent"))
         if source is None:
             return None
         return (source, None) if source.group is Group.GATEWAY else (source, esc)
@@ -55,8 +56,8 @@ class Binder:
         key = normalize(name)
         for prefix, _ in self._prefixes:
             key = key.removeprefix(prefix) or key
-        near = difflib.get_close_matches(key, _BY_KEY, n=3, cutoff=0.5)
-        names = [_BY_KEY[n].name for n in near]
+        near = difflib.get_close_matches(key, VALUES_BY_KEY, n=3, cutoff=0.5)
+        names = [VALUES_BY_KEY[n].name for n in near]
         return f" Did you mean {' or '.join(names)}?" if names else ""
 
 

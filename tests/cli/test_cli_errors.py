@@ -15,7 +15,9 @@ import pytest
 from command_line import refused, run
 
 from kontronik_can_gw.cli.arguments import REMOVED_OPTIONS
-from kontronik_can_gw.config.keys import REMOVED_KEYS, load, schema
+from kontronik_can_gw.config.export import schema
+from kontronik_can_gw.config.keys import REMOVED_KEYS
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.pty import PtyEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]

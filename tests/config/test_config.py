@@ -15,16 +15,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import kontronik_can_gw
-from kontronik_can_gw.config.keys import (
-    REMOVED_KEYS,
-    Config,
-    as_toml,
-    load,
-    mqtt_with,
-    parse,
-    schema,
-    shipped,
-)
+from kontronik_can_gw.config.export import as_toml, schema
+from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, shipped
+from kontronik_can_gw.config.parse import load, mqtt_with, parse
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS

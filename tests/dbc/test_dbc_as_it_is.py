@@ -9,7 +9,7 @@ import pytest
 
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc import counters
 from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.loss import unreported

@@ -16,7 +16,7 @@ import pytest
 
 from kontronik_can_gw.canopen.storage import decode
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk import pty
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.esc.simulator import SECOND_NS, ErrorWindow, EscOptions, Faults, SimulatedEsc
