@@ -1,6 +1,6 @@
 """Errors that a user can correct, each with its exit code. The command line prints them as plain lines, never as a traceback."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from kontronik_can_gw.printable import printable
 
@@ -22,12 +22,21 @@ class RunError(UserError):
 
 
 def did_you_mean(
-    name: str, known: Iterable[str], cutoff: float = 0.6, or_known: bool = False
+    name: str,
+    known: Iterable[str],
+    cutoff: float = 0.6,
+    *,
+    show: Callable[[str], str] = str,
+    count: int = 1,
+    or_known: bool = False,
 ) -> str:
-    """A sentence with the known name nearest to a mistyped one, after a blank; without one, empty or all that are known."""
+    """A sentence with the known names nearest to a mistyped one, after a blank.
+
+    Where none is near: empty, or with ``or_known`` a sentence with all of them. ``cutoff``: 0 to 1, how near.
+    """
     from difflib import get_close_matches  # not needed where nothing is wrong
 
     names = list(known)
-    if near := get_close_matches(name, names, n=1, cutoff=cutoff):
-        return f" Did you mean {near[0]}?"
-    return f" Known: {', '.join(names)}." if or_known else ""
+    if near := get_close_matches(name, names, n=count, cutoff=cutoff):
+        return f" Did you mean {' or '.join(map(show, near))}?"
+    return f" Known: {', '.join(map(show, names))}." if or_known else ""

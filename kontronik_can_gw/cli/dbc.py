@@ -115,10 +115,10 @@ def _canopen(args: argparse.Namespace) -> "Database":
 
 
 def _database(args: argparse.Namespace) -> "Database":
-    from kontronik_can_gw.dbc.compiler import DbcSettings
     from kontronik_can_gw.dbc.expand import among_canopen, expand
     from kontronik_can_gw.dbc.prepare import prepare
     from kontronik_can_gw.dbc.reader import choose_node, load_database
+    from kontronik_can_gw.dbc.settings import DbcSettings
 
     if args.config is not None:
         _refuse(

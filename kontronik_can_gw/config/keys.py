@@ -31,7 +31,7 @@ from kontronik_can_gw.config.kinds import (
     table_of,
 )
 from kontronik_can_gw.dbc import send_types
-from kontronik_can_gw.dbc.compiler import DbcSettings
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.signals import units

@@ -1,10 +1,10 @@
 """Finds the value that a signal is bound to: by its name, the ESC's prefix, or [dbc.bind]."""
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.names import normalize
+from kontronik_can_gw.errors import did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Group, Value
 
@@ -22,26 +22,36 @@ class Binder:
         self.escs = escs
         self.bind = bind
         self.used: set[str] = set()
+        self._known = [VALUES_BY_KEY for _ in escs]
+        """Values of each ESC by normalized name."""
         self._prefixes = sorted(
             ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
         )
 
-    def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Value, int | None] | None:
-        """The source of a normalized name without a final ``percent``; ``esc`` None: the name has no prefix."""
-        source = VALUES_BY_KEY.get(key) or VALUES_BY_KEY.get(key.removesuffix("percent"))
-        if source is None:
-            return None
-        return (source, None) if source.group is Group.GATEWAY else (source, esc)
+    def value_named(self, key: str, esc: int | None) -> Value | None:
+        """The value of a normalized name, without a final ``percent``. Here alone a bound name becomes a Value.
+
+        ``esc``: index of the ESC whose value is meant, None where the name has no prefix.
+        """
+        known = VALUES_BY_KEY if esc is None else self._known[esc]
+        return known.get(key) or known.get(key.removesuffix("percent"))
 
     def by_name(self, name: str) -> tuple[Value, int | None] | None:
         """The source of a signal name or a bound name, and its ESC (None: no ESC named, or the gateway)."""
         key = normalize(name)
-        if len(self.escs) == 1 and (found := self.gateway_or_esc(key, 0)):
-            return found
+        meant: list[tuple[str, int | None]] = [(key, 0)] if len(self.escs) == 1 else []
         for prefix, esc in self._prefixes:
-            if key.startswith(prefix) and (found := self.gateway_or_esc(key[len(prefix) :], esc)):
-                return found
-        return self.gateway_or_esc(key, None)
+            if key.startswith(prefix):
+                meant.append((key.removeprefix(prefix), esc))
+        for rest, of_esc in [*meant, (key, None)]:
+            if (value := self.value_named(rest, of_esc)) is not None:
+                return value, None if value.group is Group.GATEWAY else of_esc
+        return None
+
+    def of_signal(self, message: str, signal: str) -> tuple[Value, int | None] | None:
+        """The source that ``[dbc.bind]`` or its name gives to a signal."""
+        bound = self.bound(message, signal)
+        return self.by_name(bound if isinstance(bound, str) else signal)
 
     def bound(self, message: str, signal: str) -> str | float | None:
         """The entry of ``[dbc.bind]`` for a signal."""
@@ -56,9 +66,9 @@ class Binder:
         key = normalize(name)
         for prefix, _ in self._prefixes:
             key = key.removeprefix(prefix) or key
-        near = difflib.get_close_matches(key, VALUES_BY_KEY, n=3, cutoff=0.5)
-        names = [VALUES_BY_KEY[n].name for n in near]
-        return f" Did you mean {' or '.join(names)}?" if names else ""
+        return did_you_mean(
+            key, VALUES_BY_KEY, 0.5, show=lambda near: VALUES_BY_KEY[near].name, count=3
+        )
 
 
 def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
@@ -67,8 +77,7 @@ def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
     for message in database.messages:
         if node in message.senders:
             for signal in message.signals:
-                bound = binder.bound(message.name, signal.name)
-                found = binder.by_name(bound if isinstance(bound, str) else signal.name)
+                found = binder.of_signal(message.name, signal.name)
                 if found and found[0].group is not Group.GATEWAY:
                     escs.add(found[1])
     return escs == {None}

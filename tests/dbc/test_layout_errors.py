@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import check_load, prepare
 from kontronik_can_gw.dbc.reader import load_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout
