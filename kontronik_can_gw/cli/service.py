@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kontronik_can_gw.cli import service_files as files
+from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.service_files import NAME, WANTS, Choices, State
 from kontronik_can_gw.cli.service_machine import (
@@ -28,6 +29,10 @@ from kontronik_can_gw.errors import RunError, UserError
 
 _INSTANCE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}")
 _CHANNEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}")
+_BITRATE = number_from(
+    5_000, 1_000_000, kind=int, problem="is not a bit rate in bit/s, 5000 to 1000000"
+)
+_LINES = number_from(0, 10_000, "number of lines", kind=int)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,45 +67,47 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         sub.add_argument(
             "--dry-run", "--print", action="store_true", help="only show what would be done"
         )
-    install_parser.add_argument("--now", action="store_true", help="start it too, or restart it")
-    install_parser.add_argument(
-        "--executable", metavar="PATH", help="the program (default: this one)"
-    )
-    install_parser.add_argument(
-        "--force",
-        action="store_true",
-        help="replace files that were changed by hand; they are kept as .bak",
-    )
-    install_parser.add_argument(
-        "--network",
-        type=_bitrate,
-        metavar="BITRATE",
-        help="let systemd-networkd set up the CAN interface",
-    )
-    install_parser.add_argument(
-        "--channel",
-        type=_channel,
-        default="can0",
-        metavar="NAME",
-        help="the CAN interface (default can0)",
-    )
-    install_parser.add_argument(
-        "--prometheus",
-        action="store_true",
-        help="allow the service loopback IP, for statistics.prometheus",
-    )
-    install_parser.add_argument(
-        "--mqtt",
-        action="store_true",
-        help="a second service that publishes to the broker of the table [mqtt]",
-    )
+    _add_install_arguments(install_parser)
     uninstall_parser.add_argument(
         "--purge",
         action="store_true",
         help="remove configurations, stored parameters and the user too",
     )
     status_parser.add_argument(
-        "-n", "--lines", type=_lines, default=10, metavar="N", help="lines of the log (default 10)"
+        "-n", "--lines", type=_LINES, default=10, metavar="N", help="lines of the log (default 10)"
+    )
+
+
+def _add_install_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--now", action="store_true", help="start it too, or restart it")
+    parser.add_argument("--executable", metavar="PATH", help="the program (default: this one)")
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="replace files that were changed by hand; they are kept as .bak",
+    )
+    parser.add_argument(
+        "--network",
+        type=_BITRATE,
+        metavar="BITRATE",
+        help="let systemd-networkd set up the CAN interface",
+    )
+    parser.add_argument(
+        "--channel",
+        type=_channel,
+        default="can0",
+        metavar="NAME",
+        help="the CAN interface (default can0)",
+    )
+    parser.add_argument(
+        "--prometheus",
+        action="store_true",
+        help="allow the service loopback IP, for statistics.prometheus",
+    )
+    parser.add_argument(
+        "--mqtt",
+        action="store_true",
+        help="a second service that publishes to the broker of the table [mqtt]",
     )
 
 
@@ -124,22 +131,6 @@ def _channel(text: str) -> str:
     if not _CHANNEL.fullmatch(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not the name of an interface")
     return text
-
-
-def _bitrate(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if not 5_000 <= value <= 1_000_000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a bit rate in bit/s, 5000 to 1000000")
-    return value
-
-
-def _lines(text: str) -> int:
-    if not text.isdecimal() or int(text) > 10_000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of lines, 0 to 10000")
-    return int(text)
 
 
 def _install(args: argparse.Namespace) -> int:
