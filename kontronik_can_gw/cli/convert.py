@@ -63,9 +63,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-q", "--quiet", action="store_true", help="no summary")
     add_layout_arguments(parser)
     part = parser.add_argument_group("a part of it")
-    for option, dest, which in (("--from", "start", "from"), ("--until", "end", "up to")):
-        text = f"{which} this time after the start, in seconds"
-        part.add_argument(option, dest=dest, metavar="S", type=seconds_ns, help=text)
+    part.add_argument(
+        "--from",
+        dest="start",
+        metavar="S",
+        type=seconds_ns,
+        help="from this time after the start, in seconds",
+    )
+    part.add_argument(
+        "--until",
+        dest="end",
+        metavar="S",
+        type=seconds_ns,
+        help="up to this time after the start, in seconds",
+    )
     part.add_argument("--esc", metavar="NAME", help="only the signals (or bytes) of this ESC")
     table = parser.add_argument_group("tables")
     table.add_argument(
@@ -144,11 +155,10 @@ def _convert(args: argparse.Namespace, form: str) -> None:
     from kontronik_can_gw.cli.bus_layout import bus_layout
     from kontronik_can_gw.cli.progress import Progress
     from kontronik_can_gw.desk.recordings.convert import Output, reason
+    from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput
     from kontronik_can_gw.errors import RunError, UserError
 
-    source = Path(args.input)
-    to_screen = args.output == "-"
-    where = "standard output" if to_screen else args.output
+    source, target = Path(args.input), Path(args.output)
     layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     begun = time.monotonic()
     with _opened(args, source, layout) as recording:
@@ -157,42 +167,42 @@ def _convert(args: argparse.Namespace, form: str) -> None:
                 f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
             )
         conversion = _conversion(args, form, recording)
-        bar = Progress(source.name or recording.name, recording.size or None, to_screen)
         try:
-            with bar as progress, Output(None if to_screen else Path(args.output), form) as out:
+            with (
+                Progress(
+                    source.name or recording.name, recording.size or None, args.output == "-"
+                ) as progress,
+                Output(None if args.output == "-" else target, form) as out,
+            ):
                 summary = conversion(recording, out, progress.reach)
         except BrokenPipeError:
             raise
         except OSError as error:
+            where = "standard output" if args.output == "-" else str(target)
             raise RunError(f"{where}: cannot be written: {reason(error)}.") from None
         damage = [line for line in recording.damage if line not in recording.notes]
         if summary is None:
             raise RunError(*_nothing(args, recording, damage))
+        notes = recording.notes if form in TABLES else []
         if not args.quiet:
-            more = _others(form, recording)
-            _say(f"{where}: {summary}{more}, in {time.monotonic() - begun:.1f} s")
-            _say_assumed_times(args, form, recording)
-        for line in recording.notes if form in TABLES else []:
+            if (
+                form in TABLES
+                and not notes
+                and isinstance(recording, CanLogInput)
+                and recording.others
+            ):
+                summary += f", {recording.others} other frames passed over"
+            _say(
+                f"{'standard output' if args.output == '-' else args.output}: {summary}, in {time.monotonic() - begun:.1f} s"
+            )
+            if recording.times_assumed and form != BYTES:
+                _say(
+                    f"times are assumed: {args.live_rate or LIVE_RATE:g} live frames a second (--live-rate)"
+                )
+        for line in notes:
             _say(f"{args.input}: {line}")
         for line in damage:
             _say(f"{args.input}: damaged: {line}")
-
-
-def _others(form: str, recording: "Input") -> str:
-    """Number of frames of a CAN log that the table has not, for the summary."""
-    from kontronik_can_gw.desk.recordings.inputs import CanLogInput
-
-    if form not in TABLES or recording.notes or not isinstance(recording, CanLogInput):
-        return ""
-    return f", {recording.others} other frames passed over" if recording.others else ""
-
-
-def _say_assumed_times(args: argparse.Namespace, form: str, recording: "Input") -> None:
-    from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE
-
-    if recording.times_assumed and form != BYTES:
-        rate = args.live_rate or LIVE_RATE
-        _say(f"times are assumed: {rate:g} live frames a second (--live-rate)")
 
 
 def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None") -> "Input":

@@ -1,16 +1,6 @@
 """``kontronik-can-gw decode``: recorded UART bytes to JSON lines or CSV."""
 
 import argparse
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-from kontronik_can_gw.errors import RunError, UserError
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Callable, Iterator
-    from contextlib import ExitStack
-    from typing import TextIO
 
 EPILOG = """\
 FILE holds the bytes as they came over the UART, nothing else; - is standard input, decoded as it comes.
@@ -38,23 +28,62 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Decode args.file. RunError where something cannot be opened, read or written."""
-    import json
+    import os
     import stat
     import sys
     from contextlib import ExitStack
+    from pathlib import Path
 
     from kontronik_can_gw.cli.progress import Progress
     from kontronik_can_gw.desk.recordings import decode
+    from kontronik_can_gw.errors import RunError, UserError
 
     name = "standard input" if args.file == "-" else args.file
-    code = 0
-    failure = None
     with ExitStack() as stack:
-        fd, status = _input(args.file, name, stack)
+        try:
+            if args.file == "-":
+                fd = 0
+            else:
+                fd = os.open(args.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOCTTY)
+                stack.callback(os.close, fd)
+            status = os.fstat(fd)
+        except (OSError, ValueError) as error:
+            raise RunError(
+                f"{name}: cannot be opened: {_reason(error)}. Give a file of recorded UART bytes."
+            ) from None
+        if stat.S_ISDIR(status.st_mode):
+            raise RunError(f"{name}: is a directory. Give a file of recorded UART bytes.")
         is_file = stat.S_ISREG(status.st_mode)
-        stats = _stats(args.stats, status if is_file else None, stack)
-        write = _writer(flush=not is_file)
+
+        stats = None
+        if args.stats is not None:
+            try:
+                target = Path(args.stats)
+                if is_file and target.exists() and os.path.samestat(target.stat(), status):
+                    raise UserError(f"--stats {args.stats}: is the input. Give another file.")
+                stats = stack.enter_context(target.open("w", encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                raise RunError(
+                    f"--stats {args.stats}: cannot be written: {_reason(error)}."
+                ) from None
+
+        out = sys.stdout
+
+        def write(text: str) -> None:
+            try:
+                out.write(text)
+                if not is_file or not text:
+                    out.flush()
+            except BrokenPipeError:
+                raise
+            except OSError as error:
+                # what is buffered has nowhere to go
+                os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
+                raise RunError(f"standard output: cannot be written: {_reason(error)}.") from None
+
         decoder = decode.Decoder()
+        code = 0
+        failure = None
         try:
             with Progress(name, status.st_size if is_file else None) as progress:
                 if args.csv:
@@ -70,80 +99,18 @@ def main(args: argparse.Namespace) -> int:
         write("")
         print(decode.summary(decoder.counters), file=sys.stderr)
         if stats is not None:
-            with _writing(f"--stats {args.stats}"):
+            import json
+
+            try:
                 stats.write(json.dumps(decoder.counters.as_dict(), indent=2) + "\n")
                 stats.flush()
-    if failure is not None:
-        raise failure
+            except OSError as error:
+                raise RunError(
+                    f"--stats {args.stats}: cannot be written: {_reason(error)}."
+                ) from None
+        if failure is not None:
+            raise failure
     return code
-
-
-def _input(file: str, name: str, stack: "ExitStack") -> "tuple[int, os.stat_result]":
-    """Descriptor and status of the input. RunError where it cannot be opened."""
-    import os
-    import stat
-
-    fd = 0
-    try:
-        if file != "-":
-            fd = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOCTTY)
-            stack.callback(os.close, fd)
-        status = os.fstat(fd)
-    except (OSError, ValueError) as error:
-        raise RunError(
-            f"{name}: cannot be opened: {_reason(error)}. Give a file of recorded UART bytes."
-        ) from None
-    if stat.S_ISDIR(status.st_mode):
-        raise RunError(f"{name}: is a directory. Give a file of recorded UART bytes.")
-    return fd, status
-
-
-def _stats(
-    path: str | None, of_input: "os.stat_result | None", stack: "ExitStack"
-) -> "TextIO | None":
-    """The file of --stats, opened. UserError where it is the input, a file of this status."""
-    import os
-    from pathlib import Path
-
-    if path is None:
-        return None
-    with _writing(f"--stats {path}"):
-        target = Path(path)
-        if of_input is not None and target.exists() and os.path.samestat(target.stat(), of_input):
-            raise UserError(f"--stats {path}: is the input. Give another file.")
-        return stack.enter_context(target.open("w", encoding="utf-8"))
-
-
-def _writer(flush: bool) -> "Callable[[str], None]":
-    """A function that writes to standard output; ``flush``: at once, as it does for an empty text."""
-    import sys
-
-    from kontronik_can_gw.cli import discard_output
-
-    out = sys.stdout
-
-    def write(text: str) -> None:
-        try:
-            with _writing("standard output"):
-                out.write(text)
-                if flush or not text:
-                    out.flush()
-        except RunError:
-            discard_output()  # what is buffered has nowhere to go
-            raise
-
-    return write
-
-
-@contextmanager
-def _writing(what: str) -> "Iterator[None]":
-    """RunError where something cannot be written; the reader of a pipe may end."""
-    try:
-        yield
-    except BrokenPipeError:
-        raise
-    except (OSError, ValueError) as error:
-        raise RunError(f"{what}: cannot be written: {_reason(error)}.") from None
 
 
 def _reason(error: Exception) -> str:

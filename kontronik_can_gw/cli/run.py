@@ -17,7 +17,6 @@ from kontronik_can_gw.esc.telemetry import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.loop import Loop
-    from kontronik_can_gw.runtime.statistics import Statistics
     from kontronik_can_gw.runtime.systemd import Notifier
 
 log = logging.getLogger("kontronik_can_gw")
@@ -117,9 +116,11 @@ class _Run:
         """The loop with everything open. The parsed DBC is freed at the end of this method."""
         from kontronik_can_gw.cli.recording import in_words, record_folder, recorder_of, setup_of
         from kontronik_can_gw.gateway import Gateway
+        from kontronik_can_gw.runtime import realtime
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
         from kontronik_can_gw.runtime.recorder import state_of
+        from kontronik_can_gw.runtime.statistics import Statistics, default_file
         from kontronik_can_gw.runtime.store import ParameterStore
 
         loaded = load_all(self._file, ParameterStore)
@@ -128,13 +129,26 @@ class _Run:
         config = loaded.config
         need_descriptors(2 * len(config.esc))
         wait = self._wait or config.run.wait_for_devices
-        _begin_realtime(config.run.realtime_priority, wait)
+        if config.run.realtime_priority is not None:
+            try:
+                realtime.begin(config.run.realtime_priority)
+            except RunError as error:
+                if not wait:
+                    raise
+                log.error("%s Running without.", error)  # late frames are better than none
         silent = config.dbc.on_loss == "silent"
         created_ns = time.monotonic_ns()
         parts = (loaded.escs, loaded.layout, created_ns, silent, loaded.canopen)
         recorder = recorder_of(config, self._record)
         gateway = Gateway(*parts) if recorder is None else RecordedGateway(recorder.put, *parts)
-        statistics = _statistics(loaded)
+        try:
+            statistics = Statistics(
+                config.statistics_path or default_file(), config.statistics.address
+            )
+        except UserError:
+            if loaded.store is not None:
+                loaded.store.close(0)
+            raise
         loop = Loop(
             gateway,
             [esc.port for esc in config.esc],
@@ -163,32 +177,6 @@ class _Run:
         if self._stopping:  # a signal came before the loop existed
             loop.stop()
         return loop
-
-
-def _begin_realtime(priority: int | None, wait: bool) -> None:
-    """Real-time priority if it is configured. RunError where it is refused, except for a gateway that waits."""
-    from kontronik_can_gw.runtime import realtime
-
-    if priority is None:
-        return
-    try:
-        realtime.begin(priority)
-    except RunError as error:
-        if not wait:
-            raise
-        log.error("%s Running without.", error)  # late frames are better than none
-
-
-def _statistics(loaded: Loaded) -> "Statistics":
-    from kontronik_can_gw.runtime.statistics import Statistics, default_file
-
-    config = loaded.config
-    try:
-        return Statistics(config.statistics_path or default_file(), config.statistics.address)
-    except UserError:
-        if loaded.store is not None:
-            loaded.store.close(0)
-        raise
 
 
 def settle_memory() -> None:

@@ -29,10 +29,6 @@ from kontronik_can_gw.errors import RunError, UserError
 
 _INSTANCE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}")
 _CHANNEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}")
-_BITRATE = number_from(
-    5_000, 1_000_000, kind=int, problem="is not a bit rate in bit/s, 5000 to 1000000"
-)
-_LINES = number_from(0, 10_000, "number of lines", kind=int)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,47 +63,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         sub.add_argument(
             "--dry-run", "--print", action="store_true", help="only show what would be done"
         )
-    _add_install_arguments(install_parser)
-    uninstall_parser.add_argument(
-        "--purge",
-        action="store_true",
-        help="remove configurations, stored parameters and the user too",
+    install_parser.add_argument("--now", action="store_true", help="start it too, or restart it")
+    install_parser.add_argument(
+        "--executable", metavar="PATH", help="the program (default: this one)"
     )
-    status_parser.add_argument(
-        "-n", "--lines", type=_LINES, default=10, metavar="N", help="lines of the log (default 10)"
-    )
-
-
-def _add_install_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--now", action="store_true", help="start it too, or restart it")
-    parser.add_argument("--executable", metavar="PATH", help="the program (default: this one)")
-    parser.add_argument(
+    install_parser.add_argument(
         "--force",
         action="store_true",
         help="replace files that were changed by hand; they are kept as .bak",
     )
-    parser.add_argument(
+    install_parser.add_argument(
         "--network",
-        type=_BITRATE,
+        type=_bitrate,
         metavar="BITRATE",
         help="let systemd-networkd set up the CAN interface",
     )
-    parser.add_argument(
+    install_parser.add_argument(
         "--channel",
         type=_channel,
         default="can0",
         metavar="NAME",
         help="the CAN interface (default can0)",
     )
-    parser.add_argument(
+    install_parser.add_argument(
         "--prometheus",
         action="store_true",
         help="allow the service loopback IP, for statistics.prometheus",
     )
-    parser.add_argument(
+    install_parser.add_argument(
         "--mqtt",
         action="store_true",
         help="a second service that publishes to the broker of the table [mqtt]",
+    )
+    uninstall_parser.add_argument(
+        "--purge",
+        action="store_true",
+        help="remove configurations, stored parameters and the user too",
+    )
+    status_parser.add_argument(
+        "-n", "--lines", type=_lines, default=10, metavar="N", help="lines of the log (default 10)"
     )
 
 
@@ -131,6 +125,12 @@ def _channel(text: str) -> str:
     if not _CHANNEL.fullmatch(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not the name of an interface")
     return text
+
+
+_bitrate = number_from(
+    5_000, 1_000_000, kind=int, problem="is not a bit rate in bit/s, 5000 to 1000000"
+)
+_lines = number_from(0, 10_000, "number of lines", kind=int)
 
 
 def _install(args: argparse.Namespace) -> int:

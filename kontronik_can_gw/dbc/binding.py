@@ -48,11 +48,6 @@ class Binder:
                 return value, None if value.group is Group.GATEWAY else of_esc
         return None
 
-    def of_signal(self, message: str, signal: str) -> tuple[Value, int | None] | None:
-        """The source that ``[dbc.bind]`` or its name gives to a signal."""
-        bound = self.bound(message, signal)
-        return self.by_name(bound if isinstance(bound, str) else signal)
-
     def bound(self, message: str, signal: str) -> str | float | None:
         """The entry of ``[dbc.bind]`` for a signal."""
         for key in (f"{message}.{signal}", signal):
@@ -77,7 +72,8 @@ def is_one_esc_layout(database: "Database", node: str, binder: Binder) -> bool:
     for message in database.messages:
         if node in message.senders:
             for signal in message.signals:
-                found = binder.of_signal(message.name, signal.name)
+                bound = binder.bound(message.name, signal.name)
+                found = binder.by_name(bound if isinstance(bound, str) else signal.name)
                 if found and found[0].group is not Group.GATEWAY:
                     escs.add(found[1])
     return escs == {None}

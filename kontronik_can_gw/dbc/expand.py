@@ -196,8 +196,12 @@ def _relations(
 
 def _has_values_of_an_esc(message: "Message", bind: dict[str, str | float]) -> bool:
     binder = Binder([EscSettings()], bind)
-    found = [binder.of_signal(message.name, signal.name) for signal in message.signals]
-    return any(source and source[0].group is not Group.GATEWAY for source in found)
+    for signal in message.signals:
+        bound = binder.bound(message.name, signal.name)
+        found = binder.by_name(bound if isinstance(bound, str) else signal.name)
+        if found and found[0].group is not Group.GATEWAY:
+            return True
+    return False
 
 
 def _step(

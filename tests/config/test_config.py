@@ -561,9 +561,11 @@ def samples() -> list[tuple[str, dict[str, Any]]]:
         *(0.0005, 0.001, 0.5, 9.8, 1000.5, -0.5),
         *("", " ", "x", "silent", "not_available", "1/3", "98/10", "9.8/2", " 1/3", "1 / 3", "1e1"),
         *(".5", "+1", "-1", "٣", "a b", "1a", "A234567890123", "max", True, False, [], [1], {}),
-        *({"a": entry} for entry in (1, "x", "", True, 1.5, -1, 65_535, 65_536, {}, [])),
-        *({"a": {"b": entry}} for entry in (1, "x", {"c": 1}, [])),
     ]
+    entries: list[Any] = [1, "x", "", True, 1.5, -1, 65_535, 65_536, {}, []]
+    inner: list[Any] = [1, "x", {"c": 1}, []]
+    entries += [{"b": entry} for entry in inner]
+    values += [{"a": entry} for entry in entries]
     made = [
         (f"{t}.{k}={v!r}"[:60], tables(t, k, v))
         for t, keys in TABLES.items()
