@@ -24,6 +24,7 @@ from kontronik_can_gw.config.kinds import (
     TOPIC,
     Kind,
     choice,
+    choice_of,
     integer,
     meanings,
     number,
@@ -58,6 +59,10 @@ def _key(kind: Kind, default: Any, doc: str) -> Any:
     if isinstance(default, dict):
         return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
+
+
+def _device_names() -> list[str]:
+    return [device.text for device in Device]
 
 
 # fmt: off
@@ -232,7 +237,7 @@ class EscConfig:
         "live values older than this are not available")
     node_id: int | None = _key(_NODE_ID, None,
         "CANopen node-ID of this ESC; 255: waits for LSS (default: counted on from canopen.node_id)")
-    device: str | None = _key(choice(*(device.text for device in Device)), None,
+    device: str | None = _key(choice_of(_device_names), None,
         "the device that belongs here; another one is reported (CANopen EMCY 7510h)")
 
     @property

@@ -104,15 +104,21 @@ def number(low: float, high: float) -> Kind:
 
 def choice(*choices: str) -> Kind:
     """One of a few texts."""
+    return choice_of(lambda: choices)
+
+
+def choice_of(known: Callable[[], Sequence[str]]) -> Kind:
+    """One of a few texts that are asked for at each check: a list that may grow, as that of the devices."""
 
     def check(value: Any) -> str:
+        choices = known()
         if _text(value) not in choices:
             near = did_you_mean(value, choices, 0.5, or_known=True)
             raise ValueError(f"{value!r} is none of {', '.join(choices)}.{near}")
         return str(value)
 
-    span = ", ".join(f'"{text}"' for text in choices)
-    return Kind(span, TEXT.schema | {"enum": list(choices)}, check)
+    span = ", ".join(f'"{text}"' for text in known())
+    return Kind(span, TEXT.schema | {"enum": list(known())}, check)
 
 
 def meanings(known: Sequence[str]) -> Kind:
