@@ -1,5 +1,7 @@
 """Errors that a user can correct, each with its exit code. The command line prints them as plain lines, never as a traceback."""
 
+from collections.abc import Callable, Iterable
+
 from kontronik_can_gw.printable import printable
 
 
@@ -17,3 +19,24 @@ class RunError(UserError):
     """A port, interface or file failed when it was opened or used (exit code 1)."""
 
     exit_code = 1
+
+
+def did_you_mean(
+    name: str,
+    known: Iterable[str],
+    cutoff: float = 0.6,
+    *,
+    show: Callable[[str], str] = str,
+    count: int = 1,
+    or_known: bool = False,
+) -> str:
+    """A sentence with the known names nearest to a mistyped one, after a blank.
+
+    Where none is near: empty, or with ``or_known`` a sentence with all of them. ``cutoff``: 0 to 1, how near.
+    """
+    from difflib import get_close_matches  # not needed where nothing is wrong
+
+    names = list(known)
+    if near := get_close_matches(name, names, n=count, cutoff=cutoff):
+        return f" Did you mean {' or '.join(map(show, near))}?"
+    return f" Known: {', '.join(map(show, names))}." if or_known else ""

@@ -14,7 +14,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "kontronik_can_gw"
 NAME = "kontronik_can_gw"
-# A room may import those before it, and itself; `config.keys` is a room of its own.
+# A room may import those before it, and itself; the keys of the configuration are a room of their own.
 ORDER = (
     ("printable",),
     ("errors",),
@@ -30,7 +30,7 @@ ORDER = (
     ("id_conflicts",),
     ("gateway",),
     ("transmit_queue",),
-    ("config.keys",),
+    ("config.kinds", "config.keys", "config.rules", "config.parse", "config.export"),
     ("capture",),
     ("runtime",),
     ("config",),

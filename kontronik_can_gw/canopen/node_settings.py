@@ -32,35 +32,35 @@ class NodeSettings:
     device: int | None = None
 
 
+def _entries(settings: EscSettings) -> dict[int, int]:
+    """Settings of an ESC as the sub-indices of 2100h."""
+    return {
+        1: settings.pole_pairs,
+        2: settings.gear.numerator,
+        3: settings.gear.denominator,
+        4: settings.timeout_ns // MS,
+        7: settings.cell_count,
+        8: settings.crc_error_threshold,
+    }
+
+
 def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
     """The settings of 2100h; ``base`` where the EDS has no object for one."""
-    number = dictionary.number
-    gear = Fraction(
-        number(at.SETTINGS, 2, base.gear.numerator) or 1,
-        number(at.SETTINGS, 3, base.gear.denominator) or 1,
-    )
-    timeout_ms = number(at.SETTINGS, 4, base.timeout_ns // MS)
+    held = {sub: dictionary.number(at.SETTINGS, sub, own) for sub, own in _entries(base).items()}
     return replace(
         base,
-        pole_pairs=max(1, number(at.SETTINGS, 1, base.pole_pairs)),
-        gear=gear,
-        timeout_ns=min(max(_MIN_TIMEOUT_MS, timeout_ms), _MAX_TIMEOUT_MS) * MS,
-        cell_count=number(at.SETTINGS, 7, base.cell_count),
-        crc_error_threshold=number(at.SETTINGS, 8, base.crc_error_threshold),
+        pole_pairs=max(1, held[1]),
+        gear=Fraction(held[2] or 1, held[3] or 1),
+        timeout_ns=min(max(_MIN_TIMEOUT_MS, held[4]), _MAX_TIMEOUT_MS) * MS,
+        cell_count=held[7],
+        crc_error_threshold=held[8],
     )
 
 
 def configured_settings(base: EscSettings) -> dict[int, int]:
     """Sub-indices of 2100h that the configuration sets, and to what."""
-    standard = EscSettings()
-    listed = (
-        (1, base.pole_pairs, standard.pole_pairs),
-        (2, base.gear.numerator, 1),
-        (3, base.gear.denominator, 1),
-        (4, base.timeout_ns // MS, standard.timeout_ns // MS),
-        (7, base.cell_count, standard.cell_count),
-    )
-    return {sub: given for sub, given, default in listed if given != default}
+    standard = _entries(EscSettings())
+    return {sub: given for sub, given in _entries(base).items() if given != standard[sub]}
 
 
 def make_dictionary(

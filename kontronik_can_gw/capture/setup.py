@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
-from kontronik_can_gw.config.keys import parse
-from kontronik_can_gw.dbc.compiler import DbcSettings
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings

@@ -59,12 +59,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             say(problem, command)
         return error.exit_code
     except BrokenPipeError:  # the reader of our output ended, as `| head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_output()
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
             say(str(_too_few_files()), command)
         elif error.errno == errno.ENOSPC:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # discards buffered output
+            discard_output()
             say(f"standard output: cannot be written: {error.strerror}", command)
         else:
             raise
@@ -87,6 +87,11 @@ def _main(words: list[str], command: str | None) -> int:
     if sys.stdout is not None:  # None where it was closed, as by `>&-`
         sys.stdout.flush()
     return code
+
+
+def discard_output() -> None:
+    """Let what is buffered for standard output, and what follows, go nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def say(text: str, command: str | None = None) -> None:

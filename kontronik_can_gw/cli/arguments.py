@@ -41,19 +41,31 @@ A removed choice is written with its option: ("describe", "--format html"). Entr
 """
 
 
-def number_from(low: float, high: float, what: str = "number of seconds") -> Callable[[str], float]:
-    """An argparse type: a number within a range."""
+def number_from(
+    low: float,
+    high: float,
+    what: str = "number of seconds",
+    *,
+    kind: Callable[[str], float] = float,
+    problem: str | None = None,
+) -> Callable[[str], float]:
+    """An argparse type: a number within a range. ``kind``: ``int`` for whole ones; ``problem``: what is said of another text."""
+    said = f"is not a {what}, {low:g} to {high:g}" if problem is None else problem
 
     def read(text: str) -> float:
         try:
-            value = float(text)
+            value = kind(text)
         except ValueError:
             value = float("nan")
         if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a {what}, {low:g} to {high:g}")
+            raise argparse.ArgumentTypeError(f"{text!r} {said}")
         return value
 
     return read
+
+
+rate = number_from(0.001, 1e6, problem="is no rate between 0.001 and 1000000")
+"""A type for argparse: a rate in Hz."""
 
 
 def seconds_ns(text: str) -> int:
@@ -67,17 +79,6 @@ def seconds_ns(text: str) -> int:
     except InvalidOperation:
         pass
     raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds")
-
-
-def rate(text: str) -> float:
-    """A type for argparse: a rate in Hz."""
-    try:
-        found = float(text)
-    except ValueError:
-        found = 0.0
-    if not 0.001 <= found <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r} is no rate between 0.001 and 1000000")
-    return found
 
 
 def names(text: str) -> list[str]:

@@ -13,7 +13,7 @@ from kontronik_can_gw.canopen.traffic import bits_per_second, frames_per_second
 from kontronik_can_gw.cli.common import load_all, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config.assemble import Loaded
-from kontronik_can_gw.config.keys import as_toml
+from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.dbc.loss import is_mute, reporter
 from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.node_state import UNCONFIGURED

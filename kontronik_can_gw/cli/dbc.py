@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.canopen.dbc import database as canopen_database
 from kontronik_can_gw.canopen.dbc import waiting_for_lss
 from kontronik_can_gw.cli.common import canopen_of, load_all, say, write_output
-from kontronik_can_gw.config.keys import name_problem, shipped
+from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.config.rules import name_problem
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -116,10 +117,10 @@ def _canopen(args: argparse.Namespace) -> "Rows":
 
 
 def _database(args: argparse.Namespace) -> "Database":
-    from kontronik_can_gw.dbc.compiler import DbcSettings
     from kontronik_can_gw.dbc.expand import among_canopen, expand
     from kontronik_can_gw.dbc.prepare import prepare
     from kontronik_can_gw.dbc.reader import choose_node, load_database
+    from kontronik_can_gw.dbc.settings import DbcSettings
 
     if args.config is not None:
         _refuse(

@@ -14,8 +14,9 @@ from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.traffic import bits_per_second
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.config.assemble import Loaded, assemble
-from kontronik_can_gw.config.keys import SHIPPED, Config, load
+from kontronik_can_gw.config.keys import SHIPPED, Config
 from kontronik_can_gw.config.nodes import parameter_folder
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity, count, document
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json

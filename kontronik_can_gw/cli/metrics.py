@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.config.keys import load
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import RunError
 
 _RUN_FOLDER = Path("/run")

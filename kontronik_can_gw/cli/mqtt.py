@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
 from kontronik_can_gw.cli.common import logging_to_stderr, say, stopping_on_signals
-from kontronik_can_gw.config.keys import CanConfig, MqttConfig, mqtt_with
+from kontronik_can_gw.config.keys import CanConfig, MqttConfig
+from kontronik_can_gw.config.parse import mqtt_with
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import MS
 

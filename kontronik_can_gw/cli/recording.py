@@ -4,7 +4,8 @@ from pathlib import Path
 
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.assemble import Loaded
-from kontronik_can_gw.config.keys import Config, as_toml
+from kontronik_can_gw.config.export import as_toml
+from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.machine import state_folder
 from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings

@@ -1,9 +1,9 @@
 """``kontronik-can-gw replay``: plays a recording on a CAN bus, on pseudo terminals, or as a log."""
 
 import argparse
-import sys
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.bus_layout import add_layout_arguments
@@ -12,10 +12,14 @@ from kontronik_can_gw.errors import RunError, UserError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from kontronik_can_gw.desk.recordings.inputs import Input
+    from kontronik_can_gw.config.keys import CanConfig
+    from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
+    from kontronik_can_gw.desk.recordings.inputs import CaptureInput, Input
     from kontronik_can_gw.desk.recordings.pacing import Pace
     from kontronik_can_gw.frames import CanFrame
     from kontronik_can_gw.runtime.can_port import CanPort
+    from kontronik_can_gw.runtime.locks import Locks
+    from kontronik_can_gw.signals.plan import Layout
 
 EPILOG = """\
 FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
@@ -122,85 +126,81 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
-    from itertools import chain
-
     from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.desk.recordings.can_logs import SUFFIXES, CanLogWriter
-    from kontronik_can_gw.desk.recordings.inputs import CaptureInput
-    from kontronik_can_gw.desk.recordings.part_file import PartFile
+    from kontronik_can_gw.desk.recordings.convert import Output
 
     name = args.output
-    suffix = Path(name).suffix
-    if name != "-" and suffix not in SUFFIXES:
-        raise UserError(
-            f"{name}: the ending of its name selects the format of the log: {', '.join(SUFFIXES)}"
-        )
-    target = Path(name)
-    if name != "-" and target.exists():
-        if target.resolve() == args.file.resolve():
-            raise UserError(f"{name}: is the recording itself. Give another -o.")
-        if target.is_file() and not args.force:
-            raise UserError(f"{name}: exists. Give another -o, or --force.")
+    to_screen = name == "-"
+    kind = "candump" if to_screen else _log_kind(name, args.file, args.force)
     frames = recording.frames()
     first = next(frames, None)
     if first is None:
         raise RunError("; ".join([f"{recording.name}: has no CAN frames", *recording.damage]))
-    start = first.time_ns
-    wall = recording.wall_ns(start)
-    part = None if name == "-" else PartFile(target)
     try:
-        file = sys.stdout.buffer if part is None else part.open()
-        kind = "candump" if part is None else SUFFIXES[suffix]
-        channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
-        place = part.path if part is not None and kind == "mf4" else file
-        writer = CanLogWriter(
-            place, kind, None if wall is None else wall - start, start, channel, name
-        )
-        count, last = 0, start
-        with Progress(recording.name, recording.size, name == "-") as progress:
-            for item in chain((first,), frames):
+        with (
+            Output(None if to_screen else Path(name), kind) as out,
+            Progress(recording.name, recording.size, to_screen) as progress,
+        ):
+            writer = _log_writer(out.open(), kind, recording, first.time_ns, name)
+            count, last = 0, first.time_ns
+            wall = recording.wall_ns(last)
+            for time_ns, frame, received in chain((first,), frames):
                 if pace.stopped:
                     break
-                time_ns = item.time_ns
-                if wall is not None:  # the wall clock of that time; it may have been set since
-                    time_ns = (recording.wall_ns(time_ns) or wall) - wall + start
-                last = max(last, time_ns)
-                writer.write(last, item.frame, item.received)
+                # the wall clock of that time; it may have been set since
+                moved = 0 if wall is None else (recording.wall_ns(time_ns) or wall) - wall
+                last = max(last, time_ns if wall is None else first.time_ns + moved)
+                writer.write(last, frame, received)
                 count += 1
                 if not count & 0x3FF:
                     progress.reach(recording.position)
-        writer.close()
-        if part is not None:
-            part.finish()
-    except BaseException as error:
-        if part is not None:
-            part.discard()
-        if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
-            raise RunError(f"{name}: cannot be written: {error.strerror or error}.") from None
+            writer.close()
+            out.is_whole = True
+    except BrokenPipeError:
         raise
-    return f"{count} frames{'' if name == '-' else f' to {name}'}"
+    except OSError as error:
+        raise RunError(f"{name}: cannot be written: {error.strerror or error}.") from None
+    return f"{count} frames{'' if to_screen else f' to {name}'}"
+
+
+def _log_kind(name: str, source: Path, force: bool) -> str:
+    """The format of a log by its suffix. UserError where the file cannot be written."""
+    from kontronik_can_gw.desk.recordings.can_logs import SUFFIXES
+
+    target = Path(name)
+    if target.suffix not in SUFFIXES:
+        raise UserError(
+            f"{name}: the ending of its name selects the format of the log: {', '.join(SUFFIXES)}"
+        )
+    if target.exists() and target.resolve() == source.resolve():
+        raise UserError(f"{name}: is the recording itself. Give another -o.")
+    if target.is_file() and not force:
+        raise UserError(f"{name}: exists. Give another -o, or --force.")
+    return SUFFIXES[target.suffix]
+
+
+def _log_writer(
+    file: "IO[bytes] | Path", kind: str, recording: "Input", start_ns: int, name: str
+) -> "CanLogWriter":
+    from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
+    from kontronik_can_gw.desk.recordings.inputs import CaptureInput
+
+    wall_ns = recording.wall_ns(start_ns)
+    channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
+    begun_ns = None if wall_ns is None else wall_ns - start_ns
+    return CanLogWriter(file, kind, begun_ns, start_ns, channel, name)
 
 
 def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     from kontronik_can_gw.cli.common import say
-    from kontronik_can_gw.config.keys import CanConfig
     from kontronik_can_gw.desk.recordings.inputs import CaptureInput
     from kontronik_can_gw.desk.recordings.marking import Marker
-    from kontronik_can_gw.node_state import UNCONFIGURED
-    from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
+    from kontronik_can_gw.runtime.locks import Locks
     from kontronik_can_gw.runtime.open_can import check_interface, open_can
-    from kontronik_can_gw.signals.unpacker import SignalReader
 
-    config = recording.bus.config.can if args.config and recording.bus.config else None
-    channel = args.channel or (config.channel if config else None)
-    if channel is None:
-        raise UserError(
-            "--to can needs --channel, as vcan0, or a configuration (-c) that names one"
-        )
-    interface = args.interface or (config.interface if config else "socketcan")
     capture = recording if isinstance(recording, CaptureInput) else None
     layout = recording.bus.layout if capture is None else capture.sent_layout
-    can = CanConfig(interface, channel, fd=any(plan.fd for plan in layout.messages))
+    can = _bus(args, recording, fd=any(plan.fd for plan in layout.messages))
     check_interface(can)
     marker = Marker(layout)
     if not args.unmarked and not marker.can_mark:
@@ -208,16 +208,8 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
             "warning: no message of this DBC has the gateway's state, so receivers cannot recognize the replay"
         )
     locks = Locks()
-    if interface != "virtual":
-        names = [messages_lock(channel, key) for key in sorted(SignalReader(layout).keys)[:1]]
-        nodes = (
-            capture.setup.canopen.settings if capture is not None and capture.setup.canopen else ()
-        )
-        names += [
-            node_lock(channel, node.node_id) for node in nodes if node.node_id != UNCONFIGURED
-        ]
-        for taken in locks.hold(names):
-            raise in_use(taken)
+    if can.interface != "virtual":
+        _hold(locks, can.channel, layout, capture)
     port = open_can(can)
     count = 0
     try:
@@ -229,13 +221,43 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
                 continue
             if not pace.wait(time_ns):
                 break
-            _send(port, marker.mark(frame) if changed else frame, channel, pace)
+            _send(port, marker.mark(frame) if changed else frame, can.channel, pace)
             count += 1
     finally:
         port.close()
         locks.close()
     late = f", at most {pace.latest_ns / 1e6:.1f} ms late" if pace.speed else ""
-    return f"{count} frames to {channel}{late}"
+    return f"{count} frames to {can.channel}{late}"
+
+
+def _bus(args: argparse.Namespace, recording: "Input", fd: bool) -> "CanConfig":
+    """The interface of the options, else of the configuration. UserError where none is named."""
+    from kontronik_can_gw.config.keys import CanConfig
+
+    config = recording.bus.config.can if args.config and recording.bus.config else None
+    channel = args.channel or (config.channel if config else None)
+    if channel is None:
+        raise UserError(
+            "--to can needs --channel, as vcan0, or a configuration (-c) that names one"
+        )
+    return CanConfig(
+        args.interface or (config.interface if config else "socketcan"), channel, fd=fd
+    )
+
+
+def _hold(locks: "Locks", channel: str, layout: "Layout", capture: "CaptureInput | None") -> None:
+    """Lock messages and nodes against a gateway that sends the same. RunError where one does."""
+    from kontronik_can_gw.node_state import UNCONFIGURED
+    from kontronik_can_gw.runtime.locks import in_use, messages_lock, node_lock
+    from kontronik_can_gw.signals.unpacker import SignalReader
+
+    names = [messages_lock(channel, key) for key in sorted(SignalReader(layout).keys)[:1]]
+    if capture is not None and capture.setup.canopen is not None:
+        for node in capture.setup.canopen.settings:
+            if node.node_id != UNCONFIGURED:
+                names.append(node_lock(channel, node.node_id))
+    for taken in locks.hold(names):
+        raise in_use(taken)
 
 
 _BUSY_S = 0.0005
@@ -262,45 +284,32 @@ def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> Non
 
 
 def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
-    from contextlib import ExitStack
-
-    from kontronik_can_gw.desk.pty import PtyEsc
+    from kontronik_can_gw.cli.terminals import terminals
     from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput
 
     chunks = _chunks(recording)
-    names = (
-        [esc.name for esc in recording.setup.escs]
-        if isinstance(recording, (CaptureInput, DumpInput))
-        else []
-    )
+    names = []
+    if isinstance(recording, (CaptureInput, DumpInput)):
+        names = [esc.name for esc in recording.setup.escs]
     total = 0
-    with ExitStack() as stack:
-        terminals = [
-            stack.enter_context(PtyEsc(args.link and args.link.replace("{n}", str(number))))
-            for number in range(1, len(names) + 1)
-        ]
-        for name, terminal in zip(names, terminals, strict=True):
-            print(f"{name} {terminal.path}")
-        sys.stdout.flush()
+    with terminals(names, args.link) as opened:
         pace.pause(args.delay)
         for time_ns, esc, data in chunks:
             if not pace.wait(time_ns):
                 break
-            if esc < len(terminals):
-                terminals[esc].write(data)
+            if esc < len(opened):
+                opened[esc].write(data)
                 total += len(data)
         pace.pause(_DRAIN_S)
-        for terminal in terminals:
+        for terminal in opened:
             terminal.check()
-        dropped = sum(terminal.dropped_bytes for terminal in terminals)
-        received = [
-            name for name, terminal in zip(names, terminals, strict=True) if terminal.received
-        ]
-    if received:
+    if received := [n for n, terminal in zip(names, opened, strict=True) if terminal.received]:
         raise RunError(
             f"{', '.join(received)}: the gateway transmits to the ESC, which could take it for a command"
         )
-    return f"{total} bytes to {len(names)} pseudo terminals{f', {dropped} of them dropped (nobody read)' if dropped else ''}"
+    dropped = sum(terminal.dropped_bytes for terminal in opened)
+    lost = f", {dropped} of them dropped (nobody read)" if dropped else ""
+    return f"{total} bytes to {len(names)} pseudo terminals{lost}"
 
 
 _DRAIN_S = 0.2

@@ -3,7 +3,7 @@
 import argparse
 import json
 
-from kontronik_can_gw.config.keys import schema
+from kontronik_can_gw.config.export import schema
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

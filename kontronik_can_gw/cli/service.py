@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 from kontronik_can_gw.cli import service_files as files
+from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.service_files import NAME, WANTS, Choices
 from kontronik_can_gw.cli.service_machine import (
@@ -19,7 +20,7 @@ from kontronik_can_gw.cli.service_machine import (
 )
 from kontronik_can_gw.cli.service_removal import uninstall
 from kontronik_can_gw.cli.service_status import status
-from kontronik_can_gw.config.keys import load
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import RunError, UserError
 
 _INSTANCE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}")
@@ -114,20 +115,10 @@ def _channel(text: str) -> str:
     return text
 
 
-def _bitrate(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if not 5_000 <= value <= 1_000_000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a bit rate in bit/s, 5000 to 1000000")
-    return value
-
-
-def _lines(text: str) -> int:
-    if not text.isdecimal() or int(text) > 10_000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of lines, 0 to 10000")
-    return int(text)
+_bitrate = number_from(
+    5_000, 1_000_000, kind=int, problem="is not a bit rate in bit/s, 5000 to 1000000"
+)
+_lines = number_from(0, 10_000, "number of lines", kind=int)
 
 
 def _install(args: argparse.Namespace) -> int:
@@ -208,7 +199,7 @@ def _not_ready(own: Path) -> list[str]:
     """Why the service must not send yet: its configuration is faulty, or the unedited example."""
     import tomllib
 
-    from kontronik_can_gw.config.keys import parse
+    from kontronik_can_gw.config.parse import parse
 
     try:
         ports = {esc.port for esc in load(own).esc}

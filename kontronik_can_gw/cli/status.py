@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cli.arguments import number_from
 from kontronik_can_gw.cli.common import stopping_on_signals
-from kontronik_can_gw.config.keys import Config, load
+from kontronik_can_gw.config.keys import Config
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.printable import printable, printable_json
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.config.keys import Config, EscConfig, examine
+from kontronik_can_gw.config.keys import Config, EscConfig
+from kontronik_can_gw.config.parse import examine
 from kontronik_can_gw.dbc.loss import unreported
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.prepare import check_load, prepare

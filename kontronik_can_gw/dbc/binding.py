@@ -1,18 +1,18 @@
 """Finds the value that a signal is bound to: by its name, the ESC's prefix, or [dbc.bind]."""
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.names import normalize
-from kontronik_can_gw.esc.protocols import PROTOCOLS
+from kontronik_can_gw.errors import did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import VALUES, Group, Value, values_of, values_of_esc
+from kontronik_can_gw.esc.values import VALUES, Group, Value, values_of_esc
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
 
-_NAMES = {normalize(name): name for name in VALUES}
+VALUES_BY_KEY = {normalize(name): value for name, value in VALUES.items()}
+"""Every value by its normalized name."""
 
 
 class Binder:
@@ -21,29 +21,34 @@ class Binder:
     def __init__(self, escs: Sequence[EscSettings], bind: Mapping[str, str | float]) -> None:
         self.escs = escs
         self.bind = bind
-        self._values = [values_of_esc(esc) for esc in escs] or [values_of(PROTOCOLS[0])]
         self.used: set[str] = set()
+        self._known = [
+            {normalize(name): value for name, value in values_of_esc(esc).items()} for esc in escs
+        ]
+        """Values of each ESC by normalized name."""
         self._prefixes = sorted(
             ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
         )
 
-    def gateway_or_esc(self, key: str, esc: int | None) -> tuple[Value, int | None] | None:
-        """The source of a normalized name without a final ``percent``; ``esc`` None: the name has no prefix."""
-        name = _NAMES.get(key) or _NAMES.get(key.removesuffix("percent"))
-        if name is None:
-            return None
-        source = self._values[esc or 0][name]
-        return (source, None) if source.group is Group.GATEWAY else (source, esc)
+    def value_named(self, key: str, esc: int | None) -> Value | None:
+        """The value of a normalized name, without a final ``percent``. Here alone a bound name becomes a Value.
+
+        ``esc``: index of the ESC whose value is meant, None where the name has no prefix.
+        """
+        known = VALUES_BY_KEY if esc is None else self._known[esc]
+        return known.get(key) or known.get(key.removesuffix("percent"))
 
     def by_name(self, name: str) -> tuple[Value, int | None] | None:
         """The source of a signal name or a bound name, and its ESC (None: no ESC named, or the gateway)."""
         key = normalize(name)
-        if len(self.escs) == 1 and (found := self.gateway_or_esc(key, 0)):
-            return found
+        meant: list[tuple[str, int | None]] = [(key, 0)] if len(self.escs) == 1 else []
         for prefix, esc in self._prefixes:
-            if key.startswith(prefix) and (found := self.gateway_or_esc(key[len(prefix) :], esc)):
-                return found
-        return self.gateway_or_esc(key, None)
+            if key.startswith(prefix):
+                meant.append((key.removeprefix(prefix), esc))
+        for rest, of_esc in [*meant, (key, None)]:
+            if (value := self.value_named(rest, of_esc)) is not None:
+                return value, None if value.group is Group.GATEWAY else of_esc
+        return None
 
     def bound(self, message: str, signal: str) -> str | float | None:
         """The entry of ``[dbc.bind]`` for a signal."""
@@ -58,9 +63,9 @@ class Binder:
         key = normalize(name)
         for prefix, _ in self._prefixes:
             key = key.removeprefix(prefix) or key
-        near = difflib.get_close_matches(key, _NAMES, n=3, cutoff=0.5)
-        names = [_NAMES[n] for n in near]
-        return f" Did you mean {' or '.join(names)}?" if names else ""
+        return did_you_mean(
+            key, VALUES_BY_KEY, 0.5, show=lambda near: VALUES_BY_KEY[near].name, count=3
+        )
 
 
 def bind_key(bind: Mapping[str, str | float], message: str, signal: str) -> str | None:

@@ -1,15 +1,15 @@
 """Prepares what will be sent from a DBC file and the ESCs: the database (expanded if it describes one ESC) and its layout."""
 
-import difflib
 import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
+from kontronik_can_gw.dbc.compiler import compile_layout
 from kontronik_can_gw.dbc.expand import among_canopen, expand, needs_expansion, with_messages
 from kontronik_can_gw.dbc.reader import choose_node
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout
 
@@ -60,8 +60,7 @@ def _with_chosen(database: "Database", node: str, patterns: Sequence[str], file:
                 if others
                 else ""
             )
-            near = difflib.get_close_matches(pattern, ours, n=1)
-            hint = f" Did you mean {near[0]}?" if near and not others else ""
+            hint = "" if others else did_you_mean(pattern, ours)
             problems.append(
                 f"dbc.messages: {pattern!r} is no message of {node} in {file}.{sender}{hint}"
             )

@@ -1,10 +1,9 @@
 """Opens the CAN interface that the configuration names: any of python-can's, SocketCAN by a socket of our own."""
 
-import difflib
 from typing import Any
 
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.errors import RunError, UserError, did_you_mean
 from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.runtime.can_port import CanPort
 from kontronik_can_gw.runtime.socketcan_port import (
@@ -22,12 +21,7 @@ def check_interface(config: CanConfig) -> None:
     with without_asammdf():
         import can
     if config.interface not in can.VALID_INTERFACES:
-        near = difflib.get_close_matches(config.interface, can.VALID_INTERFACES, n=1)
-        hint = (
-            f" Did you mean {near[0]}?"
-            if near
-            else f" Known: {', '.join(sorted(can.VALID_INTERFACES))}."
-        )
+        hint = did_you_mean(config.interface, sorted(can.VALID_INTERFACES), or_known=True)
         raise UserError(f"can.interface: {config.interface!r} is no interface of python-can.{hint}")
 
 

@@ -12,7 +12,7 @@ from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.config.assemble import Loaded, assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.runtime.machine import machine_identity, serial_number
 from kontronik_can_gw.signals.plan import Layout
 

@@ -205,7 +205,8 @@ def test_settings_have_the_ranges_and_defaults_of_the_configuration(
 ) -> None:
     definition: Any = next(each for each in fields(EscConfig) if each.name == key)
     entry = entries[0x2100, sub]
-    assert limits(entry) == (definition.metadata["low"], definition.metadata["high"])
+    allowed = definition.metadata["kind"].schema
+    assert limits(entry) == (allowed["minimum"], allowed["maximum"])
     assert entry.default == definition.default
 
 

@@ -158,7 +158,7 @@ def test_room_again_and_it_goes_on_and_the_loss_is_reported(
     monkeypatch.setattr(os, "statvfs", statvfs)
     it = begun(tmp_path, clock=lambda: now, min_free_bytes=1000 * real.f_frsize)
     put(it, entries(10))
-    until(lambda: it.facts.problem != "" and not it._entries)
+    until(lambda: it._unwritten == 10)
     free = 2000 * real.f_frsize
     now += 6 * SECOND
     until(lambda: it._file is not None)
@@ -311,7 +311,7 @@ def test_a_part_that_could_not_be_begun_does_not_stand_in_the_way(
     monkeypatch.setattr(os, "write", write)
     it = begun(tmp_path, clock=lambda: now)
     put(it, entries(3))
-    until(lambda: it.facts.problem != "")
+    until(lambda: it._unwritten == 3)
     assert list(tmp_path.iterdir()) == []
     full = False
     now += 6 * SECOND
@@ -377,7 +377,7 @@ def test_a_folder_that_is_not_there_yet_is_waited_for_where_devices_are(tmp_path
     it.header = HEADER
     it.start(wait=True)
     put(it, entries(3))
-    until(lambda: it.facts.problem != "")
+    until(lambda: it._unwritten == 3)
     place.unlink()
     now += 6 * SECOND
     until(lambda: it._file is not None)
@@ -399,7 +399,7 @@ def test_a_mistake_in_what_writes_ends_nothing(
     with monkeypatch.context() as patch:
         patch.setattr(capture_part, "data_payload", fail)
         put(it, entries(2))
-        until(lambda: it.facts.problem != "" and not it._entries)
+        until(lambda: it._unwritten == 2)
     assert "a mistake of ours" in it.reports(0)[0].text
     assert it.facts.lost == 2
     now += 6 * SECOND

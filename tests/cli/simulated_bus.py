@@ -7,7 +7,7 @@ from capture_bench import START, Bench
 
 from kontronik_can_gw.capture.format import block, data_payload, json_payload
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,

@@ -15,7 +15,9 @@ import pytest
 from command_line import refused, run
 
 from kontronik_can_gw.cli.arguments import REMOVED_OPTIONS
-from kontronik_can_gw.config.keys import REMOVED_KEYS, load, schema
+from kontronik_can_gw.config.export import schema
+from kontronik_can_gw.config.keys import REMOVED_KEYS
+from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.pty import PtyEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -52,26 +54,23 @@ def terminal() -> Iterator[PtyEsc]:
 
 
 @pytest.mark.parametrize(
-    "given", ["--tape x", "--tape=x", "--format=wax", "--format wax", "-h --tape"]
+    ("given", "option"),
+    [
+        *(
+            (words, "--tape")
+            for words in ("--tape x", "--tape=x", "-h --tape", "--ta x", "--tap=x")
+        ),
+        *((words, "--format wax") for words in ("--format=wax", "--format wax", "--form=wax")),
+        ("--forma wax", "--format wax"),
+    ],
 )
-def test_a_removed_option_is_one_line_with_what_to_type_instead(
-    given: str, monkeypatch: pytest.MonkeyPatch
+def test_a_removed_option_or_its_beginning_is_one_line_with_what_to_type_instead(
+    given: str, option: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--tape"), "Type -o x.")
-    monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--format wax"), "Type -o x.")
-    option = "--tape" if "--tape" in given else "--format wax"
+    for removed in ("--tape", "--format wax"):
+        monkeypatch.setitem(REMOVED_OPTIONS, ("describe", removed), "Type -o x.")
     assert refused(2, "describe", *given.split()) == f"{option}: was removed. Type -o x."
     assert "unrecognized arguments: --tape" in refused(2, "schema", "--tape")
-
-
-@pytest.mark.parametrize("given", ["--ta x", "--tap=x", "--form=wax", "--forma wax"])
-def test_a_removed_option_is_known_by_its_beginning_as_argparse_knows_the_others(
-    given: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--tape"), "Type -o x.")
-    monkeypatch.setitem(REMOVED_OPTIONS, ("describe", "--format wax"), "Type -o x.")
-    option = "--tape" if "--ta" in given else "--format wax"
-    assert refused(2, "describe", *given.split()) == f"{option}: was removed. Type -o x."
     assert "unrecognized arguments: --other" in refused(2, "describe", "--other", "--", "--ta")
 
 

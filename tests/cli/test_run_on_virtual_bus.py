@@ -20,7 +20,7 @@ import pytest
 from cantools.database.can import Database
 
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.frames import CanFrame

@@ -15,16 +15,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import kontronik_can_gw
-from kontronik_can_gw.config.keys import (
-    REMOVED_KEYS,
-    Config,
-    as_toml,
-    load,
-    mqtt_with,
-    parse,
-    schema,
-    shipped,
-)
+from kontronik_can_gw.config.export import as_toml, schema
+from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, shipped
+from kontronik_can_gw.config.parse import load, mqtt_with, parse
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import MS
@@ -552,76 +545,16 @@ def test_every_key_of_the_schema_is_described_and_its_default_is_the_parsers() -
 def samples() -> list[tuple[str, dict[str, Any]]]:
     """Configurations in which one key has one value: of each kind, each end, each wrong type."""
     values: list[Any] = [
-        0,
-        1,
-        -1,
-        7,
-        19,
-        20,
-        100,
-        101,
-        255,
-        256,
-        9999,
-        10_000,
-        60_000,
-        60_001,
-        10**6,
-        10**6 + 1,
+        *(0, 1, -1, 7, 19, 20, 100, 101, 255, 256, 9999, 10_000, 60_000, 60_001, 10**6, 10**6 + 1),
+        *(8 * 10**6, 8 * 10**6 + 1, 0x1FFFFFFF, 0x20000000, 10**30),
+        *(0.0005, 0.001, 0.5, 9.8, 1000.5, -0.5),
+        *("", " ", "x", "silent", "not_available", "1/3", "98/10", "9.8/2", " 1/3", "1 / 3", "1e1"),
+        *(".5", "+1", "-1", "٣", "a b", "1a", "A234567890123", "max", True, False, [], [1], {}),
     ]
-    values += [
-        8 * 10**6,
-        8 * 10**6 + 1,
-        0x1FFFFFFF,
-        0x20000000,
-        10**30,
-        0.0005,
-        0.001,
-        0.5,
-        9.8,
-        1000.5,
-        -0.5,
-    ]
-    values += [
-        "",
-        " ",
-        "x",
-        "silent",
-        "not_available",
-        "1/3",
-        "98/10",
-        "9.8/2",
-        " 1/3",
-        "1 / 3",
-        "1e1",
-        ".5",
-        "+1",
-    ]
-    values += [
-        "-1",
-        "٣",
-        "a b",
-        "1a",
-        "A234567890123",
-        "max",
-        True,
-        False,
-        [],
-        [1],
-        {},
-        {"a": 1},
-        {"a": "x"},
-    ]
-    values += [
-        {"a": ""},
-        {"a": True},
-        {"a": 1.5},
-        {"a": -1},
-        {"a": 65_535},
-        {"a": 65_536},
-        {"a": {"b": 1}},
-    ]
-    values += [{"a": {"b": "x"}}, {"a": {"b": {"c": 1}}}, {"a": {"b": []}}, {"a": {}}, {"a": []}]
+    entries: list[Any] = [1, "x", "", True, 1.5, -1, 65_535, 65_536, {}, []]
+    inner: list[Any] = [1, "x", {"c": 1}, []]
+    entries += [{"b": entry} for entry in inner]
+    values += [{"a": entry} for entry in entries]
     made = [
         (f"{t}.{k}={v!r}"[:60], tables(t, k, v))
         for t, keys in TABLES.items()

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get, pascal, read
 
 from kontronik_can_gw.dbc.binding import Binder
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData

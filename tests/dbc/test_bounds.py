@@ -6,9 +6,9 @@ import cantools.database
 import pytest
 
 from kontronik_can_gw.dbc.bounds import MAX_BYTES, check_size
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database, parse_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 

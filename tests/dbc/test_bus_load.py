@@ -3,8 +3,8 @@
 import pytest
 from packer_oracle import Msg, Sig, dbc_text, read
 
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import check_load, prepare
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout

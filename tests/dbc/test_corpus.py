@@ -14,9 +14,9 @@ import opendbc  # type: ignore[import-untyped]
 import pytest
 from cantools.database.can import Database, Message, Signal
 
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import values
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout

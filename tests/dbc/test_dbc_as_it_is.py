@@ -9,13 +9,13 @@ import pytest
 
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli import check
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc import counters
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.loss import unreported
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.send_types import NAMES
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode

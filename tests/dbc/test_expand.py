@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.dbc import expand, writer
-from kontronik_can_gw.dbc.compiler import DbcSettings, compile_layout
+from kontronik_can_gw.dbc.compiler import compile_layout
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database, parse_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import MessagePlan

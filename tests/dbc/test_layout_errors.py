@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from packer_oracle import Msg, Sig, dbc_text
 
-from kontronik_can_gw.dbc.compiler import DbcSettings
-from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.prepare import check_load, prepare
 from kontronik_can_gw.dbc.reader import load_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout
@@ -293,6 +293,17 @@ def test_a_start_value_that_is_no_number_does_no_harm(tmp_path: Path) -> None:
     )
     text = text.replace('BA_DEF_DEF_ "GenSigStartValue" 0', 'BA_DEF_DEF_ "GenSigStartValue" "a"')
     assert load(tmp_path, text).messages[0].signals[0].not_available == 65535
+
+
+def test_a_bus_that_is_too_full_is_refused(tmp_path: Path) -> None:
+    layout = load(
+        tmp_path, timed('BA_ "GenMsgSendType" BO_ 256 0;\nBA_ "GenMsgCycleTime" BO_ 256 1;')
+    )
+    assert check_load(layout, 1_000_000) is None
+    warning = check_load(layout, 200_000)
+    assert warning is not None and "my_car.dbc" in warning and "%" in warning
+    with pytest.raises(UserError, match=r"my_car.dbc.*GenMsgCycleTime"):
+        check_load(layout, 125_000)
 
 
 # --- bindings -----------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ SHOW = """
 import json
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
 from kontronik_can_gw.esc.kontronik import Device, Layout, LiveData

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from kontronik_can_gw.canopen.abort import SdoAbort
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
 from kontronik_can_gw.config.nodes import shipped_canopen
-from kontronik_can_gw.dbc.compiler import DbcSettings
+from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
 from kontronik_can_gw.errors import UserError

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse, shipped
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame

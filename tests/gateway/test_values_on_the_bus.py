@@ -2,9 +2,9 @@
 
 import pytest
 
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.esc.kontronik import Device, InfoData, LiveData, codec, encode
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, MS, SECOND, EscSettings

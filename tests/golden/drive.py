@@ -13,7 +13,8 @@ from kontronik_can_gw.canopen.storage import encode
 from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse, shipped
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway

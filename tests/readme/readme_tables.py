@@ -11,18 +11,8 @@ from kontronik_can_gw.canopen.data_types import ARRAY, RECORD
 from kontronik_can_gw.canopen.eds import Eds, load
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.objects import BINDINGS
-from kontronik_can_gw.config.keys import (
-    CanConfig,
-    CanopenConfig,
-    DbcConfig,
-    EscConfig,
-    MqttConfig,
-    RecordConfig,
-    RunConfig,
-    StatisticsConfig,
-    choices,
-    shipped,
-)
+from kontronik_can_gw.config.keys import TABLES as KEYS
+from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.esc.values import VALUES, Group
 
@@ -56,30 +46,18 @@ _WHEN = {
 
 def configuration() -> str:
     lines = ["| key | range | default | meaning |", "|---|---|---|---|"]
-    for head, table in (
-        ("can", CanConfig),
-        ("dbc", DbcConfig),
-        ("canopen", CanopenConfig),
-        ("run", RunConfig),
-        ("statistics", StatisticsConfig),
-        ("record", RecordConfig),
-        ("mqtt", MqttConfig),
-        ("[esc]", EscConfig),
-    ):
+    for name, table in KEYS.items():
+        head = "[esc]" if name == "esc" else name
         for f in fields(table):
-            limits = f.metadata
-            span = f"{limits['low']} … {limits['high']}" if "low" in limits else limits["kind"]
-            if "also" in limits:
-                span += f", {limits['also']}"
-            if listed := choices(limits):
-                span = ", ".join(f'"{choice}"' for choice in listed)
             default = (
                 "**required**" if f.default is MISSING and f.default_factory is MISSING else ""
             )
             if f.default is not MISSING and f.default not in (None, ""):
                 value = float(f.default) if isinstance(f.default, Fraction) else f.default
                 default = str(value).lower() if isinstance(value, bool) else str(value)
-            lines.append(f"| `{head}.{f.name}` | {span} | {default} | {limits['doc']} |")
+            lines.append(
+                f"| `{head}.{f.name}` | {f.metadata['kind'].span} | {default} | {f.metadata['doc']} |"
+            )
     return "\n".join(lines)
 
 

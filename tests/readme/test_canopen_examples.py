@@ -18,7 +18,7 @@ from canopen.lss import LssError, LssMaster
 
 from kontronik_can_gw.canopen.storage import decode
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk import pty
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,

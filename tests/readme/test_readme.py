@@ -12,7 +12,9 @@ import cantools.database
 from readme_tables import PAGES, PROJECT, TABLES, configuration, with_tables
 
 from kontronik_can_gw.cli import COMMANDS
-from kontronik_can_gw.config.keys import parse, schema, shipped
+from kontronik_can_gw.config.export import schema
+from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.config.parse import parse
 
 README = PAGES[PROJECT / "README.md"]
 ALL = "\n".join(PAGES.values())

@@ -6,7 +6,7 @@ import pytest
 from wire_world import World, loop_in, run
 
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import GatewayState

@@ -7,7 +7,7 @@ import pytest
 from wire_world import CAN_FD, Bus, World
 
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.telemetry import MS, SECOND

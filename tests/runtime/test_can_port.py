@@ -19,7 +19,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import CanConfig, parse
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.frames import CanFrame

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw.config.assemble import Loaded, assemble
-from kontronik_can_gw.config.keys import CanConfig, parse
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData

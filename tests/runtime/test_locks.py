@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime import locks

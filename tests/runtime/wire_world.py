@@ -10,9 +10,9 @@ import pytest
 
 from kontronik_can_gw.canopen.nodes import CanopenSetup
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 from kontronik_can_gw.canopen import cob_ids, nmt
 from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.keys import parse
+from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk import pty
 from kontronik_can_gw.desk.monitor.sources import Bus, Take
 from kontronik_can_gw.desk.recordings.layouts import BusLayout

@@ -8,7 +8,7 @@ from pathlib import Path
 from kontronik_can_gw.capture.replay import TimedFrame, follow_bytes
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.dbc.compiler import DbcSettings
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.recordings.can_logs import UART_MAGIC
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.recording import CHUNK, Input

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.keys import Config
-from kontronik_can_gw.dbc.compiler import DbcSettings
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.reader import choose_node, load_database
+from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Group

@@ -1,0 +1,150 @@
+"""Compiles one message of a DBC: its frame, its times, its pages, its signals, its E2E protection."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.dbc import counters
+from kontronik_can_gw.dbc.compilation import Compilation
+from kontronik_can_gw.dbc.placement import placement_problems
+from kontronik_can_gw.dbc.signal_compiler import SignalCompiler
+from kontronik_can_gw.dbc.timing import timing
+from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.signals.plan import FD_LENGTHS, MessagePlan, Role, SendType, SignalPlan
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+_MAX_PAGES = 1024
+"""Maximum of multiplexer values in one of our messages."""
+
+
+def compile_message(job: Compilation, message: "Message") -> MessagePlan | None:
+    """The plan of a message; None, with lines in the problems, where it cannot be sent."""
+    where = f"{job.file}: {message.name}"
+    before = len(job.problems)
+    is_fd = message.is_fd or message.length > 8
+    job.problems += _frame_problems(message, is_fd and not job.fd_allowed, is_fd, where)
+    if _is_empty(message) or message.length > FD_LENGTHS[-1]:
+        return None
+    send_type, cycle_ms, delay_ms = timing(job, message, where)
+    pages = sorted({page for signal in message.signals for page in signal.multiplexer_ids or ()})
+    if problem := _too_many_pages(message, len(pages)):
+        job.problems.append(f"{where}: {problem}")
+        return None
+    signals = _signals(job, message)
+    job.problems += placement_problems(message, where)
+    job.problems += _page_problems(message, pages, signals, where)
+    job.problems += _crc_problems(job, message, signals, where)
+    if len(job.problems) > before:
+        return None
+    return MessagePlan(
+        name=message.name,
+        can_id=message.frame_id,
+        extended=message.is_extended_frame,
+        fd=is_fd,
+        length=message.length,
+        send_type=send_type,
+        cycle_ns=cycle_ms * MS if SendType.CYCLIC in send_type else 0,
+        delay_ns=delay_ms * MS,
+        signals=tuple(signals),
+        escs=frozenset(s.esc for s in signals if s.esc is not None),
+        paces=frozenset(s.source.pace or s.source.group for s in signals if s.source),
+        pages=tuple(pages) or (None,),
+        data_id=job.settings.data_ids.get(message.name, message.frame_id & 0xFFFF),
+    )
+
+
+def _is_empty(message: "Message") -> bool:
+    return message.is_container or message.length == 0 or not message.signals
+
+
+def _frame_problems(
+    message: "Message", is_forbidden: bool, is_fd: bool, where: str
+) -> Iterator[str]:
+    if is_forbidden:
+        yield (
+            f"{where}: is a CAN FD message ({message.length} bytes). Set can.fd = true, or shorten it."
+        )
+    if is_fd and message.length not in FD_LENGTHS:
+        lengths = ", ".join(map(str, FD_LENGTHS[9:]))
+        yield f"{where}: CAN FD has no frames of {message.length} bytes, but {lengths}."
+    if _is_empty(message):
+        yield (
+            f"{where}: has no signal that could be sent. Give it signals, or leave it out (dbc.messages)."
+        )
+
+
+def _too_many_pages(message: "Message", count: int) -> str | None:
+    """What is not supported of a message's multiplexing."""
+    multiplexers = [signal for signal in message.signals if signal.is_multiplexer]
+    if len(multiplexers) > 1 or any(signal.multiplexer_ids for signal in multiplexers):
+        return "has more than one level of multiplexing; one is supported."
+    if count > _MAX_PAGES:
+        return f"has {count} multiplexer values; {_MAX_PAGES} are supported."
+    return None
+
+
+def _signals(job: Compilation, message: "Message") -> list[SignalPlan]:
+    """The plans of a message's signals, those on several pages once for each."""
+    plans = []
+    for signal in message.signals:
+        if signal.length <= message.length * 8:  # others are reported with their place
+            compiler = SignalCompiler(job, message, signal)
+            plans += [compiler.plan(page) for page in signal.multiplexer_ids or (None,)]
+    return [plan for plan in plans if plan is not None]
+
+
+def _page_problems(
+    message: "Message", pages: Sequence[int], signals: Sequence[SignalPlan], where: str
+) -> Iterator[str]:
+    """Multiplexer values that do not fit, and signals that have to be on every page."""
+    for multiplexer in message.signals:
+        if multiplexer.is_multiplexer:
+            bits = multiplexer.length - (1 if multiplexer.is_signed else 0)
+            room = 0 if multiplexer.is_float else 1 << bits
+            for page in pages:
+                if page >= room:
+                    yield f"{where}.{multiplexer.name}: cannot hold the multiplexer value {page} (m{page})."
+    for signal in signals:
+        if signal.page is not None and signal.role in (Role.ALIVE, Role.CRC):
+            yield (
+                f"{where}.{signal.name}: is a multiplexed {signal.role.value}; it has to be in every frame. "
+                f"Take the m{signal.page} away, or bind it to a constant."
+            )
+
+
+def _crc_problems(
+    job: Compilation, message: "Message", signals: Sequence[SignalPlan], where: str
+) -> Iterator[str]:
+    """A checksum is sent only as AUTOSAR E2E profile 1, if it is configured or has the well-known names."""
+    crcs = [signal for signal in signals if signal.role is Role.CRC]
+    alive = [signal for signal in signals if signal.role is Role.ALIVE]
+    if len(crcs) > 1:
+        names = ", ".join(signal.name for signal in crcs)
+        yield f"{where}: has several CRC signals: {names}. Bind all but one to constants."
+    if len(crcs) != 1:
+        return
+    (crc,) = crcs
+    bound = job.binder.bound
+    asked = message.name in job.settings.data_ids or bound(message.name, crc.name) is not None
+    fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
+    has_counter = len(alive) == 1 and alive[0].high >= 14
+    by_names = has_counter and counters.is_e2e(
+        crc.name, str(bound(message.name, alive[0].name) or alive[0].name)
+    )
+    key = f"dbc.e2e_data_ids.{message.name} = 0x{message.frame_id & 0xFFFF:X}"
+    if not asked and not (fits and by_names):
+        yield (
+            f"{where}.{crc.name}: the DBC does not say how this checksum is made. AUTOSAR E2E profile 1 (8 bits on a byte border, "
+            f"beside exactly one alive counter, 0 to 14) is chosen by {key}. Otherwise bind it to a constant, if receivers take "
+            "one, or leave the message out (dbc.messages)."
+        )
+        return
+    if not fits:
+        yield f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte border."
+    if not has_counter:
+        yield f"{where}: {crc.name}: E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
+    if not asked:
+        job.warnings.append(
+            f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. If that is right, say so: {key}"
+        )
