@@ -8,8 +8,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from kontronik_can_gw.errors import did_you_mean
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.esc.kontronik import Device, Layout
-    from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Swap
+    from kontronik_can_gw.esc.kontronik.simulator import (
+        Device,
+        Dropout,
+        ErrorWindow,
+        EscOptions,
+        Layout,
+        Swap,
+    )
 
 T = TypeVar("T")
 
@@ -89,8 +95,14 @@ class Texts:
 
     def esc_options(self, number: int) -> "EscOptions | None":
         """Options of the ESC with this number, from 1."""
-        from kontronik_can_gw.esc.kontronik import Device, Layout
-        from kontronik_can_gw.esc.kontronik.simulator import FLIGHT, IDLE, EscOptions, Faults
+        from kontronik_can_gw.esc.kontronik.simulator import (
+            FLIGHT,
+            IDLE,
+            Device,
+            EscOptions,
+            Faults,
+            Layout,
+        )
 
         args = self._args
         device = self("--device", _device)
@@ -180,13 +192,13 @@ def _choice(text: str, choices: dict[str, T]) -> T:
 
 
 def _device(text: str) -> "Device":
-    from kontronik_can_gw.esc.kontronik import Device
+    from kontronik_can_gw.esc.kontronik.simulator import Device
 
     return _choice(text, {device.text.lower(): device for device in Device})
 
 
 def _layout(text: str, *more: str) -> "Layout":
-    from kontronik_can_gw.esc.kontronik import Layout
+    from kontronik_can_gw.esc.kontronik.simulator import Layout
 
     names = {layout.value: layout for layout in Layout}
     if text.lower() not in names:
@@ -216,8 +228,7 @@ def _dropout(text: str) -> "Dropout":
 
 
 def _error(text: str) -> "ErrorWindow":
-    from kontronik_can_gw.esc.kontronik import OperatingError, SelfTestError
-    from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow
+    from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, OperatingError, SelfTestError
 
     name, at, when = text.partition("@")
     bits: dict[str, OperatingError | SelfTestError] = {bit.text: bit for bit in OperatingError}

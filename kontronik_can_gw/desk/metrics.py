@@ -8,7 +8,7 @@ from typing import Any
 
 from prometheus_client import Metric
 
-from kontronik_can_gw.esc.kontronik.states import ErrorBit, OperatingError, SelfTestError
+from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.node_state import NmtState
@@ -176,13 +176,15 @@ def _values(document: Document) -> Iterator[Metric]:
         scaled = [(of, v if v is None else v * multiplier / divisor) for of, v in values]
         text = f"The ESC's {name.replace('_', ' ')}{unit_text}."
         yield from _one("_".join(filter(None, words)), text, scaled)
-    words_of_bits: tuple[tuple[str, tuple[str, ...], type[ErrorBit]], ...] = (
-        ("operating_error", ("errors", "warnings", "statuses"), OperatingError),
-        ("selftest_error", ("selftest_errors",), SelfTestError),
+    words_of_bits: tuple[tuple[str, tuple[str, ...]], ...] = (
+        ("operating_error", ("errors", "warnings", "statuses")),
+        ("selftest_error", ("selftest_errors",)),
     )
-    for name, keys, bits in words_of_bits:
+    for name, keys in words_of_bits:
         text = f"1 while the bit of the ESC's {name.replace('_', ' ')} word is set."
-        yield from _one(name, text, [flag for esc in escs for flag in _flags(esc, keys, bits)])
+        yield from _one(
+            name, text, [flag for esc in escs for flag in _flags(esc, keys, f"{name}s")]
+        )
 
 
 def _nodes(nodes: Iterable[Document]) -> Iterator[Metric]:
@@ -207,13 +209,14 @@ def _states(labels: Labels, states: type[Any], now: str) -> list[Sample]:
     return [(dict(labels) | {"state": name}, int(name == now)) for name in names]
 
 
-def _flags(esc: Document, keys: Iterable[str], bits: type[ErrorBit]) -> list[Sample]:
+def _flags(esc: Document, keys: Iterable[str], word: str) -> list[Sample]:
     """Each bit that has a name, and those without one that are set; empty while the word is not available."""
     lists = [esc[key] for key in keys]
     if None in lists:
         return []
     found = {name for names in lists for name in names}
-    known = {bit.text: bit.severity.value for bit in bits}
+    protocol = protocol_named(esc.get("protocol", PROTOCOLS[0].name))
+    known = {bit.text: bit.severity.value for bit in protocol.errors.get(word, ())}
     known |= dict.fromkeys(sorted(found - set(known)), "error")
     return [
         (_of(esc) | {"error": name, "severity": known[name]}, int(name in found)) for name in known

@@ -105,7 +105,7 @@ class Severity(Enum):
 class ErrorBit(IntEnum):
     """The bits of an error word; a protocol derives one for each of its words.
 
-    A member is written ``NAME = (bit, severity, meaning, remedy, code, is_summary)``; the last two may be left out.
+    A member is written ``NAME = (bit, severity, meaning, remedy, code, is_summary, is_normal)``; the last three may be left out.
     """
 
     severity: Severity
@@ -116,6 +116,8 @@ class ErrorBit(IntEnum):
     """Error code of a CANopen emergency; None for one of the manufacturer's."""
     is_summary: bool
     """Set with any other bit of its severity, which explains it."""
+    is_normal: bool
+    """Set in normal operation: nothing to show."""
 
     def __new__(
         cls,
@@ -125,6 +127,7 @@ class ErrorBit(IntEnum):
         remedy: str,
         code: int | None = None,
         is_summary: bool = False,
+        is_normal: bool = False,
     ) -> Self:
         member = int.__new__(cls, bit)
         member._value_ = bit
@@ -133,6 +136,7 @@ class ErrorBit(IntEnum):
         member.remedy = remedy
         member.code = code
         member.is_summary = is_summary
+        member.is_normal = is_normal
         return member
 
     @property
@@ -148,11 +152,18 @@ def bit_texts(word: int, names: type[ErrorBit] | Sequence[ErrorBit]) -> list[str
 
 
 class State(NamedTuple):
-    """An operating state: its name, the name in words, what a person should do."""
+    """An operating state."""
 
     text: str
+    """Its name."""
     meaning: str
+    """The name in words."""
     remedy: str
+    """What a person should do."""
+    kind: str | None = None
+    """``idle``, ``start``, ``run``, ``brake`` or ``fault``."""
+    phase: str = ""
+    """What it is shown alike with, in words."""
 
 
 class Field(NamedTuple):

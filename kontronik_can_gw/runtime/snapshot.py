@@ -268,6 +268,7 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         "link": name_in_words(esc.link.name),
         "fresh": live is not None,
         "diagnosis": esc.diagnosis() if live is None and port.open else None,
+        "protocol": protocol.name,
         "layout": protocol.layout_text(esc.layout),
         "device": protocol.device_text(info),
         "variant": protocol.value("variant", info),

@@ -16,7 +16,6 @@ from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of
 from kontronik_can_gw.desk.mqtt.discovery import entity, is_ours
 from kontronik_can_gw.desk.mqtt.messages import IDENTITY_NS, MAX_CHANGES, MIN_PAUSE_NS, Publisher
 from kontronik_can_gw.desk.mqtt.topics import Message, Topics
-from kontronik_can_gw.desk.mqtt.values import KIND_OF_STATE
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,
     ErrorWindow,
@@ -24,7 +23,12 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     Faults,
     Phase,
 )
-from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
+from kontronik_can_gw.esc.kontronik.states import (
+    KIND_OF_STATE,
+    OperatingError,
+    OperatingState,
+    SelfTestError,
+)
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 TOPICS = Topics("fleet", "boat")

@@ -13,6 +13,7 @@ from kontronik_can_gw.desk.recordings.decode import (
 )
 from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode, rows
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc, Swap
 
 S = 1_000_000_000
@@ -85,7 +86,7 @@ def test_an_impossible_state_in_the_unprotected_bytes_is_marked_suspect() -> Non
 @given(raw=st.integers(0, 65535), signed=st.integers(-32768, 32767))
 def test_printed_floats_read_back_to_the_exact_step(raw: int, signed: int) -> None:
     data = LiveData(battery_voltage=raw, battery_current=signed, bec_voltage=raw)
-    record = json.loads(json.dumps(physical_fields(data)))
+    record = json.loads(json.dumps(physical_fields(KONTRONIK, False, data)))
     for name in ("battery_voltage", "battery_current", "bec_voltage"):
         assert rows(LiveData)[name].raw(record[name]) == getattr(data, name)
         assert len(repr(record[name]).partition(".")[2]) <= 3

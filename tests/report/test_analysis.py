@@ -11,6 +11,7 @@ from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.report import trackers
 from kontronik_can_gw.desk.report.flight import EscFlight, Event, Flight
 from kontronik_can_gw.desk.report.ledger import Battery
+from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
 from kontronik_can_gw.esc.kontronik.states import (
     Device,
@@ -141,7 +142,7 @@ def test_sag_and_resistance(bus: BusLayout, rows: list[Row], flight: Flight) -> 
 
 def test_the_fit_is_that_of_numpy() -> None:
     random = np.random.default_rng(3)
-    esc = EscFlight("esc1")
+    esc = EscFlight("esc1", KONTRONIK)
     battery = Battery(esc)
     slopes = []
     for stretch in range(7):
@@ -275,10 +276,10 @@ def test_rows_far_apart_are_not_joined_even_without_a_row_that_shows_the_loss(po
 def test_words_of_errors_and_the_state_of_the_link_become_events() -> None:
     events, times = trackers.Events(), [0, 10, 20, 30, 40]
     programming, unknown = 1 << OperatingError.PROGRAMMING_ALLOWED, 1 << 30
-    errors = trackers.Errors(0, {"operating_errors": 0}, events)
+    errors = trackers.Errors(0, {"operating_errors": 0}, events, KONTRONIK)
     words = [programming, programming | unknown, 1, 1, None]
     errors.take(times, [1, 1, 1, 1, None], {"operating_errors": words})
-    link = trackers.Link(0, EscFlight("esc1"), events)
+    link = trackers.Link(0, EscFlight("esc1", KONTRONIK), events)
     states = ["OK", "DEGRADED", "OK", LinkState.PORT_ERROR, LinkState.PORT_ERROR]
     link.take(times, [1] * 5, {"link_state": states})
     assert [(e.begin_ns, e.end_ns, e.text, e.note) for e in events.in_order()] == [
@@ -290,7 +291,7 @@ def test_words_of_errors_and_the_state_of_the_link_become_events() -> None:
 
 
 def test_a_device_in_its_place_is_an_event() -> None:
-    found, events = EscFlight("esc1"), trackers.Events()
+    found, events = EscFlight("esc1", KONTRONIK), trackers.Events()
     device = trackers.Device(0, found, events)
     columns: dict[str, list[object]] = {
         "device": [None, "KOSMIK", "KOSMIK", None, None],

@@ -23,9 +23,10 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     ErrorWindow,
     EscOptions,
     Faults,
+    OperatingError,
     SimulatedEsc,
 )
-from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.lean import without_asammdf
 from kontronik_can_gw.node_state import NmtState
@@ -65,7 +66,8 @@ class Master(can.Listener):
                 )
         elif function == cob_ids.EMERGENCY:
             code = int.from_bytes(data[:2], "little")
-            text = next((bit.meaning for bit in OperatingError if bit == data[3]), "of the gateway")
+            bits = PROTOCOLS[0].errors["operating_errors"]
+            text = next((bit.meaning for bit in bits if bit == data[3]), "of the gateway")
             self._emergency = f"{code:04X}h {text if code else 'no error any more'}"
         elif function in _TPDOS:
             self._pdos += 1

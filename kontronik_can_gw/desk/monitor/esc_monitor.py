@@ -12,15 +12,8 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.monitor.quantities import QUANTITIES, Track
-from kontronik_can_gw.esc.kontronik.states import (
-    Device,
-    ErrorBit,
-    OperatingError,
-    SelfTestError,
-    Severity,
-    device_text,
-    state_text,
-)
+from kontronik_can_gw.esc.decoder import Severity
+from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.gateway_status import CanState, GatewayState
@@ -29,11 +22,6 @@ from kontronik_can_gw.signals.unpacker import Value
 
 _WORKING = ("ok", "degraded")
 _BELIEVED = 2
-SUMMARIES = {
-    OperatingError.OPERATING_ERROR_FOUND.text,
-    OperatingError.OPERATING_WARNING_FOUND.text,
-}
-_NO_ALARM = {OperatingError.PROGRAMMING_ALLOWED.text}
 _SEVERITIES = list(Severity)
 
 
@@ -61,6 +49,7 @@ class EscMonitor:
         self.name = settings.name
         self.tracks = {quantity.source: Track() for quantity in QUANTITIES}
         self._settings = settings
+        self._protocol = protocol_named(settings.protocol)
         self._view = view
         columns = [(name, view.reader.column_of(name, index)) for name in VALUES]
         self.columns = {name: column for name, column in columns if column is not None}
@@ -69,7 +58,8 @@ class EscMonitor:
             name: _to_source(view.reader.columns[column].unit, VALUES[name].unit)
             for name, column in self.columns.items()
         }
-        flags = {bit.text for kind in (OperatingError, SelfTestError) for bit in kind}
+        self._bits = {bit.text: bit for bits in self._protocol.errors.values() for bit in bits}
+        flags = set(self._bits)
         self._plain = {
             group: [
                 column
@@ -128,7 +118,8 @@ class EscMonitor:
         """The operating state's name, or its number if it has none; None where it is not available."""
         value = self._first("operating_state", "operating_state_raw")
         if isinstance(value, (int, float)):
-            return state_text(int(value)) or f"state {int(value)}"
+            number, states = int(value), self._protocol.states
+            return states[number].text if number in states else f"state {number}"
         return value
 
     @property
@@ -156,11 +147,13 @@ class EscMonitor:
         """Device, variant and firmware; empty where not available."""
         value = self._first("device", "device_raw")
         if isinstance(value, (int, float)):
-            value = device_text(int(value)) or f"device {int(value)}"
+            value = self._protocol.devices.get(int(value), f"device {int(value)}")
         if value is None:
             return ""
         key = normalize(value)
-        text = next((each.text for each in Device if normalize(each.text) == key), value)
+        text = next(
+            (each for each in self._protocol.devices.values() if normalize(each) == key), value
+        )
         variant, main, sub = map(self.number, ("variant", "firmware_main", "firmware_sub"))
         if variant is not None:
             text += f" {variant:.0f}"
@@ -170,20 +163,22 @@ class EscMonitor:
     def active(self) -> list[Active]:
         """The bits that are set, errors first. A flag counts only while another value of its frame is available."""
         found = [
-            *self._active(OperatingError, "operating_errors", Group.LIVE),
-            *self._active(SelfTestError, "selftest_errors", Group.INFO),
+            *self._active("operating_errors", Group.LIVE),
+            *self._active("selftest_errors", Group.INFO),
         ]
         return sorted(found, key=lambda active: _SEVERITIES.index(active.severity))
 
     @property
     def alarms(self) -> list[Active]:
         """The active bits to show: without those that are no alarm, and without a summary of bits that are shown anyway."""
-        alarms = [active for active in self.active if active.name not in _NO_ALARM]
-        plain = {active.severity for active in alarms if active.name not in SUMMARIES}
+        normal = {bit.text for bit in self._bits.values() if bit.is_normal}
+        summaries = {bit.text for bit in self._bits.values() if bit.is_summary}
+        alarms = [active for active in self.active if active.name not in normal]
+        plain = {active.severity for active in alarms if active.name not in summaries}
         return [
             active
             for active in alarms
-            if active.name not in SUMMARIES or active.severity not in plain
+            if active.name not in summaries or active.severity not in plain
         ]
 
     def document(self) -> dict[str, Any]:
@@ -208,15 +203,16 @@ class EscMonitor:
         """The first value that is available."""
         return next((value for value in map(self.value, sources) if value is not None), None)
 
-    def _active(self, kind: type[ErrorBit], word_source: str, group: Group) -> Iterable[Active]:
+    def _active(self, word_source: str, group: Group) -> Iterable[Active]:
         plain = self._plain[group]
         if plain and all(self._view.values[column] is None for column in plain):
             return
         word = int(self.number(word_source) or 0)
-        for bit in kind:
+        bits = self._protocol.errors.get(word_source, ())
+        for bit in bits:
             if word >> int(bit) & 1 or self.value(bit.text) == 1:
                 yield Active(bit.text, bit.severity, bit.meaning, bit.remedy)
-        named = {int(bit) for bit in kind}
+        named = {int(bit) for bit in bits}
         for number in range(32):
             if word >> number & 1 and number not in named:
                 meaning = f"bit {number} of {word_source}, which has no name"

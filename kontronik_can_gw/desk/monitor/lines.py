@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from rich.text import Text
 
-from kontronik_can_gw.esc.kontronik.states import Severity
+from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.printable import printable
 
 GOOD, POOR, BAD, FAINT, TITLE = "green", "yellow", "bold red", "dim", "bold"

@@ -33,7 +33,7 @@ from kontronik_can_gw.desk.monitor.lines import (
 from kontronik_can_gw.desk.monitor.model import SILENCE_NS, Monitor
 from kontronik_can_gw.desk.monitor.quantities import HISTORY_S, QUANTITIES, Quantity
 from kontronik_can_gw.desk.monitor.sources import Source
-from kontronik_can_gw.esc.kontronik.states import Severity
+from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
 

@@ -9,7 +9,6 @@ from typing import Any
 
 from rich.text import Text
 
-from kontronik_can_gw.desk.monitor.esc_monitor import SUMMARIES
 from kontronik_can_gw.desk.monitor.lines import (
     BAD,
     FAINT,
@@ -28,7 +27,8 @@ from kontronik_can_gw.desk.monitor.lines import (
     table,
     wrapped,
 )
-from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError, Severity
+from kontronik_can_gw.esc.decoder import Severity
+from kontronik_can_gw.esc.protocols import bits_by_name
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS, pid_namespace, start_ticks
@@ -38,7 +38,6 @@ _LARGEST_FILE = 1 << 22
 _FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
 _MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """What a document with values of another type raises."""
-_BITS = {bit.text: bit for bits in (OperatingError, SelfTestError) for bit in bits}
 _CAN_STYLES = {"error-active": GOOD, "unknown": "", "error-warning": POOR, "error-passive": POOR}
 _MAX_ALARM_LINES = 6
 """On a live display."""
@@ -265,12 +264,13 @@ def _esc_lines(document: Document, width: int | None) -> list[Text]:
 
 def _alarms(document: Document) -> list[Alarm]:
     """Errors and warnings that the ESCs report."""
-    found = []
+    found, bits = [], bits_by_name()
+    summaries = {bit.text for bit in bits.values() if bit.is_summary}
     for esc in document["escs"]:
         for key in ("errors", "selftest_errors", "warnings"):
             names = esc[key] or []
-            for name in [each for each in names if each not in SUMMARIES] or names:
-                bit = _BITS.get(name)
+            for name in [each for each in names if each not in summaries] or names:
+                bit = bits.get(name)
                 severity = Severity.WARNING if key == "warnings" else Severity.ERROR
                 text = f"{esc['name']} {severity.value.upper()}: {bit.meaning if bit else name}"
                 found.append(Alarm(severity, text, bit.remedy if bit else ""))

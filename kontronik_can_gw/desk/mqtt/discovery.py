@@ -6,7 +6,7 @@ from typing import Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.desk.mqtt.topics import Topics
-from kontronik_can_gw.desk.mqtt.values import KINDS, Member
+from kontronik_can_gw.desk.mqtt.values import Member
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals.unpacker import Column
 
@@ -40,7 +40,7 @@ _MOTOR: dict[str, Any] = {
     "platform": "sensor",
     "name": "Motor",
     "device_class": "enum",
-    "options": list(KINDS),
+    "options": ["idle", "start", "run", "brake", "fault"],
     "value_template": "{{ value_json.motor }}",
 }
 _NAMES = (

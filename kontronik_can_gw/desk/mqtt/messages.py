@@ -21,6 +21,7 @@ from kontronik_can_gw.desk.mqtt.discovery import device
 from kontronik_can_gw.desk.mqtt.topics import OFFLINE, ONLINE, Message, Topics
 from kontronik_can_gw.desk.mqtt.values import Member
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.signals.unpacker import SignalReader
 
@@ -86,7 +87,10 @@ class Publisher:
         columns = self.view.reader.columns
         indices = sorted({column.esc for column in columns if column.esc is not None})
         self._members = [Member(self.view, None, None)]
-        self._members += [Member(self.view, index, bus.escs[index].name) for index in indices]
+        self._members += [
+            Member(self.view, index, bus.escs[index].name, protocol_named(bus.escs[index].protocol))
+            for index in indices
+        ]
         self._timings = [_Timing(round(SECOND / rate)) for _ in self._members]
         self._live = {at: member for member in self._members for at in member.live}
         self._published: dict[str, bytes] = {}

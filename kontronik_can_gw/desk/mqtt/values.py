@@ -5,44 +5,27 @@ from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.esc.kontronik.states import (
-    Device,
-    ErrorBit,
-    OperatingError,
-    OperatingState,
-    SelfTestError,
-    Severity,
-)
+from kontronik_can_gw.esc.decoder import EscProtocol, Severity
+from kontronik_can_gw.esc.protocols import PROTOCOLS, bits_by_name
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals.unpacker import Value
 
 SILENCE_NS = 3 * SECOND
 """After this time without a frame the gateway is not available."""
-KINDS: Mapping[str, str] = {
-    "idle": "WaitForSignal WaitForMotorOff WaitForMotorOn Selftest AcousticSignal MotorOff StandBy"
-    " Programming Sync_StandBy",
-    "start": "SpoolUpFromStill SpoolUpFromTurn SpoolUpQuick",
-    "run": "Forward Backward Sync_Forward Sync_Backward RPMControl",
-    "brake": "Brake BrakeTargetBackward BrakeTargetForward",
-    "fault": "Error_Selftest CutOffDuringOperation",
-}
-"""Names of the operating states of each kind, as published in "motor"."""
-KIND_OF_STATE = {
-    OperatingState[name]: kind for kind, names in KINDS.items() for name in names.split()
-}
-_WORDS: tuple[tuple[str, type[ErrorBit]], ...] = (
-    ("operating_errors", OperatingError),
-    ("selftest_errors", SelfTestError),
-)
-_BITS: Mapping[str, ErrorBit] = {bit.text: bit for _, bits in _WORDS for bit in bits}
-_DEVICES = {normalize(device.text): device.text for device in Device}
 
 
 class Member:
     """The gateway (``index`` None) or an ESC, with its signals in the layout."""
 
-    def __init__(self, view: View, index: int | None, name: str | None) -> None:
+    def __init__(
+        self,
+        view: View,
+        index: int | None,
+        name: str | None,
+        protocol: EscProtocol = PROTOCOLS[0],
+    ) -> None:
+        self._protocol = protocol
         self.index, self.name = index, name
         self.columns: dict[str, int] = {}
         self.heard_ns: int | None = None
@@ -53,12 +36,13 @@ class Member:
         self._view = view
         self.flags: dict[str, tuple[int, int | None]] = {}
         """Flags: column, and the bit in an error word (None: a signal of its own)."""
+        known = {bit.text for bits in protocol.errors.values() for bit in bits}
         for at, column in enumerate(view.reader.columns):
-            if column.esc == index and column.source in _BITS:
+            if column.esc == index and column.source in known:
                 self.flags.setdefault(column.source, (at, None))
             elif column.esc == index:
                 self.columns.setdefault(column.source, at)
-        for word, bits in _WORDS:
+        for word, bits in protocol.errors.items():
             for bit in bits if word in self.columns else ():
                 self.flags.setdefault(bit.text, (self.columns[word], int(bit)))
         self.live = [at for name, at in self.columns.items() if VALUES[name].group is Group.LIVE]
@@ -83,7 +67,7 @@ class Member:
         """The values whose change is published at once."""
         if self.index is None:
             return self.is_available(now), self._value("can_state"), self._value("gateway_state")
-        errors, selftest = self._flags_set(OperatingError), self._flags_set(SelfTestError)
+        errors, selftest = self._flags_set("operating_errors"), self._flags_set("selftest_errors")
         return self.is_available(now), errors, selftest, self._kind(), self._value("link_state")
 
     def state(self, now: int) -> dict[str, Any]:
@@ -92,10 +76,10 @@ class Member:
         age = None if heard is None else (now - heard) // MS
         made: dict[str, Any] = {"available": self.is_available(now), "age": age}
         if self.index is not None:
-            errors = self._flags_set(OperatingError)
+            errors = self._flags_set("operating_errors")
             problem = None if errors is None else any(map(_is_error, errors))
             made |= {"motor": self._kind(), "errors": _in_words(errors), "problem": problem}
-            made |= {"selftest": _in_words(self._flags_set(SelfTestError)), "link_state": None}
+            made |= {"selftest": _in_words(self._flags_set("selftest_errors")), "link_state": None}
         for source, at in self.columns.items():
             made[source] = self._view.values[at]
         if self.index is not None:
@@ -106,7 +90,8 @@ class Member:
         """Note device and firmware; what was known stays, so that it is never shown as unknown again."""
         device, firmware = self.identity
         if isinstance(text := self._value("device"), str):
-            device = _DEVICES.get(normalize(text), text)
+            devices = self._protocol.devices.values()
+            device = next((each for each in devices if normalize(each) == normalize(text)), text)
         self.identity = device, self._firmware() or firmware
 
     def _value(self, source: str) -> Value:
@@ -122,30 +107,32 @@ class Member:
 
     def _kinds_of_values(self) -> Mapping[Value, str]:
         """The kind of each value that the operating state's signal can have."""
+        states = self._protocol.states
         if (at := self.columns.get("operating_state")) is None:
-            return {int(state): kind for state, kind in KIND_OF_STATE.items()}
+            return {number: state.kind for number, state in states.items() if state.kind}
         # by name, since the raw values of a value table may differ from the ESC's numbers
-        known = {normalize(state.text): kind for state, kind in KIND_OF_STATE.items()}
+        known = {normalize(state.text): state.kind for state in states.values() if state.kind}
         texts = [text for _, text in self._view.reader.columns[at].texts]
         return {text: known[normalize(text)] for text in texts if normalize(text) in known}
 
-    def _flags_set(self, bits: type[ErrorBit]) -> tuple[str, ...] | None:
+    def _flags_set(self, word: str) -> tuple[str, ...] | None:
         """Names of the flags that are set; None while they are not valid: flags have no 'not available'."""
         values = self._view.values
-        if not any(values[at] is not None for at in self._witnesses(bits)):
+        if not any(values[at] is not None for at in self._witnesses(word)):
             return None
         found = []
+        bits = {bit.text for bit in self._protocol.errors.get(word, ())}
         for flag, (at, bit) in self.flags.items():
             value = values[at]
-            if not isinstance(_BITS[flag], bits) or not isinstance(value, int):
+            if flag not in bits or not isinstance(value, int):
                 continue
             if value if bit is None else value >> bit & 1:
                 found.append(flag)
         return tuple(found)
 
-    def _witnesses(self, bits: type[ErrorBit]) -> Sequence[int]:
+    def _witnesses(self, word: str) -> Sequence[int]:
         """Columns one of which is available while flags are valid: state or device, else all of their group."""
-        if bits is OperatingError:
+        if word == "operating_errors":
             named, others = ("operating_state", "operating_state_raw"), self.live
         else:
             named = ("device", "device_raw")
@@ -159,13 +146,14 @@ def _first_of(columns: Mapping[str, int], *sources: str) -> int | None:
 
 def _is_error(flag: str) -> bool:
     """True for an error; false for a warning or a status."""
-    return _BITS[flag].severity is Severity.ERROR
+    return bits_by_name()[flag].severity is Severity.ERROR
 
 
 def _in_words(flags: Sequence[str] | None) -> list[dict[str, str]] | None:
     if flags is None:
         return None
-    bits = [_BITS[flag] for flag in flags]
+    known = bits_by_name()
+    bits = [known[flag] for flag in flags]
     return [
         {"name": bit.text, "severity": bit.severity.value, "meaning": bit.meaning} for bit in bits
     ]

@@ -7,22 +7,20 @@ the exact step, so that they print as 24.42 and read back to the raw value.
 import csv
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from io import StringIO
 
-from kontronik_can_gw.esc.kontronik.codec import Kind, Layout
-from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
-from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, rows
-from kontronik_can_gw.esc.kontronik.states import (
+from kontronik_can_gw.esc.decoder import (
+    Counters,
+    Data,
     ErrorBit,
-    OperatingError,
-    SelfTestError,
+    EscProtocol,
+    Field,
+    Reading,
     bit_texts,
-    device_text,
-    peak_current_of,
-    state_text,
 )
+from kontronik_can_gw.esc.protocols import PROTOCOLS
 
 Value = int | float | str | bool | list[str] | None
 Record = dict[str, Value]
@@ -31,87 +29,93 @@ CHUNK = 1 << 16
 
 
 @lru_cache(maxsize=1024)
-def _names(word: int, kind: type[ErrorBit]) -> list[str]:
-    return bit_texts(word, kind)
+def _names(word: int, bits: Sequence[ErrorBit]) -> list[str]:
+    return bit_texts(word, bits)
 
 
-def physical_fields(data: Data, device: int | None = None) -> Record:
-    """The fields of a frame in wire order, in physical units; None where the known ``device`` does not supply one.
+def physical_fields(
+    protocol: EscProtocol, is_info: bool, data: Data, device: int | None = None
+) -> Record:
+    """The fields of a reading in wire order, in physical units; None where the known ``device`` does not supply one.
 
-    Error words also as names, states and devices as names with the number beside, firmware as "1.14"; of an info frame also
+    Error words also as names, states and devices as names with the number beside, firmware as "1.14"; of information also
     whose peak current the device reports (motor, battery, None where unknown).
     """
     record: Record = {}
-    for (name, row), raw in zip(rows(type(data)).items(), data, strict=True):
-        match name:
-            case "operating_errors" | "selftest_errors":
-                record[name] = raw
-                names = OperatingError if name == "operating_errors" else SelfTestError
-                record[f"{name}_names"] = list(_names(raw, names))
-            case "operating_state":
-                record[name] = state_text(raw)
-                record["operating_state_raw"] = raw
-            case "device_and_variant" if isinstance(data, InfoData):
-                record["device"] = device_text(data.device)
-                record["device_raw"] = data.device
-                record["variant"] = data.variant
-                record["peak_current_of"] = peak_current_of(data.device)
-            case "firmware_word" if isinstance(data, InfoData):
-                record["firmware"] = data.firmware
-            case _:
-                record[name] = None if device in row.not_on else row.physical(raw)
+    fields = (field for field in protocol.fields if field.is_info is is_info)
+    for field in sorted(fields, key=lambda field: field.word):
+        name, raw = field.name, field.of(data)
+        if name == "firmware_main":
+            record["firmware"] = protocol.firmware_text(data)
+        elif name != "firmware_sub":
+            record[name] = _physical(field, raw, device)
+        if (bits := protocol.errors.get(name)) is not None:
+            record[f"{name}_names"] = list(_names(raw, tuple(bits)))
+        if name == "variant":
+            record["peak_current_of"] = protocol.peak_current_text(data)
     return record
 
 
-COLUMNS = (
-    "kind",
-    "layout",
-    "offset",
-    *physical_fields(LiveData()),
-    "suspect",
-    *physical_fields(InfoData()),
-)
-"""The CSV header: live and info fields."""
+def _physical(field: Field, raw: int, device: int | None) -> Value:
+    if field.names:
+        return field.names.get(raw)
+    if device in field.not_on:
+        return None
+    return raw if field.per_unit == 1 else raw / field.per_unit
+
+
+def columns_of(protocol: EscProtocol) -> tuple[str, ...]:
+    """The CSV header: fields of live data and of information."""
+    words = max(field.word for field in protocol.fields) + 1
+    nothing = (0,) * words
+    live, info = (physical_fields(protocol, is_info, nothing) for is_info in (False, True))
+    return ("kind", "layout", "offset", *live, "suspect", *info)
+
+
+COLUMNS = columns_of(PROTOCOLS[0])
 
 
 class Decoder:
-    """One stream. ``feed`` and ``flush`` give the records that became certain, as Deframer does the frames."""
+    """One stream. ``feed`` and ``flush`` give the records that became certain."""
 
-    __slots__ = ("_deframer", "_device", "_layout")
+    __slots__ = ("_decoder", "_device", "_layout", "_protocol")
 
-    def __init__(self) -> None:
-        self._deframer = Deframer()
+    def __init__(self, protocol: EscProtocol = PROTOCOLS[0]) -> None:
+        self._protocol = protocol
+        self._decoder = protocol.make()
         self._device: int | None = None
-        self._layout: Layout | None = None
+        self._layout = 0
 
     @property
     def counters(self) -> Counters:
-        return self._deframer.counters
+        """Of the whole stream."""
+        found: Counters = self._decoder.counters
+        return found
 
     def feed(self, data: bytes) -> list[Record]:
         """Take the next bytes."""
-        return [self._record(frame) for frame in self._deframer.feed(data)]
+        return [self._record(reading) for reading in self._decoder.feed(data)]
 
     def flush(self) -> list[Record]:
         """The stream ended."""
-        return [self._record(frame) for frame in self._deframer.flush()]
+        return [self._record(reading) for reading in self._decoder.flush()]
 
-    def _record(self, frame: Frame) -> Record:
-        if frame.layout is not self._layout:
-            # another device was plugged in: its info frame will show which
-            self._layout = frame.layout
+    def _record(self, reading: Reading) -> Record:
+        protocol, form, data = self._protocol, reading.form, reading.data
+        if form.layout_number != self._layout:
+            # another device was plugged in: its information will show which
+            self._layout = form.layout_number
             self._device = None
-        data = frame.data
-        if isinstance(data, InfoData):
-            self._device = data.device
+        if form.is_info:
+            self._device = protocol.value("device_raw", data)
         record: Record = {
-            "kind": frame.kind.value,
-            "layout": frame.layout.value,
-            "offset": frame.offset,
+            "kind": "info" if form.is_info else "live",
+            "layout": protocol.layouts[form.layout_number - 1].lower(),
+            "offset": reading.offset,
         }
-        record |= physical_fields(data, self._device)
-        if frame.kind is Kind.LIVE:
-            record["suspect"] = frame.suspect
+        record |= physical_fields(protocol, form.is_info, data, self._device)
+        if not form.is_info:
+            record["suspect"] = reading.suspect
         return record
 
 
@@ -171,9 +175,10 @@ def decode_stream(
 def summary(counters: Counters) -> str:
     """The counters in words: one line, and a second with the diagnosis where bytes but no frame came."""
     frames = counters.live + counters.info
+    held = counters.as_dict()
     layouts = {
-        "v4": counters.live_v4 + counters.info_v4,
-        "legacy": counters.live_legacy + counters.info_legacy,
+        name.lower(): held.get(f"live_{name.lower()}", 0) + held.get(f"info_{name.lower()}", 0)
+        for name in PROTOCOLS[0].layouts
     }
     which = ", ".join(f"{number} {name}" for name, number in layouts.items() if number)
     line = (

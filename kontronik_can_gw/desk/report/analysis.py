@@ -15,6 +15,7 @@ from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Flight
 from kontronik_can_gw.desk.report.ledger import Counter, Ledger, Load
 from kontronik_can_gw.desk.report.quantities import MAXIMA, MINIMA, PLOTS
 from kontronik_can_gw.desk.report.trackers import Device, Errors, Events, Link, States
+from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway_status import GatewayState
 from kontronik_can_gw.signals.unpacker import Value
@@ -30,16 +31,19 @@ LIVE = ("battery_voltage", *SPEEDS, "battery_current", "operating_state_raw", "o
 _DRAWN = tuple(source for plot in PLOTS for source in plot.lines)
 
 
-_FLAGS = {bit.text: word for word, bits in Errors.WORDS.items() for bit in bits}
+_FLAGS = {
+    bit.text: word for each in PROTOCOLS for word, bits in each.errors.items() for bit in bits
+}
+_WORDS = frozenset(_FLAGS.values())
 _SOURCES = {
-    *(*_DRAWN, *COUNTERS, *LIVE, *MAXIMA, *MINIMA, *Device.SOURCES, *Errors.WORDS),
+    *(*_DRAWN, *COUNTERS, *LIVE, *MAXIMA, *MINIMA, *Device.SOURCES, *_WORDS),
     *("cell_count", "layout", "link_state", "gateway_state"),
 }
 
 
 def needed_columns(fields: Sequence[Field]) -> list[int]:
     """The fields of a recording that an analysis needs."""
-    words = {field.source for field in fields} & Errors.WORDS.keys()
+    words = {field.source for field in fields} & _WORDS
     wanted = _SOURCES | {flag for flag, word in _FLAGS.items() if word not in words}
     return [index for index, field in enumerate(fields) if field.source in wanted]
 
@@ -164,7 +168,8 @@ class _Esc:
         self, index: int, settings: EscSettings, fields: Sequence[Field], events: Events
     ) -> None:
         self.index = index
-        self.found = EscFlight(settings.name)
+        protocol = protocol_named(settings.protocol)
+        self.found = EscFlight(settings.name, protocol)
         at = {f.source: i for i, f in reversed(list(enumerate(fields))) if f.esc == index}
         self._at = at
         self._cells = settings.cell_count or None
@@ -174,7 +179,7 @@ class _Esc:
         self._link = Link(index, self.found, events)
         self._device = Device(index, self.found, events)
         self._states = States(index, self.found, events)
-        self._errors = Errors(index, at, events)
+        self._errors = Errors(index, at, events, protocol)
         self._ledger = Ledger(self.found)
         self._live = next((source for source in LIVE if source in at), None)
         known = set(at)

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
+from kontronik_can_gw.esc.decoder import EscProtocol
+
 Number = int | float | None
 Kind = Literal["error", "state", "link", "device"]
 
@@ -50,6 +52,7 @@ class EscFlight:
     """What is known of one ESC. None: not in the recording."""
 
     name: str
+    protocol: EscProtocol
     telemetry_ns: int = 0
     """Time with telemetry."""
     turning_ns: int | None = None

@@ -73,15 +73,18 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
     def seconds(time_ns: int) -> float:
         return round((time_ns - flight.origin_ns) / SECOND, 6)
 
-    states = sorted({segment.state for esc in flight.escs for segment in esc.segments})
+    states = {segment.state: esc.protocol.states for esc in flight.escs for segment in esc.segments}
     return {
         "escs": [esc.name for esc in flight.escs],
         "from": seconds(flight.start_ns),
         "to": seconds(flight.end_ns),
         "wall": None if wall_ns is None else wall_ns // 1_000_000,
         "times": [seconds(time_ns) for time_ns in flight.times],
-        "classes": [label for label, _ in STATE_CLASSES],
-        "states": {str(state): [state_name(state), class_of(state)] for state in states},
+        "classes": list(STATE_CLASSES),
+        "states": {
+            str(state): [state_name(state, named), class_of(state, named)]
+            for state, named in sorted(states.items(), key=lambda item: item[0])
+        },
         "segments": [
             [[seconds(s.begin_ns), seconds(s.end_ns), s.state] for s in esc.segments]
             for esc in flight.escs

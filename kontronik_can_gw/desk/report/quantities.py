@@ -1,8 +1,9 @@
 """Plots, extremes and classes of operating states of the report: titles, order and decimals. Colours are in page.css."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
-from kontronik_can_gw.esc.kontronik.states import OperatingState
+from kontronik_can_gw.esc.decoder import State
 
 
 class Plot(NamedTuple):
@@ -59,31 +60,22 @@ MINIMA = {
     "bec_voltage": ("Lowest BEC voltage", 3),
 }
 
-_S = OperatingState
 STATE_CLASSES = (
-    ("Motor off, standby", (_S.MotorOff, _S.StandBy)),
-    ("Waiting", (_S.WaitForSignal, _S.WaitForMotorOff, _S.WaitForMotorOn)),
-    ("Self-test, signal", (_S.Selftest, _S.AcousticSignal)),
-    (
-        "Spooling up, synchronising",
-        (
-            *(_S.SpoolUpFromStill, _S.SpoolUpFromTurn, _S.SpoolUpQuick),
-            *(_S.Sync_Forward, _S.Sync_Backward, _S.Sync_StandBy),
-        ),
-    ),
-    ("Running", (_S.Forward, _S.Backward, _S.RPMControl)),
-    ("Braking", (_S.Brake, _S.BrakeTargetBackward, _S.BrakeTargetForward)),
-    ("Programming", (_S.Programming,)),
-    ("Fault", (_S.Error_Selftest, _S.CutOffDuringOperation)),
-    ("Unknown to this program", ()),
+    "Motor off, standby",
+    "Waiting",
+    "Self-test, signal",
+    "Spooling up, synchronising",
+    "Running",
+    "Braking",
+    "Programming",
+    "Fault",
+    "Unknown to this program",
 )
-"""Operating states shown alike, with a label; page.css has a colour for each, in this order."""
+"""Phases of operating states, which are shown alike; page.css has a colour for each, in this order."""
 UNKNOWN_CLASS = len(STATE_CLASSES) - 1
-_CLASS_OF = {
-    int(state): index for index, (_, states) in enumerate(STATE_CLASSES) for state in states
-}
 
 
-def class_of(state: int) -> int:
-    """Index in STATE_CLASSES of an operating state's number."""
-    return _CLASS_OF.get(state, UNKNOWN_CLASS)
+def class_of(state: int, states: Mapping[int, State]) -> int:
+    """Index in STATE_CLASSES of an operating state's number; ``states``: those of the ESC's protocol."""
+    phase = states[state].phase if state in states else ""
+    return STATE_CLASSES.index(phase) if phase in STATE_CLASSES else UNKNOWN_CLASS

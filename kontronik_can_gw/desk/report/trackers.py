@@ -6,14 +6,7 @@ from typing import Any
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.report.flight import EscFlight, Event, Kind, Segment
 from kontronik_can_gw.desk.report.quantities import STATE_CLASSES, UNKNOWN_CLASS, class_of
-from kontronik_can_gw.esc.kontronik.states import (
-    ErrorBit,
-    OperatingError,
-    OperatingState,
-    SelfTestError,
-    device_text,
-    state_text,
-)
+from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, State
 from kontronik_can_gw.esc.telemetry import MS, LinkState
 from kontronik_can_gw.esc.values import VALUES
 
@@ -28,7 +21,6 @@ _LINK_TEXTS = {
     LinkState.DEGRADED: "Link degraded: many bytes are damaged",
     LinkState.PORT_ERROR: "The port of the ESC cannot be used",
 }
-_STATE_NUMBERS = {normalize(state.text): int(state) for state in OperatingState}
 
 
 class Events:
@@ -137,7 +129,7 @@ class Device:
             list(zip(*parts, strict=True))
         ):
             if device is None and raw is not None:
-                device = device_text(int(raw)) or f"device {raw}"
+                device = self._found.protocol.devices.get(int(raw), f"device {raw}")
             if device is None:
                 continue
             text = str(device) if variant is None else f"{device} {variant}"
@@ -156,6 +148,8 @@ class States:
 
     def __init__(self, esc: int, found: EscFlight, events: Events) -> None:
         self._esc, self._found, self._events = esc, found, events
+        self._states = found.protocol.states
+        self._numbers = {normalize(state.text): number for number, state in self._states.items()}
         self._changes = Changes()
         self._state: int | None = None
         self._since_ns = 0
@@ -168,7 +162,7 @@ class States:
         for row, value in self._changes.of(values):
             self.finish(times[row])
             if isinstance(value, str):
-                value = _STATE_NUMBERS.get(normalize(value), -1)
+                value = self._numbers.get(normalize(value), -1)
             self._state = None if value is None else int(value)
             self._since_ns = times[row]
             self._change_class(self._state, times[row])
@@ -185,32 +179,31 @@ class States:
             segments[:] = [s for s in segments if s.end_ns - s.begin_ns >= self._shortest_ns]
 
     def _change_class(self, state: int | None, time_ns: int) -> None:
-        group = None if state is None else class_of(state)
+        group = None if state is None else class_of(state, self._states)
         if group == self._group and group != UNKNOWN_CLASS:
             return
         self._group = group
         self._events.end((self._esc, "state"), time_ns)
         if state is not None and group is not None:
-            label = STATE_CLASSES[group][0]
+            label = STATE_CLASSES[group]
             severity = "error" if label == "Fault" else "status"
-            event = Event("state", self._esc, time_ns, f"{label}: {state_name(state)}", severity)
+            text = f"{label}: {state_name(state, self._states)}"
+            event = Event("state", self._esc, time_ns, text, severity)
             self._events.begin((self._esc, "state"), event)
 
 
 class Errors:
     """Bits of both error words, by the word or else by the flag of each bit."""
 
-    WORDS: Mapping[str, type[ErrorBit]] = {
-        "operating_errors": OperatingError,
-        "selftest_errors": SelfTestError,
-    }
-
-    def __init__(self, esc: int, sources: Mapping[str, int], events: Events) -> None:
+    def __init__(
+        self, esc: int, sources: Mapping[str, int], events: Events, protocol: EscProtocol
+    ) -> None:
         self._esc, self._events = esc, events
-        self._words = [(word, Changes()) for word in self.WORDS if word in sources]
+        self._bits = protocol.errors
+        self._words = [(word, Changes()) for word in self._bits if word in sources]
         self._flags = [
             (word, bit, Changes())
-            for word, bits in self.WORDS.items()
+            for word, bits in self._bits.items()
             for bit in bits
             if word not in sources and bit.text in sources
         ]
@@ -235,23 +228,25 @@ class Errors:
             self._set.remove(key)
             self._events.end((self._esc, *key), time_ns, lost=lost)
         elif value and key not in self._set:
-            known = next((one for one in self.WORDS[word] if one == bit), None)
-            if known is OperatingError.PROGRAMMING_ALLOWED:
+            known = next((one for one in self._bits[word] if one == bit), None)
+            if known is not None and known.is_normal:
                 return
             self._set.add(key)
-            self._events.begin((self._esc, *key), self._event(known, bit, time_ns))
+            self._events.begin((self._esc, *key), self._event(known, word, bit, time_ns))
 
-    def _event(self, known: ErrorBit | None, bit: int, time_ns: int) -> Event:
+    def _event(self, known: ErrorBit | None, word: str, bit: int, time_ns: int) -> Event:
         if known is None:
             return Event(
                 "error", self._esc, time_ns, f"bit {bit}, unknown to this program", "error"
             )
-        prefix = "self-test: " if isinstance(known, SelfTestError) else ""
+        prefix = "self-test: " if word == "selftest_errors" else ""
         remedy = str(getattr(known, "remedy", "") or "")
         text, severity = prefix + known.meaning, known.severity.value
         return Event("error", self._esc, time_ns, text, severity, remedy)
 
 
-def state_name(number: int) -> str:
-    """A state's name as the data sheet spells it, or the number."""
-    return state_text(number) or (f"state {number}" if number >= 0 else "unknown state")
+def state_name(number: int, states: Mapping[int, State]) -> str:
+    """A state's name as the protocol spells it, or the number."""
+    if number in states:
+        return states[number].text
+    return f"state {number}" if number >= 0 else "unknown state"

@@ -4,6 +4,8 @@ from kontronik_can_gw.esc.decoder import EscProtocol, Field, State
 from kontronik_can_gw.esc.kontronik.deframer import Deframer
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, rows
 from kontronik_can_gw.esc.kontronik.states import (
+    KIND_OF_STATE,
+    PHASE_OF_STATE,
     Device,
     OperatingError,
     OperatingState,
@@ -11,7 +13,13 @@ from kontronik_can_gw.esc.kontronik.states import (
     peak_current_of,
 )
 
-_STATES = {int(state): State(state.text, state.meaning, state.remedy) for state in OperatingState}
+_STATES = {
+    int(state): State(
+        *(state.text, state.meaning, state.remedy),
+        *(KIND_OF_STATE[state], PHASE_OF_STATE[state]),
+    )
+    for state in OperatingState
+}
 _DEVICES = {int(device): device.text for device in Device}
 _PARTS = ("operating_state", "device_and_variant", "firmware_word")
 """Rows of the sheet that are several values, or have names."""

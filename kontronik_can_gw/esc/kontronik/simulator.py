@@ -24,6 +24,7 @@ from kontronik_can_gw.esc.kontronik.states import (
     peak_current_of,
 )
 
+__all__ = ["Device", "Layout", "OperatingError", "SelfTestError"]  # what its options are made of
 BYTE_NS = 11 * 1_000_000_000 // 115_200
 """Wire time of a byte: start, 8 data, parity, stop."""
 SECOND_NS = 1_000_000_000

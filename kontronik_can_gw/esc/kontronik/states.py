@@ -107,6 +107,34 @@ _STATE_REMEDIES = {
     OperatingState.CutOffDuringOperation: "See the remedy of the operating error that is set.",
 }
 
+KIND_OF_STATE = {
+    OperatingState[name]: kind
+    for kind, names in {
+        "idle": "WaitForSignal WaitForMotorOff WaitForMotorOn Selftest AcousticSignal MotorOff StandBy"
+        " Programming Sync_StandBy",
+        "start": "SpoolUpFromStill SpoolUpFromTurn SpoolUpQuick",
+        "run": "Forward Backward Sync_Forward Sync_Backward RPMControl",
+        "brake": "Brake BrakeTargetBackward BrakeTargetForward",
+        "fault": "Error_Selftest CutOffDuringOperation",
+    }.items()
+    for name in names.split()
+}
+PHASE_OF_STATE = {
+    OperatingState[name]: phase
+    for phase, names in {
+        "Motor off, standby": "MotorOff StandBy",
+        "Waiting": "WaitForSignal WaitForMotorOff WaitForMotorOn",
+        "Self-test, signal": "Selftest AcousticSignal",
+        "Spooling up, synchronising": "SpoolUpFromStill SpoolUpFromTurn SpoolUpQuick Sync_Forward Sync_Backward"
+        " Sync_StandBy",
+        "Running": "Forward Backward RPMControl",
+        "Braking": "Brake BrakeTargetBackward BrakeTargetForward",
+        "Programming": "Programming",
+        "Fault": "Error_Selftest CutOffDuringOperation",
+    }.items()
+    for name in names.split()
+}
+
 LARGEST_STATE = max(OperatingState)
 
 
@@ -155,7 +183,7 @@ class OperatingError(ErrorBit):
     WATCHDOG_ERROR_TRIPPED = (16, _E, "the ESC's watchdog had tripped",
         "Switch the ESC off and on. If it comes again, have the ESC checked: its program had hung.", 0x6010)
     PROGRAMMING_ALLOWED = (17, _S, "programming still allowed (set in every idle frame: no alarm)",
-        "Nothing to do.")
+        "Nothing to do.", None, False, True)
     LIMIT_BATTERY_VOLTAGE_MINIMUM = (18, _W, "preset threshold: battery voltage minimum",
         "Stop and charge the battery. The threshold is a setting of the ESC.")
     LIMIT_CURRENT_MAXIMUM = (19, _W, "preset threshold: current maximum",
