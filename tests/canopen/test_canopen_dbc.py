@@ -85,7 +85,7 @@ class Bench(dialogue.Bench):
         simulated: Sequence[EscOptions] = (),
         **more: Any,
     ) -> None:
-        self.database: Database | None = None
+        self.database = Database()
         self.seen: dict[str, list[dict[str, Any]]] = {}
         """Message name to what was decoded, in order."""
         options = simulated or (EscOptions(),) * len(escs)
@@ -115,14 +115,13 @@ class Bench(dialogue.Bench):
     def _collect(self) -> None:
         before = len(self.heard)
         super()._collect()
-        if self.database is not None:
+        if self.database.messages:
             for _, frame in self.heard[before:]:
                 self.decode(frame)
 
     def decode(self, sent: CanFrame) -> None:
         if 0x580 <= sent.can_id < 0x600 or sent.can_id == 0x7E4:
             return
-        assert self.database is not None
         message = self.database.get_message_by_frame_id(sent.can_id)
         assert len(sent.data) == message.length, message.name
         decoded: Any = message.decode(sent.data)
