@@ -117,13 +117,11 @@ class Bench:
         boot: bool = True,
         **settings: Any,
     ) -> None:
-        if escs and not isinstance(escs, Mapping):
-            base, nodes = tuple(escs), len(escs)
-            node_ids = node_ids or range(1, nodes + 1)
-        else:
-            node_ids = range(1, nodes + 1) if node_ids is None else node_ids
-            same = dict(escs) if isinstance(escs, Mapping) else {}
-            base = tuple(EscSettings(f"esc{n}", **same) for n in range(len(node_ids)))
+        own = () if isinstance(escs, Mapping) else tuple(escs)
+        same = escs if isinstance(escs, Mapping) else {}
+        if node_ids is None:
+            node_ids = range(1, (len(own) or nodes) + 1)
+        base = own or tuple(EscSettings(f"esc{n}", **same) for n in range(len(node_ids)))
         self._arguments = {
             "changes": changes,
             "eds": eds,

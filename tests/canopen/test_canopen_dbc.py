@@ -8,6 +8,7 @@ from typing import Any
 
 import dialogue
 import pytest
+from cantools.database.can import Database
 from cantools.database.namedsignalvalue import NamedSignalValue
 from dbc_rules import ENUMS, RULES, parse
 from eds_text import SHIPPED as EDS_TEXT
@@ -84,7 +85,7 @@ class Bench(dialogue.Bench):
         simulated: Sequence[EscOptions] = (),
         **more: Any,
     ) -> None:
-        self.database: Any = None
+        self.database = Database()
         self.seen: dict[str, list[dict[str, Any]]] = {}
         """Message name to what was decoded, in order."""
         options = simulated or (EscOptions(),) * len(escs)
@@ -114,14 +115,13 @@ class Bench(dialogue.Bench):
     def _collect(self) -> None:
         before = len(self.heard)
         super()._collect()
-        if self.database is not None:
+        if self.database.messages:
             for _, frame in self.heard[before:]:
                 self.decode(frame)
 
     def decode(self, sent: CanFrame) -> None:
         if 0x580 <= sent.can_id < 0x600 or sent.can_id == 0x7E4:
             return
-        assert self.database is not None
         message = self.database.get_message_by_frame_id(sent.can_id)
         assert len(sent.data) == message.length, message.name
         decoded: Any = message.decode(sent.data)

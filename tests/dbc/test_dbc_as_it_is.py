@@ -367,12 +367,12 @@ SEND_TYPES = {
 }
 
 
-def sent(text: str, cycle: int = 20, **settings: Any) -> Layout:
-    return compiled(
+def all_sent(text: str, cycle: int = 20) -> str:
+    """A DBC whose messages have this send type."""
+    return (
         f'{STATE}BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","{text}";\nBA_DEF_DEF_ "GenMsgSendType" "{text}";\n'
         'BA_DEF_ BO_ "GenMsgCycleTimeFast" INT 0 0;\nBA_DEF_DEF_ "GenMsgCycleTimeFast" 0;\n'
-        f'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 0;\nBA_DEF_DEF_ "GenMsgCycleTime" {cycle};\n',
-        **settings,
+        f'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 0;\nBA_DEF_DEF_ "GenMsgCycleTime" {cycle};\n'
     )
 
 
@@ -381,37 +381,25 @@ def sent(text: str, cycle: int = 20, **settings: Any) -> Layout:
     [(meant, text) for meant, texts in SEND_TYPES.items() for text in texts.split()],
 )
 def test_a_send_type_is_known_by_its_names_in_use(meant: str, text: str) -> None:
-    layout = sent(text)
+    layout = compiled(all_sent(text))
     assert layout.messages[0].send_type == (NAMES[meant] if meant else SendType.CYCLIC)
     assert ("sent all the time" in "".join(layout.warnings)) == (
         "active" in text.lower() or text == "EnabledPeriodic"
     )
     if not meant:
-        assert sent(text, 0).messages[0].send_type == SendType.EVENT
+        assert compiled(all_sent(text, 0)).messages[0].send_type == SendType.EVENT
 
 
 @pytest.mark.parametrize("text", ["No", "Wrong", "OnRequest", "cyclically"])
 def test_another_send_type_is_refused_unless_dbc_send_type_says_what_it_means(text: str) -> None:
-    (line,) = refused_type(text)
+    (line,) = refused(all_sent(text))
     assert f"GenMsgSendType {text!r} is not known" in line and f"dbc.send_type.{text!r}" in line
-    assert (
-        sent(text, send_types={text: "CyclicAndEvent"}).messages[0].send_type
-        == SendType.CYCLIC | SendType.EVENT
-    )
-    assert (
-        sent("OnChange", send_types={"OnChange": "Event"}).messages[0].send_type == SendType.EVENT
-    )
-    (line,) = refused_type("Event", send_types={"Evnt": "Cyclic"})
-    assert (
-        line
-        == "dbc.send_type.Evnt: no message of Gateway has this GenMsgSendType in my.dbc. Did you mean 'Event'?"
-    )
-
-
-def refused_type(text: str, **settings: Any) -> Sequence[str]:
-    with pytest.raises(UserError) as caught:
-        sent(text, **settings)
-    return caught.value.problems
+    for name, meaning in ((text, "CyclicAndEvent"), ("OnChange", "Event")):
+        (plan,) = compiled(all_sent(name), send_types={name: meaning}).messages
+        assert plan.send_type == NAMES[meaning]
+    assert refused(all_sent("Event"), send_types={"Evnt": "Cyclic"}) == [
+        "dbc.send_type.Evnt: no message of Gateway has this GenMsgSendType in my.dbc. Did you mean 'Event'?"
+    ]
 
 
 # --- counters and checksums ---------------------------------------------------------------------------------------------
