@@ -207,7 +207,8 @@ class Gateway:
         frames: list[CanFrame] = []
         for output in self._outputs:
             if output.frames:
-                frames += output.take()
+                frames += output.frames
+                output.frames.clear()
         return frames
 
     def not_sent(self, now: int) -> None:

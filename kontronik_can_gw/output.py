@@ -23,7 +23,7 @@ class Owner(NamedTuple):
 
 
 class Output:
-    """One way onto the bus. Frames are appended to ``frames``, which ``take`` hands over."""
+    """One way onto the bus. Frames are appended to ``frames``, oldest first; the owner empties it."""
 
     def __init__(self) -> None:
         self.frames: list[CanFrame] = []
@@ -47,13 +47,6 @@ class Output:
     def next_deadline(self) -> int:
         """When ``advance`` is to be called at the latest."""
         return NEVER
-
-    def take(self) -> list[CanFrame]:
-        """The frames so far, oldest first; the list is handed over."""
-        if not self.frames:
-            return []
-        frames, self.frames = self.frames, []
-        return frames
 
     # --- what happens
 

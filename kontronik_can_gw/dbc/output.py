@@ -36,6 +36,7 @@ class _Message:
         "crc_at",
         "extended",
         "fd",
+        "goes_at_once",
         "is_free",
         "is_paged",
         "is_plain",
@@ -78,6 +79,7 @@ class _Message:
         )
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
+        self.goes_at_once = self.by_event and self.is_free
         # sending it leaves nothing to note, and its bits are its data
         self.is_plain = not self.on_change and not self.alive_modulus and self.crc_at is None
         self.triggers = Event.NONE
@@ -184,16 +186,19 @@ class DbcOutput(Output):
         """Something of an ESC changed: send, or note for later, the messages that follow it."""
         state = self._escs[esc]
         up = state.live is not None
+        gone = not up or (events & Event.INFO and state.info is None)
         for index, message in self._listeners[esc][up][events]:
-            if not message.by_event:
-                if not self._note_changes(message, now):
-                    continue
-            elif message.is_paged and (not up or (events & Event.INFO and state.info is None)):
-                message.pending = list(
-                    range(len(message.pages))
-                )  # no further event will bring them
-            if message.is_free or self._schedule.request(index, now):
+            if message.goes_at_once or self._may_go(index, message, bool(gone), now):
                 self._send(index, message, now)
+
+    def _may_go(self, index: int, message: _Message, gone: bool, now: int) -> bool:
+        """Whether a message that follows an event is news and may be sent now. ``gone``: values that nothing will bring again."""
+        if not message.by_event:
+            if not self._note_changes(message, now):
+                return False
+        elif gone and message.is_paged:
+            message.pending = list(range(len(message.pages)))  # no further event brings the others
+        return message.is_free or self._schedule.request(index, now)
 
     def on_gateway_change(self, now: int, each_second: bool = False) -> None:
         """Messages with the gateway's own values that are sent by event or on change follow.

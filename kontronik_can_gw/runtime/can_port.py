@@ -18,7 +18,9 @@ from kontronik_can_gw.transmit_queue import Sent
 RECEIVE_LIMIT = 64
 """Frames, error frames among them, that one call of ``receive`` takes at most."""
 MAX_STANDARD_ID, MAX_EXTENDED_ID = 0x7FF, 0x1FFFFFFF
+# An enumeration's members are slow to look up.
 _DOWN, _UNKNOWN = CanState.DOWN, CanState.UNKNOWN
+_OK = Sent.OK
 
 Received = list[tuple[CanFrame, int | None]]
 """Frames, each with the time at which it came, on the monotonic clock; None where that is not known."""
@@ -98,7 +100,7 @@ class CanPort(ABC):
         count, answer = (0, Sent.GONE) if self.gone else self._send_each(frames, clock, latest)
         if count and (self.state is _DOWN or self.state is _UNKNOWN):
             self.state = CanState.ERROR_ACTIVE
-        if answer is Sent.DOWN or answer is Sent.GONE:
+        if answer is not _OK and (answer is Sent.DOWN or answer is Sent.GONE):
             self.state = _DOWN
         return count, answer
 

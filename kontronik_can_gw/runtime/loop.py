@@ -146,7 +146,9 @@ class Loop:
         gateway = self.gateway
         wakes = _WAKES_PER_TIMEOUT if gateway.status.escs_ok else _WAKES_PER_TIMEOUT_IN_SILENCE
         wake = last + gateway.shortest_timeout_ns // wakes - MS
-        pause = max(min(wake, due) - self._clock(), 0)
+        pause = min(wake, due) - self._clock()
+        if pause < 0:
+            pause = 0
         ready = self._poller.wait(pause)
         now = self._poller.now
         late = now - last - pause

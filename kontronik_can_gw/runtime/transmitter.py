@@ -55,10 +55,9 @@ class Transmitter:
 
         None where nothing waits or is to be tried, and where frames became late meanwhile: the next turn drops those.
         """
-        if self.due != NEVER:
-            if now < self.due:
-                return None
-            self.due = NEVER
+        if now < self.due != NEVER:
+            return None
+        self.due = NEVER
         frames = self.queue.in_order()
         if not frames:
             if not self.is_stalled:
@@ -69,9 +68,9 @@ class Transmitter:
         self._status.sent_frames += count
         if count:
             self._busy_since = None
-        if answer is Sent.LATE:
-            return None
         if answer is not _OK:
+            if answer is Sent.LATE:
+                return None
             self._status.send_failures += 1
             if answer is Sent.BUSY or answer is Sent.FULL:
                 answer = self._busy(port, answer, now)
