@@ -2,12 +2,13 @@
 
 import base64
 import hashlib
+import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from report_flights import analysed, analysis_of, data_of, shipped_bus, simulated
+from report_flights import analysed, analysis_of, column, data_of, shipped_bus, simulated
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
@@ -142,6 +143,17 @@ def test_what_the_dbc_does_not_have_is_left_out_and_reported(tmp_path: Path) -> 
     assert found.missing == ["BEC current", "BEC voltage"]
     html = render(found, title="x", source="y")
     assert "Not in the DBC, so not here: BEC current, BEC voltage." in html
+
+
+def test_infinite_values_of_float_signals_are_not_drawn() -> None:
+    bus = shipped_bus()
+    rows = list(simulated(bus, 1))
+    at = column(bus, "bec_voltage")
+    rows[50][1][at] = math.inf
+    found = data_of(render(analysed(analysis_of(bus), rows), title="x", source="y"))
+    (plot,) = (plot for plot in found["plots"] if plot["key"] == "bec_voltage")
+    assert plot["series"][0]["values"][50] is None
+    assert plot["series"][0]["values"][51] is not None
 
 
 def test_times_and_numbers_in_words() -> None:
