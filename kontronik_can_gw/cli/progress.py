@@ -46,11 +46,6 @@ class Progress:
         if self._progress is not None:
             self._progress.stop()
 
-    @property
-    def is_shown(self) -> bool:
-        """True if the bar is visible."""
-        return self._progress is not None
-
     def advance(self, size: int) -> None:
         """Add ``size`` processed bytes."""
         if self._progress is not None:

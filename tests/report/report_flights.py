@@ -76,6 +76,17 @@ def analysed(analysis: Analysis, rows: Iterable[Row]) -> Flight:
     return analysis.finish()
 
 
+def rows_of(bus: BusLayout, times: Sequence[int], **columns: Sequence[Value]) -> Iterator[Row]:
+    """Rows with values of the first ESC by source; the others are not available."""
+    count = len(SignalReader(bus.layout).columns)
+    places = [(column(bus, source), values) for source, values in columns.items()]
+    for number, time_ns in enumerate(times):
+        row: list[Value] = [None] * count
+        for at, values in places:
+            row[at] = values[number]
+        yield time_ns, row
+
+
 def data_of(html: str) -> dict[str, Any]:
     """The data that a page draws."""
     packed = html.partition(' id="data">')[2].partition("<")[0]

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 import pytest
-from report_flights import Row, analysed, analysis_of, column, shipped_bus, simulated
+from report_flights import Row, analysed, analysis_of, column, rows_of, shipped_bus, simulated
 
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.report import trackers
@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.kontronik.states import (
 )
 from kontronik_can_gw.esc.telemetry import SECOND as S
 from kontronik_can_gw.esc.telemetry import LinkState
-from kontronik_can_gw.signals.unpacker import SignalReader, Value
+from kontronik_can_gw.signals.unpacker import SignalReader
 
 GAP_NS = 500_000_000
 FAULTS = Faults(
@@ -67,16 +67,8 @@ def table(bus: BusLayout, rows: list[Row], esc: int, *sources: str) -> pd.DataFr
 def test_time_and_energy_are_those_of_pandas(
     bus: BusLayout, rows: list[Row], flight: Flight, esc: int
 ) -> None:
-    data = table(
-        bus,
-        rows,
-        esc,
-        "battery_power",
-        "battery_voltage",
-        "electrical_speed",
-        "energy_used",
-        "consumed_charge",
-    )
+    sources = ("battery_power", "battery_voltage", "electrical_speed", "energy_used")
+    data = table(bus, rows, esc, *sources)
     summary = flight.escs[esc]
     live = data[data.battery_voltage.notna()]
     assert summary.telemetry_ns == live.held.sum()
@@ -212,17 +204,12 @@ def test_a_window_is_cut_out_with_the_times_of_the_whole(bus: BusLayout, rows: l
 
 def test_counters_that_roll_go_on_and_those_that_begin_again_too() -> None:
     bus = shipped_bus()
-    at = column(bus, "losses")
-    blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
-    top = int(SignalReader(bus.layout).columns[at].high)
+    top = int(SignalReader(bus.layout).columns[column(bus, "losses")].high)
 
-    def total(*counts: int) -> float | None:
-        made = []
-        for number, count in enumerate(counts):
-            values = list(blank)
-            values[at] = count
-            made.append((number * 10_000_000, values))
-        return analysed(analysis_of(bus), made).escs[0].counted.get("losses")
+    def total(*counts: int) -> float:
+        times = [number * 10_000_000 for number in range(len(counts))]
+        flight = analysed(analysis_of(bus), rows_of(bus, times, losses=counts))
+        return flight.escs[0].counted["losses"]
 
     assert total(3, 5, 9) == 6
     assert total(top - 1, top, 0, 2) == 4
@@ -231,17 +218,14 @@ def test_counters_that_roll_go_on_and_those_that_begin_again_too() -> None:
 
 def test_many_events_and_states_stay_bounded() -> None:
     bus = shipped_bus()
-    state, flag, live = (
-        column(bus, s) for s in ("operating_state_raw", "undervoltage", "battery_voltage")
+    rows = rows_of(
+        bus,
+        range(0, 300 * S, S // 100),
+        battery_voltage=[24.0] * 30_000,
+        undervoltage=[0, 1] * 15_000,
+        operating_state_raw=[OperatingState.Forward, OperatingState.Brake] * 15_000,
     )
-    blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
-    analysis = analysis_of(bus, 1000)
-    for number in range(30_000):
-        values = list(blank)
-        values[live], values[flag] = 24.0, number & 1
-        values[state] = (OperatingState.Forward, OperatingState.Brake)[number & 1]
-        analysis.take(number * 10_000_000, values)
-    flight = analysis.finish()
+    flight = analysed(analysis_of(bus, 1000), rows)
     assert flight.left_out == 35_000
     assert len(flight.events) == 10_000
     assert len(flight.escs[0].segments) <= 4000
@@ -252,15 +236,9 @@ def test_many_events_and_states_stay_bounded() -> None:
 def test_rows_far_apart_are_not_joined_even_without_a_row_that_shows_the_loss(points: int) -> None:
     """As in a log that was stopped for a while: 2 s of rows, nothing for 1.1 s, and so on."""
     bus = shipped_bus()
-    live = column(bus, "battery_voltage")
-    blank: list[Value] = [None] * len(SignalReader(bus.layout).columns)
-    analysis = analysis_of(bus, points)
     times = [part * 3_100_000_000 + at * 10_000_000 for part in range(40) for at in range(201)]
-    for number, time_ns in enumerate(times):
-        values = list(blank)
-        values[live] = 20 + number % 7
-        analysis.take(time_ns, values)
-    flight = analysis.finish()
+    voltages = [20 + number % 7 for number in range(len(times))]
+    flight = analysed(analysis_of(bus, points), rows_of(bus, times, battery_voltage=voltages))
     line = flight.lines[0, "battery_voltage"]
     drawn = [
         (t0, t1)

@@ -6,6 +6,7 @@ holds until the next row; two rows further apart than the time-out have a gap be
 
 from collections.abc import Sequence
 from itertools import chain, pairwise
+from math import isfinite
 from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
@@ -107,11 +108,12 @@ class Analysis:
         for esc in self._escs:
             esc.finish(self._last_ns)
         times, columns = self._decimator.finish()
-        lines = {
-            key: column
-            for key, column in zip(self._drawn, columns, strict=True)
-            if any(value is not None for value in column)
-        }
+        lines = {}
+        for key, column in zip(self._drawn, columns, strict=True):
+            # a float signal may be infinite
+            finite = [value if value is None or isfinite(value) else None for value in column]
+            if any(value is not None for value in finite):
+                lines[key] = finite
         for source in self._equal_speeds():
             for esc in self._escs:
                 lines.pop((esc.index, source), None)

@@ -3,6 +3,7 @@
 import statistics
 from collections import deque
 from collections.abc import Iterable, Sequence
+from math import isfinite
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.desk.report.flight import EscFlight, Extreme, Number, Resistance
@@ -79,8 +80,9 @@ class Ledger:
                 continue
             self._account(time_ns)
             self._last = row
-            if row.voltage is not None and row.current is not None:
-                self._battery.take(time_ns, row.voltage, row.current)
+            voltage, current = row.voltage, row.current
+            if voltage is not None and current is not None and isfinite(voltage + current):
+                self._battery.take(time_ns, voltage, current)
 
     def finish(self, end_ns: int, *, has_power: bool, has_speed: bool) -> None:
         """Account for the time until the end."""

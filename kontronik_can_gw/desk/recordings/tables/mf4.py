@@ -30,32 +30,27 @@ class Mf4Table:
         with quiet():
             self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
             set_start(self._mdf, table.start_wall_ns or 0)
+            self._by_frame = table.by_frame
+            named: dict[Value, tuple[str, Sequence[int]]] = {
+                None: ("ESC values", range(len(table.fields)))
+            }
             if table.by_frame:
                 messages = dict.fromkeys(one.message for one in table.fields[2:])
-                self._groups: dict[Value, _Group] = {
-                    message: _Group(
-                        self._mdf, module, table.fields, table.indices(message), message
-                    )
-                    for message in messages
-                }
-            else:
-                self._group = _Group(
-                    self._mdf, module, table.fields, range(len(table.fields)), "ESC values"
-                )
-                self._groups = {}
+                named = {message: (message, table.indices(message)) for message in messages}
+            self._groups = {
+                key: _Group(self._mdf, module, table.fields, indices, name)
+                for key, (name, indices) in named.items()
+            }
 
     def write(self, row: Row) -> None:
         """Add a row."""
-        values = list(
-            chain.from_iterable(
-                self._nothing[i] if p is None else p for i, p in enumerate(row.parts)
-            )
-        )
-        (self._groups[values[1]] if self._groups else self._group).write(row.time_ns, values)
+        parts = zip(row.parts, self._nothing, strict=True)
+        values = list(chain.from_iterable(nothing if p is None else p for p, nothing in parts))
+        self._groups[values[1] if self._by_frame else None].write(row.time_ns, values)
 
     def close(self) -> None:
         """Write the file."""
-        for group in self._groups.values() if self._groups else [self._group]:
+        for group in self._groups.values():
             group.flush()
         save_mf4(self._mdf, self._path, self._provenance)
 
