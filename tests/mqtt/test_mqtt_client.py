@@ -130,6 +130,22 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(
         made.stop()
 
 
+def test_a_broker_that_stands_still_for_long_is_lost_and_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(mqtt_client, "KEEPALIVE_S", 1)
+    made = Mosquitto(tmp_path)
+    try:
+        with connecting(to(made.port)) as client:
+            turning(lambda: client.connected, client)
+            made.freeze(True)
+            turning(lambda: "the connection was lost: nothing came any more" in said.text, client)
+            made.freeze(False)
+            turning(lambda: "connected, after" in said.text, client)
+    finally:
+        made.stop()
+
+
 # --- brokers that end connections
 
 
