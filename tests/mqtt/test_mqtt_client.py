@@ -74,7 +74,7 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
         client.offer(Message("k/test/other", b"%d" % number))
     client.offer(Message("k/test/known", b"1", lasting=True, retain=True))
     client.offer(Message("k/test/known", b"2", lasting=True, retain=True))
-    assert client.replaced == 999 * 2 + 1
+    assert client.waiting == 3
     with Subscriber(broker.port, "k/test/#") as heard:
         client.start()
         turning(lambda: client.connected and not client.waiting, client)
@@ -113,7 +113,6 @@ def test_a_broker_that_takes_nothing_makes_nothing_pile_up(
             made.freeze(True)
             turning(lambda: said_so("takes messages too slowly: only the newest are sent"), client)
             assert client.waiting <= 3  # "online"; a state is with paho, and the newest waits
-            assert client.replaced > 0
             made.freeze(False)
             turning(lambda: said_so("takes messages again"), client)
             turning(lambda: not client.waiting, client)

@@ -53,8 +53,6 @@ class MqttClient:
 
     def __init__(self, broker: Broker, online_topic: str) -> None:
         self.broker = broker
-        self.replaced = 0
-        """Number of messages that were replaced by a newer one of the same topic before they were sent."""
         self._lasting = {online_topic: Message(online_topic, ONLINE, True, True)}
         self._waiting: dict[str, Message] = {}
         self._handed: dict[str, Any] = {}
@@ -88,7 +86,6 @@ class MqttClient:
         """Queue a message; a pending one of the same topic is replaced."""
         if message.lasting:
             self._lasting[message.topic] = message
-        self.replaced += self._waiting.pop(message.topic, None) is not None
         self._waiting[message.topic] = message
 
     def turn(self, now: int) -> None:
