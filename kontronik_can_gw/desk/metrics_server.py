@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, make_server
 
-from prometheus_client import CollectorRegistry, Metric, make_wsgi_app
+from prometheus_client import CollectorRegistry, Metric, generate_latest
 from prometheus_client.exposition import ThreadingWSGIServer
 
 from kontronik_can_gw.desk.metrics import families
@@ -19,6 +19,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 REQUEST_S = 5
 """Maximum time that a client may take for its request."""
 _MAX_FILE = 1 << 22
@@ -114,8 +115,8 @@ class MetricsServer:
             return _refusal("503 Service Unavailable", str(reason), start)
         registry = CollectorRegistry(auto_describe=False)
         registry.register(Collected(found))
-        answer: Iterable[bytes] = make_wsgi_app(registry)(environ, start)
-        return answer
+        start("200 OK", [("Content-Type", CONTENT_TYPE), ("Cache-Control", "no-store")])
+        return [generate_latest(registry)]
 
 
 def _refusal(status: str, text: str, start: Callable[..., Any]) -> list[bytes]:

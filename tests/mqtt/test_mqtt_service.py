@@ -1,15 +1,11 @@
-"""The publisher as a systemd service of its own: its unit, how it is installed and removed."""
+"""The publisher as a systemd service of its own: how it is installed and removed. Its unit: tests/service."""
 
 import os
-import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from kontronik_can_gw.cli import main
-from kontronik_can_gw.cli.service_files import Choices, planned
 
 WANTS = "etc/systemd/system/multi-user.target.wants"
 UNITS = "etc/systemd/system"
@@ -37,46 +33,6 @@ def configuration(
 ) -> None:
     file = root / f"etc/kontronik-can-gw/{name}.toml"
     file.write_text(f'{mqtt}[[esc]]\nport = "/dev/ttyAMA0"\npole_pairs = 7\n')
-
-
-def analyze(*words: str) -> "subprocess.CompletedProcess[str]":
-    if shutil.which("systemd-analyze") is None:
-        pytest.skip("no systemd-analyze on this machine: sudo apt-get install systemd")
-    environment = os.environ | {"SYSTEMD_COLORS": "0", "LC_ALL": "C.UTF-8"}
-    return subprocess.run(
-        ["systemd-analyze", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-        env=environment,
-    )
-
-
-def units(folder: Path) -> list[Path]:
-    """Both units, the template as an instance."""
-    made = []
-    for file in planned(Choices("/bin/true", False, "dialout", mqtt=True), folder):
-        if "-mqtt" in file.path:
-            made.append(folder / Path(file.path).name.replace("@.", "@left."))
-            made[-1].write_text(file.text)
-    return made
-
-
-def test_systemd_finds_nothing_to_complain_about_and_hardly_any_exposure(tmp_path: Path) -> None:
-    found = units(tmp_path)
-    assert [unit.name for unit in found] == [
-        "kontronik-can-gw-mqtt.service",
-        "kontronik-can-gw-mqtt@left.service",
-    ]
-    for unit in found:
-        done = analyze("verify", "--man=no", str(unit))
-        ours = [line for line in (done.stdout + done.stderr).splitlines() if "kontronik" in line]
-        assert (done.returncode, ours) == (0, []), done.stderr
-        done = analyze("security", "--offline=true", "--no-pager", str(unit))
-        level = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
-        assert level, done.stdout + done.stderr
-        assert float(level[1]) <= 2.0
 
 
 def test_it_is_installed_and_enabled_on_request_only(

@@ -53,8 +53,6 @@ class MqttClient:
 
     def __init__(self, broker: Broker, online_topic: str) -> None:
         self.broker = broker
-        self.replaced = 0
-        """Number of messages that were replaced by a newer one of the same topic before they were sent."""
         self._lasting = {online_topic: Message(online_topic, ONLINE, True, True)}
         self._waiting: dict[str, Message] = {}
         self._handed: dict[str, Any] = {}
@@ -88,7 +86,6 @@ class MqttClient:
         """Queue a message; a pending one of the same topic is replaced."""
         if message.lasting:
             self._lasting[message.topic] = message
-        self.replaced += self._waiting.pop(message.topic, None) is not None
         self._waiting[message.topic] = message
 
     def turn(self, now: int) -> None:
@@ -181,7 +178,8 @@ class _Link:
         self.since_ns = 0
         """Beginning of the newest connection."""
         self._broker = broker
-        self._answered = False
+        self._answered: bool | None = None
+        """True once the broker has answered CONNECT; None without a connection."""
         self._short = 0
         self._stopping = False
         self._context = tls_context(broker.config) if broker.config.tls else None
@@ -189,7 +187,7 @@ class _Link:
             client.tls_set_context(self._context)
         client.connect_timeout = _CONNECT_S
         client.on_pre_connect = self._prepare
-        client.on_socket_open = _limit_buffer
+        client.on_socket_open = self._opened
         client.on_connect = self._connected
         client.on_connect_fail = self._not_connected
         client.on_disconnect = self._disconnected
@@ -213,7 +211,7 @@ class _Link:
 
     def end(self, seconds: float) -> None:
         """Send DISCONNECT, so that the broker publishes no last will, and wait for that."""
-        self._stopping = True
+        self._stopping, self.problem = True, None
         if self.client.disconnect() == MQTTErrorCode.MQTT_ERR_SUCCESS:
             self.client.ended.wait(max(0, seconds))
 
@@ -227,6 +225,12 @@ class _Link:
             self.client.username_pw_set(config.username, None if file is None else password(file))
         if self._context is not None:
             show_certificate(config, self._context)
+
+    def _opened(self, _client: object, _data: object, sock: Any) -> None:
+        self._answered = False
+        # a small buffer in the kernel, since data in it cannot be replaced by newer, and no delay
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def _connected(
         self, _client: object, _data: object, _flags: object, reason: Any, _properties: object
@@ -250,7 +254,9 @@ class _Link:
     def _disconnected(
         self, _client: object, _data: object, _flags: object, reason: Any, _properties: object
     ) -> None:
-        answered, self._answered = self._answered, False
+        answered, self._answered = self._answered, None
+        if answered is None:  # paho says it twice where a ping has no answer
+            return
         is_silent = str(reason) == _TIMEOUT
         if not answered:
             closed = "closed the connection instead of answering. Does it want TLS (--tls)?"
@@ -284,12 +290,6 @@ def _is_done(info: paho.MQTTMessageInfo) -> bool:
         return info.is_published()
     except (ValueError, RuntimeError):  # it could not be queued, or the connection was lost
         return True
-
-
-def _limit_buffer(_client: object, _data: object, sock: Any) -> None:
-    """Keep the kernel's buffer small, since data in it cannot be replaced by newer, and send without delay."""
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def remove(
