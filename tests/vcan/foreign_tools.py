@@ -30,7 +30,7 @@ class Zencan:
     """zencan-cli on an interface. It waits 150 ms for an answer, by a clock that is slower for it."""
 
     def __init__(self, interface: str, folder: Path) -> None:
-        need(ZENCAN.exists(), "zencan-cli")
+        need(ZENCAN.exists() and shutil.which("cc") is not None, "zencan-cli or cc")
         self._interface = interface
         self._clock = folder / "slow_clock.so"
         command = ["cc", "-shared", "-fPIC", "-o", str(self._clock), str(FOREIGN / "slow_clock.c")]

@@ -49,7 +49,10 @@ def test_every_frame_is_on_the_bus_as_it_was_sent_and_the_last_word_is_that_it_e
             )
         newest = [len(fed.sent) - 1 for fed in run.escs]
         assert run.watch.values > 2 * times * len(identities)
-        assert all(fresh[-1].n == n for fresh, n in zip(run.watch.fresh, newest, strict=True))
+        wait_for(
+            lambda: all(fresh[-1].n == n for fresh, n in zip(run.watch.fresh, newest, strict=True)),
+            "the newest values",
+        )
         assert gateway.end(number) == 0, gateway.log
         run.catch_up()
         assert run.signal("GatewayStatus", "gateway_state") == STOPPING

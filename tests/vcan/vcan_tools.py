@@ -244,25 +244,27 @@ class Chain:
         with gateway_process(self.config, self.toml, *options) as self.gateway:
             yield self.gateway
 
+    @property
+    def held_up(self) -> int:
+        """How often the gateway said that it stood still: then it may throw frames away."""
+        assert self.gateway is not None
+        return self.gateway.log.count("suspended")
+
     def feed(self, *escs: int, times: int = 1) -> None:
         """The next live frame of these ESCs, of all unless given, each time as soon as the bus has shown the ones before."""
-        assert self.gateway is not None
         chosen = [self.escs[esc] for esc in escs] or self.escs
         for _ in range(times):
             numbers = [len(fed.sent) for fed in chosen]
-            held_up = self.gateway.log.count("suspended")
+            held_up = self.held_up
             for fed, number in zip(chosen, numbers, strict=True):
                 while len(fed.sent) == number:  # an info frame now and then
                     fed.send_one()
 
             def shown(numbers: Sequence[int] = numbers, held_up: int = held_up) -> bool:
-                assert self.gateway is not None
                 seen = all(
                     fed.seen[n] == SPEED | CURRENT for fed, n in zip(chosen, numbers, strict=True)
                 )
-                return (
-                    seen or self.gateway.log.count("suspended") > held_up
-                )  # then it may throw frames away, and says so
+                return seen or self.held_up > held_up
 
             wait_for(shown, f"frames {numbers} on the bus")
 
