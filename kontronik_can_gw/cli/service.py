@@ -56,33 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="DIR",
             help="only write below DIR, as for a disk image; call no tools",
         )
-    install_parser.add_argument("--now", action="store_true", help="start it too, or restart it")
-    install_parser.add_argument(
-        "--executable", metavar="PATH", help="the program (default: this one)"
-    )
-    install_parser.add_argument(
-        "--network",
-        type=_bitrate,
-        metavar="BITRATE",
-        help="let systemd-networkd set up the CAN interface",
-    )
-    install_parser.add_argument(
-        "--channel",
-        type=_channel,
-        default="can0",
-        metavar="NAME",
-        help="the CAN interface (default can0)",
-    )
-    install_parser.add_argument(
-        "--mqtt",
-        action="store_true",
-        help="a second service that publishes to the broker of the table [mqtt]",
-    )
-    install_parser.add_argument(
-        "--metrics",
-        action="store_true",
-        help="a service that serves the statistics for Prometheus on 127.0.0.1:9123",
-    )
+    _add_install_options(install_parser)
     uninstall_parser.add_argument(
         "--purge",
         action="store_true",
@@ -90,6 +64,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     status_parser.add_argument(
         "-n", "--lines", type=_lines, default=10, metavar="N", help="lines of the log (default 10)"
+    )
+
+
+def _add_install_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--now", action="store_true", help="start it too, or restart it")
+    parser.add_argument("--executable", metavar="PATH", help="the program (default: this one)")
+    parser.add_argument(
+        "--network",
+        type=_bitrate,
+        metavar="BITRATE",
+        help="let systemd-networkd set up the CAN interface",
+    )
+    parser.add_argument(
+        "--channel",
+        type=_channel,
+        default="can0",
+        metavar="NAME",
+        help="the CAN interface (default can0)",
+    )
+    parser.add_argument(
+        "--mqtt",
+        action="store_true",
+        help="a second service that publishes to the broker of the table [mqtt]",
+    )
+    parser.add_argument(
+        "--metrics",
+        action="store_true",
+        help="a service that serves the statistics for Prometheus on 127.0.0.1:9123",
     )
 
 

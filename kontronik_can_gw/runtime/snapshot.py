@@ -168,27 +168,14 @@ def snapshot(
             "pid_namespace": program.pid_namespace,
             "started": program.started,
             "uptime_s": _seconds(now - status.started_ns),
-            "rss_bytes": process.rss_bytes,
-            "open_fds": process.open_fds,
-            "threads": process.threads,
+            **asdict(process),
         },
         "gateway": {
             "state": name_in_words(status.state.name),
             "esc_count": status.esc_count,
             "escs_ok": status.escs_ok,
         },
-        "can": {
-            "interface": can.interface,
-            "channel": can.channel,
-            "bitrate": can.bitrate,
-            "state": name_in_words(status.can_state.name),
-            "open": can.open,
-            "stalled": can.stalled,
-            "complaint": can.complaint or None,
-            "restart_ms": can.restart_ms,
-            "error_counters": None if can.error_counters is None else list(can.error_counters),
-            "counters": {name: getattr(status, name) for name in _STATUS_COUNTERS},
-        },
+        "can": _can(can, status),
         "units": _UNITS,
         "escs": [
             _esc(esc, port, status, now) for esc, port in zip(gateway.escs, ports, strict=True)
@@ -202,11 +189,24 @@ def snapshot(
             }
             for name, (node_id, state, sent) in zip(names, nodes, strict=False)
         ],
-        "store": None
-        if store is None
-        else {"waiting": store.waiting, "last_error": store.last_error or None},
+        "store": store and {"waiting": store.waiting, "last_error": store.last_error or None},
         "recording": None if recorder is None else asdict(recorder),
         "log": list(log_lines)[-LOG_LINES:],
+    }
+
+
+def _can(can: CanFacts, status: GatewayStatus) -> Document:
+    return {
+        "interface": can.interface,
+        "channel": can.channel,
+        "bitrate": can.bitrate,
+        "state": name_in_words(status.can_state.name),
+        "open": can.open,
+        "stalled": can.stalled,
+        "complaint": can.complaint or None,
+        "restart_ms": can.restart_ms,
+        "error_counters": None if can.error_counters is None else list(can.error_counters),
+        "counters": {name: getattr(status, name) for name in _STATUS_COUNTERS},
     }
 
 

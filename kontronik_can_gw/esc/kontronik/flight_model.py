@@ -1,0 +1,228 @@
+"""The flight of a simulated ESC: battery, motor and heat, as live data and information."""
+
+from random import Random
+
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant, rows
+from kontronik_can_gw.esc.kontronik.simulator_options import POWER_UP, EscOptions
+from kontronik_can_gw.esc.kontronik.states import (
+    Device,
+    OperatingError,
+    OperatingState,
+    peak_current_of,
+)
+
+_STANDING = frozenset(state for state in OperatingState if state <= OperatingState.StandBy)
+_INT16 = 32_767
+_SPEED_PER_VOLT = 2500.0  # electrical 1/min for each V at the motor
+_SUPPLIES_NO_BEC_CURRENT = rows(LiveData)["bec_current"].not_on
+
+
+_LOGGED_FROM_ZERO = frozenset(
+    {
+        *("electrical_speed", "battery_current", "motor_current", "peak_current", "bec_current"),
+        *("throttle", "output_opening"),
+    }
+)
+"""The log of their greatest values begins at 0."""
+
+
+class FlightModel:
+    """Battery, motor and heat of one ESC since its power-up, stepped once a period."""
+
+    __slots__ = (
+        "_bec_temperature",
+        "_charge",
+        "_device",
+        "_dt",
+        "_full",
+        "_has_run",
+        "_log",
+        "_measures_battery_peak",
+        "_next_phase",
+        "_options",
+        "_peak",
+        "_phase_s",
+        "_ramp_from",
+        "_random",
+        "_speed",
+        "_stage_temperature",
+        "_strength",
+        "_supplies_bec_current",
+        "_throttle",
+        "phase",
+    )
+
+    def __init__(self, options: EscOptions, device: Device, seed: int) -> None:
+        self._options = options
+        self._device = device
+        self._dt = options.period_ns / 1e9
+        self._random = Random(f"model {seed}").random
+        self._measures_battery_peak = peak_current_of(device) == "battery"
+        self._supplies_bec_current = device not in _SUPPLIES_NO_BEC_CURRENT
+        self._strength = options.max_current * (0.95 + 0.1 * self._random())
+        self._stage_temperature = options.ambient + 4 + 2 * self._random()
+        self._bec_temperature = options.ambient + 6 + 2 * self._random()
+        self._power_up()
+
+    def _power_up(self) -> None:
+        self._full = 0.94 + 0.06 * self._random()
+        self._charge = 0.0
+        self._speed = 0.0
+        self._throttle = 0.0
+        self._peak = 0
+        self._has_run = False
+        self._log: dict[str, int] = {}
+        self._next_phase = 0
+        self._phase_s = 0.0
+        self._ramp_from = 0.0
+        self.phase = POWER_UP[0]
+
+    def _enter_next_phase(self) -> None:
+        self._phase_s -= self.phase.duration_s
+        self._next_phase += 1
+        profile = self._options.profile
+        at = self._next_phase - len(POWER_UP)
+        if at < 0:
+            self.phase = POWER_UP[self._next_phase]
+        elif at and at % len(profile) == 0 and self._charge > 0.8 * self._options.capacity:
+            self._power_up()
+        else:
+            self.phase = profile[at % len(profile)]
+            # From driving to braking and back the throttle jumps to 0: no current runs against the state.
+            target = self.phase.throttle
+            self._ramp_from = self._throttle if target * self._throttle >= 0 else 0.0
+
+    def step(self, errors: int) -> LiveData:
+        """One period on; the live data at its end. ``errors`` are set beside the bits that belong to the state."""
+        self._phase_s += self._dt
+        while self._phase_s >= self.phase.duration_s:
+            self._enter_next_phase()
+        phase = self.phase
+        ramp = min(self._phase_s / phase.ramp_s, 1.0) if phase.ramp_s else 1.0
+        self._throttle = self._ramp_from + (phase.throttle - self._ramp_from) * ramp
+        motor_current, battery_current, voltage = self._drive(self._throttle / 100)
+        bec_current = 0.25 + 0.1 * self._random()
+        if self._throttle > 0:
+            bec_current += 0.8 * self._random()
+        if battery_current > 0:
+            self._charge += battery_current * self._dt / 3.6
+        self._heat(motor_current, bec_current)
+        live = self._in_steps(motor_current, battery_current, voltage, bec_current, errors)
+        self._remember(live)
+        return live
+
+    def _drive(self, drive: float) -> tuple[float, float, float]:
+        """Motor current, battery current and battery voltage; ``drive``: throttle, -1..1.
+
+        A propeller: current with the square of the speed and with the acceleration.
+        """
+        options, dt, speed = self._options, self._dt, self._speed
+        cells = options.cell_count
+        state_of_charge = max(self._full - self._charge / options.capacity, 0.0)
+        open_voltage = cells * (3.5 + 0.7 * state_of_charge)
+        full_speed = 3.8 * cells * _SPEED_PER_VOLT
+        motor_current = battery_current = 0.0
+        part = speed / full_speed
+        if drive > 0:
+            lag = open_voltage * drive * _SPEED_PER_VOLT - speed
+            if (
+                lag > -0.03 * full_speed
+            ):  # else it turns faster: nothing is driven until the speed is down
+                motor_current = self._strength * (
+                    0.75 * part * part + min(max(lag, 0) / full_speed, 0.4) + 0.01
+                )
+                motor_current *= 0.98 + 0.04 * self._random()
+            battery_current = motor_current * drive
+            speed += lag * min(dt / 0.4, 1.0)
+        elif speed > 0:
+            strength = 0.3 - 1.5 * drive  # the stronger the more negative
+            motor_current = -self._strength * strength * part if drive < 0 else 0.0
+            battery_current = motor_current * part
+            speed -= speed * min(dt * (0.5 + strength), 1.0)
+            if speed < 400:
+                speed = 0.0
+        self._speed = speed
+        return (
+            motor_current,
+            battery_current,
+            open_voltage - battery_current * cells * 0.3 / options.max_current,
+        )
+
+    def _heat(self, motor_current: float, bec_current: float) -> None:
+        """A first-order lag each. At full load the power stage settles about 60 K above ambient."""
+        options, dt = self._options, self._dt
+        stage = self._stage_temperature
+        stage += (
+            4 + 60 * abs(motor_current) / options.max_current + options.ambient - stage
+        ) * min(dt / 25, 1.0)
+        self._stage_temperature = stage
+        bec = self._bec_temperature
+        bec += (
+            5 + 4 * bec_current + 0.2 * (stage - options.ambient) + options.ambient - bec
+        ) * min(dt / 40, 1.0)
+        self._bec_temperature = bec
+
+    def _in_steps(
+        self,
+        motor_current: float,
+        battery_current: float,
+        voltage: float,
+        bec_current: float,
+        errors: int,
+    ) -> LiveData:
+        """As the ESC says it. What could leave its wire type is kept inside."""
+        battery_raw = min(max(round(battery_current * 10), -_INT16), _INT16)
+        motor_raw = min(max(round(motor_current * 10), -_INT16), _INT16)
+        peak = battery_raw if self._measures_battery_peak else motor_raw
+        if peak > 0:
+            peak = min(peak + peak // 8, _INT16)
+            self._peak = max(self._peak, peak)
+        if self.phase.state in _STANDING:
+            errors |= 1 << OperatingError.PROGRAMMING_ALLOWED
+        throttle = round(self._throttle)
+        return LiveData(
+            electrical_speed=round(self._speed),
+            battery_voltage=min(max(round(voltage * 100), 0), 65_535),
+            battery_current=battery_raw,
+            motor_current=motor_raw,
+            peak_current=self._peak,
+            consumed_charge=min(int(self._charge), 65_535),
+            bec_current=round(bec_current * 1000) if self._supplies_bec_current else 0,
+            bec_voltage=round((8.03 - 0.02 * bec_current) * 1000),
+            pwm_input=1001 + (9 * throttle if throttle > 0 else throttle),
+            throttle=throttle,
+            output_opening=abs(throttle) if self._speed > 0 else 0,
+            power_stage_temperature=min(max(round(self._stage_temperature), -128), 127),
+            bec_temperature=min(max(round(self._bec_temperature), -128), 127),
+            operating_errors=errors,
+            operating_state=self.phase.state,
+            timing=20,
+        )
+
+    def _remember(self, live: LiveData) -> None:
+        """The ESC's own log: the extremes of InfoData."""
+        self._has_run = self._has_run or live.electrical_speed > 0
+        log = self._log
+        for name in InfoData._fields:
+            extreme, _, of = name.partition("_")
+            if extreme not in ("max", "min"):
+                continue
+            value: int = getattr(live, of)
+            if name not in log:
+                log[name] = 0 if of in _LOGGED_FROM_ZERO else value
+            log[name] = max(log[name], value) if extreme == "max" else min(log[name], value)
+        if not self._has_run:
+            log["max_battery_voltage"] = 0
+
+    def info(self, selftest_errors: int) -> InfoData:
+        """The info data now: extremes of all live data since power-up, sent or not."""
+        options = self._options
+        main, sub = options.firmware
+        pair = device_and_variant(self._device, options.variant)
+        return InfoData(
+            device_and_variant=pair,
+            firmware_word=main << 8 | sub,
+            selftest_errors=selftest_errors,
+            cell_count=options.cell_count,
+            **self._log,
+        )
