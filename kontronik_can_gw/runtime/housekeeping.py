@@ -14,11 +14,11 @@ from kontronik_can_gw.runtime.esc_port import EscPort
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.parameter_saver import ParameterSaver
+from kontronik_can_gw.runtime.process import process_facts
 from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     ProgramFacts,
     name_in_words,
-    process_facts,
     snapshot,
 )
 from kontronik_can_gw.runtime.statistics import Statistics

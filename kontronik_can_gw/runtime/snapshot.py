@@ -4,11 +4,11 @@ A snapshot is made by the loop's thread from the gateway and from facts about wh
 made, or is null.
 """
 
-import contextlib
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from enum import Enum
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from kontronik_can_gw.esc.values import VALUES, Group, Value, physical, steps, s
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.runtime.process import ProcessFacts, pid_namespace, start_ticks
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.recorder import RecorderFacts
@@ -84,15 +85,6 @@ class ProgramFacts:
     started: str = ""
 
 
-@dataclass(frozen=True)
-class ProcessFacts:
-    """What the process uses. 0 where it is unknown."""
-
-    rss_bytes: int = 0
-    open_fds: int = 0
-    threads: int = 0
-
-
 def program_facts(configuration: Path | str) -> ProgramFacts:
     """About this process."""
     pid = os.getpid()
@@ -103,35 +95,6 @@ def program_facts(configuration: Path | str) -> ProgramFacts:
         pid_namespace=pid_namespace(),
         started=utc(time.time()),
     )
-
-
-def process_facts() -> ProcessFacts:
-    """About this process, now: two looks into /proc."""
-    threads = rss = fds = 0
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        found = _stat_fields("self")
-        threads, rss = int(found[17]), int(found[21]) * os.sysconf("SC_PAGE_SIZE")
-    with contextlib.suppress(OSError):
-        fds = len(os.listdir("/proc/self/fd")) - 1  # noqa: PTH208  names are enough; one is that of the listing itself
-    return ProcessFacts(rss, fds, threads)
-
-
-def start_ticks(pid: int) -> int:
-    """When a process started, in clock ticks since boot: with the pid it is one and no other.
-
-    0 where it is unknown, -1 for a process that has ended and only waits for its parent.
-    """
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        found = _stat_fields(str(pid))
-        return -1 if found[0] in (b"Z", b"X") else int(found[19])
-    return 0
-
-
-def pid_namespace() -> str:
-    """The namespace of this process's pids; '' where it is unknown."""
-    with contextlib.suppress(OSError):
-        return str(Path("/proc/self/ns/pid").readlink())
-    return ""
 
 
 def utc(wall: float) -> str:
@@ -153,8 +116,7 @@ def snapshot(
     recorder: "RecorderFacts | None" = None,
 ) -> Document:
     """The document: plain dictionaries, lists, texts and numbers. ``now`` monotonic nanoseconds, ``wall`` seconds of the wall clock."""
-    status, nodes = gateway.status, gateway.node_states()
-    names = [port.name for port in ports]
+    status = gateway.status
     return {
         "format": FORMAT,
         "program": PROGRAM,
@@ -181,17 +143,21 @@ def snapshot(
             _esc(esc, port, status, now) for esc, port in zip(gateway.escs, ports, strict=True)
         ],
         "nodes": [
-            {
-                "esc": name,
-                "node_id": None if node_id == UNCONFIGURED else node_id,
-                "state": name_in_words(state.name),
-                "pdos_sent": sent,
-            }
-            for name, (node_id, state, sent) in zip(names, nodes, strict=False)
+            _node(port.name, *found)
+            for port, found in zip(ports, gateway.node_states(), strict=False)
         ],
         "store": store and {"waiting": store.waiting, "last_error": store.last_error or None},
         "recording": None if recorder is None else asdict(recorder),
         "log": list(log_lines)[-LOG_LINES:],
+    }
+
+
+def _node(esc: str, node_id: int, state: Enum, pdos_sent: int) -> Document:
+    return {
+        "esc": esc,
+        "node_id": None if node_id == UNCONFIGURED else node_id,
+        "state": name_in_words(state.name),
+        "pdos_sent": pdos_sent,
     }
 
 
@@ -227,11 +193,6 @@ def with_rates(document: Document, before: Document | None) -> Document:
         round((now["pdos_sent"] - then["pdos_sent"]) / seconds, 1) for now, then in pdos
     ]
     return document | {"rates": {"seconds": round(seconds, 3)} | rates}
-
-
-def _stat_fields(pid: str) -> list[bytes]:
-    """The fields of /proc/PID/stat after the program's name, which may hold anything."""
-    return Path("/proc", pid, "stat").read_bytes().rpartition(b")")[2].split()
 
 
 def _seconds(ns: int) -> float:

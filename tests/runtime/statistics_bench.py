@@ -10,10 +10,10 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND, EscSettings
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     PortFacts,
-    ProcessFacts,
     ProgramFacts,
     StoreFacts,
     snapshot,

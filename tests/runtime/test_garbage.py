@@ -20,13 +20,13 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.loop import Loop
+from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
 from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings
 from kontronik_can_gw.runtime.snapshot import (
     CanFacts,
     Document,
     PortFacts,
-    ProcessFacts,
     ProgramFacts,
     snapshot,
     with_rates,

@@ -14,12 +14,11 @@ from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError, state_text
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.runtime.process import process_facts, start_ticks
 from kontronik_can_gw.runtime.snapshot import (
     LOG_LINES,
     PortFacts,
-    process_facts,
     program_facts,
-    start_ticks,
 )
 from kontronik_can_gw.runtime.statistics import default_file
 

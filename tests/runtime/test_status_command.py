@@ -33,13 +33,13 @@ from kontronik_can_gw.desk.monitor.status import (
 )
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.gateway_status import CanState
+from kontronik_can_gw.runtime.process import pid_namespace
 from kontronik_can_gw.runtime.snapshot import (
     STALE_NS,
     CanFacts,
     PortFacts,
     ProgramFacts,
     StoreFacts,
-    pid_namespace,
     program_facts,
 )
 

@@ -31,7 +31,8 @@ from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.protocols import bits_by_name
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
-from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS, pid_namespace, start_ticks
+from kontronik_can_gw.runtime.process import pid_namespace, start_ticks
+from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
 HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3
 _LARGEST_FILE = 1 << 22
