@@ -39,8 +39,6 @@ _WAKES_PER_TIMEOUT = 4
 
 A millisecond sooner, for a wait is rounded up to one.
 """
-_WAKES_PER_TIMEOUT_IN_SILENCE = 2
-"""The same while no ESC sends. Only the first frame after a silence may go early by more, and its successor replaces it."""
 _LAST_SAVE_S = 0.2
 
 
@@ -143,9 +141,7 @@ class Loop:
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
         last, due = self._now, self._next_deadline()
-        gateway = self.gateway
-        wakes = _WAKES_PER_TIMEOUT if gateway.status.escs_ok else _WAKES_PER_TIMEOUT_IN_SILENCE
-        wake = last + gateway.shortest_timeout_ns // wakes - MS
+        wake = last + self.gateway.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
         pause = min(wake, due) - self._clock()
         if pause < 0:
             pause = 0
