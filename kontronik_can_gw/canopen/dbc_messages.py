@@ -274,10 +274,11 @@ class NodeMessages:
                 for number in range(0x100)
             }, "OperatingState"
         if name == "device_raw":
-            devices = self._protocol.devices
+            devices, field = self._protocol.devices, self._protocol.by_name.get("device_raw")
+            last = 0 if field is None else min(field.high, 0xFF)
             return {
                 number: pascal_case(devices.get(number, f"Device{number}"))
-                for number in range(0x40)
+                for number in range(last + 1)
             }, "Device"
         return {int(number): pascal_case(text) for number, text in names.items()}, pascal_case(name)
 

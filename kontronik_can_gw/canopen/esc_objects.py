@@ -96,7 +96,7 @@ class EscObjects:
         device = protocol.value("device_raw", info)
         if device is None:
             raise SdoAbort(Abort.NO_DATA)
-        return (protocol.device_name(info) or f"device {device}").encode("ascii")
+        return (protocol.device_name(info) or f"device {device}").encode("ascii", "replace")
 
     def _firmware(self, _now: int) -> bytes:
         text = self._esc.protocol.firmware_text(self._esc.last_info)

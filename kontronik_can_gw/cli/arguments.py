@@ -23,11 +23,11 @@ REMOVED_OPTIONS: dict[tuple[str, str], str] = {
     (
         "service",
         "--dry-run",
-    ): "Give --root DIR: the files are written below DIR and nothing else is done.",
+    ): "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
     (
         "service",
         "--print",
-    ): "Give --root DIR: the files are written below DIR and nothing else is done.",
+    ): "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
     (
         "service",
         "--force",

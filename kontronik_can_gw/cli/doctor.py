@@ -19,6 +19,7 @@ from kontronik_can_gw.config.nodes import parameter_folder
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity, count, document
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.runtime.store import parameter_file
@@ -78,7 +79,13 @@ def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
     if config is not None:
         _configuration(system, about, config, loaded, unit)
         for esc in config.esc:
-            found += check_port(system, esc.name, esc.port, unit, look)
+            found += check_port(
+                system,
+                esc.name,
+                esc.port,
+                unit,
+                look if protocol_named(esc.protocol).even_parity else None,
+            )
         found += check_can(system, config.can)
     found += check_machine(system, unit)
     code = int(count(found, Severity.ERROR) > 0)

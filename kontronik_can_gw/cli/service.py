@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "install", help="write units, udev rules, user and an example configuration; enable"
     )
     status_parser = actions.add_parser(
-        "status", help="state, configuration and last log lines; exit code 0 running, 3 not"
+        "status", help="state and last log lines of the services in use; exit code 0 running, 3 not"
     )
     uninstall_parser = actions.add_parser(
         "uninstall", help="stop, disable, and remove what install wrote"
@@ -144,8 +144,10 @@ def _install(args: argparse.Namespace) -> int:
         say(f"{root / file.path}: {file.put(root)}")
     files.remove_obsolete(root)
     if args.network is not None:
-        for path in (root / files.NETWORK).glob(f"*{NAME}-{args.channel}.*.{files.EXAMPLE}"):
-            files.remove(path)  # an active file replaces it
+        for kind in ("network", "link"):  # an active file replaces its example
+            path = root / files.NETWORK / f"50-{NAME}-{args.channel}.{kind}.{files.EXAMPLE}"
+            if path.exists():
+                files.remove(path)
     if files.read(own) is None:
         files.write(own, _example())
         say(f"{own}: new, an example")

@@ -218,7 +218,9 @@ def remove(path: Path) -> None:
 def remove_obsolete(root: Path) -> None:
     """Remove what earlier versions installed and this one does not, unless it was changed by hand."""
     for path in (root / place for place in OBSOLETE):
-        if is_ours(read(path) or ""):
+        if (text := read(path)) is not None and not is_ours(text):
+            say(f"{path}: was changed by hand, kept; the gateway needs it no more")
+        elif text is not None:
             remove(path)
             with suppress(OSError):  # it holds drop-ins of others
                 path.parent.rmdir()

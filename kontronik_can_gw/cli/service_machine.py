@@ -84,8 +84,11 @@ def call(*words: str) -> None:
 
 def reload(channel: str | None) -> None:
     """Make user and lock folder and apply units, udev rules and, with a channel, network files."""
-    call("systemd-sysusers", f"/{SYSUSERS}")
-    call("systemd-tmpfiles", "--create", f"/{TMPFILES}")
+    if shutil.which("systemd-sysusers"):
+        call("systemd-sysusers", f"/{SYSUSERS}")
+    _check_user()
+    if shutil.which("systemd-tmpfiles"):
+        call("systemd-tmpfiles", "--create", f"/{TMPFILES}")
     call("systemctl", "daemon-reload")
     if shutil.which("udevadm"):
         call("udevadm", "control", "--reload")
@@ -103,6 +106,17 @@ def reload(channel: str | None) -> None:
     say(
         f"the queue length of {channel} holds from the next start of the machine; now: sudo ip link set {channel} txqueuelen 128"
     )
+
+
+def _check_user() -> None:
+    import pwd
+
+    try:
+        pwd.getpwnam(NAME)
+    except KeyError:
+        raise RunError(
+            f"user {NAME}: could not be made. By hand: sudo useradd --system {NAME}, in the group of serial ports"
+        ) from None
 
 
 def own_executable() -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
-from kontronik_can_gw.dbc.loss import unreported
+from kontronik_can_gw.dbc.loss import unreported, unsupplied
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.prepare import check_load, prepare
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
@@ -155,6 +155,6 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             *nodes.load_of_stored(warnings[0], layout, bitrate, data_bitrate, bits),
         ]
     damaged = () if kept is None else tuple(kept.damaged)
-    mute = unreported(layout, config.dbc.on_loss == "silent")
+    mute = [*unreported(layout, config.dbc.on_loss == "silent"), *unsupplied(layout, escs)]
     said = tuple(warning for warning in (*config.warnings, *ignored, *mute, *warnings) if warning)
     return Loaded(config, escs, database, layout, canopen, damaged, store, said, dbc)

@@ -22,6 +22,9 @@ def esc_problems(escs: Mapping[int, EscConfig]) -> Iterator[str]:
         if (other := seen.setdefault(esc.port, number)) != number:
             yield f"esc[{number}].port: {esc.port!r} is also that of esc[{other}]"
     for number, esc in escs.items():
+        if esc.device is not None and esc.device_number is None:
+            yield f"esc[{number}].device: {esc.device!r} is no device of the protocol {esc.protocol}"
+    for number, esc in escs.items():
         if _is_ambiguous(names[number], {"", *names.values()}):
             yield (
                 f"esc[{number}].name: {esc.name!r} makes signal names ambiguous. "

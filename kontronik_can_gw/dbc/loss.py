@@ -2,7 +2,9 @@
 
 import math
 import struct
+from collections.abc import Sequence
 
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, SignalPlan
 
@@ -16,6 +18,7 @@ def is_mute(signal: SignalPlan) -> bool:
         source is None
         or source.bit is None
         or source.group not in (Group.LIVE, Group.INFO)
+        or not source.supplied
         or signal.is_float
     ):
         return False
@@ -66,5 +69,23 @@ def unreported(layout: Layout, silent: bool) -> list[str]:
         found.append(
             f"{layout.file}: {message.name}: without telemetry {names} are sent as if they were known, and no signal of the message "
             f"reports the loss. Add one bound to link_state, or with NotAvailable in its value table{remedy}."
+        )
+    return found
+
+
+def unsupplied(layout: Layout, escs: Sequence[EscSettings]) -> list[str]:
+    """A warning for each message with values that the protocol of their ESC does not have."""
+    found = []
+    for message in layout.messages:
+        missing = [s for s in message.signals if s.source is not None and not s.source.supplied]
+        if not missing:
+            continue
+        names = ", ".join(signal.name for signal in missing[:3]) + (
+            f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        )
+        whose = sorted({escs[signal.esc or 0].protocol for signal in missing})
+        found.append(
+            f"{layout.file}: {message.name}: {names}: not supplied by the protocol {' or '.join(whose)}, never available. "
+            "A flag, which has no code for that, is sent as 0 or its start value."
         )
     return found

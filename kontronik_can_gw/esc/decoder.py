@@ -175,7 +175,7 @@ class Field(NamedTuple):
     is_info: bool = False
     per_unit: int = 1
     low: int = 0
-    """Smallest and greatest possible value in steps."""
+    """Smallest and greatest possible value in steps: a signal that cannot hold them is checked."""
     high: int = 0
     shift: int = 0
     mask: int = -1
@@ -187,6 +187,10 @@ class Field(NamedTuple):
     def of(self, data: Sequence[int]) -> int:
         """The value in a reading, in steps."""
         return data[self.word] >> self.shift & self.mask
+
+
+_WHOLE_WORDS = frozenset({"electrical_speed", "battery_voltage", "battery_current"})
+"""Other values are derived of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +218,16 @@ class EscProtocol:
     devices: Mapping[int, str] = field(default_factory=dict)
     peak_current_of: Mapping[int, str] = field(default_factory=dict)
     """Number of a device to whose peak current it reports: ``motor`` or ``battery``."""
+
+    def __post_init__(self) -> None:
+        """ValueError for a field without a range, and for one with bits where whole words are needed."""
+        for found in self.fields:
+            if found.low >= found.high:
+                raise ValueError(f"ESC protocol {self.name}: {found.name} has no range")
+            if found.name in _WHOLE_WORDS and (found.shift, found.mask) != (0, -1):
+                raise ValueError(
+                    f"ESC protocol {self.name}: {found.name} must be a word of its own"
+                )
 
     @cached_property
     def by_name(self) -> Mapping[str, Field]:
@@ -255,7 +269,9 @@ class EscProtocol:
     def firmware_text(self, data: Data | None) -> str | None:
         """Main and sub version of the firmware, as "1.14"."""
         main, sub = self.value("firmware_main", data), self.value("firmware_sub", data)
-        return None if main is None else f"{main}.{sub}"
+        if main is None:
+            return None
+        return str(main) if sub is None else f"{main}.{sub}"
 
     def peak_current_text(self, data: Data | None) -> str | None:
         """Whose peak current the device reports (a held maximum): ``motor``, ``battery``, or None where unknown."""

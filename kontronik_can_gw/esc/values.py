@@ -91,6 +91,8 @@ class Value:
     """The last known info is taken, fresh or not."""
     pace: Group | None = None
     """What the value changes with, where that is not its group."""
+    supplied: bool = True
+    """False where the ESC's protocol does not have it: it is never available."""
 
     @property
     def bit(self) -> int | None:
@@ -244,12 +246,12 @@ def _derived(fields: Mapping[str, Field]) -> Iterator[Value]:
             divisor=Divisor.CELLS,
             optional=True,
         )
-    drawn: tuple[tuple[str, str, Kind, Read, int], ...] = (
-        ("energy_used", "Wh", Kind.INTEGRAL, lambda esc, _g, _now: esc.drawn.energy, MWS_PER_WH),
-        ("motor_run_time", "s", Kind.RUN_TIME, lambda esc, _g, _now: esc.drawn.run_time, SECOND),
-    )
-    for value in drawn:
-        yield _of_link(*value)
+    if voltage is not None and current is not None:
+        energy: Read = lambda esc, _gateway, _now: esc.drawn.energy  # noqa: E731
+        yield _of_link("energy_used", "Wh", Kind.INTEGRAL, energy, MWS_PER_WH)
+    if speed is not None:
+        turning: Read = lambda esc, _gateway, _now: esc.drawn.run_time  # noqa: E731
+        yield _of_link("motor_run_time", "s", Kind.RUN_TIME, turning, SECOND)
 
 
 def _link(protocol: EscProtocol) -> Iterator[Value]:
@@ -316,10 +318,17 @@ def _never(_esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> None:
     """Of a value that the ESC's protocol does not supply."""
 
 
-VALUES: Mapping[str, Value] = {
-    value.name: value for protocol in reversed(PROTOCOLS) for value in _listed(protocol)
-}
-"""Every value of one ESC and of the gateway by name, as the first protocol that has it supplies it."""
+def _all_values(protocols: Sequence[EscProtocol]) -> Mapping[str, Value]:
+    """By name, as the first protocol that has it supplies it; in the order of the first, then what others have besides."""
+    found: dict[str, Value] = {}
+    for protocol in protocols:
+        for value in _listed(protocol):
+            found.setdefault(value.name, value)
+    return found
+
+
+VALUES = _all_values(PROTOCOLS)
+"""Every value of one ESC and of the gateway by name."""
 
 
 @cache
@@ -327,11 +336,9 @@ def values_of(protocol: EscProtocol) -> Mapping[str, Value]:
     """Every value of VALUES by name, as an ESC of this protocol supplies it; others are never available."""
     own = {value.name: value for value in _listed(protocol)}
     for name, value in own.items():
-        if name not in VALUES or value.unit != VALUES[name].unit:
-            raise ValueError(
-                f"ESC protocol {protocol.name}: value {name} in {value.unit!r} is unknown"
-            )
-    return {name: own.get(name) or _missing(value) for name, value in VALUES.items()}
+        if name in VALUES and value.unit != VALUES[name].unit:
+            raise ValueError(f"ESC protocol {protocol.name}: {name} is in {VALUES[name].unit}")
+    return {name: own.get(name) or _missing(value) for name, value in VALUES.items()} | own
 
 
 def values_of_esc(settings: EscSettings) -> Mapping[str, Value]:
@@ -340,4 +347,4 @@ def values_of_esc(settings: EscSettings) -> Mapping[str, Value]:
 
 
 def _missing(value: Value) -> Value:
-    return replace(value, words=(), read=_never, low=None, high=None, optional=True)
+    return replace(value, words=(), read=_never, low=None, high=None, optional=True, supplied=False)

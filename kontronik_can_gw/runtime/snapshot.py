@@ -271,7 +271,7 @@ def _words(protocol: EscProtocol, live: Data | None, info: Data | None) -> Docum
         "statuses": alarms.get(Severity.STATUS),
         "selftest_errors": None
         if selftest is None
-        else bit_texts(selftest, protocol.errors["selftest_errors"]),
+        else bit_texts(selftest, protocol.errors.get("selftest_errors", ())),
     }
 
 
@@ -280,7 +280,7 @@ def _alarms(protocol: EscProtocol, word: int | None) -> dict[Severity, list[str]
     """The bits of the error word by their class, one without a name is an error; empty without a word."""
     if word is None:
         return {}
-    bits = protocol.errors["operating_errors"]
+    bits = protocol.errors.get("operating_errors", ())
     severities = {bit.text: bit.severity for bit in bits}
     found: dict[Severity, list[str]] = {severity: [] for severity in Severity}
     for text in bit_texts(word, bits):

@@ -145,7 +145,7 @@ def _terms(signals: Sequence[SignalPlan]) -> list[str]:
     for signal in signals:
         source = signal.source
         assert source is not None
-        if source.bit is not None and source.read is None and _is_plain_flag(signal):
+        if source.bit is not None and source.supplied and _is_plain_flag(signal):
             key = (source.words[0], signal.pieces[0].at - source.bit)
             flags[key] = flags.get(key, 0) | 1 << source.bit
             continue

@@ -169,6 +169,8 @@ def _row(signal: SignalPlan) -> tuple[int, int, Callable[[int], Value]]:
 
 def _value_of(signal: SignalPlan) -> Callable[[int], Value]:
     """A function from a signal's raw value, without its sign, to its value."""
+    if signal.source is not None and not signal.source.supplied:
+        return lambda _raw: None
     if _is_flag(signal):
         return int
     # a code amid the values counts as the code: the packer sends no value that looks like it

@@ -1,7 +1,7 @@
 """The recipe for another ESC protocol: kiss.py goes through the whole gateway, beside a KONTRONIK ESC, without a change of the package."""
 
 import termios
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,14 @@ from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import protocols
+from kontronik_can_gw.esc.decoder import Field
 from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.telemetry import SECOND, LinkState
-from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.esc.values import VALUES, Group, _all_values, values_of
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.serial_port import SerialPort
-from kontronik_can_gw.runtime.snapshot import PortFacts, _esc
+from kontronik_can_gw.runtime.snapshot import PortFacts, _esc, _words
+from kontronik_can_gw.signals.unpacker import SignalReader
 
 from .kiss import GAP_NS, KISS, Kiss, frame
 
@@ -91,6 +93,49 @@ def test_both_protocols_reach_the_bus_side_by_side() -> None:
         "OldBatteryCurrent": pytest.approx(-0.5),
         "OldElectricalSpeed": 9_000,
     }
+
+
+def test_who_reads_the_bus_takes_no_flag_that_the_protocol_has_not_for_a_good_sign() -> None:
+    flight = Flight()
+    flight.send(OLD, frame(20, 2_400, 1_234, 55, 210))
+    reader = SignalReader(flight.loaded.layout)
+    column = reader.column_of("undervoltage", 1)
+    assert column is not None
+    first, values = (reader.read(258, bytes(8)) or [])[0]
+    assert values[column - first] is None
+    (warning,) = [line for line in flight.loaded.warnings if "not supplied by" in line]
+    assert (
+        "KissMore: KissBecVoltage, KissUndervoltage: not supplied by the protocol kiss" in warning
+    )
+
+
+def test_a_protocol_without_speed_or_current_has_no_run_time_and_no_energy() -> None:
+    for missing, value in (
+        ("electrical_speed", "motor_run_time"),
+        ("battery_current", "energy_used"),
+    ):
+        fields = tuple(field for field in KISS.fields if field.name != missing)
+        values = values_of(replace(KISS, fields=fields))
+        assert not values[value].supplied
+        assert values_of(KISS)[value].supplied
+
+
+def test_a_field_without_a_range_or_a_part_of_a_word_to_derive_from_is_refused() -> None:
+    for wrong in (
+        Field("consumed_charge", "mAh", 3),
+        Field("battery_voltage", "V", 1, high=255, shift=8, mask=255),
+    ):
+        with pytest.raises(ValueError, match=f"ESC protocol kiss: {wrong.name}"):
+            replace(KISS, fields=(wrong,))
+
+
+def test_the_first_protocol_gives_the_order_of_all_values() -> None:
+    assert list(_all_values((*protocols.PROTOCOLS, KISS))) == list(VALUES)
+
+
+def test_error_words_without_named_bits_are_shown_by_number() -> None:
+    fields = (*KISS.fields, Field("operating_errors", "", 3, high=0xFFFF))
+    assert _words(replace(KISS, fields=fields), (0, 0, 0, 5, 0), None)["errors"] == ["bit0", "bit2"]
 
 
 def test_lost_telemetry_is_not_available_and_the_other_esc_goes_on() -> None:
@@ -189,6 +234,12 @@ def test_its_line_is_set_without_parity() -> None:
             assert speed == termios.B115200
         finally:
             port.close()
+
+
+def test_a_device_of_another_protocol_is_refused() -> None:
+    esc = {"port": "/dev/null", "protocol": "kiss", "device": "KOSMIK"}
+    with pytest.raises(UserError, match="'KOSMIK' is no device of the protocol kiss"):
+        parse(MIXED | {"esc": [esc]}, "mixed.toml")
 
 
 def test_an_unknown_protocol_is_refused_with_the_nearest() -> None:

@@ -18,7 +18,7 @@ from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.desk.describe.parts import Facts, error, number
 from kontronik_can_gw.esc.decoder import Severity
-from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
+from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.node_state import UNCONFIGURED
 
@@ -143,17 +143,17 @@ def _pdo(tpdo: Tpdo) -> Facts:
 
 
 def _emergencies(eds: Eds, escs: Sequence[EscSettings]) -> Iterator[Facts]:
-    """Emergencies of the (first) ESC's bits that the EDS enables, of the gateway's faults, and of "no error"."""
+    """Emergencies of the ESCs' bits that the EDS enables, of the gateway's faults, and of "no error"."""
     mask = Dictionary(eds).number(*_MASK)
-    protocol = protocol_named(escs[0].protocol) if escs else PROTOCOLS[0]
-    bits = protocol.errors.get("operating_errors", ())
-    codes, named = BitCodes(bits), {int(bit): error(bit) for bit in bits}
-    for bit in range(32):
-        if mask >> bit & 1:
-            about = named.get(bit) or _about(
-                f"bit{bit}", "a bit that has no name yet", "Ask the maker of the ESC."
-            )
-            yield _emergency(codes.code(bit), bit, None, about)
+    for protocol in dict.fromkeys(protocol_named(esc.protocol) for esc in escs):
+        bits = protocol.errors.get("operating_errors", ())
+        codes, named = BitCodes(bits), {int(bit): error(bit) for bit in bits}
+        for bit in range(32 if bits else 0):
+            if mask >> bit & 1:
+                about = named.get(bit) or _about(
+                    f"bit{bit}", "a bit that has no name yet", "Ask the maker of the ESC."
+                )
+                yield _emergency(codes.code(bit), bit, None, about)
     for fault in GatewayError:
         code, detail = fault.value
         byte4 = None if fault is GatewayError.HEARTBEAT_LOST else detail

@@ -16,8 +16,10 @@ _UNSTABLE = ("ttyUSB", "ttyACM")
 _READ_AND_WRITE = 6
 
 
-def check_port(system: System, esc: str, port: str, unit: Unit | None, look: Look) -> list[Finding]:
-    """All findings about the port of one ESC. ``unit``: the service that uses it, or None."""
+def check_port(
+    system: System, esc: str, port: str, unit: Unit | None, look: Look | None
+) -> list[Finding]:
+    """All findings about the port of one ESC. ``unit``: the service that uses it, or None. ``look`` None: no parity is needed."""
     status, real = system.status(port), system.real(port)
     tty = real.rpartition("/")[2]
     findings = Findings(f"Serial port of {esc}", port=port, tty=tty, user=system.user.name)
@@ -68,7 +70,7 @@ class _Port:
         self._holders, self._complete = system.openers(status)
         self._has_gateway = any(process.is_gateway for process in self._holders)
 
-    def check(self, unit: Unit | None, look: Look) -> None:
+    def check(self, unit: Unit | None, look: Look | None) -> None:
         """All of them, in the order of the report."""
         what = str(self._adapter)
         real = f" is {self._tty}" if self._tty not in self._port else ""
@@ -83,6 +85,8 @@ class _Port:
         _users(self._findings, others, self._complete)
         self._latency()
         self._power()
+        if look is None:
+            return
         if self._adapter.mini_uart:
             self._say("port.parity", "mini_uart")
         elif self._holders or is_console or has_prompt:

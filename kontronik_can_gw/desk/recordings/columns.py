@@ -29,7 +29,9 @@ def _listed(values: Mapping[str, EscValue], of_gateway: bool) -> list[EscValue]:
     chosen = (
         value
         for value in values.values()
-        if value.name not in LEFT_OUT and (value.group is Group.GATEWAY) is of_gateway
+        if value.name not in LEFT_OUT
+        and value.supplied
+        and (value.group is Group.GATEWAY) is of_gateway
     )
     return sorted(chosen, key=lambda value: _ORDER[value.group])
 
