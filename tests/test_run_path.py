@@ -145,10 +145,6 @@ ONLY_WITH = {
         "kontronik_can_gw.runtime.recorder",
         "kontronik_can_gw.runtime.recorded_gateway",
     ),
-    "prometheus": (
-        "kontronik_can_gw.runtime.metrics_server",
-        "kontronik_can_gw.runtime.prometheus",
-    ),
 }
 """Of our own modules, those that are there only where this stands in the configuration."""
 

@@ -1,6 +1,7 @@
 """``monitor``: a live screen of the ESCs, from the CAN bus by the DBC or from a recording. It never sends anything."""
 
 import argparse
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -92,7 +93,8 @@ def main(args: argparse.Namespace) -> int:
             document = once(source, monitor, args.timeout or _ONCE_S, stop.is_set)
         if stop.is_set():
             return 130
-        print(printable_json(document, ascii_only=True))
+        is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
+        print(printable_json(document, ascii_only=not is_utf8))
         return 0
 
 

@@ -159,9 +159,9 @@ def _escs(escs: list[Document]) -> Iterator[Metric]:
     ]
     text = "Line errors that the serial driver counted, by kind."
     yield from _one("esc_port_line_errors_total", text, kinds)
-    for key in escs[0]["counters"] if escs else ():
+    for key in dict.fromkeys(key for esc in escs for key in esc["counters"]):
         text = f"The ESC's stream: {key.replace('_', ' ')}."
-        counts = [(_of(esc), esc["counters"][key]) for esc in escs]
+        counts = [(_of(esc), esc["counters"].get(key)) for esc in escs]
         yield from _one(f"esc_{_COUNTER_NAMES.get(key, key)}_total", text, counts)
 
 

@@ -1,5 +1,6 @@
 """Serves the metrics of one gateway's status file on a loopback address, by prometheus_client and the standard library's WSGI server."""
 
+import contextlib
 import errno
 import json
 import re
@@ -20,8 +21,10 @@ from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-REQUEST_S = 5
-"""Maximum time that a client may take for its request."""
+REQUEST_S = 5.0
+"""Maximum time of a connection."""
+MAX_CLIENTS = 8
+"""At a time; others are turned away."""
 _MAX_FILE = 1 << 22
 _LOOPBACK = re.compile(r"(localhost|127(\.[0-9]{1,3}){3}|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 
@@ -60,8 +63,34 @@ def metrics_of(file: Path, now: int) -> list[Metric]:
 
 
 class _Server(ThreadingWSGIServer):
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        self._places = threading.BoundedSemaphore(MAX_CLIENTS)
+        super().__init__(*arguments, **more)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._places.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve a client, for no longer than ``REQUEST_S``."""
+        end = threading.Timer(REQUEST_S, _end, (request,))
+        end.daemon = True
+        end.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            end.cancel()
+            self._places.release()
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that ends early or never comes to an end is no fault of ours."""
+
+
+def _end(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # it has ended already
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 class _Server6(_Server):
@@ -69,8 +98,6 @@ class _Server6(_Server):
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = REQUEST_S
-
     def log_message(self, *_: object) -> None:
         """A log of all requests is of no use."""
 

@@ -1,6 +1,6 @@
 """The ESC protocols that the gateway can decode. Another one is a folder beside ``kontronik`` and a line here."""
 
-from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol
+from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 
 PROTOCOLS: tuple[EscProtocol, ...] = (KONTRONIK,)
@@ -15,11 +15,6 @@ def protocol_named(name: str) -> EscProtocol:
     raise ValueError(
         f"ESC protocol {name[:40]!r} is unknown, there is {', '.join(protocol_names())}"
     )
-
-
-def bits_by_name() -> dict[str, ErrorBit]:
-    """Every error bit of all protocols."""
-    return {bit.text: bit for each in PROTOCOLS for bits in each.errors.values() for bit in bits}
 
 
 def protocol_names() -> tuple[str, ...]:

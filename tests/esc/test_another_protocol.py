@@ -16,6 +16,8 @@ from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.nodes import shipped_canopen
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dbc.settings import DbcSettings
+from kontronik_can_gw.desk.metrics import families
+from kontronik_can_gw.desk.monitor.status import _alarms
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.columns import fields_of_values, sections
 from kontronik_can_gw.errors import UserError
@@ -25,8 +27,16 @@ from kontronik_can_gw.esc.kontronik import Layout, LiveData, encode
 from kontronik_can_gw.esc.telemetry import SECOND, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group, _all_values, values_of
 from kontronik_can_gw.gateway import Gateway
+from kontronik_can_gw.runtime.process import ProcessFacts
 from kontronik_can_gw.runtime.serial_port import SerialPort
-from kontronik_can_gw.runtime.snapshot import PortFacts, _esc, _words
+from kontronik_can_gw.runtime.snapshot import (
+    CanFacts,
+    PortFacts,
+    ProgramFacts,
+    _esc,
+    _words,
+    snapshot,
+)
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 from .kiss import GAP_NS, KISS, Kiss, frame
@@ -270,3 +280,28 @@ def test_frames_are_found_however_cut_and_after_a_gap_whatever_came(
     counters = decoder.counters
     assert counters.bytes == 10 * counters.live + counters.dropped_bytes + decoder.pending
     assert counters.live == before + len(frames)
+
+
+def test_metrics_and_screen_of_both_in_one_document() -> None:
+    flight = Flight()
+    undervoltage = LiveData(operating_errors=1)
+    flight.send(encode(undervoltage, Layout.V4), frame(20, 2_400, 1_234, 55, 210))
+    document = snapshot(
+        flight.gateway,
+        now=flight.now,
+        wall=0,
+        program=ProgramFacts("mixed.toml"),
+        process=ProcessFacts(),
+        ports=[PortFacts(name, "/dev/null", open=True) for name in ("old", "kiss")],
+        can=CanFacts("virtual", "kiss", None, open=True),
+    )
+    counted = {
+        (sample.name, sample.labels["esc"]): sample.value
+        for family in families(document, 0)
+        for sample in family.samples
+        if sample.name.startswith("kontronik_esc_live")
+    }
+    assert counted["kontronik_esc_live_v4_total", "old"] == 1
+    assert ("kontronik_esc_live_v4_total", "kiss") not in counted
+    alarms = [(alarm.text, alarm.remedy[:9]) for alarm in _alarms(document)]
+    assert ("old ERROR: battery voltage too low", "Stop soon") in alarms

@@ -1,4 +1,4 @@
-"""The page as a file: self-contained, escaped, the same bytes each time, values exact."""
+"""The page as a file: self-contained, escaped, its data those of the lines."""
 
 import base64
 import hashlib

@@ -28,7 +28,7 @@ from kontronik_can_gw.desk.monitor.lines import (
     wrapped,
 )
 from kontronik_can_gw.esc.decoder import Severity
-from kontronik_can_gw.esc.protocols import bits_by_name
+from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.process import pid_namespace, start_ticks
@@ -265,16 +265,19 @@ def _esc_lines(document: Document, width: int | None) -> list[Text]:
 
 def _alarms(document: Document) -> list[Alarm]:
     """Errors and warnings that the ESCs report."""
-    found, bits = [], bits_by_name()
-    summaries = {bit.text for bit in bits.values() if bit.is_summary}
+    found = []
     for esc in document["escs"]:
+        protocol = protocol_named(esc.get("protocol", PROTOCOLS[0].name))
+        bits = {bit.text: bit for bits in protocol.errors.values() for bit in bits}
+        summaries = {bit.text for bit in bits.values() if bit.is_summary}
         for key in ("errors", "selftest_errors", "warnings"):
             names = esc[key] or []
             for name in [each for each in names if each not in summaries] or names:
                 bit = bits.get(name)
                 severity = Severity.WARNING if key == "warnings" else Severity.ERROR
-                text = f"{esc['name']} {severity.value.upper()}: {bit.meaning if bit else name}"
-                found.append(Alarm(severity, text, bit.remedy if bit else ""))
+                meaning, remedy = (name, "") if bit is None else (bit.meaning, bit.remedy)
+                text = f"{esc['name']} {severity.value.upper()}: {meaning}"
+                found.append(Alarm(severity, text, remedy))
     return found
 
 

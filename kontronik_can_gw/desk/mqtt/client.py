@@ -224,6 +224,8 @@ class _Link:
             file = config.password_file
             self.client.username_pw_set(config.username, None if file is None else password(file))
         if self._context is not None:
+            if config.ca_file is not None:
+                self._context.load_verify_locations(config.ca_file)
             show_certificate(config, self._context)
 
     def _opened(self, _client: object, _data: object, sock: Any) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.esc.decoder import EscProtocol, Severity
-from kontronik_can_gw.esc.protocols import PROTOCOLS, bits_by_name
+from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals.unpacker import Value
@@ -36,9 +36,9 @@ class Member:
         self._view = view
         self.flags: dict[str, tuple[int, int | None]] = {}
         """Flags: column, and the bit in an error word (None: a signal of its own)."""
-        known = {bit.text for bits in protocol.errors.values() for bit in bits}
+        self._bits = {bit.text: bit for bits in protocol.errors.values() for bit in bits}
         for at, column in enumerate(view.reader.columns):
-            if column.esc == index and column.source in known:
+            if column.esc == index and column.source in self._bits:
                 self.flags.setdefault(column.source, (at, None))
             elif column.esc == index:
                 self.columns.setdefault(column.source, at)
@@ -77,9 +77,12 @@ class Member:
         made: dict[str, Any] = {"available": self.is_available(now), "age": age}
         if self.index is not None:
             errors = self._flags_set("operating_errors")
-            problem = None if errors is None else any(map(_is_error, errors))
-            made |= {"motor": self._kind(), "errors": _in_words(errors), "problem": problem}
-            made |= {"selftest": _in_words(self._flags_set("selftest_errors")), "link_state": None}
+            problem = None if errors is None else any(map(self._is_error, errors))
+            made |= {"motor": self._kind(), "errors": self._in_words(errors), "problem": problem}
+            made |= {
+                "selftest": self._in_words(self._flags_set("selftest_errors")),
+                "link_state": None,
+            }
         for source, at in self.columns.items():
             made[source] = self._view.values[at]
         if self.index is not None:
@@ -139,21 +142,19 @@ class Member:
             others = [at for s, at in self.columns.items() if VALUES[s].group is Group.INFO]
         return [self.columns[source] for source in named if source in self.columns] or others
 
+    def _is_error(self, flag: str) -> bool:
+        """True for an error; false for a warning or a status."""
+        return self._bits[flag].severity is Severity.ERROR
+
+    def _in_words(self, flags: Sequence[str] | None) -> list[dict[str, str]] | None:
+        if flags is None:
+            return None
+        bits = [self._bits[flag] for flag in flags]
+        return [
+            {"name": bit.text, "severity": bit.severity.value, "meaning": bit.meaning}
+            for bit in bits
+        ]
+
 
 def _first_of(columns: Mapping[str, int], *sources: str) -> int | None:
     return next((columns[source] for source in sources if source in columns), None)
-
-
-def _is_error(flag: str) -> bool:
-    """True for an error; false for a warning or a status."""
-    return bits_by_name()[flag].severity is Severity.ERROR
-
-
-def _in_words(flags: Sequence[str] | None) -> list[dict[str, str]] | None:
-    if flags is None:
-        return None
-    known = bits_by_name()
-    bits = [known[flag] for flag in flags]
-    return [
-        {"name": bit.text, "severity": bit.severity.value, "meaning": bit.meaning} for bit in bits
-    ]

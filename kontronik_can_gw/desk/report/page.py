@@ -73,7 +73,12 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
     def seconds(time_ns: int) -> float:
         return round((time_ns - flight.origin_ns) / SECOND, 6)
 
-    states = {segment.state: esc.protocol.states for esc in flight.escs for segment in esc.segments}
+    states = {
+        (esc.protocol.name, segment.state): esc.protocol.states
+        for esc in flight.escs
+        for segment in esc.segments
+    }
+    keys = {known: number for number, known in enumerate(sorted(states))}
     return {
         "escs": [esc.name for esc in flight.escs],
         "from": seconds(flight.start_ns),
@@ -81,12 +86,15 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
         "wall": None if wall_ns is None else wall_ns // 1_000_000,
         "times": [seconds(time_ns) for time_ns in flight.times],
         "classes": list(STATE_CLASSES),
-        "states": {
-            str(state): [state_name(state, named), class_of(state, named)]
-            for state, named in sorted(states.items(), key=lambda item: item[0])
-        },
+        "states": [
+            [state_name(number, states[of, number]), class_of(number, states[of, number])]
+            for of, number in keys
+        ],
         "segments": [
-            [[seconds(s.begin_ns), seconds(s.end_ns), s.state] for s in esc.segments]
+            [
+                [seconds(s.begin_ns), seconds(s.end_ns), keys[esc.protocol.name, s.state]]
+                for s in esc.segments
+            ]
             for esc in flight.escs
         ],
         "plots": _plots(flight),
