@@ -208,10 +208,14 @@ def test_nothing_outside_its_folder_knows_the_wire() -> None:
             assert not known, f"{name} knows the wire"
 
 
-# Ratchets: what is not clean yet stands in ratchet.txt and may only shrink.
-RATCHET = Path(__file__).with_name("ratchet.txt")
+# Larger than the limits for a reason; at most five.
+EXCEPTIONS = {
+    "function esc/kontronik/deframer.py:Deframer:_scan": 63,  # the contract of the brute-force search in one piece
+    "methods canopen/nodes.py:Nodes": 27,  # one for each event of an Output, and what nodes ask of each other
+    "methods gateway.py:Gateway": 33,  # one for each call that the runtime makes and a capture records
+}
 BANNED_WORDS = re.compile(
-    r"\b(?i:told|tell(s|ing)?|ow(ed|es?|ing)|misfits?|pass(ed|es)? over|behind|so many|look(s|ed)? round|surroundings"
+    r"\b(?i:told|tells|telling|ow(ed|es?|ing)|misfits?|pass(ed|es)? over|behind|so many|look(s|ed)? round|surroundings"
     r"|who(m|ever)|images?|short ways?|who needs? them|goes without|stands? beside|(what|that|which) is none)\b|\b(MOST|LEAST)\b"
 )
 MAX_LINES = {"file": 350, "class": 250, "function": 50}
@@ -249,8 +253,8 @@ def _sizes(tree: ast.AST, place: str) -> Iterator[tuple[str, int]]:
         yield from _sizes(node, inside)
 
 
-def _ratchet() -> dict[str, int]:
-    """Everything that is not clean: banned words of each room; files, classes and functions over their limits."""
+def _over_the_limits() -> dict[str, int]:
+    """Banned words of each room; files, classes and functions over their limits."""
     found: Counter[str] = Counter()
     for path in MODULES:
         source = path.read_text(encoding="utf-8")
@@ -263,26 +267,10 @@ def _ratchet() -> dict[str, int]:
     return {key: number for key, number in sorted(found.items()) if number}
 
 
-def _allowed() -> dict[str, int]:
-    lines = RATCHET.read_text(encoding="utf-8").splitlines()
-    return {key: int(number) for key, number in (line.rsplit(" ", 1) for line in lines)}
-
-
-def test_banned_words_and_sizes_only_shrink() -> None:
-    allowed = _allowed()
-    grown = [
-        f"{key} is {number}, allowed {allowed.get(key, 0)}"
-        for key, number in _ratchet().items()
-        if number > allowed.get(key, 0)
-    ]
-    assert not grown, (
-        "Use the words of the field (docs/design.md), or split by subject:\n"
-        + "\n".join(grown)
-        + "\nAfter a move edit tests/ratchet.txt by hand; `python tests/test_architecture.py` takes out what became smaller."
-    )
-
-
-if __name__ == "__main__":
-    now = _ratchet()
-    kept = {key: min(number, now[key]) for key, number in _allowed().items() if key in now}
-    RATCHET.write_text("".join(f"{key} {number}\n" for key, number in kept.items()))
+def test_words_are_those_of_the_field_and_sizes_those_of_a_screen() -> None:
+    """Use the words of docs/design.md; split by subject. An exception may only become smaller."""
+    assert len(EXCEPTIONS) <= 5
+    found = _over_the_limits()
+    assert found.keys() <= EXCEPTIONS.keys(), set(found) - set(EXCEPTIONS)
+    for key, number in EXCEPTIONS.items():
+        assert found.get(key) == number, f"{key} is {found.get(key)}: write that, or take it out"

@@ -43,7 +43,7 @@ class Replay:
         self.gateway = gateway
         self.lost = 0
         """Number of entries that the recorder could not record."""
-        self.passed_over = 0
+        self.rejected = 0
         """Number of entries that are invalid."""
         self._marked = marked
         self._waiting = TransmitQueue()
@@ -69,7 +69,7 @@ class Replay:
             found += self._play(entry)
         except Exception:
             # a damaged or hostile capture can hold calls that no gateway ever made, which may raise anything
-            self.passed_over += 1
+            self.rejected += 1
         return found
 
     def finish(self) -> list[TimedFrame]:

@@ -165,7 +165,7 @@ def _report(
     if not args.quiet:
         others = recording.others if isinstance(recording, CanLogInput) else 0
         if form in TABLES and not notes and others:
-            summary += f", {others} other frames passed over"
+            summary += f", {others} other frames left out"
         where = "standard output" if args.output == "-" else args.output
         _say(f"{where}: {summary}, in {seconds:.1f} s")
         if recording.times_assumed and form != BYTES:

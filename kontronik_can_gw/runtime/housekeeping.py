@@ -129,7 +129,7 @@ class Housekeeping:
         """Log which nodes have another state or node-ID, and stored values that were rejected."""
         for index, key in self._gateway.take_rejected_parameters():
             log.warning(
-                "%s: the stored %04Xh:%02X is passed over: it does not fit this EDS, or clashes",
+                "%s: the stored %04Xh:%02X is ignored: it does not fit this EDS, or clashes",
                 self._escs[index].name,
                 key >> 8,
                 key & 0xFF,

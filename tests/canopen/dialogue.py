@@ -189,7 +189,7 @@ class Bench:
         self._collect()
 
     def start(self, node: int = 0) -> "Bench":
-        """NMT start, and what it causes passed over."""
+        """NMT start; what it causes is left out."""
         self.put(0, bytes((1, node)))
         self.take()
         return self

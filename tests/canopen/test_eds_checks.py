@@ -187,7 +187,7 @@ def test_any_case_and_lf_are_taken() -> None:
     assert ours.entries == reader.load(SHIPPED.encode(), "kontronik_esc.eds").entries
 
 
-def test_comments_and_unknown_sections_are_passed_over() -> None:
+def test_comments_and_unknown_sections_are_ignored() -> None:
     text = SHIPPED.replace("[1017]\r\n", "; a comment\r\n[1017]\r\n  ; another\r\n# a third\r\n")
     text = (
         text.replace("DefaultValue=0x03E8", "DefaultValue=0x03E8 ; one second")

@@ -237,8 +237,8 @@ class CaptureInput(Input):
             self.damage.append(
                 f"{replay.lost} entries could not be recorded: the disk was too slow or full"
             )
-        if replay.passed_over:
-            self.damage.append(f"{replay.passed_over} entries make no sense to this version")
+        if replay.rejected:
+            self.damage.append(f"{replay.rejected} entries make no sense to this version")
 
     def _describe(self) -> None:
         header, words = self.header, self.provenance
