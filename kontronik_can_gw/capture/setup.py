@@ -24,7 +24,7 @@ from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
+from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, EscSettings
 from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
@@ -183,9 +183,7 @@ def _esc(found: Mapping[str, Any]) -> EscSettings:
         _number(found["cell_count"], 0, 255),
         _number(found["timeout_ns"], MS, 65_536 * MS),
         _number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
-        protocol_named(
-            found.get("protocol", PROTOCOLS[0].name)
-        ).name,  # not in captures of 0.6.0 and before
+        protocol_named(found.get("protocol")).name,  # not in captures of 0.5.0
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from prometheus_client import Metric
 
-from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
+from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.node_state import NmtState
@@ -215,7 +215,7 @@ def _flags(esc: Document, keys: Iterable[str], word: str) -> list[Sample]:
     if None in lists:
         return []
     found = {name for names in lists for name in names}
-    protocol = protocol_named(esc.get("protocol", PROTOCOLS[0].name))
+    protocol = protocol_named(esc.get("protocol"))
     known = {bit.text: bit.severity.value for bit in protocol.errors.get(word, ())}
     known |= dict.fromkeys(sorted(found - set(known)), "error")
     return [

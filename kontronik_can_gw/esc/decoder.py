@@ -235,6 +235,11 @@ class EscProtocol:
         return {found.name: found for found in self.fields}
 
     @cached_property
+    def bits(self) -> Mapping[str, ErrorBit]:
+        """The bits of all error words by name."""
+        return {bit.text: bit for bits in self.errors.values() for bit in bits}
+
+    @cached_property
     def byte_ns(self) -> int:
         """Wire time of a byte, ns."""
         return (11 if self.even_parity else 10) * SECOND_NS // self.baud_rate

@@ -7,8 +7,10 @@ PROTOCOLS: tuple[EscProtocol, ...] = (KONTRONIK,)
 """The first is that of an ESC whose configuration names none."""
 
 
-def protocol_named(name: str) -> EscProtocol:
-    """The protocol of this name. ValueError where there is none."""
+def protocol_named(name: str | None) -> EscProtocol:
+    """The protocol of this name; None, as in files of 0.5.0: the first. ValueError where there is none."""
+    if name is None:
+        return PROTOCOLS[0]
     for protocol in PROTOCOLS:
         if protocol.name == name:
             return protocol

@@ -4,6 +4,7 @@ import struct
 
 import pytest
 
+from kontronik_can_gw.esc.decoder import ErrorBit, bit_texts
 from kontronik_can_gw.esc.kontronik import (
     Device,
     InfoData,
@@ -18,8 +19,6 @@ from kontronik_can_gw.esc.kontronik.codec import FORMS, Form
 from kontronik_can_gw.esc.kontronik.fields import DataType, device_and_variant
 from kontronik_can_gw.esc.kontronik.states import (
     LARGEST_STATE,
-    ErrorBit,
-    bit_texts,
     device_text,
     peak_current_of,
     state_text,

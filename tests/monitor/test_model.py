@@ -15,8 +15,9 @@ from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.quantities import HISTORY_S
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
-from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError, Severity
+from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
 

@@ -58,7 +58,7 @@ class EscMonitor:
             name: _to_source(view.reader.columns[column].unit, VALUES[name].unit)
             for name, column in self.columns.items()
         }
-        self._bits = {bit.text: bit for bits in self._protocol.errors.values() for bit in bits}
+        self._bits = self._protocol.bits
         flags = set(self._bits)
         self._plain = {
             group: [

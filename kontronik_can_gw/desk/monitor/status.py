@@ -28,7 +28,7 @@ from kontronik_can_gw.desk.monitor.lines import (
     wrapped,
 )
 from kontronik_can_gw.esc.decoder import Severity
-from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
+from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.process import pid_namespace, start_ticks
@@ -267,8 +267,7 @@ def _alarms(document: Document) -> list[Alarm]:
     """Errors and warnings that the ESCs report."""
     found = []
     for esc in document["escs"]:
-        protocol = protocol_named(esc.get("protocol", PROTOCOLS[0].name))
-        bits = {bit.text: bit for bits in protocol.errors.values() for bit in bits}
+        bits = protocol_named(esc.get("protocol")).bits
         summaries = {bit.text for bit in bits.values() if bit.is_summary}
         for key in ("errors", "selftest_errors", "warnings"):
             names = esc[key] or []

@@ -36,7 +36,7 @@ class Member:
         self._view = view
         self.flags: dict[str, tuple[int, int | None]] = {}
         """Flags: column, and the bit in an error word (None: a signal of its own)."""
-        self._bits = {bit.text: bit for bits in protocol.errors.values() for bit in bits}
+        self._bits = protocol.bits
         for at, column in enumerate(view.reader.columns):
             if column.esc == index and column.source in self._bits:
                 self.flags.setdefault(column.source, (at, None))

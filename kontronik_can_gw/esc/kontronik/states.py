@@ -5,9 +5,7 @@ Numbers without a name stay numbers: no function here raises for a value that ne
 
 from enum import IntEnum
 
-from kontronik_can_gw.esc.decoder import ErrorBit, Severity, bit_texts
-
-__all__ = ["ErrorBit", "Severity", "bit_texts"]  # while desk modules take them from here
+from kontronik_can_gw.esc.decoder import ErrorBit, Severity
 
 
 class Device(IntEnum):
