@@ -1,7 +1,8 @@
 #!/bin/sh
-# Installs what tests/vm/run needs on Debian and Ubuntu:  setup.sh [uml] [qemu]
+# Installs what tests/vm/run needs on Debian and Ubuntu:  setup.sh [uml] [xstate] [qemu]
 #   (nothing)  can-utils, iproute2: enough where the running kernel has vcan
 #   uml        User Mode Linux, 41 MB: what `make test` uses where the kernel has no vcan
+#   xstate     what it needs to start on a processor with AMX (uml_xstate.c)
 #   qemu       QEMU and Debian's stock kernel, 90 MB: serial ports and CAN controllers besides vcan
 # Needs root or a sudo that asks nothing. The kernel for QEMU is downloaded and unpacked, not installed.
 # VM_CACHE: where it goes (tests/vm/.cache). VM_APT_UPDATED=1: the package lists are fresh.
@@ -11,11 +12,13 @@ here=$(cd "$(dirname "$0")" && pwd)
 cache=${VM_CACHE:-$here/.cache}
 packages="can-utils iproute2"
 qemu=no
+xstate=no
 for part in "$@"; do
     case $part in
         uml) packages="$packages busybox-static user-mode-linux" ;;
+        xstate) packages="$packages gcc libc6-dev" xstate=yes ;;
         qemu) packages="$packages busybox-static qemu-system-x86 kmod cpio xz-utils zstd" qemu=yes ;;
-        *) echo "usage: setup.sh [uml] [qemu]" >&2; exit 2 ;;
+        *) echo "usage: setup.sh [uml] [xstate] [qemu]" >&2; exit 2 ;;
     esac
 done
 
@@ -42,6 +45,10 @@ else
     rm -f "$log"
     echo "setup.sh: apt-get install $packages: failed" >&2
     exit 1
+fi
+if [ $xstate = yes ]; then
+    mkdir -p "$cache"
+    gcc -O2 -Wall -shared -fPIC -o "$cache/uml_xstate.so" "$here/uml_xstate.c" -ldl
 fi
 [ $qemu = yes ] || exit 0
 

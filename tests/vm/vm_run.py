@@ -153,6 +153,13 @@ def uml_guest_environment() -> dict[str, str]:
     return environment
 
 
+def uml_host_environment(job: str) -> dict[str, str]:
+    """Its own, outside of the guest; uml_xstate.so is there where it does not start without."""
+    help_to_start = os.path.join(cache(), "uml_xstate.so")
+    preload = {"LD_PRELOAD": help_to_start} if os.path.exists(help_to_start) else {}
+    return {"TMPDIR": uml_memory_folder(job)} | preload
+
+
 def uml_memory_folder(job: str) -> str:
     """Where UML keeps its memory file: /dev/shm if it has the room and allows to execute, as in a container it may not."""
     with contextlib.suppress(OSError):
@@ -163,11 +170,14 @@ def uml_memory_folder(job: str) -> str:
     return job
 
 
+def cache() -> str:
+    """What setup.sh has made."""
+    return os.environ.get("VM_CACHE") or os.path.join(HERE, ".cache")
+
+
 def qemu_kernel() -> str | None:
     """The newest kernel that setup.sh has unpacked."""
-    kernels = glob.glob(
-        os.path.join(os.environ.get("VM_CACHE") or os.path.join(HERE, ".cache"), "*", "vmlinux")
-    )
+    kernels = glob.glob(os.path.join(cache(), "*", "vmlinux"))
     return max(kernels, key=os.path.getmtime, default=None)
 
 
@@ -361,7 +371,7 @@ def run_in_vm(
                 start_new_session=True,
                 env={
                     **os.environ,
-                    "TMPDIR": uml_memory_folder(job),
+                    **(uml_host_environment(job) if backend == "uml" else {"TMPDIR": job}),
                     "PATH": with_sbin(os.environ.get("PATH", "")),
                 },
             )
