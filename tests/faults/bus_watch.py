@@ -116,9 +116,10 @@ class Judge:
         self.emergencies: list[Emergency] = []
         self.fresh: list[deque[Fresh]] = [deque(maxlen=5_000) for _ in escs]
         """The EscSpeed frames that were right."""
-        self.longest_silence_ns = [0 for _ in escs]
+        self._longest_silence_ns = [0 for _ in escs]
         self.last_ns = 0
-        self._last_fresh_ns = [0 for _ in escs]
+        self._silent_since_ns = 0
+        self._shown = [-1 for _ in escs]
         self._suspects: list[Wrong] = []
         # CAN id -> number of the newest live frame that it has carried
         self._newest: dict[int, int] = {}
@@ -232,9 +233,22 @@ class Judge:
 
     def reset_silence(self) -> None:
         """Measure the longest silence anew."""
-        now = time.monotonic_ns()
-        self.longest_silence_ns = [0 for _ in self.escs]
-        self._last_fresh_ns = [now for _ in self.escs]
+        self._silent_since_ns = time.monotonic_ns()
+        self._longest_silence_ns = [0 for _ in self.escs]
+
+    def silence_ns(self, esc: int) -> int:
+        """How long at most, since ``reset_silence``, an ESC had sent something newer than the last right values on the bus.
+
+        (While it sends nothing, because it is off or its feeder is held up, the gateway cannot be silent.)
+        """
+        return max(
+            self._longest_silence_ns[esc],
+            self._silence(esc, len(self.escs[esc].sent) - 1, time.monotonic_ns()),
+        )
+
+    def _silence(self, esc: int, n: int, at_ns: int) -> int:
+        first = self._shown[esc] + 1
+        return at_ns - max(self.escs[esc].left(first), self._silent_since_ns) if first <= n else 0
 
     # --- judging
 
@@ -258,11 +272,9 @@ class Judge:
             esc.seen[n] |= follows
             if follows == SPEED:
                 self.fresh[said.esc].append(Fresh(at_ns, n))
-                if last := self._last_fresh_ns[said.esc]:
-                    self.longest_silence_ns[said.esc] = max(
-                        self.longest_silence_ns[said.esc], at_ns - last
-                    )
-                self._last_fresh_ns[said.esc] = at_ns
+                longest = self._longest_silence_ns
+                longest[said.esc] = max(longest[said.esc], self._silence(said.esc, n, at_ns))
+                self._shown[said.esc] = n
 
     def _origin(self, said: Said, older: int, newest: int) -> Wrong:
         """Where values come from that none of the newest frames had."""

@@ -34,19 +34,20 @@ def run(bench: Bench, report: Report, generator: random.Random, end: float) -> N
         for f in in_order("UML")
         if f.bench == "two" and not any(text in f.name for text in NEW_PROCESS)
     ]
+    escs = range(len(bench.fed))
     quiet_ns, longest_ns, injected = 0, 0, 0
     before = bench.gateway.figures()
     while time.monotonic() < end:
         fault = generator.choice(faults)
         bench.watch.reset_silence()
         time.sleep(generator.uniform(0.5, 3))
-        quiet_ns = max(quiet_ns, *bench.watch.longest_silence_ns)
+        quiet_ns = max(quiet_ns, *map(bench.watch.silence_ns, escs))
         if injected == 5:
             before = bench.gateway.figures()
         injected += 1
         bench.watch.reset_silence()
         programme.run_one(bench, fault, report, 1)
-        longest_ns = max(longest_ns, *bench.watch.longest_silence_ns)
+        longest_ns = max(longest_ns, *map(bench.watch.silence_ns, escs))
     row = report.row(GROWTH)
     row.figures = {
         "faults": injected,

@@ -162,3 +162,16 @@ def test_all_values_are_inside_the_ranges_of_the_sheet() -> None:
         for name, value in live(Identity(3, alarms=True), n)._asdict().items():
             low, high = rows(LiveData)[name].stated_range
             assert low <= value <= high, name
+
+
+def test_a_silence_begins_with_the_first_frame_that_is_not_shown(
+    judge: Judge, escs: list[FedEsc]
+) -> None:
+    del escs[0].sent[20:]  # then the ESC itself is silent, until frame 20
+    for n, at in list(enumerate(times()))[:20]:
+        judge.take(SPEED_ID, of_live(judge, SPEED_ID, n), at + MS)
+    assert judge._longest_silence_ns == [MS, 0]
+    sent = START + 45 * PERIOD
+    escs[0].sent.extend([sent, sent + PERIOD])
+    judge.take(SPEED_ID, of_live(judge, SPEED_ID, 21), sent + PERIOD + 3 * MS)
+    assert judge._longest_silence_ns == [PERIOD + 3 * MS, 0]
