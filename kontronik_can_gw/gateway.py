@@ -6,7 +6,7 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.dbc.output import DbcOutput
+from kontronik_can_gw.dbc.messages import Messages
 from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
@@ -35,7 +35,7 @@ class Gateway:
     ) -> None:
         self.escs = [EscTelemetry(settings, now) for settings in escs]
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
-        dbc = DbcOutput(layout, self.escs, self.status, now, silent_on_loss)
+        dbc = Messages(layout, self.escs, self.status, now, silent_on_loss)
         self.nodes: Nodes | None = None
         if canopen is not None:
             self.nodes = _nodes(canopen, layout, self.escs, self.status, self._apply)

@@ -100,7 +100,7 @@ class _Message:
         return bool(self.triggers & events)
 
 
-class DbcOutput(Output):
+class Messages(Output):
     """All messages of one layout. Frames are appended to ``frames``, which the owner empties.
 
     ``silent``: on loss of telemetry messages with values of a lost ESC stop instead of carrying NotAvailable.
