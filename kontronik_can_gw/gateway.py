@@ -1,4 +1,4 @@
-"""The assembly of the pure core, and the only surface the runtime sees: bytes, CAN frames and time in, CAN frames and deadlines out.
+"""The core with its outputs, and the only surface the runtime sees: bytes, CAN frames and time in, CAN frames and deadlines out.
 
 ``now`` is integer nanoseconds of one monotonic clock: the loop's when live, the capture's in replay.
 """
@@ -6,11 +6,11 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.dbc.messages import Messages
-from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.core import Core
+from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayState, GatewayStatus
-from kontronik_can_gw.id_conflicts import Conflict, IdConflicts
+from kontronik_can_gw.id_conflicts import IdConflicts
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals.plan import Layout
 
@@ -22,7 +22,7 @@ MakeOutput = Callable[[Sequence[EscTelemetry], GatewayStatus, int], Output]
 
 
 class Gateway:
-    """One gateway: several ESCs in, one CAN bus out. ``canopen`` None: no CANopen nodes; a layout without messages: no DBC output."""
+    """One gateway: several ESCs in, one CAN bus out. ``canopen`` None: no CANopen nodes; a layout without messages: only nodes."""
 
     def __init__(
         self,
@@ -33,46 +33,38 @@ class Gateway:
         canopen: "CanopenSetup | None" = None,
         further: Sequence[MakeOutput] = (),
     ) -> None:
-        self.escs = [EscTelemetry(settings, now) for settings in escs]
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
-        dbc = Messages(layout, self.escs, self.status, now, silent_on_loss)
+        self.core = Core(escs, layout, self.status, now, silent_on_loss, self._follow)
+        self.escs = self.core.escs
         self.nodes: Nodes | None = None
         if canopen is not None:
-            self.nodes = _nodes(canopen, layout, self.escs, self.status, self._apply)
-        self._message_bits = dbc.bits
+            self.nodes = _nodes(canopen, layout, self.core, self.status)
         self._outputs: tuple[Output, ...] = (
             *(() if self.nodes is None else (self.nodes,)),
             *(make(self.escs, self.status, now) for make in further),
-            dbc,
         )
-        self._conflicts = IdConflicts(self._outputs)
+        self.conflicts = IdConflicts(self.core.messages.own_ids(), self._outputs)
         self._being_saved: list[tuple[int, Output]] = []
         self._link_changes: list[int] = []
         self._dropped = False
-        self._second_ns = now
-        self.shortest_timeout_ns = self._shortest_timeout()
-        """Of all ESCs: live data of one is not available after this."""
-        self._next_expiry = 0
-        """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
 
     def start(self, now: int, can_open: bool = True) -> None:
         """The runtime has opened what it could: run. Nodes boot when there is a bus that can hear it."""
         self.status.state = GatewayState.RUNNING
+        self.core.messages.repeat(now)
         for output in self._outputs:
             output.start(now, can_open)
 
     def stop(self, now: int) -> None:
         """The last word: a status that says the gateway is going."""
         self.status.state = GatewayState.STOPPING
+        self.core.messages.stop(now)
         for output in self._outputs:
             output.stop(now)
 
     def receive_bytes(self, esc: int, data: bytes, now: int, since: int) -> None:
         """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
-        if now >= self._next_expiry:
-            self._expire(now, but=esc)  # a message may hold values of several ESCs
-        for events in self.escs[esc].receive_each(data, now, since):
-            self._follow(esc, events, now)
+        self.core.receive(esc, data, now, since)
 
     @property
     def receive_ids(self) -> frozenset[int]:
@@ -80,30 +72,21 @@ class Gateway:
 
         Those that the outputs listen to, and those that only this gateway sends with: another device that does is to be noticed.
         """
-        return self._conflicts.receive_ids
+        return self.conflicts.receive_ids
 
     def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
         """A data frame of another device with one of ``receive_ids``, read at ``now``; it came ``at``."""
-        if not frame.remote and self._conflicts.receive(frame.key, now):
+        if not frame.remote and self.conflicts.receive(frame.key, now):
             self.status.id_conflicts += 1
         takers = [output for output in self._outputs if output.receive_ids]
         if takers:
-            self._expire(now)
+            self.core.expire(now)
         for output in takers:
             output.receive(frame, now, at)
 
     def can_opened(self, now: int) -> None:
         """The interface was opened (again): what we sent before may still come back, and is no conflict."""
-        self._conflicts.can_opened(now)
-
-    @property
-    def first_message_id(self) -> int | None:
-        """The lowest id that the gateway itself, not the node of an ESC, sends with; None without any."""
-        return self._conflicts.first_own_id()
-
-    def take_conflicts(self) -> list[Conflict]:
-        """Conflicts of ids that have begun, or are over, since the last call."""
-        return self._conflicts.take()
+        self.conflicts.can_opened(now)
 
     def receive_overrun(self, now: int) -> None:
         """The CAN controller lost received frames."""
@@ -142,17 +125,14 @@ class Gateway:
         for output in self._outputs:
             output.parameters_damaged(esc, now)
 
-    def port_opened(self, esc: int, now: int) -> None:
-        """An ESC's port is open (again)."""
-        self._follow(esc, self.escs[esc].port_opened(), now)
-
-    def port_lost(self, esc: int, now: int) -> None:
-        """An ESC's port cannot be used: its values are not available from now on."""
-        self._follow(esc, self.escs[esc].port_lost(), now)
+    def port(self, esc: int, is_open: bool, now: int) -> None:
+        """An ESC's port is open (again), or cannot be used: its values are not available from now on."""
+        self.core.port(esc, is_open, now)
 
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost: say everything that has no cycle once more."""
-        self._expire(now)
+        self.core.expire(now)
+        self.core.messages.repeat(now)
         for output in self._outputs:
             output.can_returned(now)
 
@@ -161,36 +141,35 @@ class Gateway:
 
         ``dropped``: measurements that waited to be sent were dropped: they are made anew with the next ``advance``, of what came by then.
         """
-        self._expire(now)
+        self.core.expire(now)
         self._dropped = dropped
         for output in self._outputs:
             output.held_up(now)
 
     def set_can_state(self, state: CanState, now: int) -> None:
         """What the runtime knows of the CAN controller."""
-        self._expire(now)
+        self.core.expire(now)
         before, self.status.can_state = self.status.can_state, state
+        if state is not before:
+            self.core.messages.on_can_state(before, state, now)
         for output in self._outputs:
             output.on_can_state(before, state, now)
 
     def advance(self, now: int) -> None:
         """Let time pass: time-outs, cyclic messages."""
-        if now >= self._next_expiry:
-            self._expire(now)
+        self.core.advance(now)
+        self.conflicts.advance(now)
         if self._dropped:
             self._dropped = False
+            self.core.messages.repeat(now)
             for output in self._outputs:
                 output.make_anew(now)
         for output in self._outputs:
             output.advance(now)
 
-    def message_bits(self, message: int, now: int, page: int | None = None) -> int:
-        """What the layout's message of this index would hold if it were sent now, alive counter and CRC 0; bit 0 is bit 0 of byte 0."""
-        return self._message_bits(message, now, page)
-
     def next_deadline(self) -> int:
         """When ``advance`` is to be called at the latest."""
-        due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
+        due = self.core.next_deadline()
         for output in self._outputs:
             of_output = output.next_deadline()
             if of_output < due:
@@ -199,17 +178,17 @@ class Gateway:
 
     @property
     def frames_wait(self) -> bool:
-        """True while ``take_frames`` has something to hand over."""
-        return any(output.frames for output in self._outputs)
+        """True while ``take_frames`` has something to do."""
+        return self.core.messages.is_pending or any(output.frames for output in self._outputs)
 
-    def take_frames(self) -> list[CanFrame]:
-        """The frames to send, oldest first, output by output; the list is handed over."""
+    def take_frames(self, now: int) -> list[CanFrame]:
+        """The frames to send: those of the outputs, oldest first, then those of the messages that are due, with the values of now."""
         frames: list[CanFrame] = []
         for output in self._outputs:
             if output.frames:
                 frames += output.frames
                 output.frames.clear()
-        return frames
+        return frames + self.core.take(now)
 
     def not_sent(self, now: int) -> None:
         """The frames that were taken last were thrown away. The gateway itself need not know; who records it does."""
@@ -226,60 +205,20 @@ class Gateway:
         """Grows with each change of a node's state or node-ID."""
         return sum([output.state_changes for output in self._outputs])
 
-    @property
-    def node_ids(self) -> list[int]:
-        """Node-IDs of the nodes; before the start those that they will have."""
-        return [node_id for node_id, _, _ in self.node_states()]
-
     def node_states(self) -> list[tuple[int, Any, int]]:
         """Of each ESC's node: node-ID, state, PDOs sent so far. Empty without nodes."""
         return [state for output in self._outputs for state in output.node_states()]
 
-    def _expire(self, now: int, but: int | None = None) -> None:
-        """What is too old by now goes before anything is sent."""
-        if now < self._next_expiry:
-            return
-        for index, esc in enumerate(self.escs):
-            if index != but and now >= esc.next_deadline():
-                self._follow(index, esc.advance(now), now)
-        self._next_expiry = min(esc.next_deadline() for esc in self.escs)
-        if now - self._second_ns >= SECOND:
-            self._second_ns = now
-            self._conflicts.advance(now)
-            for output in self._outputs:
-                output.on_gateway_change(now, each_second=True)
-
     def _follow(self, esc: int, events: int, now: int) -> None:
-        if events:
-            for output in self._outputs:
-                output.on_event(esc, events, now)
+        for output in self._outputs:
+            output.on_event(esc, events, now)
         if events & Event.LINK:
-            self._next_expiry = min(self._next_expiry, self.escs[esc].next_deadline())
             self._link_changes.append(esc)
-            escs_ok = sum([e.live is not None for e in self.escs])
-            if escs_ok != self.status.escs_ok:
-                self.status.escs_ok = escs_ok
-                for output in self._outputs:
-                    output.on_gateway_change(now)
-
-    def _apply(self, esc: int, settings: EscSettings) -> None:
-        """Settings that came over the bus: they hold for everything that is sent, the DBC's messages too."""
-        self.escs[esc].apply(settings)
-        self.shortest_timeout_ns = self._shortest_timeout()
-        self._next_expiry = 0
-
-    def _shortest_timeout(self) -> int:
-        return min(esc.settings.timeout_ns for esc in self.escs)
 
 
-def _nodes(
-    setup: "CanopenSetup",
-    layout: Layout,
-    escs: Sequence[EscTelemetry],
-    status: GatewayStatus,
-    apply: Callable[[int, EscSettings], None],
-) -> "Nodes":
+def _nodes(setup: "CanopenSetup", layout: Layout, core: Core, status: GatewayStatus) -> "Nodes":
     from kontronik_can_gw.canopen.nodes import Nodes  # nothing of it is loaded without CANopen
 
     ids = {m.can_id: f"message {m.name}" for m in layout.messages if not m.extended}
-    return Nodes(setup, escs, status, apply, ids)
+    # settings that come over the bus hold for everything that is sent, the messages too
+    return Nodes(setup, core.escs, status, core.apply, ids)

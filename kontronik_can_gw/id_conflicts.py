@@ -1,6 +1,6 @@
 """Others on the bus that send with ids that only this gateway may send with."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import EXTENDED
@@ -32,12 +32,13 @@ class Conflict:
 
 
 class IdConflicts:
-    """Watches the ids of all outputs."""
+    """Watches the ids of the gateway's messages, ``of_gateway``, and of all outputs."""
 
-    def __init__(self, outputs: Sequence[Output]) -> None:
+    def __init__(self, of_gateway: Mapping[int, Owner], outputs: Sequence[Output]) -> None:
+        self._of_gateway = of_gateway
         self._outputs = outputs
-        self._routed: list[frozenset[int]] = []
-        self._own: dict[int, Owner] = {}
+        self._routed: list[frozenset[int]] | None = None
+        self._own: Mapping[int, Owner] = {}
         self._receive_ids = NO_IDS
         self._present: dict[int, Conflict] = {}
         self._news: list[Conflict] = []
@@ -50,17 +51,18 @@ class IdConflicts:
         return self._receive_ids
 
     def _follow(self) -> None:
-        for output, known in zip(self._outputs, self._routed, strict=False):
-            if output.receive_ids is not known:
-                break
-        else:
-            if self._routed:
+        if self._routed is not None:
+            for output, known in zip(self._outputs, self._routed, strict=True):
+                if output.receive_ids is not known:
+                    break
+            else:
                 return
         self._routed = [output.receive_ids for output in self._outputs]
-        self._own = {}
+        own = dict(self._of_gateway)
         for output in self._outputs:
-            self._own |= output.own_ids()
-        self._receive_ids = frozenset(self._own).union(*self._routed)
+            own |= output.own_ids()
+        self._own = own
+        self._receive_ids = frozenset(own).union(*self._routed)
 
     def first_own_id(self) -> int | None:
         """The lowest id of ours that is of no ESC's node; None without any."""
@@ -88,6 +90,8 @@ class IdConflicts:
 
     def advance(self, now: int) -> None:
         """End the conflicts of which no frame has come for ten seconds."""
+        if not self._present:
+            return
         for conflict in [c for c in self._present.values() if now - c.last > _OVER_NS]:
             conflict.over = True
             del self._present[conflict.key]

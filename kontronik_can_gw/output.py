@@ -59,9 +59,6 @@ class Output:
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Something of an ESC changed: bits of telemetry.Event."""
 
-    def on_gateway_change(self, now: int, each_second: bool = False) -> None:
-        """The gateway's own state changed; ``each_second``: only its counters."""
-
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         """The CAN controller's state, as the runtime knows it; DOWN may be followed by DOWN."""
 

@@ -67,6 +67,8 @@ class Replay:
         found, self._taken = self._taken, []
         try:
             found += self._play(entry)
+            if self.gateway.core.packs_at_once:
+                self.gateway.core.pack(entry.time_ns)
         except Exception:
             # a damaged or hostile capture can hold calls that no gateway ever made, which may raise anything
             self.rejected += 1
@@ -116,9 +118,9 @@ class Replay:
         gateway = self.gateway
         match kind:
             case Kind.PORT_OPENED:
-                gateway.port_opened(esc, now)
+                gateway.port(esc, True, now)
             case Kind.PORT_LOST:
-                gateway.port_lost(esc, now)
+                gateway.port(esc, False, now)
             case Kind.CAN_OPENED:
                 gateway.can_opened(now)
             case Kind.CAN_RETURNED:
@@ -151,11 +153,11 @@ class Replay:
     def _take(self, now: int) -> None:
         gateway = self.gateway
         gateway.take_saves()  # unread, the list would grow
-        frames = in_order(gateway.take_frames(), self._waiting)
+        frames = in_order(gateway.take_frames(now), self._waiting)
         gateway.status.sent_frames += len(frames)
         gateway.take_link_changes()
         gateway.take_rejected_parameters()
-        gateway.take_conflicts()
+        gateway.conflicts.take()
         self._taken = [TimedFrame(now, frame) for frame in frames]
 
     def _take_up(self, state: Mapping[str, Any]) -> None:
@@ -183,14 +185,14 @@ def follow_bytes(gateway: Gateway, chunks: Iterable[tuple[int, bytes]]) -> Itera
     for now, data in chunks:
         if not started:
             started = True
-            gateway.port_opened(0, now)
+            gateway.port(0, True, now)
             gateway.start(now)
         while (due := gateway.next_deadline()) < now:
             gateway.advance(due)
-            for frame in in_order(gateway.take_frames(), waiting):
+            for frame in in_order(gateway.take_frames(due), waiting):
                 yield TimedFrame(due, frame)
         gateway.receive_bytes(0, data, now, now)
         gateway.advance(now)
-        for frame in in_order(gateway.take_frames(), waiting):
+        for frame in in_order(gateway.take_frames(now), waiting):
             yield TimedFrame(now, frame)
         gateway.take_link_changes()

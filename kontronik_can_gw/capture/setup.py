@@ -51,6 +51,8 @@ class CaptureSetup:
     canopen: "CanopenSetup | None"
     configuration: str = ""
     file: str = ""
+    version: int = VERSION
+    """Of the capture's format; 1: of 0.5.0."""
 
     def header(self) -> dict[str, Any]:
         """The header's JSON content."""
@@ -120,6 +122,7 @@ class CaptureSetup:
             None if found is None else _canopen(found),
             str(header["configuration"]),
             str(header["file"]),
+            header["version"],
         )
 
     def database(self) -> tuple["Database", Layout] | None:
@@ -131,7 +134,9 @@ class CaptureSetup:
 
     def gateway(self, layout: Layout, now: int) -> Gateway:
         """The gateway in its state before the start."""
-        return Gateway(self.escs, layout, now, self.silent_on_loss, self.canopen)
+        made = Gateway(self.escs, layout, now, self.silent_on_loss, self.canopen)
+        made.core.packs_at_once = self.version == 1
+        return made
 
 
 def _canopen_json(setup: "CanopenSetup") -> dict[str, Any]:

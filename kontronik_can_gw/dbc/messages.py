@@ -1,13 +1,17 @@
-"""Plans, packers and schedule put together: telemetry events and time in, CAN frames out."""
+"""The messages of a layout: what makes each of them pending, and its frame when it is handed over.
 
-from collections.abc import Iterator, Sequence
+Pure: ``on_event`` and time (``advance``) mark messages as pending, ``take`` packs what is pending: newest wins. A message is handed
+over at most once in a step: in the order of the times at which the messages became due, then of their index.
+"""
 
-from kontronik_can_gw.dbc.schedule import Schedule
+from collections.abc import Sequence
+
+from kontronik_can_gw.dbc.schedule import CYCLE, REQUEST, Schedule
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway_status import CanState, GatewayStatus
-from kontronik_can_gw.output import Output, Owner
+from kontronik_can_gw.output import Owner
 from kontronik_can_gw.signals import e2e
 from kontronik_can_gw.signals.packer import alive_modulus, compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
@@ -24,8 +28,8 @@ _EVENT_OF_PACE = {
 class _Message:
     """One message at work.
 
-    ``last`` holds the bits of the last frame of each page, without alive counter and CRC; ``pending`` the places of the pages that
-    have to follow without waiting for an event.
+    ``last`` holds the bits of the last frame of each page, without alive counter and CRC, of a message that is sent on change;
+    ``pages_to_send`` the places of the pages that have to follow without waiting for an event.
     """
 
     __slots__ = (
@@ -36,7 +40,6 @@ class _Message:
         "crc_at",
         "extended",
         "fd",
-        "goes_at_once",
         "is_free",
         "is_paged",
         "is_plain",
@@ -46,7 +49,7 @@ class _Message:
         "pack",
         "page",
         "pages",
-        "pending",
+        "pages_to_send",
         "plan",
         "silent_able",
         "triggers",
@@ -61,25 +64,24 @@ class _Message:
             plan.fd,
         )
         self.pages = [page or 0 for page in plan.pages]
-        self.is_paged = plan.pages != (None,)
+        self.is_paged = len(plan.pages) > 1
         # no cycle, no minimum distance, nothing that follows by itself: the schedule never has to know of it
         self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         self.pack = compile_pack(plan)
         self.page = 0
-        self.pending: list[int] = []
+        self.pages_to_send: list[int] = []
         self.alive = 0
         crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
         alive = next((signal for signal in plan.signals if signal.role is Role.ALIVE), None)
         self.crc_at = None if crc is None else crc.pieces[0].at // 8
         self.alive_modulus = alive_modulus(alive, crc is not None) if alive else 0
-        self.last: dict[int | None, int] = {}
+        self.last: dict[int, int] = {}
         # messages with the link's state always go on
         self.silent_able = (
             silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         )
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
-        self.goes_at_once = self.by_event and self.is_free
         # sending it leaves nothing to note, and its bits are its data
         self.is_plain = not self.on_change and not self.alive_modulus and self.crc_at is None
         self.triggers = Event.NONE
@@ -99,9 +101,27 @@ class _Message:
             events &= ~Event.LINK
         return bool(self.triggers & events)
 
+    def add_all_pages(self) -> None:
+        """Let all pages follow, of a message that has several."""
+        if self.is_paged:
+            self.pages_to_send = list(range(len(self.pages)))
 
-class Messages(Output):
-    """All messages of one layout. Frames are appended to ``frames``, which the owner empties.
+    def turn_page(self) -> None:
+        """Let the page follow whose turn it is, of a message that has several."""
+        if self.is_paged:
+            if self.page not in self.pages_to_send:
+                self.pages_to_send.append(self.page)
+            self.page = (self.page + 1) % len(self.pages)
+
+    def next_place(self) -> int:
+        """The place of the page to send: the first of those that are to follow, else that whose turn it is."""
+        if not self.pages_to_send:
+            self.turn_page()
+        return self.pages_to_send.pop(0)
+
+
+class Messages:
+    """All messages of one layout.
 
     ``silent``: on loss of telemetry messages with values of a lost ESC stop instead of carrying NotAvailable.
     """
@@ -114,14 +134,17 @@ class Messages(Output):
         now: int,
         silent: bool = False,
     ) -> None:
-        super().__init__()
         self._escs = escs
         self._gateway = gateway
         self._messages = [_Message(plan, silent) for plan in layout.messages]
         self._of_gateway = [
-            (i, m) for i, m in enumerate(self._messages) if Group.GATEWAY in m.plan.paces
+            (i, m)
+            for i, m in enumerate(self._messages)
+            if Group.GATEWAY in m.plan.paces and (m.by_event or m.on_change)
         ]
         self._schedule = Schedule(layout.messages, now)
+        self._pending: dict[int, tuple[int, int, int]] = {}
+        """By message: (since when, message, CYCLE: it is sent in any case, REQUEST: where it is news)."""
         self._listeners = [
             [
                 [self._listeners_of(esc, up, events) for events in range(Event.ALL + 1)]
@@ -130,6 +153,7 @@ class Messages(Output):
             for esc in range(len(escs))
         ]
         """The messages that follow: by ESC, whether its live data is fresh, and combination of events."""
+        self._stopping = False
 
     def _listeners_of(self, esc: int, up: bool, events: int) -> list[tuple[int, _Message]]:
         return [
@@ -138,30 +162,8 @@ class Messages(Output):
             if esc in m.plan.escs and m.follows(events, up)
         ]
 
-    def start(self, now: int, can_open: bool) -> None:  # noqa: ARG002
-        self._send_all(now)
-
-    def stop(self, now: int) -> None:
-        """The last word, without regard to the minimum distance of messages."""
-        for index, message in self._changed_of_gateway(now):
-            self._send(index, message, now)
-            while message.pending:
-                self._send(index, message, now)
-
-    def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
-        if state is before:
-            return
-        self.on_gateway_change(now)
-        if before is CanState.BUS_OFF and state is not CanState.DOWN:
-            self._send_all(now)  # what was handed over meanwhile never reached the bus
-
-    def can_returned(self, now: int) -> None:
-        self._send_all(now)
-
-    def make_anew(self, now: int) -> None:
-        self._send_all(now)
-
     def own_ids(self) -> dict[int, Owner]:
+        """The ids of the messages (29-bit ones with EXTENDED), and what for."""
         return {
             message.can_id | (EXTENDED if message.extended else 0): Owner(
                 None, f"message {message.plan.name}"
@@ -169,125 +171,127 @@ class Messages(Output):
             for message in self._messages
         }
 
-    def _send_all(self, now: int) -> None:
+    # --- what makes messages pending
+
+    def on_event(self, esc: int, events: int, now: int) -> None:
+        """Something of an ESC changed: bits of telemetry.Event."""
+        state, pending = self._escs[esc], self._pending
+        up = state.live is not None
+        gone = not up or (events & Event.INFO and state.info is None)
+        for index, message in self._listeners[esc][up][events]:
+            if gone and message.is_paged and message.by_event:
+                message.add_all_pages()  # no further event brings the others
+            if index not in pending:
+                if message.is_free:
+                    pending[index] = (now, index, REQUEST)
+                else:
+                    self._request(index, now)
+
+    def on_gateway_change(self, now: int, each_second: bool = False) -> None:
+        """The gateway's own state changed; ``each_second``: only its counters, which is news for messages that have no cycle."""
+        for index, message in self._of_gateway:
+            if not (each_second and message.plan.cycle_ns):
+                self._request(index, now)
+
+    def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
+        """The CAN controller's state changed."""
+        self.on_gateway_change(now)
+        if before is CanState.BUS_OFF and state is not CanState.DOWN:
+            self.repeat(now)  # what was handed over meanwhile never reached the bus
+
+    def repeat(self, now: int) -> None:
         """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
         for index, message in enumerate(self._messages):
             message.last.clear()
             if not message.plan.cycle_ns:
-                if not message.is_free:
-                    message.pending = list(range(len(message.pages)))
-                self._request(index, message, now)
+                message.add_all_pages()
+                self._request(index, now)
 
-    def bits(self, index: int, now: int, page: int | None) -> int:
-        """What a message would hold now, alive counter and CRC 0."""
-        return self._messages[index].pack(self._escs, self._gateway, now, 0, page or 0)
-
-    def on_event(self, esc: int, events: int, now: int) -> None:
-        """Something of an ESC changed: send, or note for later, the messages that follow it."""
-        state = self._escs[esc]
-        up = state.live is not None
-        gone = not up or (events & Event.INFO and state.info is None)
-        for index, message in self._listeners[esc][up][events]:
-            if message.goes_at_once or self._may_go(index, message, bool(gone), now):
-                self._send(index, message, now)
-
-    def _may_go(self, index: int, message: _Message, gone: bool, now: int) -> bool:
-        """Whether a message that follows an event is news and may be sent now. ``gone``: values that nothing will bring again."""
-        if not message.by_event:
-            if not self._note_changes(message, now):
-                return False
-        elif gone and message.is_paged:
-            message.pending = list(range(len(message.pages)))  # no further event brings the others
-        return message.is_free or self._schedule.request(index, now)
-
-    def on_gateway_change(self, now: int, each_second: bool = False) -> None:
-        """Messages with the gateway's own values that are sent by event or on change follow.
-
-        ``each_second``: only its counters went on, which is news for messages that have no cycle.
-        """
-        for index, message in self._changed_of_gateway(now, each_second):
-            self._request(index, message, now)
-
-    def _changed_of_gateway(
-        self, now: int, each_second: bool = False
-    ) -> Iterator[tuple[int, _Message]]:
+    def stop(self, now: int) -> None:
+        """What the gateway says of itself goes out once more, all pages at once, without regard to minimum distances."""
+        self._stopping = True
         for index, message in self._of_gateway:
-            if each_second and message.plan.cycle_ns:
-                continue
-            if message.by_event or (message.on_change and self._note_changes(message, now)):
-                yield index, message
+            if message.by_event:
+                message.add_all_pages()
+            self._pending[index] = (now, index, REQUEST)
 
     def advance(self, now: int) -> None:
-        """Send what is due."""
-        for index, cyclic in self._schedule.due(now):
-            message = self._messages[index]
-            if cyclic and len(message.pages) > 1:
-                if message.page not in message.pending:
-                    message.pending.append(message.page)
-                message.page = (message.page + 1) % len(message.pages)
-            if cyclic or message.by_event or message.pending or self._note_changes(message, now):
-                self._send(index, message, now)
+        """Let time pass: cycles, and what a minimum distance has put off."""
+        for when, index, why in self._schedule.due(now):
+            since, _, before = self._pending.get(index, (when, index, 0))
+            self._pending[index] = (min(since, when), index, before | why)
 
     def next_deadline(self) -> int:
+        """When ``advance`` has something to do."""
         return self._schedule.next_deadline()
 
-    def _request(self, index: int, message: _Message, now: int) -> None:
-        if self._schedule.request(index, now):
-            self._send(index, message, now)
+    @property
+    def is_pending(self) -> bool:
+        """True while ``take`` has something to do."""
+        return bool(self._pending)
 
-    def _note_changes(self, message: _Message, now: int) -> bool:
-        """True if a page differs from what was sent of it last; with several pages those that do are pending."""
-        pack, last, pages = message.pack, message.last, message.plan.pages
-        if len(pages) == 1:
-            return pack(self._escs, self._gateway, now, 0, pages[0] or 0) != last.get(pages[0])
+    def _request(self, index: int, now: int) -> None:
+        """Let a message be handed over as soon as its minimum distance allows."""
+        if self._schedule.may_go(index, now):
+            self._pending.setdefault(index, (now, index, REQUEST))
+        elif self._is_news(self._messages[index], now):
+            self._schedule.defer(index)
+
+    # --- frames
+
+    def take(self, now: int) -> list[CanFrame]:
+        """The frames of what is pending, as they are now."""
+        if not self._pending:
+            return []
+        pending, self._pending = sorted(self._pending.values()), {}
+        frames: list[CanFrame] = []
+        for _, index, why in pending:
+            message = self._messages[index]
+            if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
+                message.pages_to_send.clear()
+            elif (why & REQUEST and self._is_news(message, now)) or why & CYCLE:
+                if why & CYCLE and message.is_paged:
+                    message.turn_page()
+                frames.append(self._frame(index, message, now))
+                while self._stopping and message.pages_to_send:
+                    frames.append(self._frame(index, message, now))
+        return frames
+
+    def _is_news(self, message: _Message, now: int) -> bool:
+        """False for a message that is sent on change and has not changed; of several pages those that have follow."""
+        if message.by_event or not message.on_change:
+            return True
+        pack, last = message.pack, message.last
         changed = [
             place
-            for place, page in enumerate(pages)
-            if pack(self._escs, self._gateway, now, 0, page or 0) != last.get(page)
+            for place, page in enumerate(message.pages)
+            if pack(self._escs, self._gateway, now, 0, page) != last.get(page)
         ]
-        message.pending += [place for place in changed if place not in message.pending]
-        return bool(changed)
-
-    def _send(self, index: int, message: _Message, now: int) -> None:
-        if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
-            message.pending.clear()
-            return
-        place = page = 0
         if message.is_paged:
-            place = self._next_place(message)
-            page = message.pages[place]
+            message.pages_to_send += [p for p in changed if p not in message.pages_to_send]
+        return bool(changed or message.pages_to_send)
+
+    def _frame(self, index: int, message: _Message, now: int) -> CanFrame:
+        place = message.next_place() if message.is_paged else 0
+        page = message.pages[place]
         bits = message.pack(self._escs, self._gateway, now, message.alive, page)
         data = bits.to_bytes(message.length, "little")
         if not message.is_plain:
-            data = self._finish(message, data, place, now)
-        self.frames.append(
-            _new(
-                CanFrame, (message.can_id, data, message.extended, message.fd, place, False, False)
-            )
-        )
+            data = self._finish(message, data, page, now)
         if not message.is_free:
             self._schedule.sent(index, now)
-            if not message.is_paged:
-                message.pending.clear()
-            elif message.pending:
+            if message.pages_to_send:
                 self._schedule.wait(index, now)
+        return _new(
+            CanFrame, (message.can_id, data, message.extended, message.fd, place, False, False)
+        )
 
-    def _next_place(self, message: _Message) -> int:
-        """The place of the page to send: the oldest pending one, else that whose turn it is."""
-        if message.pending:
-            return message.pending.pop(0)
-        place = message.page
-        message.page = (place + 1) % len(message.pages)
-        return place
-
-    def _finish(self, message: _Message, data: bytes, place: int, now: int) -> bytes:
+    def _finish(self, message: _Message, data: bytes, page: int, now: int) -> bytes:
         """The data with its CRC; the alive counter goes on, and what was sent is noted for a message that is sent on change."""
         if message.alive_modulus:
             message.alive = (message.alive + 1) % message.alive_modulus
         if message.on_change:
-            message.last[message.plan.pages[place]] = message.pack(
-                self._escs, self._gateway, now, 0, message.pages[place]
-            )
+            message.last[page] = message.pack(self._escs, self._gateway, now, 0, page)
         if message.crc_at is None:
             return data
         at = message.crc_at

@@ -1,7 +1,7 @@
 """When each message is sent: cyclic with spread phases, by event, on change, never closer than its minimum distance.
 
-Pure: ``request`` asks whether a message may be sent now, ``due`` returns the messages to send, ``sent`` reports a sent one, and
-``next_deadline`` returns the time of the next call.
+Pure: ``may_go`` says whether a message may be sent now, ``defer`` puts it off until it may, ``due`` returns the messages to send, ``sent``
+reports a sent one, and ``next_deadline`` returns the time of the next call.
 """
 
 import heapq
@@ -11,7 +11,8 @@ from kontronik_can_gw.output import NEVER
 from kontronik_can_gw.signals.plan import MessagePlan
 
 _LONG_AGO = -(1 << 62)
-
+CYCLE, REQUEST = 1, 2
+"""Why a message is due: its cycle, a request that was deferred."""
 
 MIN_DISTANCE_NS = 1_000_000
 """Minimum distance between frames of a message that are not caused by an event."""
@@ -34,12 +35,13 @@ class Schedule:
         """(when, message, True for a deferred request): at the same time the cycle of a message comes first."""
         heapq.heapify(self._heap)
 
-    def request(self, index: int, now: int) -> bool:
-        """True if the message may be sent now; otherwise it is deferred, and ``due`` returns it when it may."""
-        if now >= self._last[index] + self._delay[index]:
-            return True
+    def may_go(self, index: int, now: int) -> bool:
+        """True if the message may be sent now: its minimum distance is over."""
+        return now >= self._last[index] + self._delay[index]
+
+    def defer(self, index: int) -> None:
+        """Let ``due`` return the message when its minimum distance is over."""
         self._defer(index, self._last[index] + self._delay[index])
-        return False
 
     def wait(self, index: int, now: int) -> None:
         """Defer the message until it may follow a frame sent now."""
@@ -50,15 +52,15 @@ class Schedule:
         self._last[index] = now
         self._deferred[index] = self._cycle_deferred[index] = False
 
-    def due(self, now: int) -> list[tuple[int, bool]]:
-        """(message, True for its cycle, False for a deferred request), in the order of their deadlines, each once.
+    def due(self, now: int) -> list[tuple[int, int, int]]:
+        """(deadline, message, CYCLE, REQUEST or both), each message once.
 
         A late call skips missed cycles: it never returns a message twice.
         """
         heap = self._heap
         if not heap or heap[0][0] > now:
             return []
-        found: dict[int, bool] = {}
+        found: dict[int, tuple[int, int, int]] = {}
         while heap and heap[0][0] <= now:
             when, index, is_deferred = heap[0]
             if is_deferred:
@@ -69,16 +71,20 @@ class Schedule:
                     heapq.heappush(heap, (self._last[index] + self._delay[index], index, True))
                     continue
                 self._deferred[index] = False
-                found[index] = found.get(index, False) or self._cycle_deferred[index]
+                first, _, why = found.get(index, (when, index, 0))
+                why |= CYCLE | REQUEST if self._cycle_deferred[index] else REQUEST
+                found[index] = (first, index, why)
                 self._cycle_deferred[index] = False
             else:
                 cycle = self._cycle[index]
                 heapq.heapreplace(heap, (when + cycle * ((now - when) // cycle + 1), index, False))
-                if self.request(index, now):
-                    found[index] = True
+                if self.may_go(index, now):
+                    first, _, why = found.get(index, (when, index, 0))
+                    found[index] = (first, index, why | CYCLE)
                 else:
+                    self.defer(index)
                     self._cycle_deferred[index] = True
-        return list(found.items())
+        return list(found.values())
 
     def next_deadline(self) -> int:
         """When ``due`` will return a message; NEVER for never."""

@@ -236,7 +236,7 @@ class CanLink:
 
     def transmit(self, now: int) -> None:
         """Hand what is to be sent to the interface, as far as it takes it."""
-        frames, port, transmitter = self._gateway.take_frames(), self.port, self.transmitter
+        frames, port, transmitter = self._gateway.take_frames(now), self.port, self.transmitter
         if frames:
             transmitter.put(frames)
         if port is None or (self.controller.is_off and self.controller.loses_frames):

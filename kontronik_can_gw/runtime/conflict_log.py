@@ -7,7 +7,7 @@ from kontronik_can_gw.runtime.fault_log import FaultLog
 
 def log_conflicts(gateway: Gateway, conditions: FaultLog, channel: str, now: int) -> None:
     """Log which conflicts have begun, and which are over."""
-    for conflict in gateway.take_conflicts():
+    for conflict in gateway.conflicts.take():
         _log(conflict, conditions, channel, now)
 
 

@@ -118,7 +118,7 @@ class EscPort:
         self._counted = port.line_errors()
         self._served, self._seen_waiting = True, False
         self._selector.register(port.fileno(), selectors.EVENT_READ, self.serve)
-        self._gateway.port_opened(self._index, now)
+        self._gateway.port(self._index, True, now)
         said = f"{self.name}: {port.path} is open"
         if self._conditions.is_on(self.log.port_condition):
             self._conditions.end(self.log.port_condition, said, now)
@@ -211,7 +211,7 @@ class EscPort:
         self.due = self._retry.failed(now)
         self._lost.add(self)
         self._lost_since = self._lost_since or now
-        self._gateway.port_lost(self._index, now)
+        self._gateway.port(self._index, False, now)
         self._conditions.begin(
             self.log.port_condition, f"{self.name}: {reason} Trying again.", now, quiet=quiet
         )

@@ -26,10 +26,10 @@ class IdLocks:
         channel = self._config.channel
         names = [
             node_lock(channel, node_id)
-            for node_id in self._gateway.node_ids
+            for node_id, _, _ in self._gateway.node_states()
             if node_id != UNCONFIGURED
         ]
-        if (first := self._gateway.first_message_id) is not None:
+        if (first := self._gateway.conflicts.first_own_id()) is not None:
             names.append(messages_lock(channel, first))
         if names == self._names:
             return

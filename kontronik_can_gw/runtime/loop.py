@@ -141,7 +141,7 @@ class Loop:
     def turn(self) -> None:
         """Wait until something has come or is due, and do it."""
         last, due = self._now, self._next_deadline()
-        wake = last + self.gateway.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
+        wake = last + self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
         pause = min(wake, due) - self._clock()
         if pause < 0:
             pause = 0

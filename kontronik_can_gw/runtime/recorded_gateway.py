@@ -71,13 +71,9 @@ class RecordedGateway(Gateway):
         self._note(now, Kind.DAMAGED, esc)
         super().parameters_damaged(esc, now)
 
-    def port_opened(self, esc: int, now: int) -> None:
-        self._note(now, Kind.PORT_OPENED, esc)
-        super().port_opened(esc, now)
-
-    def port_lost(self, esc: int, now: int) -> None:
-        self._note(now, Kind.PORT_LOST, esc)
-        super().port_lost(esc, now)
+    def port(self, esc: int, is_open: bool, now: int) -> None:
+        self._note(now, Kind.PORT_OPENED if is_open else Kind.PORT_LOST, esc)
+        super().port(esc, is_open, now)
 
     def can_returned(self, now: int) -> None:
         self._note(now, Kind.CAN_RETURNED)
@@ -92,8 +88,8 @@ class RecordedGateway(Gateway):
         self._note(now, Kind.ADVANCE)
         super().advance(now)
 
-    def take_frames(self) -> list[CanFrame]:
-        frames = super().take_frames()
+    def take_frames(self, now: int) -> list[CanFrame]:
+        frames = super().take_frames(now)
         # as a rule all of them are sent: only what comes otherwise is recorded
         self._counters = (self._counters[0] + len(frames), *self._counters[1:])
         return frames

@@ -42,7 +42,7 @@ class Transmitter:
 
     def max_turn_ns(self) -> int:
         """A frame that is to go out this long after its turn began is old by then."""
-        limit = self._gateway.shortest_timeout_ns
+        limit = self._gateway.core.shortest_timeout_ns
         return min(MAX_LATE_NS, limit)
 
     def put(self, frames: Sequence[CanFrame]) -> None:

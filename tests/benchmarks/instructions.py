@@ -67,7 +67,7 @@ def ours(all_frames: list[bytes]) -> int:
         now += PERIOD_NS
         gateway.receive_bytes(0, frame, now, now)
         gateway.advance(now)
-        count += len(gateway.take_frames())
+        count += len(gateway.take_frames(now))
     return count
 
 

@@ -9,7 +9,7 @@ One line for each frame or happening, times in ms from power-on, data in hexadec
       20 read 1 2000:02 = 8A 09                       an upload by SDO from node 1, and its data
       20 read 1 2001:05 ! 08000024                    the same, refused
       30 write 1 1017:00 F4 01                        a download that is confirmed; with "! code" refused
-      40 do gateway.port_lost(0, now)                 anything else
+      40 do gateway.port(0, False, now)                 anything else
      500 -                                            nothing more until then
 
 Between the lines time passes by ``advance`` at each ``next_deadline``; what is due at the time of a line comes before it. Nothing
@@ -285,9 +285,9 @@ class Bench:
             case (("read" | "write"), _):
                 return self._say_sdo(verb, rest)
             case "port", ["lost", esc]:
-                self.gateway.port_lost(int(esc), self.now)
+                self.gateway.port(int(esc), False, self.now)
             case "port", ["opened", esc]:
-                self.gateway.port_opened(int(esc), self.now)
+                self.gateway.port(int(esc), True, self.now)
             case "can", ["returned"]:
                 self.gateway.can_returned(self.now)
             case "can", ["overrun"]:
@@ -344,7 +344,7 @@ class Bench:
         return f"{said} {hexadecimal(data)}" + ("" if refused is None else f" ! {refused:08X}")
 
     def _collect(self) -> None:
-        self.heard += [(self.now, frame) for frame in self.gateway.take_frames()]
+        self.heard += [(self.now, frame) for frame in self.gateway.take_frames(self.now)]
 
     def heard_lines(self) -> list[str]:
         """What was sent since the last call, as lines."""

@@ -62,7 +62,7 @@ def test_every_other_index_is_06020000h(bench: Bench) -> None:
     unknown = "0000 0001 1006 1201 1400 1600 1806 2003 5FFF 6000 A000 FFFF"
     for index in (int(text, 16) for text in unknown.split()):
         assert bench.write(index, 0, 0) == NO_OBJECT
-    assert gateway.take_frames() == []
+    assert gateway.take_frames(bench.now) == []
 
 
 def test_every_other_sub_index_is_06090011h(bench: Bench) -> None:

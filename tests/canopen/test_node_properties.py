@@ -94,9 +94,9 @@ def happen(bench: Bench, what: tuple[Any, ...]) -> None:
         case "can", state:
             gateway.set_can_state(state, now)
         case "lost", esc:
-            gateway.port_lost(esc, now)
+            gateway.port(esc, False, now)
         case "opened", esc:
-            gateway.port_opened(esc, now)
+            gateway.port(esc, True, now)
         case ("overrun",):
             gateway.receive_overrun(now)
         case ("returned",):
@@ -279,7 +279,7 @@ def test_heartbeats_tell_the_state_at_their_times(story: list[CanFrame | int]) -
             boot_ups = model.boot_ups
             model.take(part)
             bench.gateway.receive_frame(part, bench.now, bench.now)
-            bench.gateway.take_frames()
+            bench.gateway.take_frames(bench.now)
             booted = bench.now if model.boot_ups > boot_ups else booted
             continue
         begin = bench.now

@@ -60,9 +60,9 @@ def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:
     """Locks between gateways are taken while nothing has been sent yet."""
     setup: CanopenSetup = Bench(node_ids=[5, 9, UNCONFIGURED]).setup
     gateway = Gateway([EscSettings(f"esc{n}") for n in range(3)], EMPTY, 0, canopen=setup)
-    assert gateway.node_ids == [5, 9, UNCONFIGURED]
+    assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
     gateway.start(0)
-    assert gateway.node_ids == [5, 9, UNCONFIGURED]
+    assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
 
 
 def test_what_the_bus_has_to_carry_is_reckoned_with_the_pace_of_each_pdo() -> None:

@@ -60,7 +60,7 @@ class Bench:
         self.entries.append(Entry(time_ns, kind, esc, data, flags, came_ns))
 
     def take(self, now: int) -> None:
-        frames = in_order(self.gateway.take_frames(), self._waiting)
+        frames = in_order(self.gateway.take_frames(now), self._waiting)
         if self._is_open:
             self.gateway.status.sent_frames += len(frames)
             self.sent += [TimedFrame(now, frame) for frame in frames]
@@ -84,7 +84,7 @@ class Bench:
             for _ in self.setup.escs
         ]
         for index in range(len(escs)):
-            gateway.port_opened(index, now)
+            gateway.port(index, True, now)
         gateway.start(now, rng.random() < 0.9)
         self.take(now)
         open_ports = [True] * len(escs)
@@ -118,7 +118,7 @@ class Bench:
         what = rng.random()
         if what < 0.002:
             open_ports[index] = not open_ports[index]
-            (gateway.port_opened if open_ports[index] else gateway.port_lost)(index, now)
+            gateway.port(index, open_ports[index], now)
         elif what < 0.006:
             gateway.set_can_state(rng.choice(list(CanState)), now)
             self._is_open = self._is_open and gateway.status.can_state is not CanState.DOWN

@@ -74,7 +74,7 @@ def plain_run(
             due.append((end, index, sent))
             if sent.intact:
                 meant[index].append((end, sent.data))
-        gateway.port_opened(index, START)
+        gateway.port(index, True, START)
     gateway.start(START)
     bench.take(START)
     for now, index, sent in sorted(due, key=lambda item: item[:2]):

@@ -448,7 +448,7 @@ def test_a_header_that_is_damaged_is_there_once_more(tmp_path: Path) -> None:
 
 def test_all_parts_of_a_run_together_replay_as_the_run(tmp_path: Path) -> None:
     bench = Bench(*made(2, canopen=True)).live(4, 12)
-    it = Recorder(RecordSettings(tmp_path, min_free_bytes=0, part_bytes=60_000))
+    it = Recorder(RecordSettings(tmp_path, min_free_bytes=0, part_bytes=40_000))
     it.header = bench.setup.header() | {"created_ns": START, "state": {}}
     it.start()
     for at in range(0, len(bench.entries), 1000):

@@ -61,7 +61,7 @@ def test_frames_that_were_thrown_away_are_not_replayed() -> None:
     """The interface was down when they were to be handed over: a NOT_SENT entry after the turn in which they were made."""
     bench = Bench(*made(1))
     gateway, now = bench.gateway, START
-    gateway.port_opened(0, now)
+    gateway.port(0, True, now)
     gateway.start(now)
     bench.take(now)
     for n in range(1, 30):

@@ -53,7 +53,7 @@ def flight(
     simulated = [SimulatedEsc(each, seed=index) for index, each in enumerate(given)]
     gateway = Gateway(bus.escs, bus.layout, 0)
     for index in range(len(simulated)):
-        gateway.port_opened(index, 0)
+        gateway.port(index, True, 0)
     gateway.start(0)
     if replay:
         gateway.status.state = GatewayState.REPLAY
@@ -64,7 +64,7 @@ def flight(
                 if now < until * SECOND_NS:
                     gateway.receive_bytes(index, sent.wire, now, now)
         gateway.advance(now)
-        frames += [(now, frame) for frame in gateway.take_frames()]
+        frames += [(now, frame) for frame in gateway.take_frames(now)]
     return frames
 
 

@@ -316,7 +316,7 @@ def test_each_page_has_its_own_constants_beside_those_of_every_frame() -> None:
     layout = layout_of([Msg("M", 0x100, 3, signals)], {"A": 0x51, "B": 0x92, "C": 7})
     gateway = Gateway([EscSettings("esc1", 7)], layout, 0)
     for page, constant in ((0, 0x51), (6, 0x92)):
-        bits = gateway.message_bits(0, 50 * MS, page)
+        bits = compile_pack(layout.messages[0])(gateway.escs, gateway.status, 0, 0, page)
         assert bits.to_bytes(3, "little") == bytes((page, constant, 0x70))
 
 
@@ -397,14 +397,12 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
     data_id = data_ids.get("M", 0x2345)
     gateway = Gateway([EscSettings("esc1", 7, Fraction(1))], layout, 0)
     gateway.start(0)
+    frames = gateway.take_frames(0)
     for n in range(40):
-        gateway.receive_bytes(
-            0,
-            encode(LIVE._replace(battery_voltage=n * 100), WireLayout.V4),
-            (50 + n * 10) * MS,
-            (50 + n * 10) * MS,
-        )
-    frames = gateway.take_frames()
+        now = (50 + n * 10) * MS
+        wire = encode(LIVE._replace(battery_voltage=n * 100), WireLayout.V4)
+        gateway.receive_bytes(0, wire, now, now)
+        frames += gateway.take_frames(now)
     assert [get(frame.data, counter_at, 4, True) for frame in frames] == [n % 15 for n in range(41)]
     for frame in frames:
         if at < 7:  # the package needs a byte after the CRC

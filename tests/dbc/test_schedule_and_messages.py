@@ -65,7 +65,7 @@ class Bench:
             self.take()
 
     def take(self) -> None:
-        self.sent += [(self.now, frame) for frame in self.gateway.take_frames()]
+        self.sent += [(self.now, frame) for frame in self.gateway.take_frames(self.now)]
 
     def until(self, when: int) -> None:
         """Let time pass as a perfect runtime does: awake at each deadline."""
@@ -163,9 +163,43 @@ def test_scene(kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[i
             case ["info"]:
                 bench.live(InfoData())
             case ["lost"]:
-                bench.gateway.port_lost(0, bench.now)
+                bench.gateway.port(0, False, bench.now)
                 bench.take()
     assert list(zip(bench.times(), bench.raws(), strict=True)) == sent
+
+
+# --- one step -----------------------------------------------------------------------------------------------------------
+
+
+def test_two_frames_in_one_read_make_one_frame_of_a_message_with_the_newest_values() -> None:
+    bench = lone(EVENT, 0, 0, Sig("AliveCounter", 16, 4))
+    for at in (10, 20):
+        bench.until(at * MS)
+        wire = b"".join(encode(volts(at + n), WireLayout.V4) for n in range(3))
+        bench.gateway.receive_bytes(0, wire, bench.now, bench.now)
+        bench.take()
+    assert list(zip(bench.times(), bench.raws(), bench.raws(4, 16), strict=True)) == [
+        (10, 12, 0),
+        (20, 22, 1),
+    ]
+
+
+def test_messages_of_one_step_go_in_the_order_in_which_they_became_due_then_of_their_index() -> (
+    None
+):
+    ids = {0x100: (EVENT, 0), 0x101: (CYCLIC, 20), 0x102: (EVENT, 0), 0x103: (CYCLIC, 50)}
+    messages = [
+        (Msg(f"EscPower{n}", n, 8, [VOLTAGE]), kind, cycle, 0) for n, (kind, cycle) in ids.items()
+    ]
+    bench = Bench(messages)
+    bench.until(0)
+    bench.forget()
+    due = sorted(bench.gateway.core.messages._schedule._heap)
+    bench.now = 60 * MS  # both cycles were missed
+    bench.gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), bench.now, bench.now)
+    bench.jump(bench.now)
+    cyclic = [0x100 + index for _, index, _ in due]
+    assert [frame.can_id for _, frame in bench.sent] == [*cyclic, 0x100, 0x102]
 
 
 # --- cyclic -------------------------------------------------------------------------------------------------------------
@@ -194,7 +228,7 @@ def test_the_same_message_of_several_escs_never_goes_at_one_instant(count: int) 
     names = {plan.can_id: re.sub("^Esc[0-9]", "", plan.name) for plan in layout.messages}
     while (now := gateway.next_deadline()) < 3 * SECOND:
         gateway.advance(now)
-        frames = gateway.take_frames()
+        frames = gateway.take_frames(now)
         assert len(frames) <= 2
         for frame in frames:
             escs_of_one.setdefault((names[frame.can_id], now), []).append(frame.can_id)
@@ -731,7 +765,7 @@ def test_no_frame_is_ever_older_than_the_time_out(
             newest[number] = bench.now
             bench.live(volts(number))
         elif what == "lost":
-            bench.gateway.port_lost(0, bench.now)
+            bench.gateway.port(0, False, bench.now)
             bench.take()
     bench.until(bench.now + SECOND)
     for when, frame in bench.sent:

@@ -33,7 +33,7 @@ for now in range(0, 3_000_000_000, 10_000_000):
         for sent in esc.frames_until(now):
             gateway.receive_bytes(index, sent.wire, now, now)
     gateway.advance(now)
-    frames += [f"{now} {f.can_id:X} {f.data.hex()}" for f in gateway.take_frames()]
+    frames += [f"{now} {f.can_id:X} {f.data.hex()}" for f in gateway.take_frames(now)]
 fields = [f for f in fields_of_values(config.escs) if f.source != "dummy"]
 parts = sections(fields, [n for n, f in enumerate(fields) if f.esc == 1], config.escs)
 port = PortFacts("esc", "/dev/null", open=True)

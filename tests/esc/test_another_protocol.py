@@ -76,7 +76,7 @@ class Flight:
             if wire:
                 self.gateway.receive_bytes(esc, wire, self.now, self.now)
         self.gateway.advance(self.now)
-        for sent in self.gateway.take_frames():
+        for sent in self.gateway.take_frames(self.now):
             if 257 <= sent.can_id <= 259:
                 found: Any = self._database.decode_message(sent.can_id, sent.data)  # type: ignore[union-attr]
                 self.seen |= found

@@ -62,7 +62,7 @@ def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
             wire = encode(LiveData(battery_voltage=2400), codec.Layout.V4)
             gateway.receive_bytes(1, wire, now, now)
         gateway.advance(now)
-        found += [(now, f.can_id - FIRST_ID, f.data.hex()) for f in gateway.take_frames()]
+        found += [(now, f.can_id - FIRST_ID, f.data.hex()) for f in gateway.take_frames(now)]
         if now == 2 * SECOND:
             gateway.receive_frame(CanFrame(COMMAND_ID, b"\x09"), now, now)
     assert [each for each in found if each[1] == 1] == [
@@ -103,4 +103,4 @@ def test_another_device_with_its_ids_is_noticed() -> None:
     gateway = Gateway(ESCS, Layout("", "", ()), 0, further=(Voltages,))
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
-    assert [(each.whose, each.node) for each in gateway.take_conflicts()] == [("voltage", 1)]
+    assert [(each.whose, each.node) for each in gateway.conflicts.take()] == [("voltage", 1)]

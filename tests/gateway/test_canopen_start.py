@@ -27,9 +27,9 @@ def gateway() -> Gateway:
 def test_an_outage_later_on_does_not_boot_the_nodes_again() -> None:
     made = gateway()
     made.start(0)
-    assert [f.can_id for f in made.take_frames()] == [0x701]
+    assert [f.can_id for f in made.take_frames(0)] == [0x701]
     made.can_returned(SECOND // 2)
-    assert 0x701 not in [f.can_id for f in made.take_frames()]
+    assert 0x701 not in [f.can_id for f in made.take_frames(SECOND // 2)]
 
 
 def test_an_interface_that_goes_down_again_before_a_frame_was_sent_makes_the_nodes_boot_when_it_is_up() -> (
@@ -38,11 +38,11 @@ def test_an_interface_that_goes_down_again_before_a_frame_was_sent_makes_the_nod
     made = gateway()
     made.start(0)
     made.set_can_state(CanState.ERROR_ACTIVE, 0)
-    made.take_frames()
+    made.take_frames(0)
     for now in (SECOND, 2 * SECOND, 3 * SECOND):
         made.set_can_state(CanState.DOWN, now)
         made.can_returned(now)
-        assert [(f.can_id, f.data) for f in made.take_frames()] == [(0x701, b"\0")]
+        assert [(f.can_id, f.data) for f in made.take_frames(now)] == [(0x701, b"\0")]
 
 
 def refused(tmp_path: Path, eds: bytes = b"", dbc: str = "") -> str:
@@ -98,14 +98,14 @@ def test_a_pdo_carries_the_error_code_and_register_and_is_sent_when_they_change(
         "2F 04 1A 00 02 00 00 00",
         "23 04 18 01 A1 01 00 40",
     ):
-        made.take_frames()
+        made.take_frames(0)
         made.receive_frame(CanFrame(0x601, bytes.fromhex(request)), 0, 0)
-        assert [f.data[0] for f in made.take_frames() if f.can_id == 0x581] == [0x60]
+        assert [f.data[0] for f in made.take_frames(0) if f.can_id == 0x581] == [0x60]
     live = bytes.fromhex(
         "4B4F444C 00000000 8A09" + "0000" * 5 + "581F E903 00 00 1D 20 00000200 0C 00 39234C14"
     )
     made.receive_bytes(0, live, SECOND, SECOND)
-    made.take_frames()
+    made.take_frames(SECOND)
     made.advance(2 * SECOND)
-    sent = [frame.data for frame in made.take_frames() if frame.can_id == 0x1A1]
+    sent = [frame.data for frame in made.take_frames(2 * SECOND) if frame.can_id == 0x1A1]
     assert sent == [bytes.fromhex("107501")]

@@ -78,7 +78,7 @@ class Drive:
         self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.canopen)
         self._waiting = TransmitQueue()
         self._open = True
-        self._looked = 0
+        self._looked = self._now = 0
 
     @property
     def deadline(self) -> int:
@@ -86,17 +86,19 @@ class Drive:
         return self._gateway.next_deadline()
 
     def advance(self, now: int) -> None:
-        self._looked = now
+        self._looked = self._now = now
         self._gateway.advance(now)
 
     def uart(self, esc: int, data: bytes, now: int) -> None:
         """Bytes that are read from the port of an ESC (0 ...). They came just now, but where a deadline was missed."""
+        self._now = now
         if self.deadline >= now:
             self._looked = now
         self._gateway.receive_bytes(esc, data, now, self._looked)
 
     def put(self, frame: Frame, now: int) -> None:
         """A frame from the bus. What no filter lets pass the gateway is never given."""
+        self._now = now
         can = CanFrame(frame.can_id, frame.data, frame.extended, frame.fd, remote=frame.remote)
         if can.key in self._gateway.receive_ids:
             self._gateway.status.received_frames += 1
@@ -104,7 +106,7 @@ class Drive:
 
     def happen(self, verb: str, words: Sequence[str], now: int) -> None:
         """Anything else: see README.md."""
-        gateway = self._gateway
+        gateway, self._now = self._gateway, now
         esc = int(words[0]) - 1 if words and words[0].isdecimal() else 0
         match verb:
             case "start":
@@ -112,9 +114,9 @@ class Drive:
             case "stop":
                 gateway.stop(now)
             case "port_opened":
-                gateway.port_opened(esc, now)
+                gateway.port(esc, True, now)
             case "port_lost":
-                gateway.port_lost(esc, now)
+                gateway.port(esc, False, now)
             case "line_errors":
                 gateway.escs[esc].line_errors = int(words[1])
             case "can_state":
@@ -135,7 +137,7 @@ class Drive:
 
     def take(self) -> list[Frame]:
         """What was sent since the last call."""
-        frames = in_order(self._gateway.take_frames(), self._waiting)
+        frames = in_order(self._gateway.take_frames(self._now), self._waiting)
         if not self._open:
             return []
         self._gateway.status.sent_frames += len(frames)
@@ -152,7 +154,7 @@ class Drive:
             f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}"
             for esc, key in gateway.take_rejected_parameters()
         ]
-        for conflict in gateway.take_conflicts():
+        for conflict in gateway.conflicts.take():
             found.append(
                 f"conflict {conflict.can_id:03X} {conflict.whose}{' is over' if conflict.over else ''}"
             )

@@ -242,7 +242,7 @@ def record(path: Path, seconds: float, escs: int = 1, seed: int = 1) -> Recordin
         sent, waiting = recording.sent, TransmitQueue()
 
         def take(now: int) -> None:
-            frames = in_order(gateway.take_frames(), waiting)
+            frames = in_order(gateway.take_frames(now), waiting)
             gateway.status.sent_frames += len(frames)
             gateway.take_link_changes()
             for frame in frames:
@@ -262,7 +262,7 @@ def record(path: Path, seconds: float, escs: int = 1, seed: int = 1) -> Recordin
         happenings += [(recording.clock_set_ns, 3, 0)]
         happenings.sort()
         for index in range(escs):
-            gateway.port_opened(index, START)
+            gateway.port(index, True, START)
         gateway.start(START)
         take(START)
         for read in _reads(recording, seconds, random.Random(seed)):
@@ -274,7 +274,7 @@ def record(path: Path, seconds: float, escs: int = 1, seed: int = 1) -> Recordin
                 elif what == 3:
                     writer.put(at, Kind.CLOCK, 0, number_data(at - START + WALL + CLOCK_STEP), 0)
                 else:
-                    (gateway.port_lost if what == 1 else gateway.port_opened)(0, at)
+                    gateway.port(0, what != 1, at)
                 gateway.advance(at)
                 take(at)
             turns(read.time_ns)

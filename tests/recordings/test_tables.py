@@ -432,14 +432,14 @@ def test_the_age_of_an_esc_that_is_lost_goes_on_in_the_rows_of_another() -> None
     fields = fields_of_values([esc.settings for esc in escs])
     ages = [index for index, one in enumerate(fields) if one.source == "data_age"]
     maker = RowMaker(
-        escs, GatewayStatus(), sections(fields, ages, [esc.settings for esc in escs]), 0
+        sections(fields, ages, [esc.settings for esc in escs]), escs, GatewayStatus(), 0
     )
     wire = encode(LiveData(), Layout.V4)
     for now in range(SECOND, 3 * SECOND, 100 * MS):
         for number, esc in enumerate(escs):
             if number == 0 or now == SECOND:
                 for events in esc.receive_each(wire, now, now - 5 * MS):
-                    maker.follow(number, events, now)
+                    maker.on_event(number, events, now)
     rows = [row.values for row in maker.finish()]
     assert [value for _, value in rows][-3:] == [1700, 1800, 1900]
     assert {value for value, _ in rows} == {0}

@@ -48,12 +48,12 @@ def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()
         now, index = due[0]
         while (deadline := gateway.next_deadline()) is not None and deadline < now:
             gateway.advance(deadline)
-            for frame in gateway.take_frames():
+            for frame in gateway.take_frames(deadline):
                 view.take(frame.key, frame.data, deadline)
         for sent in escs[index].frames_until(now):
             gateway.receive_bytes(index, sent.wire, now, now)
         gateway.advance(now)
-        for frame in gateway.take_frames():
+        for frame in gateway.take_frames(now):
             view.take(frame.key, frame.data, now)
         view.expire(now)
         yield now, list(view.values)

@@ -313,7 +313,7 @@ def test_a_queue_that_stays_full_with_nothing_waiting_is_no_sign_of_life(
     bench.can._is_proven = False
     bench.can.transmitter.clear()
     later = bench.now + SECOND
-    bench.gateway.take_frames()
+    bench.gateway.take_frames(bench.now)
     bench.can.transmit(later)
     assert not bench.can._is_proven
     assert bench.can.transmitter._busy_since is None

@@ -91,8 +91,8 @@ def drive(
             wire = wire[:9] + b"?" + wire[10:]
         gateway.receive_bytes(esc, wire, now, now)
         if turn % 700 == 0:
-            gateway.port_lost(esc, now)
-            gateway.port_opened(esc, now)
+            gateway.port(esc, False, now)
+            gateway.port(esc, True, now)
         if turn % 300 == 0:
             gateway.set_can_state(CanState.BUS_OFF if turn % 600 else CanState.ERROR_ACTIVE, now)
         if turn % 50 == 0:
@@ -101,9 +101,9 @@ def drive(
             gateway.receive_frame(CanFrame(0x000, bytes([1, 0])), now, now)
         gateway.advance(now)
         gateway.take_link_changes()
-        gateway.take_conflicts()
+        gateway.conflicts.take()
         gateway.take_saves()
-        sent += len(gateway.take_frames())
+        sent += len(gateway.take_frames(now))
         each_turn(turn, now)
     return sent
 

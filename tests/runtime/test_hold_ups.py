@@ -175,7 +175,7 @@ def test_the_loop_looks_at_its_ports_four_times_within_the_shortest_time_out_wha
     loop.open()
     loop.begin()
     for timeout in (SECOND, 60 * MS, 20 * MS, 400 * MS):
-        loop.gateway._apply(0, EscSettings("esc1", timeout_ns=timeout))
+        loop.gateway.core.apply(0, EscSettings("esc1", timeout_ns=timeout))
         shortest = min(timeout, 250 * MS)
         end = world.now + 2 * SECOND
         if sends:

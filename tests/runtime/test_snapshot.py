@@ -113,7 +113,7 @@ def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_er
 def test_a_port_that_is_lost_tells_since_when_and_why_and_the_log_is_the_newest() -> None:
     bench = Bench(1)
     bench.run(1)
-    bench.gateway.port_lost(0, bench.now)
+    bench.gateway.port(0, False, bench.now)
     lines = [f"line {n}" for n in range(30)]
     document = bench.document(
         ports=[PortFacts("esc1", "/dev/b", False, "gone", lost_since_ns=bench.now - 5 * SECOND)],

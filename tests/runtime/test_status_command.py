@@ -115,7 +115,7 @@ def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
 
 def test_a_port_that_is_lost_is_told_with_its_complaint_and_for_how_long() -> None:
     bench = heard()
-    bench.gateway.port_lost(0, bench.now)
+    bench.gateway.port(0, False, bench.now)
     ports = [
         PortFacts(
             "esc1",

@@ -225,8 +225,8 @@ class Node(Gateway):
     def frames_wait(self) -> bool:
         return bool(self.waiting) or super().frames_wait
 
-    def take_frames(self) -> list[CanFrame]:
-        frames, self.waiting = [*self.waiting, *super().take_frames()], []
+    def take_frames(self, now: int) -> list[CanFrame]:
+        frames, self.waiting = [*self.waiting, *super().take_frames(now)], []
         return frames
 
 

@@ -23,8 +23,9 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
-from kontronik_can_gw.desk.recordings.samples import Sample, SampledGateway
+from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
 
 _LOOK_FOR_HEADER = 1 << 25
@@ -86,12 +87,23 @@ class CaptureInput(Input):
             replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
             for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
         ]
-        gateway = SampledGateway(self.setup, escs, self._sections(chosen), self._created_ns)
+        sections, makers = self._sections(chosen), []
+
+        def make(*of_gateway: Any) -> RowMaker:
+            makers.append(RowMaker(sections, *of_gateway))
+            return makers[0]
+
+        # without messages; nodes are there, because they may change pole pairs and gear
+        gateway = Gateway(
+            *(escs, Layout("", "", ()), self._created_ns),
+            canopen=self.setup.canopen,
+            further=(make,),
+        )
         replay = Replay(gateway, self.header.get("state"))
         for entry in self.entries():
             replay.play(entry)
-            yield from gateway.maker.take_rows()
-        yield from gateway.maker.finish()
+            yield from makers[0].take_rows()
+        yield from makers[0].finish()
         self._add_losses(replay)
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:

@@ -11,17 +11,15 @@ from itertools import chain, groupby
 from typing import NamedTuple
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.recordings.columns import Section, Values
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct, field_of_signal
 from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
-from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
+from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals import units
-from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.unpacker import Column, Part, SignalReader, Value
 
 SAME_ROW_NS = 5 * MS
@@ -46,16 +44,17 @@ class Sample(NamedTuple):
 # --- from bytes
 
 
-class RowMaker:
+class RowMaker(Output):
     """Makes rows of what ESCs say. They gather in ``rows``, which the owner empties; ``finish`` gives the last."""
 
     def __init__(
         self,
+        sections: Sequence[Section],
         escs: Sequence[EscTelemetry],
         status: GatewayStatus,
-        sections: Sequence[Section],
         now: int,
     ) -> None:
+        super().__init__()
         self.rows: list[Sample] = []
         self._escs = escs
         self._status = status
@@ -92,7 +91,7 @@ class RowMaker:
         self._close_row()
         return self.take_rows()
 
-    def follow(self, esc: int, events: int, now: int) -> None:
+    def on_event(self, esc: int, events: int, now: int) -> None:
         """Something changed with an ESC."""
         if not events & (Event.LIVE | Event.LINK | Event.INFO):
             return
@@ -130,24 +129,6 @@ class RowMaker:
             self._in_row.clear()
 
 
-class SampledGateway(Gateway):
-    """A gateway without messages whose ESCs make ``rows``. CANopen nodes are there: they may change pole pairs and gear."""
-
-    def __init__(
-        self,
-        setup: CaptureSetup,
-        escs: Sequence[EscSettings],
-        sections: Sequence[Section],
-        now: int,
-    ) -> None:
-        super().__init__(escs, Layout("", "", ()), now, canopen=setup.canopen)
-        self.maker = RowMaker(self.escs, self.status, sections, now)
-
-    def _follow(self, esc: int, events: int, now: int) -> None:
-        super()._follow(esc, events, now)
-        self.maker.follow(esc, events, now)
-
-
 class FoundTelemetry(EscTelemetry):
     """Telemetry of bytes whose times are only known when their frames are found."""
 
@@ -167,18 +148,18 @@ def samples_of_bytes(
 ) -> Iterator[Sample]:
     """The rows of one ESC's frames (time, bytes, frame); a gateway runs from the first one on."""
     status = GatewayStatus(GatewayState.RUNNING, esc_count=1)
-    maker = RowMaker([esc], status, sections, 0)
+    maker = RowMaker(sections, [esc], status, 0)
     due = 0
     for now, _, frame in found:
         if frame is None:
             continue
         while due < now and (due := esc.next_deadline()) < now:
-            maker.follow(0, esc.advance(due), due)
+            maker.on_event(0, esc.advance(due), due)
         events = esc.take(frame, now)
         if events & Event.LINK:
             status.escs_ok = int(esc.up)
             due = 0
-        maker.follow(0, events, now)
+        maker.on_event(0, events, now)
         if maker.rows:
             yield from maker.take_rows()
     yield from maker.finish()

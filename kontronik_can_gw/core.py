@@ -1,0 +1,110 @@
+"""The core: bytes of ESCs and time in, CAN frames and deadlines out. Telemetry of each ESC, the messages of a layout, their schedule.
+
+Pure, and the way of every value: ``receive`` decodes and marks messages as pending, ``advance`` lets cycles and time-outs pass,
+``take`` packs what is pending. What happens besides is reported to ``on_event`` as it happens. ``now`` is integer nanoseconds of one
+monotonic clock.
+"""
+
+from collections.abc import Callable, Sequence
+
+from kontronik_can_gw.dbc.messages import Messages
+from kontronik_can_gw.esc.telemetry import SECOND, EscSettings, EscTelemetry, Event
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway_status import GatewayStatus
+from kontronik_can_gw.signals.plan import Layout
+
+OnEvent = Callable[[int, int, int], None]
+"""ESC, bits of telemetry.Event, time."""
+
+
+class Core:
+    """``escs`` are the ESCs' states. ``silent``: see Messages."""
+
+    def __init__(
+        self,
+        escs: Sequence[EscSettings],
+        layout: Layout,
+        status: GatewayStatus,
+        now: int,
+        silent: bool,
+        on_event: OnEvent,
+    ) -> None:
+        self.escs = [EscTelemetry(settings, now) for settings in escs]
+        self.messages = Messages(layout, self.escs, status, now, silent)
+        self.shortest_timeout_ns = self._shortest_timeout()
+        """Of all ESCs: live data of one is not available after this."""
+        self.packs_at_once = False
+        """As 0.5.0 did, to replay its captures: with each event, so that one step may make several frames of a message."""
+        self._packed: list[CanFrame] = []
+        self._status = status
+        self._on_event = on_event
+        self._second_ns = now
+        self._next_expiry = 0
+        """No ESC has a deadline before this: they only move on, but for a link that comes up, which sets this back."""
+
+    def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
+        """Bytes of one ESC's UART, read at ``now``. ``since``: none of them had come by then (telemetry.py, Arrival)."""
+        if now >= self._next_expiry:
+            self.expire(now, but=esc)  # a message may hold values of several ESCs
+        for events in self.escs[esc].receive_each(data, now, since):
+            self._report(esc, events, now)
+
+    def port(self, esc: int, is_open: bool, now: int) -> None:
+        """An ESC's port was opened (again), or cannot be used: its values are not available from now on."""
+        state = self.escs[esc]
+        self._report(esc, state.port_opened() if is_open else state.port_lost(), now)
+
+    def apply(self, esc: int, settings: EscSettings) -> None:
+        """Other settings of an ESC from now on."""
+        self.escs[esc].apply(settings)
+        self.shortest_timeout_ns = self._shortest_timeout()
+        self._next_expiry = 0
+
+    def expire(self, now: int, but: int | None = None) -> None:
+        """What is too old by now goes, of all ESCs ``but`` one that is about to bring something."""
+        if now < self._next_expiry:
+            return
+        for index, esc in enumerate(self.escs):
+            if index != but and now >= esc.next_deadline():
+                self._report(index, esc.advance(now), now)
+        self._next_expiry = min(esc.next_deadline() for esc in self.escs)
+        if now - self._second_ns >= SECOND:
+            self._second_ns = now
+            self.messages.on_gateway_change(now, each_second=True)
+
+    def advance(self, now: int) -> None:
+        """Let time pass: time-outs, cyclic messages."""
+        self.expire(now)
+        self.messages.advance(now)
+
+    def next_deadline(self) -> int:
+        """When ``advance`` is to be called at the latest."""
+        due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
+        return min(due, self.messages.next_deadline())
+
+    def take(self, now: int) -> list[CanFrame]:
+        """The frames of the messages that are due, with the values of now, in the order in which they became due."""
+        self.pack(now)
+        frames, self._packed = self._packed, []
+        return frames
+
+    def pack(self, now: int) -> None:
+        """Make the frames of what is pending, before ``take`` asks for them."""
+        self._packed += self.messages.take(now)
+
+    def _report(self, esc: int, events: int, now: int) -> None:
+        if not events:
+            return
+        self.messages.on_event(esc, events, now)
+        if events & Event.LINK:
+            self._next_expiry = min(self._next_expiry, self.escs[esc].next_deadline())
+            escs_ok = sum([e.live is not None for e in self.escs])
+            if escs_ok != self._status.escs_ok:
+                self._status.escs_ok = escs_ok
+                self.messages.on_gateway_change(now)
+        if self.packs_at_once:
+            self.pack(now)
+        self._on_event(esc, events, now)
+
+    def _shortest_timeout(self) -> int:
+        return min(esc.settings.timeout_ns for esc in self.escs)
