@@ -1,4 +1,4 @@
-"""The command line: ``kontronik-can-gw COMMAND``. One module per command; each imports heavy modules only when it runs.
+"""The command line: ``kontronik-can-gw COMMAND``. One module per command, which is imported only when it is given.
 
 Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data goes to standard output, messages to standard error.
 """
@@ -14,10 +14,10 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import NoReturn
+from types import ModuleType
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.cli.arguments import refuse_removed_options
+from kontronik_can_gw.cli.arguments import add_options, refuse_removed_options
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 
@@ -53,7 +53,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     command = next((word for word in words if not word.startswith("-")), None)
     try:
-        return _main(words, command)
+        _prepare_streams()
+        need_descriptors()
+        refuse_removed_options(command, words)
+        args = make_parser([] if command is None else [command]).parse_args(words)
+        with _interruptible():
+            code: int = args.main(args)
+        sys.stdout.flush()
+        return code
     except UserError as error:
         for problem in error.problems:
             say(problem, command)
@@ -71,22 +78,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return RunError.exit_code
-
-
-def _main(words: list[str], command: str | None) -> int:
-    _prepare_streams()
-    need_descriptors()
-    refuse_removed_options(command, words)
-    try:
-        args = make_parser([] if command is None else [command]).parse_args(words)
-    except _UsageError as error:
-        refuse_removed_options(command, words, error.message)
-        argparse.ArgumentParser.error(error.parser, error.message)
-    with _interruptible():
-        code: int = args.main(args)
-    if sys.stdout is not None:  # None where it was closed, as by `>&-`
-        sys.stdout.flush()
-    return code
 
 
 def discard_output() -> None:
@@ -139,34 +130,35 @@ def _too_few_files(needed: int = _DESCRIPTORS) -> RunError:
     )
 
 
-class _UsageError(Exception):
-    def __init__(self, parser: argparse.ArgumentParser, message: str) -> None:
-        super().__init__(message)
-        self.parser = parser
-        self.message = message
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise _UsageError(self, message)
-
-
 def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """The parser of the program. Only commands in ``complete`` get their options; a run needs only those of one command."""
-    parser = _Parser(
+    parser = argparse.ArgumentParser(
         prog="kontronik-can-gw",
         description="Gateway from KONTRONIK ESC telemetry (UART) to CAN, described by a DBC.",
         epilog="kontronik-can-gw COMMAND --help describes a command.",
+        allow_abbrev=False,
     )
     parser.add_argument("-V", "--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, line in COMMANDS.items():
-        sub = commands.add_parser(name, help=line, description=line[0].upper() + line[1:] + ".")
+        text = line[0].upper() + line[1:] + "."
+        sub = commands.add_parser(name, help=line, description=text, allow_abbrev=False)
         if name in complete:
-            module = import_module(f"kontronik_can_gw.cli.{name}")
-            module.add_arguments(sub)
-            sub.set_defaults(main=module.main)
+            _complete(sub, import_module(f"kontronik_can_gw.cli.{name}"))
     return parser
+
+
+def _complete(parser: argparse.ArgumentParser, module: ModuleType) -> None:
+    """Declare what a command's module has: OPTIONS, EPILOG, ``main``, and ACTIONS (each a line and its options) if there are any."""
+    add_options(parser, module.OPTIONS)
+    parser.epilog = module.EPILOG
+    if "\n" in module.EPILOG:
+        parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.set_defaults(main=module.main)
+    if actions := getattr(module, "ACTIONS", None):
+        subs = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+        for name, (line, options) in actions.items():
+            add_options(subs.add_parser(name, help=line, allow_abbrev=False), options)
 
 
 class _Plain(logging.Formatter):

@@ -1,44 +1,68 @@
-"""Checks of options that several commands share."""
+"""Options of commands as rows of a table, and what several commands share of them."""
 
 import argparse
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from kontronik_can_gw.errors import UserError
 
+# fmt: off
 REMOVED_OPTIONS: dict[tuple[str, str], str] = {
-    (
-        "describe",
-        "--format html",
-    ): "Type kontronik-can-gw describe -o bus.md; pandoc -s bus.md -o bus.html makes a page of it.",
-    (
-        "describe",
-        "--format man",
-    ): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
-    (
-        "service",
-        "--prometheus",
-    ): "Type kontronik-can-gw service install --metrics: a service of its own"
-    " serves /metrics, and the gateway listens on nothing.",
-    (
-        "service",
-        "--dry-run",
-    ): "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
-    (
-        "service",
-        "--print",
-    ): "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
-    (
-        "service",
-        "--force",
-    ): "Leave it out: a file that was changed by hand stays. Remove it to have it written anew.",
+    ("describe", "--format html"): "Type kontronik-can-gw describe -o bus.md; pandoc -s bus.md -o bus.html makes a page of it.",
+    ("describe", "--format man"): "Type kontronik-can-gw --help, or kontronik-can-gw COMMAND --help.",
+    ("service", "--prometheus"):
+        "Type kontronik-can-gw service install --metrics: a service of its own serves /metrics, and the gateway listens on nothing.",
+    ("service", "--dry-run"):
+        "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
+    ("service", "--print"):
+        "Give install --root DIR: the files are written below DIR and nothing else is done. uninstall prints what it removes.",
+    ("service", "--force"): "Leave it out: a file that was changed by hand stays. Remove it to have it written anew.",
     ("report", "--png"): "Give -o FILE: the page has the same plots, and prints them.",
     ("report", "--to"): "Type --until S.",
 }
+# fmt: on
 """Removed options by command, as ("report", "--png"), and a sentence that says what to type instead.
 
 A removed choice is written with its option: ("describe", "--format html"). Entries may be deleted a year after the removal.
 """
+
+
+class Option(NamedTuple):
+    """An option or argument, with the words for ``add_argument``."""
+
+    names: Sequence[str]
+    settings: dict[str, Any]
+
+
+Rows = Sequence["Option | str | Rows"]
+"""Options of a command. A text is the title of the group of those after it; of rows in a row only one may be given."""
+
+
+def option(typed: str, text: str, **settings: Any) -> Option:
+    """An option by what is typed, as "-c --config FILE", a switch as "--json", or an argument as "FILE"; ``text`` is its help."""
+    *names, last = typed.split()
+    if last.startswith("-"):
+        names.append(last)
+        if "choices" not in settings:
+            settings["action"] = "store_true"
+    else:
+        settings["metavar"] = last
+        names = names or [settings.pop("dest", last.lower())]
+    return Option(names, {"help": text, **settings})
+
+
+def add_options(parser: "argparse._ActionsContainer", rows: Rows) -> None:
+    """Declare options."""
+    group = parser
+    for row in rows:
+        if isinstance(row, str):
+            group = parser.add_argument_group(row)
+        elif isinstance(row, Option):
+            group.add_argument(*row.names, **row.settings)
+        else:
+            add_options(parser.add_mutually_exclusive_group(), row)
 
 
 def number_from(
@@ -64,36 +88,19 @@ def number_from(
     return read
 
 
-rate = number_from(0.001, 1e6, problem="is no rate between 0.001 and 1000000")
-"""A type for argparse: a rate in Hz."""
+# fmt: off
+CONFIG = option("-c --config FILE", "TOML configuration", type=Path, required=True)
+JSON = option("--json", "one JSON document on standard output")
+OUTPUT = option("-o --output FILE", "where to (default: standard output)", default="-")
+LAYOUT = (
+    option("-c --config FILE", "TOML configuration of the gateway whose frames they are", type=Path),
+    option("--dbc FILE", "DBC of the frames (default: the shipped one, for one ESC)", type=Path),
+)
+# fmt: on
 
 
-def seconds_ns(text: str) -> int:
-    """A type for argparse: seconds as ns."""
-    from decimal import Decimal, InvalidOperation
-
-    try:
-        number = Decimal(text)
-        if number.is_finite() and 0 <= number < 10**9:
-            return int(number * 10**9)
-    except InvalidOperation:
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds")
-
-
-def names(text: str) -> list[str]:
-    """A type for argparse: names with commas between."""
-    found = [name.strip() for name in text.split(",") if name.strip()]
-    if not found:
-        raise argparse.ArgumentTypeError("give names of signals, with commas between")
-    return found
-
-
-def refuse_removed_options(command: str | None, words: Sequence[str], rejected: str = "") -> None:
-    """UserError with the replacement where a command line has a removed option.
-
-    ``rejected``: argparse's message about the command line: the beginning of a removed option that is named in it counts too.
-    """
+def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
+    """UserError with the replacement where a command line has a removed option."""
     options = words[: words.index("--")] if "--" in words else words
     parts = [
         part
@@ -101,8 +108,6 @@ def refuse_removed_options(command: str | None, words: Sequence[str], rejected: 
         for part in (word.split("=", 1) if word.startswith("--") else [word])
     ]
     for part, value in pairwise([*parts, ""]):
-        for (of, option), advice in REMOVED_OPTIONS.items():
-            name, _, choice = option.partition(" ")
-            is_short = len(part) > 2 and name.startswith(part) and (choice or part) in rejected
-            if of == command and (part == name or is_short) and choice in ("", value):
-                raise UserError(f"{option}: was removed. {advice}")
+        for removed in (part, f"{part} {value}"):
+            if (advice := REMOVED_OPTIONS.get((command or "", removed))) is not None:
+                raise UserError(f"{removed}: was removed. {advice}")

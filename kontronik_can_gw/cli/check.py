@@ -3,13 +3,13 @@
 import argparse
 import struct
 from collections.abc import Sequence
-from pathlib import Path
 
 from kontronik_can_gw.canopen.cob_ids import all_ids
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.canopen.pdo import Tpdo
 from kontronik_can_gw.canopen.pdo_parameters import EVENT_TYPES
 from kontronik_can_gw.canopen.traffic import bits_per_second, frames_per_second
+from kontronik_can_gw.cli.arguments import CONFIG
 from kontronik_can_gw.cli.common import load_all, show
 from kontronik_can_gw.cli.recording import in_words, record_folder
 from kontronik_can_gw.config.assemble import Loaded
@@ -19,15 +19,11 @@ from kontronik_can_gw.esc.telemetry import MS
 from kontronik_can_gw.node_state import UNCONFIGURED
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType, SignalPlan
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration"
-    )
-    parser.epilog = (
-        "Prints the effective configuration, each message and signal with its source, what is lost, and the bus load. "
-        "Opens no port and no interface. Exit code: 0 it can be used (there may be warnings), 2 it cannot."
-    )
+OPTIONS = (CONFIG,)
+EPILOG = (
+    "Prints the effective configuration, each message and signal with its source, what is lost, and the bus load. "
+    "Opens no port and no interface. Exit code: 0 it can be used (there may be warnings), 2 it cannot."
+)
 
 
 def main(args: argparse.Namespace) -> int:

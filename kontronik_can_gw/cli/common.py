@@ -1,6 +1,5 @@
-"""Shared by several commands: the log, signals, output files, and warnings of a configuration on standard error."""
+"""Shared by several commands: the log, signals, and warnings of a configuration on standard error."""
 
-import io
 import logging
 import os
 import signal
@@ -13,8 +12,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.cli import say as say
 from kontronik_can_gw.cli import show as show
 from kontronik_can_gw.config.assemble import Loaded, load_configuration
-from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.printable import printable
+from kontronik_can_gw.errors import UserError
 
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup
@@ -100,42 +98,3 @@ def canopen_of(loaded: Loaded) -> "CanopenSetup":
             f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. Set it to true."
         )
     return loaded.canopen
-
-
-def write_output(where: str, text: str, encoding: str) -> None:
-    """Write text to a file and say so, or to standard output for ``-``; line ends stay. RunError where it cannot be written."""
-    if where == "-" and sys.stdout.isatty():
-        text = printable(text, keep="\r\n\t")
-    data = text.encode(encoding)
-    if where != "-":
-        write_file(Path(where), data)
-        say(f"{where} written")
-    elif isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.buffer.write(data)
-    else:
-        sys.stdout.write(text)
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file atomically. Anything but a plain file (a pipe, /dev/stdout) is written to, not replaced."""
-    import tempfile
-
-    beside: Path | None = None
-    try:
-        target = path.resolve()
-        if target.exists() and not target.is_file():
-            target.write_bytes(data)
-            return
-        with tempfile.NamedTemporaryFile(
-            dir=target.parent, prefix=f".{path.name}.", delete=False
-        ) as file:
-            beside = Path(file.name)
-            file.write(data)
-        beside.chmod(0o644)
-        beside.replace(target)
-        beside = None
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror}. Give another -o.") from None
-    finally:
-        if beside is not None:
-            beside.unlink(missing_ok=True)

@@ -3,9 +3,14 @@
 import argparse
 from collections.abc import Iterator
 
+import shtab
+
+from kontronik_can_gw.cli import make_parser
+from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.errors import RunError
 
-SHELLS = ("bash", "zsh", "tcsh", "fish")
+_SHELLS = ("bash", "zsh", "tcsh", "fish")
+OPTIONS = (option("SHELL", ", ".join(_SHELLS), choices=_SHELLS),)
 EPILOG = """\
 bash:  kontronik-can-gw completion bash > ~/.local/share/bash-completion/completions/kontronik-can-gw
        or once, for this shell: eval "$(kontronik-can-gw completion bash)"
@@ -17,23 +22,12 @@ exit codes: 0 done, 1 the installed shtab does not know this shell, 2 wrong usag
 """
 _FILES = frozenset({"FILE", "DBC", "PATH", "IN", "OUT"})
 _FOLDERS = frozenset({"DIR", "FOLDER"})
-_ENDINGS = {"config": ("*.toml",), "dbc": ("*.dbc", "*.DBC"), "source": ("*.dbc", "*.DBC")}
+_ENDINGS = {"config": ("*.toml",), "dbc": ("*.dbc", "*.DBC"), "from": ("*.dbc", "*.DBC")}
 """File name endings for options, by their attribute name."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare SHELL."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    parser.add_argument("shell", metavar="SHELL", choices=SHELLS, help=", ".join(SHELLS))
 
 
 def main(args: argparse.Namespace) -> int:
     """Print the script. RunError where the installed shtab is too old for the shell."""
-    import shtab
-
-    from kontronik_can_gw.cli import make_parser
-
     if args.shell not in shtab.SUPPORTED_SHELLS:
         raise RunError(
             f"{args.shell}: needs a newer shtab than {shtab.__version__}: pip install --upgrade shtab"

@@ -1,11 +1,19 @@
-"""``kontronik-can-gw convert``: recordings to tables, CAN logs and plain bytes."""
+"""``convert``: recordings to tables, CAN logs and plain bytes."""
 
 import argparse
+import signal
+import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import names, rate, seconds_ns
+from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
+from kontronik_can_gw.cli.bus_layout import given_layout
+from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.progress import Progress
 from kontronik_can_gw.desk.recordings.convert import (
     BYTES,
     FORMATS,
@@ -14,15 +22,59 @@ from kontronik_can_gw.desk.recordings.convert import (
     STREAMS,
     SUFFIXES,
     TABLES,
+    BytesConversion,
+    Conversion,
+    LogConversion,
+    Output,
+    TableConversion,
+    reason,
 )
+from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput, Input, open_input
+from kontronik_can_gw.desk.recordings.spool import is_stream
+from kontronik_can_gw.desk.recordings.tables.rows import Choice, fields_of_frames
+from kontronik_can_gw.errors import RunError, UserError
 
-if TYPE_CHECKING:
-    from pathlib import Path
 
-    from kontronik_can_gw.desk.recordings.convert import Conversion
-    from kontronik_can_gw.desk.recordings.inputs import Input
-    from kontronik_can_gw.desk.recordings.layouts import BusLayout
+def _seconds_ns(text: str) -> int:
+    """A type for argparse: seconds as ns."""
+    try:
+        number = Decimal(text)
+        if number.is_finite() and 0 <= number < 10**9:
+            return int(number * 10**9)
+    except InvalidOperation:
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds")
 
+
+def _names(text: str) -> list[str]:
+    """A type for argparse: names with commas between."""
+    found = [name.strip() for name in text.split(",") if name.strip()]
+    if not found:
+        raise argparse.ArgumentTypeError("give names of signals, with commas between")
+    return found
+
+
+_RATE = number_from(0.001, 1e6, problem="is no rate between 0.001 and 1000000")
+# fmt: off
+OPTIONS = (
+    option("IN", "capture, CAN log or UART bytes; - for standard input", dest="input"),
+    option("OUT", "file to write, or - for standard output", dest="output"),
+    option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS),
+    option("--force", "write over OUT if it is there"),
+    option("-q --quiet", "no summary"),
+    LAYOUT,
+    option("--live-rate HZ", "live frames a second of plain UART bytes, which have no time (default 100)", type=_RATE),
+    "a part of it",
+    option("--from S", "from this time after the start, in seconds", type=_seconds_ns, dest="start"),
+    option("--until S", "up to this time after the start, in seconds", type=_seconds_ns, dest="end"),
+    option("--esc NAME", "only the signals (or bytes) of this ESC"),
+    "tables",
+    option("--signals A,B*", "only these signals, in this order; * and ? stand for others", type=_names, default=[]),
+    option("--rate HZ", "rows a second at most, the newest of each period", type=_RATE),
+    option("--frames", "a row for each CAN frame, with its own signals only"),
+    option("--units-line", "jsonl: a first line with the units"),
+)
+# fmt: on
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder of captures for all parts of a run), a log of CAN frames (candump, Vector ASC or
 BLF, PEAK TRC, MF4 bus logging), or plain UART bytes of one ESC. What it is is found out by its content.
@@ -48,37 +100,6 @@ library is missing; 2 wrong usage, or IN is no recording
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare IN, OUT and what is wanted of it."""
-    from kontronik_can_gw.cli.bus_layout import add_layout_arguments
-
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    source = "capture, CAN log or UART bytes; - for standard input"
-    parser.add_argument("input", metavar="IN", help=source)
-    parser.add_argument("output", metavar="OUT", help="file to write, or - for standard output")
-    parser.add_argument("--to", metavar="FORMAT", choices=FORMATS, help=", ".join(FORMATS))
-    parser.add_argument("--force", action="store_true", help="write over OUT if it is there")
-    parser.add_argument("-q", "--quiet", action="store_true", help="no summary")
-    add_layout_arguments(parser)
-    part = parser.add_argument_group("a part of it")
-    for option, dest, word in (("--from", "start", "from"), ("--until", "end", "up to")):
-        text = f"{word} this time after the start, in seconds"
-        part.add_argument(option, dest=dest, metavar="S", type=seconds_ns, help=text)
-    part.add_argument("--esc", metavar="NAME", help="only the signals (or bytes) of this ESC")
-    table = parser.add_argument_group("tables")
-    signals = "only these signals, in this order; * and ? stand for others"
-    table.add_argument("--signals", metavar="A,B*", type=names, default=[], help=signals)
-    text = "rows a second at most, the newest of each period"
-    table.add_argument("--rate", metavar="HZ", type=rate, help=text)
-    frames = "a row for each CAN frame, with its own signals only"
-    table.add_argument("--frames", action="store_true", help=frames)
-    units = "jsonl: a first line with the units"
-    table.add_argument("--units-line", action="store_true", help=units)
-    live_rate = "live frames a second of plain UART bytes, which have no time (default 100)"
-    parser.add_argument("--live-rate", metavar="HZ", type=rate, help=live_rate)
-
-
 def main(args: argparse.Namespace) -> int:
     """Convert args.input. UserError for wrong usage, RunError where something cannot be read or written."""
     form = _format(args)
@@ -99,17 +120,12 @@ class _Ended(KeyboardInterrupt):
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
     """SIGTERM and SIGHUP leave no half file either; what is ignored (nohup) stays ignored."""
-    import signal
-    import threading
 
     def end(_number: int, _frame: object) -> None:
         raise _Ended
 
-    numbers = (
-        (signal.SIGTERM, signal.SIGHUP)
-        if threading.current_thread() is threading.main_thread()
-        else ()
-    )
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGTERM, signal.SIGHUP) if is_main else ()
     changed = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
     for number in changed:
         signal.signal(number, end)
@@ -121,25 +137,15 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _convert(args: argparse.Namespace, form: str) -> None:
-    import time
-    from pathlib import Path
-
-    from kontronik_can_gw.cli.bus_layout import bus_layout
-    from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.desk.recordings.convert import Output, reason
-    from kontronik_can_gw.errors import RunError, UserError
-
-    source = Path(args.input)
     target = None if args.output == "-" else Path(args.output)
-    layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     begun = time.monotonic()
-    with _opened(args, source, layout) as recording:
+    with _opened(args) as recording:
         if args.live_rate is not None and not recording.times_assumed:
             raise UserError(
                 f"--live-rate is for plain UART bytes: {recording.name} has times of its own. Leave it out."
             )
         conversion = _conversion(args, form, recording)
-        name, size = source.name or recording.name, recording.size or None
+        name, size = Path(args.input).name or recording.name, recording.size or None
         try:
             with Progress(name, size, target is None) as progress, Output(target, form) as out:
                 summary = conversion(recording, out, progress.reach)
@@ -152,15 +158,13 @@ def _convert(args: argparse.Namespace, form: str) -> None:
 
 
 def _report(
-    args: argparse.Namespace, form: str, recording: "Input", summary: str | None, seconds: float
+    args: argparse.Namespace, form: str, recording: Input, summary: str | None, seconds: float
 ) -> None:
     """Say what was written, and what of the recording was not intact. RunError where there was nothing."""
-    from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput
-    from kontronik_can_gw.errors import RunError
-
     damage = [line for line in recording.damage if line not in recording.notes]
+    damage = [f"{args.input}: damaged: {line}" for line in damage]
     if summary is None:
-        raise RunError(*_nothing(args, recording, damage))
+        raise RunError(*damage, f"{args.input}: {_nothing(args, recording)}")
     notes = recording.notes if form in TABLES else []
     if not args.quiet:
         others = recording.others if isinstance(recording, CanLogInput) else 0
@@ -171,34 +175,30 @@ def _report(
         if recording.times_assumed and form != BYTES:
             live_rate = args.live_rate or LIVE_RATE
             _say(f"times are assumed: {live_rate:g} live frames a second (--live-rate)")
-    for line in notes:
-        _say(f"{args.input}: {line}")
-    for line in damage:
-        _say(f"{args.input}: damaged: {line}")
+    for line in (*(f"{args.input}: {note}" for note in notes), *damage):
+        _say(line)
 
 
-def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None") -> "Input":
+def _nothing(args: argparse.Namespace, recording: Input) -> str:
+    """Why there is nothing to convert."""
+    if args.start is not None or args.end is not None:
+        return "nothing in it is between --from and --until"
+    if isinstance(recording, CanLogInput) and not recording.others:
+        return "nothing in it can be converted: it has no CAN frame."
+    return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
+
+
+def _opened(args: argparse.Namespace) -> Input:
     """The recording; of a pipe with a bar while it is read into a file."""
-    from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, open_input
-    from kontronik_can_gw.desk.recordings.spool import is_stream
-
-    rate = args.live_rate or LIVE_RATE
+    source, layout, rate = Path(args.input), given_layout(args), args.live_rate or LIVE_RATE
     if not is_stream(source):
         return open_input(source, layout, rate)
     with Progress(f"reading {source}", None, args.output == "-") as progress:
         return open_input(source, layout, rate, progress.reach)
 
 
-def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Conversion":
+def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Conversion:
     """What is to be done. UserError for what the recording has not."""
-    from kontronik_can_gw.desk.recordings.convert import (
-        BytesConversion,
-        LogConversion,
-        TableConversion,
-    )
-    from kontronik_can_gw.desk.recordings.tables.rows import Choice, fields_of_frames
-
     if form == BYTES:
         return BytesConversion(_esc(args, recording, needed=True) or 0)
     if form in LOGS:
@@ -210,10 +210,6 @@ def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Con
 
 
 def _format(args: argparse.Namespace) -> str:
-    from pathlib import Path
-
-    from kontronik_can_gw.errors import UserError
-
     if args.to:
         return str(args.to)
     if args.output == "-":
@@ -232,11 +228,6 @@ def _format(args: argparse.Namespace) -> str:
 
 def _check(args: argparse.Namespace, form: str) -> None:
     """Wrong usage that is known before anything is opened. UserError."""
-    import sys
-    from pathlib import Path
-
-    from kontronik_can_gw.errors import UserError
-
     if args.output == "-" and form not in STREAMS:
         raise UserError(
             f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}"
@@ -280,39 +271,17 @@ def _check(args: argparse.Namespace, form: str) -> None:
         ) from None
 
 
-def _esc(args: argparse.Namespace, recording: "Input", needed: bool = False) -> int | None:
+def _esc(args: argparse.Namespace, recording: Input, needed: bool = False) -> int | None:
     """Index of the ESC that --esc names; None where none is named and none is needed. UserError."""
-    from kontronik_can_gw.errors import UserError
-
     names = [esc.name for esc in recording.bus.escs]
     if args.esc is None:
-        if not needed:
-            return None
-        if len(names) > 1:
+        if needed and len(names) > 1:
             raise UserError(f"bin holds the bytes of one ESC. Give --esc: {', '.join(names)}")
-        return 0
+        return None
     if args.esc not in names:
         raise UserError(f"--esc {args.esc}: there is no such ESC. There are: {', '.join(names)}")
     return names.index(args.esc)
 
 
-def _nothing(args: argparse.Namespace, recording: "Input", damage: list[str]) -> list[str]:
-    """Why there is nothing to convert."""
-    from kontronik_can_gw.desk.recordings.inputs import CanLogInput
-
-    lines = [f"{args.input}: damaged: {line}" for line in damage]
-    if args.start is not None or args.end is not None:
-        return [*lines, f"{args.input}: nothing in it is between --from and --until"]
-    file = recording.bus.layout.file
-    if isinstance(recording, CanLogInput) and not recording.others:
-        return [*lines, f"{args.input}: nothing in it can be converted: it has no CAN frame."]
-    return [
-        *lines,
-        f"{args.input}: nothing in it can be converted: no frame of {file}. Give the right DBC by --dbc or -c.",
-    ]
-
-
 def _say(text: str) -> None:
-    from kontronik_can_gw.cli import say
-
     say(text, "convert")

@@ -1,4 +1,4 @@
-"""``kontronik-can-gw decode``: recorded UART bytes to JSON lines or CSV."""
+"""``decode``: recorded UART bytes to JSON lines or CSV."""
 
 import argparse
 import json
@@ -9,8 +9,17 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TextIO
 
+from kontronik_can_gw.cli import discard_output
+from kontronik_can_gw.cli.arguments import option
+from kontronik_can_gw.cli.progress import Progress
+from kontronik_can_gw.desk.recordings import decode
 from kontronik_can_gw.errors import RunError, UserError
 
+OPTIONS = (
+    option("FILE", "file of UART bytes, or - for standard input"),
+    option("--csv", "CSV with a header instead of JSON lines"),
+    option("--stats FILE", "write the counters to FILE as JSON when done"),
+)
 EPILOG = """\
 FILE holds the bytes as they came over the UART, nothing else; - is standard input, decoded as it comes.
 Frames go to standard output in file order, as JSON objects or CSV rows; a summary goes to standard error.
@@ -22,24 +31,8 @@ exit codes: 0 the input was read to its end, even if no frame was found in it (t
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare FILE, --csv, --stats."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    parser.add_argument("file", metavar="FILE", help="file of UART bytes, or - for standard input")
-    parser.add_argument(
-        "--csv", action="store_true", help="CSV with a header instead of JSON lines"
-    )
-    parser.add_argument(
-        "--stats", metavar="FILE", help="write the counters to FILE as JSON when done"
-    )
-
-
 def main(args: argparse.Namespace) -> int:
     """Decode args.file. RunError where something cannot be opened, read or written."""
-    from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.desk.recordings import decode
-
     name = "standard input" if args.file == "-" else args.file
     failure, code = None, 0
     with ExitStack() as stack:
@@ -107,16 +100,14 @@ def _stats_file(file: str, source: os.stat_result, stack: ExitStack) -> TextIO:
 
 def _write(text: str, *, flush: bool) -> None:
     """Write to standard output."""
-    out = sys.stdout
     try:
-        out.write(text)
+        sys.stdout.write(text)
         if flush:
-            out.flush()
+            sys.stdout.flush()
     except BrokenPipeError:
         raise
     except OSError as error:
-        # what is buffered has nowhere to go
-        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
+        discard_output()  # what is buffered has nowhere to go
         raise _unwritable("standard output", error) from None
 
 

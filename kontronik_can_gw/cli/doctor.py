@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.traffic import bits_per_second
+from kontronik_can_gw.cli.arguments import CONFIG, JSON
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import SHIPPED, Config
@@ -38,15 +39,11 @@ _INDENT = " " * 11
 _WIDTHS = (40, 100)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration"
-    )
-    parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
-    parser.epilog = (
-        "Changes nothing and sends nothing, neither to the bus nor to an ESC; may be called while the gateway runs. "
-        "As root it sees more. Exit code: 0 no error (there may be warnings), 1 errors, 2 the configuration cannot be used."
-    )
+OPTIONS = (CONFIG, JSON)
+EPILOG = (
+    "Changes nothing and sends nothing, neither to the bus nor to an ESC; may be called while the gateway runs. "
+    "As root it sees more. Exit code: 0 no error (there may be warnings), 1 errors, 2 the configuration cannot be used."
+)
 
 
 def main(args: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ import ipaddress
 import threading
 from pathlib import Path
 
+from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.errors import RunError
@@ -13,25 +14,31 @@ _RUN_FOLDER = Path("/run")
 _NAME = "kontronik-can-gw"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "-c", "--config", type=Path, metavar="FILE", help="the gateway with this TOML configuration"
+def _loopback(text: str) -> tuple[str, int]:
+    """A type for argparse: an address of this machine, and a port."""
+    host, _, port = text.rpartition(":")
+    host = {"localhost": "127.0.0.1"}.get(host, host).strip("[]")
+    try:
+        if ipaddress.ip_address(host).is_loopback and 0 <= int(port) <= 65535:
+            return host, int(port)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(
+        f"{text!r} is no port on this machine, as 127.0.0.1:9123 or [::1]:9123"
     )
-    where.add_argument(
-        "--file",
-        type=Path,
-        metavar="FILE",
-        help=f"the gateway with this statistics file (default {_RUN_FOLDER}/{_NAME}/status.json)",
-    )
-    parser.add_argument(
-        "--listen",
-        type=_loopback,
-        default=("127.0.0.1", 9123),
-        metavar="HOST:PORT",
-        help="where Prometheus may fetch /metrics, on this machine (default 127.0.0.1:9123)",
-    )
-    parser.epilog = "A gateway that does not run is answered with 503: Prometheus's up is 0."
+
+
+# fmt: off
+OPTIONS = (
+    (
+        option("-c --config FILE", "the gateway with this TOML configuration", type=Path),
+        option("--file FILE", f"the gateway with this statistics file (default {_RUN_FOLDER}/{_NAME}/status.json)", type=Path),
+    ),
+    option("--listen HOST:PORT", "where Prometheus may fetch /metrics, on this machine (default 127.0.0.1:9123)",
+           type=_loopback, default=("127.0.0.1", 9123)),
+)
+# fmt: on
+EPILOG = "A gateway that does not run is answered with 503: Prometheus's up is 0."
 
 
 def main(args: argparse.Namespace) -> int:
@@ -53,22 +60,6 @@ def main(args: argparse.Namespace) -> int:
 
 def _status_file(config: Path | None) -> Path:
     """The file of a configuration's gateway: its own, or the service's of the same name."""
-    if config is None:
-        return _RUN_FOLDER / _NAME / "status.json"
-    own = load(config).statistics_path
-    folder = _NAME if config.stem == "gateway" else f"{_NAME}-{config.stem}"
+    own = None if config is None else load(config).statistics_path
+    folder = _NAME if config is None or config.stem == "gateway" else f"{_NAME}-{config.stem}"
     return own or _RUN_FOLDER / folder / "status.json"
-
-
-def _loopback(text: str) -> tuple[str, int]:
-    """A type for argparse: an address of this machine, and a port."""
-    host, _, port = text.rpartition(":")
-    host = {"localhost": "127.0.0.1"}.get(host, host).strip("[]")
-    try:
-        if ipaddress.ip_address(host).is_loopback and 0 <= int(port) <= 65535:
-            return host, int(port)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(
-        f"{text!r} is no port on this machine, as 127.0.0.1:9123 or [::1]:9123"
-    )

@@ -6,18 +6,31 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cli.arguments import number_from
-from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
+from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
+from kontronik_can_gw.cli.bus_layout import bus_layout, given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
+from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.desk.monitor.screen import file_of
+from kontronik_can_gw.desk.monitor.sources import Bus, Recording, Source, can_config
+from kontronik_can_gw.desk.monitor.watch import once, watch
+from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable_json
 
-if TYPE_CHECKING:
-    from kontronik_can_gw.desk.monitor.sources import Source
-
 _ONCE_S = 3.0
+# fmt: off
+OPTIONS = (
+    option("FILE", "a recording instead of the bus", type=Path, nargs="?"),
+    LAYOUT,
+    option("--interface NAME", "python-can interface (default socketcan)"),
+    option("--channel NAME", "channel of the interface (default can0)"),
+    option("--speed FACTOR", "play FILE faster by this factor (0.01 to 1000, default 1)", type=number_from(0.01, 1000, "factor")),
+    option("--once", "one line of JSON with everything, then end"),
+    option("--timeout S", f"--once: maximum time to wait (default {_ONCE_S:g})", type=number_from(0.1, 3600)),
+    option("--interval S", "time between screens (default 0.15; lines: 1)", type=number_from(0.1, 3600)),
+)
+# fmt: on
 EPILOG = """\
 Without FILE it listens on the CAN bus, at any place: it only needs the DBC (-c,
 --dbc) and never sends a frame. With -c the interface and the channel are those
@@ -41,47 +54,9 @@ frame came (--once), or something cannot be opened; 2 wrong usage
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    parser.add_argument(
-        "file", nargs="?", type=Path, metavar="FILE", help="a recording instead of the bus"
-    )
-    add_layout_arguments(parser)
-    parser.add_argument(
-        "--interface", metavar="NAME", help="python-can interface (default socketcan)"
-    )
-    parser.add_argument("--channel", metavar="NAME", help="channel of the interface (default can0)")
-    parser.add_argument(
-        "--speed",
-        type=number_from(0.01, 1000, "factor"),
-        metavar="FACTOR",
-        help="play FILE faster by this factor (0.01 to 1000, default 1)",
-    )
-    parser.add_argument(
-        "--once", action="store_true", help="one line of JSON with everything, then end"
-    )
-    parser.add_argument(
-        "--timeout",
-        type=number_from(0.1, 3600),
-        metavar="S",
-        help=f"--once: maximum time to wait (default {_ONCE_S:g})",
-    )
-    parser.add_argument(
-        "--interval",
-        type=number_from(0.1, 3600),
-        metavar="S",
-        help="time between screens (default 0.15; lines: 1)",
-    )
-
-
 def main(args: argparse.Namespace) -> int:
     _check_usage(args)
     with _source_of(args) as source:
-        from kontronik_can_gw.desk.monitor.model import Monitor
-        from kontronik_can_gw.desk.monitor.screen import file_of
-        from kontronik_can_gw.desk.monitor.watch import once, watch
-
         monitor, stop = Monitor(source.bus), Event()
         with stopping_on_signals(stop.set):
             if not args.once:
@@ -110,17 +85,13 @@ def _check_usage(args: argparse.Namespace) -> None:
 
 
 @contextmanager
-def _source_of(args: argparse.Namespace) -> "Iterator[Source]":
-    from kontronik_can_gw.desk.monitor.sources import Bus, Recording, can_config
-    from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
-
-    is_given = args.config is not None or args.dbc is not None
+def _source_of(args: argparse.Namespace) -> Iterator[Source]:
     if args.file is None:
-        bus = bus_layout(args.config, args.dbc)
+        bus = bus_layout(args)
         with Bus(bus, can_config(bus, args.interface, args.channel)) as live:
             yield live
         return
-    given = bus_layout(args.config, args.dbc) if is_given else None
+    given = given_layout(args)
     with open_input(args.file, given) as opened:
         if given is not None and isinstance(opened, CaptureInput):
             raise UserError(

@@ -10,23 +10,31 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
-from kontronik_can_gw.cli.bus_layout import add_layout_arguments, bus_layout
+from kontronik_can_gw.cli.arguments import LAYOUT, option
+from kontronik_can_gw.cli.bus_layout import bus_layout, given_layout
 from kontronik_can_gw.cli.common import logging_to_stderr, say, stopping_on_signals
-from kontronik_can_gw.config.keys import CanConfig, MqttConfig
+from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.config.parse import mqtt_with
+from kontronik_can_gw.desk.monitor.sources import can_config
+from kontronik_can_gw.desk.mqtt.broker import Broker, check
+from kontronik_can_gw.desk.mqtt.discovery import is_ours
+from kontronik_can_gw.desk.mqtt.messages import Publisher
+from kontronik_can_gw.desk.mqtt.sources import Turn, from_bus, from_recording
+from kontronik_can_gw.desk.mqtt.topics import OFFLINE, Topics
+from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.runtime.fault_log import FaultLog
+from kontronik_can_gw.runtime.locks import Locks
+from kontronik_can_gw.runtime.open_can import check_interface
+from kontronik_can_gw.runtime.systemd import Notifier
 
-if TYPE_CHECKING:
-    from kontronik_can_gw.desk.mqtt.broker import Broker
+if TYPE_CHECKING:  # it needs paho-mqtt
     from kontronik_can_gw.desk.mqtt.client import MqttClient
-    from kontronik_can_gw.desk.mqtt.messages import Publisher
-    from kontronik_can_gw.desk.mqtt.sources import Turn
-    from kontronik_can_gw.desk.mqtt.topics import Topics
-    from kontronik_can_gw.desk.recordings.layouts import BusLayout
-    from kontronik_can_gw.runtime.systemd import Notifier
 
 log = logging.getLogger("kontronik_can_gw")
 
@@ -38,59 +46,37 @@ _STATUS_NS = 500 * MS
 _FILES = ("ca_file", "cert_file", "key_file", "password_file")
 _KEYS = ("broker", "tls", *_FILES, "username", "gateway", "topic", "rate", "retain", "discovery")
 _DEFAULT_DISCOVERY = "homeassistant"
-_EPILOG = (
+# fmt: off
+OPTIONS = (
+    option("FILE", "publish a recording, in its own time, instead of the bus", type=Path, nargs="?"),
+    LAYOUT,
+    option("--interface NAME", "python-can interface (default: can.interface, socketcan)"),
+    option("--channel NAME", "its channel (default: can.channel, can0)"),
+    "broker (defaults: table [mqtt] of the configuration)",
+    option("--broker HOST[:PORT]", "the MQTT broker (port 1883, with TLS 8883)"),
+    option("--tls", "encrypt, and check the broker's certificate", default=None),
+    option("--ca-file FILE", "certificate of the authority that signed the broker's"),
+    option("--cert-file FILE", "certificate to show to the broker"),
+    option("--key-file FILE", "key of that certificate"),
+    option("--username NAME", "user name at the broker"),
+    option("--password-file FILE", "file with the password on its first line"),
+    "topics",
+    option("--gateway NAME", "name of this gateway in the topics (default: the host name)"),
+    option("--topic PREFIX", "what all topics begin with (default kontronik)"),
+    option("--retain", "let the broker keep the last states", default=None),
+    option("--rate HZ", "states of each ESC in a second, 0.01 to 20 (default 1)", type=float),
+    option("--discovery PREFIX", "announce each value to Home Assistant (prefix, default homeassistant)",
+           nargs="?", const=_DEFAULT_DISCOVERY),
+    option("--remove-discovery", "clear the broker's retained discovery of this gateway and end; "
+                                 "if the gateway is offline, its own topics too"),
+)
+# fmt: on
+EPILOG = (
     "The password is never given on the command line, where everybody could read it. A broker that is missing, lost or refuses "
     "the connection is reported once, and tried again for ever. SIGTERM and SIGINT publish 'offline' and end it within half a second. "
     "link_state is the last one on the bus, where it has its own message: after a gap it may still be Lost for up to that message's "
     "cycle while available is already true."
 )
-_BROKER_OPTIONS = (
-    ("--broker", "HOST[:PORT]", "the MQTT broker (port 1883, with TLS 8883)"),
-    ("--tls", None, "encrypt, and check the broker's certificate"),
-    ("--ca-file", "FILE", "certificate of the authority that signed the broker's"),
-    ("--cert-file", "FILE", "certificate to show to the broker"),
-    ("--key-file", "FILE", "key of that certificate"),
-    ("--username", "NAME", "user name at the broker"),
-    ("--password-file", "FILE", "file with the password on its first line"),
-)
-_TOPIC_OPTIONS = (
-    ("--gateway", "NAME", "name of this gateway in the topics (default: the host name)"),
-    ("--topic", "PREFIX", "what all topics begin with (default kontronik)"),
-    ("--retain", None, "let the broker keep the last states"),
-)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    text = "publish a recording, in its own time, instead of the bus"
-    parser.add_argument("file", type=Path, nargs="?", metavar="FILE", help=text)
-    add_layout_arguments(parser)
-    text = "python-can interface (default: can.interface, socketcan)"
-    parser.add_argument("--interface", metavar="NAME", help=text)
-    text = "its channel (default: can.channel, can0)"
-    parser.add_argument("--channel", metavar="NAME", help=text)
-    where = parser.add_argument_group("broker (defaults: table [mqtt] of the configuration)")
-    what = parser.add_argument_group("topics")
-    for group, options in ((where, _BROKER_OPTIONS), (what, _TOPIC_OPTIONS)):
-        for option, metavar, text in options:
-            if metavar is None:
-                group.add_argument(option, action="store_true", default=None, help=text)
-            else:
-                group.add_argument(option, metavar=metavar, help=text)
-    text = "states of each ESC in a second, 0.01 to 20 (default 1)"
-    what.add_argument("--rate", type=float, metavar="HZ", help=text)
-    what.add_argument(
-        "--discovery",
-        nargs="?",
-        const=_DEFAULT_DISCOVERY,
-        metavar="PREFIX",
-        help="announce each value to Home Assistant (prefix, default homeassistant)",
-    )
-    what.add_argument(
-        "--remove-discovery",
-        action="store_true",
-        help="clear the broker's retained discovery of this gateway and end; if the gateway is offline, its own topics too",
-    )
-    parser.epilog = _EPILOG
 
 
 def main(args: argparse.Namespace) -> int:
@@ -99,16 +85,11 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.desk.mqtt.broker import Broker, check
-    from kontronik_can_gw.desk.mqtt.topics import Topics
-    from kontronik_can_gw.runtime.locks import Locks
-
     if args.file is None and args.discovery is not None and Path(args.discovery).is_file():
         raise UserError(f"--discovery {args.discovery}: is a file. Give FILE before the options.")
     if args.file is not None and (args.interface or args.channel):
         raise UserError("--interface, --channel: are for the bus, not for a recording")
-    is_given = args.file is None or args.config or args.dbc
-    bus = bus_layout(args.config, args.dbc) if is_given else None
+    bus = bus_layout(args) if args.file is None else given_layout(args)
     settings = _settings(args, bus)
     topics = Topics(settings.topic, settings.gateway or host_name())
     broker = Broker(settings, f"kontronik-can-gw-{topics.gateway}")
@@ -116,12 +97,11 @@ def _main(args: argparse.Namespace) -> int:
         log.warning("%s", warning)
     if args.remove_discovery:
         return _remove(broker, topics, settings.discovery or _DEFAULT_DISCOVERY)
-    locks = Locks()
-    if locks.hold([f"{broker.place}/mqtt/{topics.gateway}"]):
-        raise RunError(
-            f"another process on this machine publishes as {topics.gateway} to {broker}. End it, or give another --gateway."
-        )
-    with closing(locks):
+    with closing(Locks()) as locks:
+        if locks.hold([f"{broker.place}/mqtt/{topics.gateway}"]):
+            raise RunError(
+                f"another process on this machine publishes as {topics.gateway} to {broker}. End it, or give another --gateway."
+            )
         _publish(args, bus, broker, topics)
     return 0
 
@@ -132,7 +112,7 @@ def host_name() -> str:
     return name[:64] or "gateway"
 
 
-def _settings(args: argparse.Namespace, bus: "BusLayout | None") -> MqttConfig:
+def _settings(args: argparse.Namespace, bus: BusLayout | None) -> MqttConfig:
     """The [mqtt] table with absolute file names, overridden by the options. UserError with every mistake."""
     table = MqttConfig()
     if bus is not None and bus.config is not None:
@@ -149,11 +129,9 @@ def _settings(args: argparse.Namespace, bus: "BusLayout | None") -> MqttConfig:
     return settings
 
 
-def _remove(broker: "Broker", topics: "Topics", discovery: str) -> int:
+def _remove(broker: Broker, topics: Topics, discovery: str) -> int:
     """Clear the retained discovery, and all other retained topics of a gateway that is not online."""
     from kontronik_can_gw.desk.mqtt.client import remove
-    from kontronik_can_gw.desk.mqtt.discovery import is_ours
-    from kontronik_can_gw.desk.mqtt.topics import OFFLINE
 
     kept: dict[str, bytes] = {}
 
@@ -176,64 +154,42 @@ def _remove(broker: "Broker", topics: "Topics", discovery: str) -> int:
 
 
 def _publish(
-    args: argparse.Namespace,
-    bus: "BusLayout | None",
-    broker: "Broker",
-    topics: "Topics",
+    args: argparse.Namespace, bus: BusLayout | None, broker: Broker, topics: Topics
 ) -> None:
     """Publish the bus, or the recording, until a signal or its end."""
     from kontronik_can_gw.desk.mqtt.client import MqttClient
-    from kontronik_can_gw.desk.mqtt.messages import Publisher
-    from kontronik_can_gw.desk.mqtt.sources import from_bus, from_recording
-    from kontronik_can_gw.runtime.systemd import Notifier
 
-    def publisher(bus: "BusLayout", replay: bool) -> Publisher:
-        how = broker.config
+    def publisher(bus: BusLayout) -> Publisher:
+        how, is_replay = broker.config, args.file is not None
         return Publisher(
-            bus, topics, how.rate, retain=how.retain, discovery=how.discovery, replay=replay
+            bus, topics, how.rate, retain=how.retain, discovery=how.discovery, replay=is_replay
         )
 
-    notifier = Notifier()
-
-    client = MqttClient(broker, topics.online)
-    if args.file is None:
-        assert bus is not None
-        made = publisher(bus, False)
-        turns = from_bus(_can(args, bus), made.view.reader.keys, notifier.present)
-        _Run(made, client, notifier).run(turns)
+    notifier, client = Notifier(), MqttClient(broker, topics.online)
+    if args.file is not None:
+        with open_input(args.file, bus) as recorded:
+            _Run(publisher(recorded.bus), client, notifier).run(from_recording(recorded))
+            for line in recorded.damage:
+                log.warning("%s: %s", recorded.name, line)
         return
-    from kontronik_can_gw.desk.recordings.inputs import open_input
-
-    with open_input(args.file, bus) as recorded:
-        _Run(publisher(recorded.bus, True), client, notifier).run(from_recording(recorded))
-        for line in recorded.damage:
-            log.warning("%s: %s", recorded.name, line)
-
-
-def _can(args: argparse.Namespace, bus: "BusLayout") -> CanConfig:
-    from kontronik_can_gw.runtime.open_can import check_interface
-
-    can = bus.config.can if bus.config is not None else CanConfig()
-    names = ("interface", "channel")
-    can = replace(can, **{n: getattr(args, n) for n in names if getattr(args, n) is not None})
+    assert bus is not None
+    can = can_config(bus, args.interface, args.channel)
     check_interface(can)
-    return can
+    made = publisher(bus)
+    _Run(made, client, notifier).run(from_bus(can, made.view.reader.keys, notifier.present))
 
 
 class _Run:
     """Publishes from the source to the broker, until a signal or the end of the source."""
 
-    def __init__(self, publisher: "Publisher", client: "MqttClient", notifier: "Notifier") -> None:
-        from kontronik_can_gw.runtime.fault_log import FaultLog
-
+    def __init__(self, publisher: Publisher, client: "MqttClient", notifier: Notifier) -> None:
         self._publisher, self._client, self._notifier = publisher, client, notifier
         self._conditions = FaultLog()
-        self._stopping = False
-        self._due_ns = 0
-        self._status_ns = 0
+        self._stopping = Event()
+        self._due_ns = self._status_ns = 0
 
-    def run(self, turns: "Generator[Turn, None, None]") -> None:
-        with stopping_on_signals(self._stop), closing(turns):
+    def run(self, turns: Generator[Turn, None, None]) -> None:
+        with stopping_on_signals(self._stopping.set), closing(turns):
             first = next(turns)  # it raises where the source cannot be opened
             names = ", ".join(self._publisher.escs) or "no ESC"
             log.info("publishing %s below %s/", names, self._publisher.topics.base)
@@ -241,7 +197,7 @@ class _Run:
             self._notifier.ready("started")
             try:
                 for turn in chain([first], turns):
-                    if self._stopping:
+                    if self._stopping.is_set():
                         return
                     self._turn(turn)
                 self._finish()
@@ -249,10 +205,7 @@ class _Run:
                 self._notifier.stopping("ending")
                 self._client.stop(_STOP_S)
 
-    def _stop(self) -> None:
-        self._stopping = True
-
-    def _turn(self, turn: "Turn") -> None:
+    def _turn(self, turn: Turn) -> None:
         """Take frames, publish due messages, report faults, feed the watchdog."""
         for when, frame in turn.frames:
             self._publisher.take(frame.key, frame.data, when)
@@ -277,9 +230,9 @@ class _Run:
     def _finish(self) -> None:
         """Send what is pending at the end of a recording. RunError if the broker does not take it."""
         end = time.monotonic() + _LAST_S
-        while self._client.waiting and not self._stopping and time.monotonic() < end:
+        while self._client.waiting and not self._stopping.is_set() and time.monotonic() < end:
             self._client.turn(time.monotonic_ns())
             time.sleep(0.01)
-        if self._client.waiting and not self._stopping:
+        if self._client.waiting and not self._stopping.is_set():
             why = self._client.problem or f"{self._client.broker}: not fast enough"
             raise RunError(f"the end of the recording was not published. {why}")

@@ -1,26 +1,62 @@
-"""``kontronik-can-gw replay``: plays a recording on a CAN bus, on pseudo terminals, or as a log."""
+"""``replay``: plays a recording on a CAN bus, on pseudo terminals, or as a log."""
 
 import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
 
-from kontronik_can_gw.cli.arguments import number_from
-from kontronik_can_gw.cli.bus_layout import add_layout_arguments
+from kontronik_can_gw.capture.format import Kind
+from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
+from kontronik_can_gw.cli.bus_layout import given_layout
+from kontronik_can_gw.cli.common import say, stopping_on_signals
+from kontronik_can_gw.cli.progress import Progress
+from kontronik_can_gw.cli.terminals import terminals
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.desk.monitor.sources import can_config
+from kontronik_can_gw.desk.recordings.can_logs import SUFFIXES, CanLogWriter
+from kontronik_can_gw.desk.recordings.convert import Output
+from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput, Input, open_input
+from kontronik_can_gw.desk.recordings.marking import Marker
+from kontronik_can_gw.desk.recordings.pacing import Pace
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.node_state import UNCONFIGURED
+from kontronik_can_gw.runtime.can_port import CanPort
+from kontronik_can_gw.runtime.locks import Locks, in_use, messages_lock, node_lock
+from kontronik_can_gw.runtime.open_can import check_interface, open_can
+from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.unpacker import SignalReader
+from kontronik_can_gw.transmit_queue import Sent
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+_DRAIN_S = 0.2
+"""Time for a gateway to read the last bytes before the terminals are closed."""
+_BUSY_S = 0.0005
+_MAX_BUSY_S = 5
 
-    from kontronik_can_gw.config.keys import CanConfig
-    from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
-    from kontronik_can_gw.desk.recordings.inputs import CaptureInput, Input
-    from kontronik_can_gw.desk.recordings.pacing import Pace
-    from kontronik_can_gw.frames import CanFrame
-    from kontronik_can_gw.runtime.can_port import CanPort
-    from kontronik_can_gw.runtime.locks import Locks
-    from kontronik_can_gw.signals.plan import Layout
 
+def _speed(text: str) -> float | None:
+    return None if text == "max" else number_from(0.01, 1000, "factor, and not max")(text)
+
+
+# fmt: off
+OPTIONS = (
+    option("FILE", "the recording", type=Path),
+    option("--to", "where to", choices=("can", "pty", "log"), required=True),
+    LAYOUT,
+    option("--speed FACTOR", "times real time, 0.01 to 1000, or max: as fast as possible (default 1; --to log is always max)",
+           type=_speed, default=1.0),
+    option("--interface NAME", "--to can: python-can interface (default socketcan)"),
+    option("--channel NAME", "--to can: its channel, as vcan0 (default: that of -c)"),
+    option("--unmarked", "--to can: do not mark the frames as replay"),
+    option("--link PATH", "--to pty: symbolic link; {n} is the ESC's number, from 1"),
+    option("--delay S", "--to pty: time for a gateway to open them (default 1)", type=number_from(0, 3600), default=1.0),
+    option("-o --output FILE", "--to log: file (default -: standard output)", default="-"),
+    option("--force", "--to log: replace FILE if it exists"),
+)
+# fmt: on
+_ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",), "log": ("force",)}
 EPILOG = """\
 FILE is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
 bytes, or a CAN log (candump, ASC, BLF, TRC, MF4); a pipe, or - for standard input, is read to its end first. A capture
@@ -43,94 +79,29 @@ exit codes: 0 done, 1 failed while running, 2 wrong usage, or a file that is no 
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare FILE and the options."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    parser.add_argument("file", type=Path, metavar="FILE", help="the recording")
-    parser.add_argument("--to", choices=("can", "pty", "log"), required=True, help="where to")
-    add_layout_arguments(parser)
-    parser.add_argument(
-        "--speed",
-        type=_speed,
-        default=1.0,
-        metavar="FACTOR",
-        help="times real time, 0.01 to 1000, or max: as fast as possible (default 1; --to log is always max)",
-    )
-    parser.add_argument(
-        "--interface", metavar="NAME", help="--to can: python-can interface (default socketcan)"
-    )
-    parser.add_argument(
-        "--channel", metavar="NAME", help="--to can: its channel, as vcan0 (default: that of -c)"
-    )
-    parser.add_argument(
-        "--unmarked", action="store_true", help="--to can: do not mark the frames as replay"
-    )
-    parser.add_argument(
-        "--link", metavar="PATH", help="--to pty: symbolic link; {n} is the ESC's number, from 1"
-    )
-    parser.add_argument(
-        "--delay",
-        type=number_from(0, 3600),
-        default=1.0,
-        metavar="S",
-        help="--to pty: time for a gateway to open them (default 1)",
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        default="-",
-        metavar="FILE",
-        help="--to log: file (default -: standard output)",
-    )
-    parser.add_argument("--force", action="store_true", help="--to log: replace FILE if it exists")
-
-
-def _speed(text: str) -> float | None:
-    return None if text == "max" else number_from(0.01, 1000, "factor, and not max")(text)
-
-
-_OPTIONS = {
-    "can": ("interface", "channel", "unmarked"),
-    "pty": ("link",),
-    "log": ("force",),
-}
-
-
 def main(args: argparse.Namespace) -> int:
     """Replay args.file."""
-    from kontronik_can_gw.cli.bus_layout import bus_layout
-    from kontronik_can_gw.cli.common import say, stopping_on_signals
-    from kontronik_can_gw.desk.recordings.inputs import open_input
-    from kontronik_can_gw.desk.recordings.pacing import Pace
-
-    for place, names in _OPTIONS.items():
+    for place, names in _ONLY_FOR.items():
         given = [name for name in names if getattr(args, name)]
         if place != args.to and given:
             raise UserError(f"--{given[0]} is for --to {place}")
     if args.to != "log" and args.output != "-":
         raise UserError("--output is for --to log")
-    given_layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
     pace = Pace(args.speed)
-    with open_input(args.file, given_layout) as recording, stopping_on_signals(pace.stop):
+    with open_input(args.file, given_layout(args)) as recording, stopping_on_signals(pace.stop):
         play = {"can": _to_can, "pty": _to_pty, "log": _to_log}[args.to]
         text = play(args, recording, pace)
         if recording.times_assumed:
-            text += (
-                f"; times are assumed: {recording.provenance['times'].removeprefix('assumed: ')}"
-            )
+            assumed = recording.provenance["times"].removeprefix("assumed: ")
+            text += f"; times are assumed: {assumed}"
         say(f"{text}{', stopped' if pace.stopped else ''}")
         for line in recording.damage:
             say(f"warning: {line}")
     return 0
 
 
-def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
-    from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.desk.recordings.convert import Output
-
-    name = args.output
-    to_screen = name == "-"
+def _to_log(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
+    name, to_screen = args.output, args.output == "-"
     kind = "candump" if to_screen else _log_kind(name, args.file, args.force)
     frames = recording.frames()
     first = next(frames, None)
@@ -141,9 +112,11 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
             Output(None if to_screen else Path(name), kind) as out,
             Progress(recording.name, recording.size, to_screen) as progress,
         ):
-            writer = _log_writer(out.open(), kind, recording, first.time_ns, name)
-            count, last = 0, first.time_ns
-            wall = recording.wall_ns(last)
+            last, wall = first.time_ns, recording.wall_ns(first.time_ns)
+            channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
+            begun = None if wall is None else wall - last
+            writer = CanLogWriter(out.open(), kind, begun, last, channel, name)
+            count = 0
             for time_ns, frame, received in chain((first,), frames):
                 if pace.stopped:
                     break
@@ -165,8 +138,6 @@ def _to_log(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
 
 def _log_kind(name: str, source: Path, force: bool) -> str:
     """The format of a log by its suffix. UserError where the file cannot be written."""
-    from kontronik_can_gw.desk.recordings.can_logs import SUFFIXES
-
     target = Path(name)
     if target.suffix not in SUFFIXES:
         raise UserError(
@@ -179,25 +150,7 @@ def _log_kind(name: str, source: Path, force: bool) -> str:
     return SUFFIXES[target.suffix]
 
 
-def _log_writer(
-    file: "IO[bytes] | Path", kind: str, recording: "Input", start_ns: int, name: str
-) -> "CanLogWriter":
-    from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
-    from kontronik_can_gw.desk.recordings.inputs import CaptureInput
-
-    wall_ns = recording.wall_ns(start_ns)
-    channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
-    begun_ns = None if wall_ns is None else wall_ns - start_ns
-    return CanLogWriter(file, kind, begun_ns, start_ns, channel, name)
-
-
-def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
-    from kontronik_can_gw.cli.common import say
-    from kontronik_can_gw.desk.recordings.inputs import CaptureInput
-    from kontronik_can_gw.desk.recordings.marking import Marker
-    from kontronik_can_gw.runtime.locks import Locks
-    from kontronik_can_gw.runtime.open_can import check_interface, open_can
-
+def _to_can(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
     capture = recording if isinstance(recording, CaptureInput) else None
     layout = recording.bus.layout if capture is None else capture.sent_layout
     can = _bus(args, recording, fd=any(plan.fd for plan in layout.messages))
@@ -230,27 +183,19 @@ def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     return f"{count} frames to {can.channel}{late}"
 
 
-def _bus(args: argparse.Namespace, recording: "Input", fd: bool) -> "CanConfig":
+def _bus(args: argparse.Namespace, recording: Input, fd: bool) -> CanConfig:
     """The interface of the options, else of the configuration. UserError where none is named."""
-    from kontronik_can_gw.config.keys import CanConfig
-
-    config = recording.bus.config.can if args.config and recording.bus.config else None
-    channel = args.channel or (config.channel if config else None)
-    if channel is None:
+    if args.config and recording.bus.config:
+        return replace(can_config(recording.bus, args.interface, args.channel), fd=fd)
+    if args.channel is None:
         raise UserError(
             "--to can needs --channel, as vcan0, or a configuration (-c) that names one"
         )
-    return CanConfig(
-        args.interface or (config.interface if config else "socketcan"), channel, fd=fd
-    )
+    return CanConfig(args.interface or "socketcan", args.channel, fd=fd)
 
 
-def _hold(locks: "Locks", channel: str, layout: "Layout", capture: "CaptureInput | None") -> None:
+def _hold(locks: Locks, channel: str, layout: Layout, capture: CaptureInput | None) -> None:
     """Lock messages and nodes against a gateway that sends the same. RunError where one does."""
-    from kontronik_can_gw.node_state import UNCONFIGURED
-    from kontronik_can_gw.runtime.locks import in_use, messages_lock, node_lock
-    from kontronik_can_gw.signals.unpacker import SignalReader
-
     names = [messages_lock(channel, key) for key in sorted(SignalReader(layout).keys)[:1]]
     if capture is not None and capture.setup.canopen is not None:
         for node in capture.setup.canopen.settings:
@@ -260,16 +205,8 @@ def _hold(locks: "Locks", channel: str, layout: "Layout", capture: "CaptureInput
         raise in_use(taken)
 
 
-_BUSY_S = 0.0005
-_MAX_BUSY_S = 5
-
-
-def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> None:
+def _send(port: CanPort, frame: CanFrame, channel: str, pace: Pace) -> None:
     """Send one frame; wait while the queue is full. RunError where the bus accepts no frames any more."""
-    import time
-
-    from kontronik_can_gw.transmit_queue import Sent
-
     since = time.monotonic()
     while (answer := port.send(frame)) is not Sent.OK:
         if answer in (Sent.DOWN, Sent.GONE):
@@ -283,10 +220,7 @@ def _send(port: "CanPort", frame: "CanFrame", channel: str, pace: "Pace") -> Non
         time.sleep(_BUSY_S)
 
 
-def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
-    from kontronik_can_gw.cli.terminals import terminals
-    from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput
-
+def _to_pty(args: argparse.Namespace, recording: Input, pace: Pace) -> str:
     chunks = _chunks(recording)
     names = []
     if isinstance(recording, (CaptureInput, DumpInput)):
@@ -312,15 +246,8 @@ def _to_pty(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:
     return f"{total} bytes to {len(names)} pseudo terminals{lost}"
 
 
-_DRAIN_S = 0.2
-"""Time for a gateway to read the last bytes before the terminals are closed."""
-
-
-def _chunks(recording: "Input") -> "Iterator[tuple[int, int, bytes]]":
+def _chunks(recording: Input) -> Iterator[tuple[int, int, bytes]]:
     """(time, ESC, bytes) of a capture or of plain bytes."""
-    from kontronik_can_gw.capture.format import Kind
-    from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput
-
     if isinstance(recording, CaptureInput):
         return ((e.time_ns, e.esc, e.data) for e in recording.entries() if e.kind == Kind.BYTES)
     if isinstance(recording, DumpInput):

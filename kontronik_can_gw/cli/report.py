@@ -1,16 +1,33 @@
-"""``kontronik-can-gw report``: writes a recorded flight as one page for a browser."""
+"""``report``: writes a recorded flight as one page for a browser."""
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cli.arguments import number_from
-from kontronik_can_gw.cli.bus_layout import add_layout_arguments
+from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
+from kontronik_can_gw.cli.bus_layout import given_layout
+from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.output import write_output
+from kontronik_can_gw.cli.progress import Progress
+from kontronik_can_gw.desk.recordings.inputs import Input, open_input
+from kontronik_can_gw.desk.report.analysis import Analysis, needed_columns
+from kontronik_can_gw.desk.report.flight import Flight
+from kontronik_can_gw.desk.report.page import render
+from kontronik_can_gw.errors import RunError, UserError
 
-if TYPE_CHECKING:
-    from kontronik_can_gw.desk.recordings.inputs import Input
-    from kontronik_can_gw.desk.report.flight import Flight
-
+_POINTS = number_from(100, 1_000_000, kind=int, problem="is not a number of points, 100 to 1000000")
+_SECONDS = number_from(0, 1e9)
+# fmt: off
+OPTIONS = (
+    option("IN", "capture, CAN log or UART bytes", dest="input"),
+    option("-o --output FILE", "page to write, or - for standard output", required=True),
+    option("--force", "replace FILE if it exists"),
+    LAYOUT,
+    option("--points N", "points of a line, 100 to 1000000 (default 20000)", type=_POINTS, default=20_000),
+    option("--title TEXT", "the page's title (default: the name of IN)"),
+    option("--from S", "begin at this time in seconds after the start", type=_SECONDS, dest="start"),
+    option("--until S", "end at this time in seconds after the start", type=_SECONDS, dest="end"),
+)
+# fmt: on
 EPILOG = """\
 IN is a capture (.kcap; a folder or a common prefix of file names stands for all parts of one run), a file of plain UART
 bytes, or a CAN log (candump, ASC, BLF, TRC, MF4). For a CAN log give the DBC of its frames with -c or --dbc.
@@ -29,39 +46,13 @@ exit codes: 0 done, 1 something cannot be read or written, or has no values; 2 w
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare IN and the options."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    parser.add_argument("input", metavar="IN", help="capture, CAN log or UART bytes")
-    output = "page to write, or - for standard output"
-    parser.add_argument("-o", "--output", metavar="FILE", required=True, help=output)
-    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
-    add_layout_arguments(parser)
-    points = "points of a line, 100 to 1000000 (default 20000)"
-    parser.add_argument("--points", type=_points, default=20_000, metavar="N", help=points)
-    title = "the page's title (default: the name of IN)"
-    parser.add_argument("--title", metavar="TEXT", help=title)
-    for option, dest, word in (("--from", "start", "begin"), ("--until", "end", "end")):
-        text = f"{word} at this time in seconds after the start"
-        seconds = number_from(0, 1e9)
-        parser.add_argument(option, dest=dest, type=seconds, metavar="S", help=text)
-
-
 def main(args: argparse.Namespace) -> int:
     """Report on args.input. UserError for wrong usage, RunError where a file cannot be read or written."""
-    from kontronik_can_gw.cli.bus_layout import bus_layout
-    from kontronik_can_gw.cli.common import say, write_output
-    from kontronik_can_gw.desk.recordings.inputs import open_input
-    from kontronik_can_gw.desk.report.page import render
-    from kontronik_can_gw.errors import RunError, UserError
-
     if args.start is not None and args.end is not None and args.end <= args.start:
         raise UserError(f"--until {args.end:g}: must be greater than --from {args.start:g}")
     source = Path(args.input)
     _check_target(source, args.output, force=args.force)
-    layout = bus_layout(args.config, args.dbc) if args.config or args.dbc else None
-    with open_input(source, layout) as recording:
+    with open_input(source, given_layout(args)) as recording:
         flight = _analysed(recording, args)
         if flight is None:
             say("stopped: nothing is written")
@@ -80,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
             wall_ns=recording.wall_ns(flight.origin_ns),
             damage=recording.damage,
         )
-        write_output(args.output, page, "utf-8")
+        write_output(args.output, page)
     for line in (*(f"{args.input}: {note}" for note in recording.notes), *damage):
         say(line, "report")
     return 0
@@ -88,8 +79,6 @@ def main(args: argparse.Namespace) -> int:
 
 def _check_target(source: Path, output: str, *, force: bool) -> None:
     """UserError where the page cannot be written, or exists."""
-    from kontronik_can_gw.errors import UserError
-
     if output == "":
         raise UserError("-o: is empty. Give a file, or - for standard output.")
     try:
@@ -105,12 +94,8 @@ def _check_target(source: Path, output: str, *, force: bool) -> None:
         raise UserError(f"{output}: cannot be written: {why}.") from None
 
 
-def _analysed(recording: "Input", args: argparse.Namespace) -> "Flight | None":
+def _analysed(recording: Input, args: argparse.Namespace) -> Flight | None:
     """The flight of all rows; None if the user stopped it. UserError where nothing could be shown."""
-    from kontronik_can_gw.cli.progress import Progress
-    from kontronik_can_gw.desk.report.analysis import Analysis, needed_columns
-    from kontronik_can_gw.errors import UserError
-
     chosen = needed_columns(recording.fields)
     fields = [recording.fields[index] for index in chosen]
     analysis = Analysis(recording.bus.escs, fields, args.points, (args.start, args.end))
@@ -128,9 +113,3 @@ def _analysed(recording: "Input", args: argparse.Namespace) -> "Flight | None":
     except KeyboardInterrupt:
         return None
     return analysis.finish()
-
-
-def _points(text: str) -> int:
-    if not text.isdecimal() or not 100 <= int(text) <= 1_000_000:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of points, 100 to 1000000")
-    return int(text)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.cli import need_descriptors
-from kontronik_can_gw.cli.arguments import number_from
+from kontronik_can_gw.cli.arguments import CONFIG, number_from, option
 from kontronik_can_gw.cli.common import load_all, logging_to_stderr, stopping_on_signals
 from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.errors import RunError, UserError
@@ -31,37 +31,25 @@ _PAUSE_S = 5
 """Pause before the end of a service that cannot start; a signal ends it at once."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration"
-    )
-    parser.add_argument(
-        "--wait",
-        action="store_true",
-        help="wait for ports and interfaces that are missing at start (run.wait_for_devices)",
-    )
-    parser.add_argument(
-        "--status",
-        type=number_from(0.1, 1e6),
-        metavar="SECONDS",
-        help="log a line about telemetry, CAN, NMT states and PDO traffic at this interval in seconds (default: changes only)",
-    )
-    parser.add_argument(
-        "--record",
-        type=_folder,
-        metavar="DIR",
-        help="write captures of what comes in to this folder (record.directory)",
-    )
-    parser.epilog = (
-        "Ends by SIGTERM or SIGINT within half a second. The configuration is read at the start only. The serial ports are only read; "
-        "nothing is ever transmitted to an ESC."
-    )
-
-
 def _folder(text: str) -> Path:
     if not text.strip():
         raise argparse.ArgumentTypeError("is empty. Give a folder")
     return Path(text)
+
+
+# fmt: off
+OPTIONS = (
+    CONFIG,
+    option("--wait", "wait for ports and interfaces that are missing at start (run.wait_for_devices)"),
+    option("--status SECONDS", "log a line about telemetry, CAN, NMT states and PDO traffic at this interval in seconds "
+                               "(default: changes only)", type=number_from(0.1, 1e6)),
+    option("--record DIR", "write captures of what comes in to this folder (record.directory)", type=_folder),
+)
+# fmt: on
+EPILOG = (
+    "Ends by SIGTERM or SIGINT within half a second. The configuration is read at the start only. The serial ports are only read; "
+    "nothing is ever transmitted to an ESC."
+)
 
 
 def main(args: argparse.Namespace) -> int:

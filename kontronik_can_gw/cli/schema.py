@@ -5,9 +5,8 @@ import json
 
 from kontronik_can_gw.config.export import schema
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Editors with TOML support (taplo, Even Better TOML) check and complete gateway.toml with it. Exit code: 0."
+OPTIONS = ()
+EPILOG = "Editors with TOML support (taplo, Even Better TOML) check and complete gateway.toml with it. Exit code: 0."
 
 
 def main(_args: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,13 +24,16 @@ TMPFILES = f"etc/tmpfiles.d/{NAME}.conf"
 NETWORK = "etc/systemd/network"
 WANTS = f"{UNITS}/multi-user.target.wants"
 EXAMPLE = "example"
-COMPANIONS = {"mqtt": "telemetry to MQTT", "metrics": "statistics for Prometheus"}
-"""Services that may be installed beside the gateway's, each with its template of this name."""
+COMPANIONS = {
+    "mqtt": ("telemetry to MQTT", "paho", "paho-mqtt 2"),
+    "metrics": ("statistics for Prometheus", "prometheus_client", "prometheus-client"),
+}
+"""Services that may be installed beside the gateway's, each with its template of this name: description, module, library needed."""
 OBSOLETE = tuple(f"{UNITS}/{NAME}{end}.service.d/prometheus.conf" for end in ("", "@"))
 """Files that earlier versions installed; an install removes them."""
-_NETWORK_PREFIX = f"50-{NAME}-"
 _HEAD = re.compile(rf'# Written by "{NAME} service install" \S+, checksum ([0-9a-f]{{64}})\.')
 _PLACEHOLDER = re.compile(r"@[A-Z]+@")
+_IN_HOME = "# The program itself is in a home folder.\nProtectHome=read-only"
 _SERIAL_GROUPS = ("dialout", "uucp")
 """Groups that own serial ports, on Debian and on Arch."""
 
@@ -66,18 +69,18 @@ class Choices:
     channel: str = "can0"
     bitrate: int | None = None
     """CAN interface; None: the network files are examples only."""
-    mqtt: bool = False
-    metrics: bool = False
+    companions: Collection[str] = ()
 
 
-def unit(instance: str | None) -> str:
-    """Name of an instance's service; None: the plain one."""
-    return f"{NAME}.service" if instance is None else f"{NAME}@{instance}.service"
+def unit(instance: str | None, companion: str = "") -> str:
+    """Name of an instance's service, or of a ``companion`` of it; instance None: the plain one."""
+    beside = f"-{companion}" if companion else ""
+    return f"{NAME}{beside}.service" if instance is None else f"{NAME}{beside}@{instance}.service"
 
 
-def companion(kind: str, instance: str | None) -> str:
-    """Name of the service ("mqtt", "metrics") beside an instance's; None: beside the plain one."""
-    return f"{NAME}-{kind}.service" if instance is None else f"{NAME}-{kind}@{instance}.service"
+def network_files(channel: str) -> list[str]:
+    """Paths of the files for systemd-networkd, below the root."""
+    return [f"{NETWORK}/50-{NAME}-{channel}.{kind}" for kind in ("network", "link")]
 
 
 def configuration(instance: str | None) -> str:
@@ -87,42 +90,32 @@ def configuration(instance: str | None) -> str:
 
 def planned(choices: Choices, root: Path) -> list[PlannedFile]:
     """All files in the order of writing. Active network files have no examples."""
-    common = {
+    words = {
         "EXECUTABLE": choices.executable,
         "GROUP": choices.group,
-        "HOME": _home(choices.home_visible),
+        "HOME": _IN_HOME if choices.home_visible else "ProtectHome=yes",
     }
-    plain = common | {
-        "DESCRIPTION": "KONTRONIK ESC telemetry to CAN",
-        "CONFIGURATION": "gateway",
-        "FOLDER": NAME,
-    }
-    template = common | {
-        "DESCRIPTION": "KONTRONIK ESC telemetry to CAN, %i",
-        "CONFIGURATION": "%i",
-        "FOLDER": f"{NAME}-%i",
-    }
-    files = [
-        _made(SYSUSERS, "sysusers.conf", common),
-        _made(TMPFILES, "tmpfiles.conf", {}),
-        _made(f"{UNITS}/{NAME}.service", "gateway.service", plain),
-        _made(f"{UNITS}/{NAME}@.service", "gateway.service", template),
-        _made(f"etc/udev/rules.d/70-{NAME}.rules", "udev.rules", {}),
-    ]
-    chosen = {"mqtt": choices.mqtt, "metrics": choices.metrics}
-    for kind in (kind for kind in COMPANIONS if chosen[kind]):
-        text = f"KONTRONIK ESC {COMPANIONS[kind]}"
-        for end, words, name in (("", plain, text), ("@", template, f"{text}, %i")):
-            path = f"{UNITS}/{NAME}-{kind}{end}.service"
-            files.append(_made(path, f"{kind}.service", words | {"DESCRIPTION": name}))
-    for kind in ("network", "link"):
-        path = f"{NETWORK}/{_NETWORK_PREFIX}{choices.channel}.{kind}"
-        words = {"CHANNEL": choices.channel, "BITRATE": str(choices.bitrate or 500_000), "HOW": ""}
+    files = [_made(SYSUSERS, "sysusers.conf", words), _made(TMPFILES, "tmpfiles.conf", {})]
+    texts = {kind: f"KONTRONIK ESC {COMPANIONS[kind][0]}" for kind in choices.companions}
+    for kind, text in {"": "KONTRONIK ESC telemetry to CAN", **texts}.items():
+        plain = {"DESCRIPTION": text, "CONFIGURATION": "gateway", "FOLDER": NAME}
+        template = {
+            "DESCRIPTION": f"{text}, %i",
+            "CONFIGURATION": "%i",
+            "FOLDER": f"{NAME}-%i",
+        }
+        for instance, own in ((None, plain), ("", template)):
+            path = f"{UNITS}/{unit(instance, kind)}"
+            files.append(_made(path, f"{kind or 'gateway'}.service", words | own))
+    files.append(_made(f"etc/udev/rules.d/70-{NAME}.rules", "udev.rules", {}))
+    words = {"CHANNEL": choices.channel, "BITRATE": str(choices.bitrate or 500_000), "HOW": ""}
+    for path in network_files(choices.channel):
+        name = f"can.{path.rpartition('.')[2]}"
         if choices.bitrate is not None:
-            files.append(_made(path, f"can.{kind}", words))
+            files.append(_made(path, name, words))
         elif not (root / path).exists():
-            words["HOW"] = f" An example: set it right, then take .{EXAMPLE} off its name."
-            files.append(_made(f"{path}.{EXAMPLE}", f"can.{kind}", words))
+            how = f" An example: set it right, then take .{EXAMPLE} off its name."
+            files.append(_made(f"{path}.{EXAMPLE}", name, words | {"HOW": how}))
     return files
 
 
@@ -131,7 +124,7 @@ def installed(root: Path) -> list[Path]:
     patterns = {
         file.path
         for bitrate in (None, 0)
-        for file in planned(Choices("", False, "", "*", bitrate, True, True), root)
+        for file in planned(Choices("", False, "", "*", bitrate, COMPANIONS), root)
     }
     return sorted(path for pattern in {*patterns, *OBSOLETE} for path in root.glob(pattern))
 
@@ -141,11 +134,6 @@ def serial_group(root: Path) -> str:
     text = read(root / "etc/group") or ""
     groups = {line.split(":")[0] for line in text.splitlines()}
     return next((group for group in _SERIAL_GROUPS if group in groups), _SERIAL_GROUPS[0])
-
-
-def template(name: str) -> str:
-    """A template shipped with the package."""
-    return (Path(__file__).parent.parent / "service" / name).read_text(encoding="utf-8")
 
 
 def is_ours(text: str) -> bool:
@@ -232,18 +220,12 @@ def put_aside(path: Path) -> Path:
         return path.replace(path.with_name(path.name + ".bak"))
 
 
-def _home(visible: bool) -> str:
-    if visible:
-        return "# The program itself is in a home folder.\nProtectHome=read-only"
-    return "ProtectHome=yes"
-
-
 def _made(path: str, name: str, words: dict[str, str]) -> PlannedFile:
-    body = _PLACEHOLDER.sub(lambda found: words[found[0].strip("@")], template(name))
-    return PlannedFile(
-        path,
-        f'# Written by "{NAME} service install" {__version__}, checksum {_checksum(body)}.\n{body}',
-    )
+    template = Path(__file__).parent.parent / "service" / name
+    text = template.read_text(encoding="utf-8")
+    body = _PLACEHOLDER.sub(lambda found: words[found[0].strip("@")], text)
+    head = f'# Written by "{NAME} service install" {__version__}, checksum {_checksum(body)}.'
+    return PlannedFile(path, f"{head}\n{body}")
 
 
 def _checksum(body: str) -> str:

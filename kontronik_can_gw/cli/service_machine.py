@@ -2,10 +2,13 @@
 
 import contextlib
 import os
+import pwd
 import re
 import shutil
 import subprocess
 import sys
+import sysconfig
+from collections.abc import Iterable
 from pathlib import Path
 
 from kontronik_can_gw.cli.common import say
@@ -19,16 +22,14 @@ _BOOTED = Path("/run/systemd/system")
 _HIDDEN = ("/tmp", "/var/tmp")  # noqa: S108  the service has its own (PrivateTmp=)
 
 
-def check_rights(live: bool, root: Path, action: str) -> None:
-    if not live:
-        if not root.is_dir():
-            raise UserError(
-                f"{root}: is not a folder. --root names the top folder of a disk image."
-            )
-        return
-    check_systemd()
-    if os.geteuid() != 0:
-        raise RunError(f"only root may do that: sudo {own_executable()} service {action} ...")
+def check_rights(root: Path | None, action: str) -> None:
+    """UserError or RunError where an action cannot be done below ``root``, or to this machine (None)."""
+    if root is None:
+        check_systemd()
+        if os.geteuid() != 0:
+            raise RunError(f"only root may do that: sudo {own_executable()} service {action} ...")
+    elif not root.is_dir():
+        raise UserError(f"{root}: is not a folder. --root names the top folder of a disk image.")
 
 
 def check_systemd() -> None:
@@ -57,29 +58,23 @@ def run(*words: str) -> "subprocess.CompletedProcess[str]":
         raise RunError(f"`{' '.join(words)}` did not end within two minutes.") from None
 
 
-def output(*words: str) -> str:
-    return run(*words).stdout
-
-
 def show_property(unit: str, name: str) -> str:
     """A property of a unit, as systemctl shows it."""
-    return output("systemctl", "show", "--value", "--property", name, unit).strip()
+    return run("systemctl", "show", "--value", "--property", name, unit).stdout.strip()
 
 
 def listed(verb: str, *patterns: str) -> list[str]:
     """Names of the units that ``list-units`` or ``list-unit-files`` has."""
-    lines = output("systemctl", verb, "--all", "--plain", "--no-legend", *patterns).splitlines()
-    return [line.split()[0] for line in lines if line.strip()]
+    done = run("systemctl", verb, "--all", "--plain", "--no-legend", *patterns)
+    return [line.split()[0] for line in done.stdout.splitlines() if line.strip()]
 
 
 def call(*words: str) -> None:
     """Call a tool. RunError with its output where it fails."""
     done = run(*words)
     if done.returncode:
-        said = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [
-            f"exit code {done.returncode}"
-        ]
-        raise RunError(f"`{' '.join(words)}` failed: {said[0]}")
+        said = done.stderr.strip() or f"exit code {done.returncode}"
+        raise RunError(f"`{' '.join(words)}` failed: {said.splitlines()[0].strip()}")
 
 
 def reload(channel: str | None) -> None:
@@ -109,8 +104,6 @@ def reload(channel: str | None) -> None:
 
 
 def _check_user() -> None:
-    import pwd
-
     try:
         pwd.getpwnam(NAME)
     except KeyError:
@@ -121,13 +114,8 @@ def _check_user() -> None:
 
 def own_executable() -> str:
     """Path of the installed program of this Python. UserError where there is none."""
-    import sysconfig
-
-    for folder in (
-        sysconfig.get_path("scripts"),
-        str(Path(sys.prefix) / "bin"),
-        str(Path(sys.argv[0]).absolute().parent),
-    ):
+    started = Path(sys.argv[0]).absolute().parent
+    for folder in (sysconfig.get_path("scripts"), f"{sys.prefix}/bin", started):
         if os.access(Path(folder) / NAME, os.X_OK):
             return str(Path(folder) / NAME)
     raise UserError(f"no installed {NAME} belongs to this Python. Name it with --executable.")
@@ -139,26 +127,32 @@ def check_executable(executable: str, root: Path) -> bool:
         raise UserError(
             f"{executable}: must be an absolute path without spaces, quotes, % and the like: --executable"
         )
-    program = root / executable.lstrip("/")
+    program, needed = root / executable.lstrip("/"), [Path(executable)]
     if root != Path("/") and not program.exists():
         say(f"warning: {program}: is not there yet")
-        return executable.startswith(tuple(f"{home}/" for home in _HOMES))
-    if not os.access(program, os.X_OK) or not program.is_file():
+    elif not os.access(program, os.X_OK) or not program.is_file():
         raise UserError(f"{program}: is not a program. Name the installed one with --executable.")
-    if root != Path("/"):
-        return executable.startswith(tuple(f"{home}/" for home in _HOMES))
-    needed = _needed(Path(executable))
-    for path in needed:
-        if str(path).startswith(tuple(f"{folder}/" for folder in _HIDDEN)):
-            raise UserError(
-                f"{path}: the service has a /tmp of its own and does not see it. Install the program in /opt/{NAME}."
-            )
-        if (closed := closed_to_others(path)) is not None:
-            raise UserError(
-                f"{path}: the service's user cannot reach it: {closed} is closed to others. "
-                f"Install the program where all may read, as in /opt/{NAME}."
-            )
-    return any(str(path).startswith(tuple(f"{home}/" for home in _HOMES)) for path in needed)
+    elif root == Path("/"):
+        needed = _needed(program)
+        for path in needed:
+            _check_reachable(path)
+    return any(_is_below(path, _HOMES) for path in needed)
+
+
+def _check_reachable(path: Path) -> None:
+    if _is_below(path, _HIDDEN):
+        raise UserError(
+            f"{path}: the service has a /tmp of its own and does not see it. Install the program in /opt/{NAME}."
+        )
+    if (closed := closed_to_others(path)) is not None:
+        raise UserError(
+            f"{path}: the service's user cannot reach it: {closed} is closed to others. "
+            f"Install the program where all may read, as in /opt/{NAME}."
+        )
+
+
+def _is_below(path: Path, folders: Iterable[str]) -> bool:
+    return any(path.is_relative_to(folder) for folder in folders)
 
 
 def _needed(program: Path) -> list[Path]:
@@ -166,9 +160,8 @@ def _needed(program: Path) -> list[Path]:
     needed = [program, program.resolve()]
     with contextlib.suppress(OSError):
         first = program.open("rb").readline(4096).decode(errors="replace")
-        if first.startswith("#!/") and (interpreter := Path(first[2:].split()[0])).name.startswith(
-            "python"
-        ):
+        interpreter = Path(first[2:].split()[0]) if first.startswith("#!/") else Path()
+        if interpreter.name.startswith("python"):
             needed += [interpreter, interpreter.resolve()]
             if interpreter.parent == Path(sys.executable).parent:
                 needed.append(Path(__file__).resolve())

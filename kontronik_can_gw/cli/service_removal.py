@@ -19,13 +19,10 @@ from kontronik_can_gw.cli.service_machine import (
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.locks import is_held
 
-_ENDS = tuple(f"-{kind}" for kind in files.COMPANIONS)
-
 
 def uninstall(args: argparse.Namespace) -> int:
-    live = args.root is None
-    root = Path("/") if live else args.root
-    check_rights(live, root, "uninstall")
+    live, root = args.root is None, args.root or Path("/")
+    check_rights(args.root, "uninstall")
     links = sorted((root / WANTS).glob(f"{NAME}*.service"))
     if args.instance:
         if args.purge:
@@ -42,7 +39,7 @@ def uninstall(args: argparse.Namespace) -> int:
         return 0
     units = _units(None)
     if live:
-        units += listed("list-units", *(f"{NAME}{kind}@*.service" for kind in ("", *_ENDS)))
+        units += listed("list-units", *_units("*"))
     _disable(units, links, live)
     for path in found:
         _remove_file(path)
@@ -66,7 +63,7 @@ def uninstall(args: argparse.Namespace) -> int:
 
 def _units(instance: str | None) -> list[str]:
     """An instance's service and those beside it."""
-    return [files.unit(instance), *(files.companion(kind, instance) for kind in files.COMPANIONS)]
+    return [files.unit(instance, kind) for kind in ("", *files.COMPANIONS)]
 
 
 def _disable(units: Sequence[str], links: Sequence[Path], live: bool) -> None:
@@ -81,10 +78,8 @@ def _disable(units: Sequence[str], links: Sequence[Path], live: bool) -> None:
 
 
 def _kept_data(root: Path) -> list[Path]:
-    states = (
-        p for p in root.glob(f"var/lib/{NAME}*") if p.name == NAME or p.name.startswith(f"{NAME}-")
-    )
-    return [path for path in (root / files.CONFIGURATIONS, *sorted(states)) if path.exists()]
+    patterns = (files.CONFIGURATIONS, f"var/lib/{NAME}", f"var/lib/{NAME}-*")
+    return [path for pattern in patterns for path in sorted(root.glob(pattern))]
 
 
 def _remove_runtime_folders(root: Path, pattern: str) -> None:

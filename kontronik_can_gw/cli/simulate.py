@@ -1,13 +1,20 @@
-"""``kontronik-can-gw simulate``: simulates ESCs on pseudo terminals, with or without faults."""
+"""``simulate``: simulates ESCs on pseudo terminals, with or without faults."""
 
 import argparse
-from typing import TYPE_CHECKING
+import sys
+from collections import Counter
+from contextlib import nullcontext
+from pathlib import Path
+from threading import Event
 
-from kontronik_can_gw.cli.simulate_options import Texts, add_options, time_ns, whole_number
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.desk.pty import PtyEsc
-    from kontronik_can_gw.esc.kontronik.simulator import Sent, SimulatedEsc
+from kontronik_can_gw.cli import discard_output
+from kontronik_can_gw.cli.common import stopping_on_signals
+from kontronik_can_gw.cli.simulate_options import OPTIONS as OPTIONS
+from kontronik_can_gw.cli.simulate_options import esc_options, mistakes
+from kontronik_can_gw.cli.terminals import terminals
+from kontronik_can_gw.desk.pty import run
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, Sent, SimulatedEsc
 
 EPILOG = """\
 Prints a line "esc1 /dev/pts/5" for each ESC on standard output, then sends until SIGINT, SIGTERM or --seconds.
@@ -28,65 +35,41 @@ exit codes: 0 done, 1 failed while running or a gateway transmitted, 2 wrong usa
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options, all as text: ``main`` reads them and reports every mistake at once."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    add_options(parser)
-
-
 def main(args: argparse.Namespace) -> int:
     """Simulate. UserError for each bad value, RunError if a gateway transmitted or a file failed."""
-    from kontronik_can_gw.errors import UserError
-    from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
-
-    read = Texts(args)
-    count = read("--esc", lambda text: whole_number(text, 1, 1000)) or 1
-    seed = read("--seed", whole_number) or 0
-    seconds = read("--seconds", lambda text: time_ns(text) / 1e9)
-    options = [read.esc_options(number) for number in range(1, min(count, 2) + 1)]
+    problems = mistakes(args)
+    has_several = isinstance(args.esc, int) and args.esc > 1
     for option, path in (("--link", args.link), ("--out", args.out)):
-        if path is not None and count > 1 and "{n}" not in path:
-            read.problems.append(
-                f"{option} {path}: needs {{n}} in the path, for the number of each of the {count} ESCs."
+        if path is not None and has_several and "{n}" not in path:
+            problems.append(
+                f"{option} {path}: needs {{n}} in the path, for the number of each of the {args.esc} ESCs."
             )
     if args.out is not None and args.seconds is None:
-        read.problems.append(f"--out {args.out}: has no end. Give --seconds.")
+        problems.append(f"--out {args.out}: has no end. Give --seconds.")
     if args.out is not None and args.link is not None:
-        read.problems.append("--link: there is no pseudo terminal with --out. Give one of the two.")
-    if read.problems:
-        raise UserError(*dict.fromkeys(read.problems))
-
+        problems.append("--link: there is no pseudo terminal with --out. Give one of the two.")
+    if problems:
+        raise UserError(*problems)
     escs = []
-    for index in range(count):
-        chosen = options[index % len(options)]
-        assert chosen is not None
-        # Spread over the period, since real ESCs are not synchronized.
-        escs.append(
-            SimulatedEsc(chosen, seed=seed + index, start_ns=chosen.period_ns * index // count)
-        )
+    for index in range(args.esc):
+        chosen = esc_options(args, index + 1)
+        # spread over the period, since real ESCs are not synchronized
+        start_ns = chosen.period_ns * index // args.esc
+        escs.append(SimulatedEsc(chosen, seed=args.seed + index, start_ns=start_ns))
     if args.out is not None:
-        assert seconds is not None
-        return _to_files(escs, args.out, seconds)
-    return _to_terminals(escs, args.link, seconds)
+        _to_files(escs, args.out, args.seconds)
+    else:
+        _to_terminals(escs, args.link, args.seconds)
+    return 0
 
 
-def _to_files(escs: "list[SimulatedEsc]", path: str, seconds: float) -> int:
-    import sys
-    from contextlib import nullcontext
-    from pathlib import Path
-
-    from kontronik_can_gw.cli import discard_output
-    from kontronik_can_gw.errors import RunError
-    from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS
-
+def _to_files(escs: list[SimulatedEsc], path: str, time_ns: int) -> None:
     for index, esc in enumerate(escs):
         name = path.replace("{n}", str(index + 1))
         try:
             with nullcontext(sys.stdout.buffer) if path == "-" else Path(name).open("wb") as file:
                 total = frames = 0
-                begin = esc.next_ns
-                end = begin + round(seconds * SECOND_NS)
+                begin, end = esc.next_ns, esc.next_ns + time_ns
                 while begin < end:  # in steps of a minute, so that a year fits
                     begin = min(begin + 60 * SECOND_NS, end)
                     for sent in esc.frames_until(begin - 1):
@@ -101,79 +84,43 @@ def _to_files(escs: "list[SimulatedEsc]", path: str, seconds: float) -> int:
                 discard_output()
             raise RunError(f"--out {name}: cannot be written: {error.strerror}.") from None
         print(f"esc{index + 1}: {frames} frames, {total} bytes to {name}", file=sys.stderr)
-    return 0
 
 
-def _to_terminals(escs: "list[SimulatedEsc]", link: str | None, seconds: float | None) -> int:
-    import signal
-    import sys
-    from contextlib import ExitStack
-
-    from kontronik_can_gw.cli.terminals import terminals
-    from kontronik_can_gw.desk.pty import run
-    from kontronik_can_gw.errors import RunError
-
-    stopped = False
-
-    def stop(*_: object) -> None:
-        nonlocal stopped
-        stopped = True
-
+def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | None) -> None:
     names = [f"esc{number}" for number in range(1, len(escs) + 1)]
-    with ExitStack() as stack:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            stack.callback(signal.signal, number, signal.signal(number, stop))
-        opened = stack.enter_context(terminals(names, link))
-        played = [_Played(name, terminal) for name, terminal in zip(names, opened, strict=True)]
+    stop, frames, intact, guilty = Event(), Counter[int](), Counter[int](), dict[int, str]()
+    with stopping_on_signals(stop.set), terminals(names, link) as opened:
+
+        def count(index: int, sent: Sent, taken: bool) -> None:
+            frames[index] += 1
+            intact[index] += sent.intact and taken
+
+        def complain(index: int) -> None:
+            """Report once that the gateway transmits to the ESC."""
+            if index not in guilty:
+                guilty[index] = f"{names[index]} {opened[index].path}: "
+                said = f"the gateway transmits to the ESC: {opened[index].first_received.hex(' ')}"
+                print(f"ERROR: {guilty[index]}{said}", file=sys.stderr)
+
         run(
             list(zip(escs, opened, strict=True)),
-            seconds=seconds,
-            stop=lambda: stopped,
-            on_sent=lambda index, sent, taken: played[index].count(sent, taken),
-            on_received=lambda index: played[index].complain(),
+            seconds=None if time_ns is None else time_ns / SECOND_NS,
+            stop=stop.is_set,
+            on_sent=count,
+            on_received=complain,
         )
-        for each in played:
-            print(each.summary, file=sys.stderr)
-    if guilty := [each.problem for each in played if each.terminal.received]:
-        raise RunError(*guilty)
-    return 0
-
-
-class _Played:
-    """An ESC on its pseudo terminal: what it sent, and what it was sent."""
-
-    def __init__(self, name: str, terminal: "PtyEsc") -> None:
-        self.name = name
-        self.terminal = terminal
-        self._frames = 0
-        self._intact = 0
-        self._complained = False
-
-    def count(self, sent: "Sent", taken: bool) -> None:
-        self._frames += 1
-        self._intact += sent.intact and taken
-
-    def complain(self) -> None:
-        """Report once that the gateway transmits to the ESC."""
-        import sys
-
-        if not self._complained:
-            self._complained = True
+        for index, terminal in enumerate(opened):
+            lost = terminal.dropped_bytes
+            dropped = f", {lost} bytes dropped (nobody read)" if lost else ""
             print(
-                f"ERROR: {self.name} {self.terminal.path}: the gateway transmits to the ESC: "
-                f"{self.terminal.first_received.hex(' ')}",
+                f"{names[index]}: {frames[index]} frames, {intact[index]} of them intact{dropped}",
                 file=sys.stderr,
             )
-
-    @property
-    def summary(self) -> str:
-        lost = self.terminal.dropped_bytes
-        dropped = f", {lost} bytes dropped (nobody read)" if lost else ""
-        return f"{self.name}: {self._frames} frames, {self._intact} of them intact{dropped}"
-
-    @property
-    def problem(self) -> str:
-        return (
-            f"{self.name} {self.terminal.path}: {self.terminal.received} bytes came from the gateway, beginning with "
-            f"{self.terminal.first_received.hex(' ')}. Nothing may ever be sent to an ESC: turn echo and writing off."
+    if guilty:
+        raise RunError(
+            *(
+                f"{where}{opened[index].received} bytes came from the gateway, beginning with "
+                f"{opened[index].first_received.hex(' ')}. Nothing may ever be sent to an ESC: turn echo and writing off."
+                for index, where in sorted(guilty.items())
+            )
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.cli.arguments import number_from
+from kontronik_can_gw.cli.arguments import JSON, number_from, option
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.parse import load
@@ -30,31 +30,21 @@ class NotRunning(RunError):
     exit_code = 3
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "-c", "--config", type=Path, metavar="FILE", help="the gateway with this TOML configuration"
-    )
-    where.add_argument(
-        "--file", type=Path, metavar="FILE", help="the gateway with this statistics file"
-    )
-    parser.add_argument(
-        "--once",
-        action="store_true",
-        help="show it once, as in a pipe (default on a terminal: live)",
-    )
-    parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
-    parser.add_argument(
-        "--interval",
-        type=number_from(0.1, 3600),
-        default=1.0,
-        metavar="S",
-        help="live: interval in seconds (default 1)",
-    )
-    parser.epilog = (
-        "Default: all gateways that run as a service. Exit code 0: running and healthy (also at the end of the live display); "
-        "1: running, but an ESC is not heard or nothing gets onto the CAN bus; 2: wrong usage; 3: not running, or no answer for 3 s."
-    )
+# fmt: off
+OPTIONS = (
+    (
+        option("-c --config FILE", "the gateway with this TOML configuration", type=Path),
+        option("--file FILE", "the gateway with this statistics file", type=Path),
+    ),
+    option("--once", "show it once, as in a pipe (default on a terminal: live)"),
+    JSON,
+    option("--interval S", "live: interval in seconds (default 1)", type=number_from(0.1, 3600), default=1.0),
+)
+# fmt: on
+EPILOG = (
+    "Default: all gateways that run as a service. Exit code 0: running and healthy (also at the end of the live display); "
+    "1: running, but an ESC is not heard or nothing gets onto the CAN bus; 2: wrong usage; 3: not running, or no answer for 3 s."
+)
 
 
 def main(args: argparse.Namespace) -> int:

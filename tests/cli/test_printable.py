@@ -12,8 +12,8 @@ from command_line import run
 from rich.console import Console
 
 from kontronik_can_gw.cli import main, say, show
-from kontronik_can_gw.cli.common import write_output
 from kontronik_can_gw.cli.doctor import _show
+from kontronik_can_gw.cli.output import write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.doctor.findings import Finding, Severity
 from kontronik_can_gw.desk.monitor.lines import line

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from kontronik_can_gw.cli.service_files import Choices, PlannedFile, planned
+from kontronik_can_gw.cli.service_files import COMPANIONS, Choices, PlannedFile, planned
 from kontronik_can_gw.runtime.locks import SYSTEM_FOLDER
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
@@ -34,7 +34,7 @@ def files(root: Path, **more: Any) -> dict[str, PlannedFile]:
 
 def units(folder: Path, beside: bool = False) -> list[Path]:
     """The gateway's units in a folder, or those of the services beside it; the template as an instance."""
-    choices = Choices("/bin/true", False, "dialout", mqtt=beside, metrics=beside)
+    choices = Choices("/bin/true", False, "dialout", companions=COMPANIONS if beside else ())
     for file in planned(choices, folder):
         if "/system/" in file.path:
             path = folder / file.path.partition("/system/")[2].replace("@.service", "@left.service")
@@ -137,7 +137,7 @@ def test_it_never_gives_up_is_watched_and_speaks_can_and_nothing_of_the_internet
 
 
 def test_metrics_are_for_this_machine_only(tmp_path: Path) -> None:
-    made = files(tmp_path, metrics=True)
+    made = files(tmp_path, companions=["metrics"])
     for name, configuration in (("", "gateway"), ("@", "%i")):
         unit = settings(made[f"kontronik-can-gw-metrics{name}.service"].text)
         assert unit["ExecStart"] == [
@@ -164,7 +164,7 @@ def test_it_may_open_serial_ports_and_nothing_else(tmp_path: Path) -> None:
 
 def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it(tmp_path: Path) -> None:
     """In the plain unit's runtime folder, which systemd would remove with it; every instance and the publisher write there."""
-    made = files(tmp_path, mqtt=True)
+    made = files(tmp_path, companions=["mqtt"])
     lines = [line for line in made["tmpfiles.d"].text.splitlines() if line.startswith("d ")]
     assert f"d {SYSTEM_FOLDER} 0755 kontronik-can-gw kontronik-can-gw -" in lines
     for name in (*NAMES, "kontronik-can-gw-mqtt.service", "kontronik-can-gw-mqtt@.service"):
@@ -177,7 +177,7 @@ def test_the_folder_of_locks_belongs_to_the_service_and_outlives_it(tmp_path: Pa
 
 def test_nothing_is_left_to_be_filled_in(tmp_path: Path) -> None:
     for bitrate in (None, 250_000):
-        for file in files(tmp_path, bitrate=bitrate, mqtt=True, metrics=True).values():
+        for file in files(tmp_path, bitrate=bitrate, companions=COMPANIONS).values():
             assert not re.search(r"@[A-Z]+@", file.text)
 
 
