@@ -20,8 +20,7 @@ fish:  kontronik-can-gw completion fish > ~/.config/fish/completions/kontronik-c
 
 exit codes: 0 done, 1 the installed shtab does not know this shell, 2 wrong usage
 """
-_FILES = frozenset({"FILE", "DBC", "PATH", "IN", "OUT"})
-_FOLDERS = frozenset({"DIR", "FOLDER"})
+_KINDS = dict.fromkeys(("FILE", "PATH", "IN", "OUT"), shtab.FILE) | {"DIR": shtab.DIRECTORY}
 _ENDINGS = {"config": ("*.toml",), "dbc": ("*.dbc", "*.DBC"), "from": ("*.dbc", "*.DBC")}
 """File name endings for options, by their attribute name."""
 
@@ -34,13 +33,11 @@ def main(args: argparse.Namespace) -> int:
         )
     parser = make_parser()
     for action in _actions(parser):
-        names = {action.metavar} if isinstance(action.metavar, str) else set(action.metavar or ())
+        complete = _KINDS.get(str(action.metavar))
         if endings := _ENDINGS.get(action.dest):
-            action.complete = shtab.glob(*endings)  # type: ignore[attr-defined]
-        elif names & _FILES:
-            action.complete = shtab.FILE  # type: ignore[attr-defined]
-        elif names & _FOLDERS:
-            action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
+            complete = shtab.glob(*endings)
+        if complete is not None:
+            action.complete = complete  # type: ignore[attr-defined]
     print(shtab.complete(parser, args.shell))
     return 0
 

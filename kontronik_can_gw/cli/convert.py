@@ -102,6 +102,8 @@ library is missing; 2 wrong usage, or IN is no recording
 
 def main(args: argparse.Namespace) -> int:
     """Convert args.input. UserError for wrong usage, RunError where something cannot be read or written."""
+    if args.output != "-" and Path(args.output).is_dir():
+        raise UserError(f"{args.output}: is a directory. Give a file.")
     form = _format(args)
     _check(args, form)
     try:
@@ -216,8 +218,6 @@ def _format(args: argparse.Namespace) -> str:
         raise UserError(
             f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}; bin through a pipe"
         )
-    if Path(args.output).is_dir():
-        raise UserError(f"{args.output}: is a directory. Give a file.")
     suffix = Path(args.output).suffix.lower()
     if suffix not in SUFFIXES:
         raise UserError(
@@ -228,47 +228,36 @@ def _format(args: argparse.Namespace) -> str:
 
 def _check(args: argparse.Namespace, form: str) -> None:
     """Wrong usage that is known before anything is opened. UserError."""
-    if args.output == "-" and form not in STREAMS:
-        raise UserError(
-            f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}"
-        )
-    if args.output == "-" and form == BYTES and sys.stdout.isatty():
-        raise UserError("bin cannot go to a terminal. Give a file, or a pipe behind it.")
-    given = {"--signals": args.signals, "--rate": args.rate, "--frames": args.frames}
-    if form not in TABLES:
-        for option, value in given.items():
-            if value:
-                raise UserError(f"{option} is for tables ({', '.join(TABLES)}), not for {form}")
-    if args.units_line and form != "jsonl":
-        raise UserError(f"--units-line is for jsonl, not for {form}")
-    if args.esc is not None and form in LOGS:
-        raise UserError(f"--esc is for tables and bin: {form} holds the frames as they are")
-    if form == BYTES and (args.start is not None or args.end is not None):
-        raise UserError("--from and --until are not for bin, which has no times")
-    if form == BYTES and args.live_rate is not None:
-        raise UserError("--live-rate is not for bin, which has no times")
-    if args.start is not None and args.end is not None and args.end < args.start:
-        raise UserError("--until is before --from")
-    if args.output == "-":
+    to_screen, start, end = args.output == "-", args.start, args.end
+    has_rows, is_bytes = form in TABLES, form == BYTES
+    only_rows = f"is for tables ({', '.join(TABLES)}), not for {form}"
+    # fmt: off
+    rules = (
+        (to_screen and form not in STREAMS,
+         f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(STREAMS)}"),
+        (to_screen and is_bytes and sys.stdout.isatty(), "bin cannot go to a terminal. Give a file, or a pipe behind it."),
+        (args.signals and not has_rows, f"--signals {only_rows}"),
+        (args.rate and not has_rows, f"--rate {only_rows}"),
+        (args.frames and not has_rows, f"--frames {only_rows}"),
+        (args.units_line and form != "jsonl", f"--units-line is for jsonl, not for {form}"),
+        (args.esc is not None and form in LOGS, f"--esc is for tables and bin: {form} holds the frames as they are"),
+        (is_bytes and not (start is None and end is None), "--from and --until are not for bin, which has no times"),
+        (is_bytes and args.live_rate is not None, "--live-rate is not for bin, which has no times"),
+        (start is not None and end is not None and end < start, "--until is before --from"),
+    )
+    # fmt: on
+    for is_wrong, problem in rules:
+        if is_wrong:
+            raise UserError(problem)
+    source, target = Path(args.input), Path(args.output)
+    if to_screen or not target.exists():
         return
-    target = Path(args.output)
-    try:
-        if target.is_dir():
-            raise UserError(f"{target}: is a directory. Give a file.")
-        if not target.exists():
-            return
-        source = Path(args.input)
-        if source.exists() and source.samefile(target):
-            raise UserError(f"{target}: is IN. Give another OUT.")
-        if target.is_file():
-            if not args.force:
-                raise UserError(f"{target}: is there already. Give --force to write over it.")
-        elif form not in (*ON_SCREEN, BYTES):
-            raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"{target}: cannot be written: {getattr(error, 'strerror', None) or error}."
-        ) from None
+    if source.exists() and source.samefile(target):
+        raise UserError(f"{target}: is IN. Give another OUT.")
+    if target.is_file() and not args.force:
+        raise UserError(f"{target}: is there already. Give --force to write over it.")
+    if not target.is_file() and form not in STREAMS:
+        raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
 
 
 def _esc(args: argparse.Namespace, recording: Input, needed: bool = False) -> int | None:

@@ -8,26 +8,29 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.traffic import bits_per_second
 from kontronik_can_gw.cli.arguments import CONFIG, JSON
 from kontronik_can_gw.cli.common import show
+from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.config.assemble import Loaded, assemble
 from kontronik_can_gw.config.keys import SHIPPED, Config
 from kontronik_can_gw.config.nodes import parameter_folder
 from kontronik_can_gw.config.parse import load
+from kontronik_can_gw.desk.doctor.can_interface import check_can
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings, Severity, count, document
+from kontronik_can_gw.desk.doctor.folders import check_folder, check_readable
+from kontronik_can_gw.desk.doctor.line import look
+from kontronik_can_gw.desk.doctor.machine import check_machine
+from kontronik_can_gw.desk.doctor.serial_ports import check_port
+from kontronik_can_gw.desk.doctor.service import Unit, unit_of
+from kontronik_can_gw.desk.doctor.system import System
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.runtime.store import parameter_file
-
-if TYPE_CHECKING:
-    from kontronik_can_gw.desk.doctor.service import Unit
-    from kontronik_can_gw.desk.doctor.system import System
 
 _STYLES = {
     Severity.OK: "green",
@@ -47,8 +50,6 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    from kontronik_can_gw.desk.doctor.system import System
-
     findings, code = examine(System(), args.config)
     if args.json:
         print(printable_json(document(findings, __version__, str(args.config), code), indent=2))
@@ -57,14 +58,8 @@ def main(args: argparse.Namespace) -> int:
     return code
 
 
-def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
+def examine(system: System, path: Path) -> tuple[list[Finding], int]:
     """All findings, and the exit code. Parts that do not depend on a mistake in the configuration are checked nevertheless."""
-    from kontronik_can_gw.desk.doctor.can_interface import check_can
-    from kontronik_can_gw.desk.doctor.line import look
-    from kontronik_can_gw.desk.doctor.machine import check_machine
-    from kontronik_can_gw.desk.doctor.serial_ports import check_port
-    from kontronik_can_gw.desk.doctor.service import unit_of
-
     unit = unit_of(system, str(path.absolute()))
     about = Findings("Configuration")
     config, loaded, refused = _load(path, unit)
@@ -76,20 +71,15 @@ def examine(system: "System", path: Path) -> tuple[list[Finding], int]:
     if config is not None:
         _configuration(system, about, config, loaded, unit)
         for esc in config.esc:
-            found += check_port(
-                system,
-                esc.name,
-                esc.port,
-                unit,
-                look if protocol_named(esc.protocol).even_parity else None,
-            )
+            line = look if protocol_named(esc.protocol).even_parity else None
+            found += check_port(system, esc.name, esc.port, unit, line)
         found += check_can(system, config.can)
     found += check_machine(system, unit)
     code = int(count(found, Severity.ERROR) > 0)
     return found, code if refused is None else refused.exit_code
 
 
-def _load(path: Path, unit: "Unit | None") -> tuple[Config | None, Loaded | None, UserError | None]:
+def _load(path: Path, unit: Unit | None) -> tuple[Config | None, Loaded | None, UserError | None]:
     """Configuration, the objects made from it, and the error; None for what could not be made."""
     config = None
     try:
@@ -103,10 +93,8 @@ def _load(path: Path, unit: "Unit | None") -> tuple[Config | None, Loaded | None
 
 
 def _configuration(
-    system: "System", findings: Findings, config: Config, loaded: Loaded | None, unit: "Unit | None"
+    system: System, findings: Findings, config: Config, loaded: Loaded | None, unit: Unit | None
 ) -> None:
-    from kontronik_can_gw.cli.recording import record_folder
-    from kontronik_can_gw.desk.doctor.folders import check_folder, check_readable
 
     if loaded is not None:
         _outputs(findings, config, loaded)
@@ -158,53 +146,47 @@ def _warnings(findings: Findings, config: Config, loaded: Loaded) -> None:
         findings.say("config.parameters", "damaged" if is_open else "closed", damage=damage)
 
 
-class _Piece(NamedTuple):
-    """A line of the report: a styled word, then text."""
-
-    word: str
-    style: str
-    text: str
-
-
 def _show(findings: list[Finding]) -> None:
     lowest, highest = _WIDTHS
-    width = max(lowest, min(highest, shutil.get_terminal_size().columns))
+    lines = _lines(findings, max(lowest, min(highest, shutil.get_terminal_size().columns)))
     if not sys.stdout.isatty():
-        for piece in _lines(findings, width):
-            show(piece.word + piece.text)
+        for word, _, text in lines:
+            show(word + text)
         return
     from rich.console import Console
     from rich.text import Text
 
     console = Console(highlight=False, soft_wrap=True)
-    for piece in _lines(findings, width):
-        console.print(Text.assemble((printable(piece.word), piece.style), printable(piece.text)))
+    for word, style, text in lines:
+        console.print(Text.assemble((printable(word), style), printable(text)))
 
 
-def _lines(findings: list[Finding], width: int) -> Iterator[_Piece]:
-    """The lines of the report. Commands are not wrapped, so that they can be copied."""
+def _lines(findings: list[Finding], width: int) -> Iterator[tuple[str, str, str]]:
+    """The lines of the report: a word, its style, text. Commands are not wrapped, so that they can be copied."""
     group = ""
     for finding in findings:
         if finding.group != group:
             if group:
-                yield _Piece("", "", "")
+                yield "", "", ""
             group = finding.group
-            yield _Piece(group, "bold", "")
-        first, *more = textwrap.wrap(
-            finding.text, width - len(_INDENT), break_on_hyphens=False
-        ) or [""]
-        yield _Piece(f"  {finding.severity:<9}", _STYLES[finding.severity], first)
+            yield group, "bold", ""
+        first, *more = _wrapped(finding.text, width) or [""]
+        yield f"  {finding.severity:<9}", _STYLES[finding.severity], first
         for line in more:
-            yield _Piece("", "", _INDENT + line)
+            yield "", "", _INDENT + line
         arrow = "-> "
-        for line in textwrap.wrap(finding.remedy, width - len(_INDENT) - 3, break_on_hyphens=False):
-            yield _Piece("", "", f"{_INDENT}{arrow}{line}")
+        for line in _wrapped(finding.remedy, width - len(arrow)):
+            yield "", "", f"{_INDENT}{arrow}{line}"
             arrow = "   "
         if finding.command:
-            yield _Piece(_INDENT + arrow, "", finding.command)
-    yield _Piece("", "", "")
+            yield _INDENT + arrow, "", finding.command
+    yield "", "", ""
     parts = []
     for severity in (Severity.ERROR, Severity.WARNING, Severity.NOTE):
         number = count(findings, severity)
         parts.append(f"{number or 'no'} {severity}{'s' * (number != 1)}")
-    yield _Piece("", "", ", ".join(parts))
+    yield "", "", ", ".join(parts)
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, width - len(_INDENT), break_on_hyphens=False)

@@ -1,4 +1,4 @@
-"""Makes the recorder of a gateway from its configuration."""
+"""Makes a gateway that is recorded, from its configuration."""
 
 from pathlib import Path
 
@@ -7,8 +7,10 @@ from kontronik_can_gw.config.assemble import Loaded
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.runtime.machine import state_folder
-from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings
+from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
+from kontronik_can_gw.runtime.recorder import Recorder, RecordSettings, state_of
 
 _MB = 1_000_000
 _STATE = "state"
@@ -27,34 +29,34 @@ def in_words(config: Config, folder: Path) -> str:
     """Folder and limits of the captures, in a line."""
     record = config.record
     words = f"{folder}, parts of {record.part_mb} MB or {record.part_minutes} min"
-    words += f", {record.keep_mb} MB in all" if record.keep_mb else ""
-    return words
+    return words + (f", {record.keep_mb} MB in all" if record.keep_mb else "")
 
 
-def recorder_of(config: Config, given: Path | None) -> Recorder:
-    """The recorder, of a configuration or command line that names a folder."""
-    record = config.record
-    folder = record_folder(config, given)
+def recorded(
+    loaded: Loaded, given: Path | None, now: int, silent: bool
+) -> tuple[Gateway, Recorder]:
+    """The gateway of a configuration, and what records it in the folder that is given or configured."""
+    record, folder = loaded.config.record, record_folder(loaded.config, given)
     assert folder is not None
-    recorder = Recorder(
-        RecordSettings(
-            folder,
-            record.part_mb * _MB,
-            record.part_minutes * 60 * SECOND,
-            record.keep_mb * _MB,
-            record.min_free_mb * _MB,
-        )
+    settings = RecordSettings(
+        folder,
+        part_bytes=record.part_mb * _MB,
+        part_ns=record.part_minutes * 60 * SECOND,
+        keep_bytes=record.keep_mb * _MB,
+        min_free_bytes=record.min_free_mb * _MB,
     )
-    recorder.words = in_words(config, folder)
-    return recorder
+    recorder = Recorder(settings)
+    recorder.words = in_words(loaded.config, folder)
+    gateway = RecordedGateway(recorder.put, loaded.escs, loaded.layout, now, silent, loaded.canopen)
+    known = {"created_ns": now, "state": state_of(gateway)}
+    recorder.header = setup_of(loaded).header() | known
+    return gateway, recorder
 
 
 def setup_of(loaded: Loaded) -> CaptureSetup:
     """The configuration as stored in the header of a capture."""
     config = loaded.config
-    dbc = None
-    if config.dbc.enabled:
-        dbc = (config.dbc_path.name, loaded.dbc)
+    dbc = (config.dbc_path.name, loaded.dbc) if config.dbc.enabled else None
     return CaptureSetup(
         tuple(loaded.escs),
         tuple(esc.port for esc in config.esc),

@@ -81,17 +81,15 @@ def _check_target(source: Path, output: str, *, force: bool) -> None:
     """UserError where the page cannot be written, or exists."""
     if output == "":
         raise UserError("-o: is empty. Give a file, or - for standard output.")
-    try:
-        if output != "-" and (target := Path(output)).exists():
-            if source.exists() and target.samefile(source):
-                raise UserError(f"-o {output}: is the input. Give another file.")
-            if target.is_dir():
-                raise UserError(f"-o {output}: is a folder. Give a file.")
-            if target.is_file() and not force:
-                raise UserError(f"{output}: exists. Give another -o, or --force.")
-    except (OSError, ValueError) as error:  # a name too long, or with a null byte
-        why = getattr(error, "strerror", None) or error
-        raise UserError(f"{output}: cannot be written: {why}.") from None
+    target = Path(output)
+    if output == "-" or not target.exists():
+        return
+    if source.exists() and target.samefile(source):
+        raise UserError(f"-o {output}: is the input. Give another file.")
+    if target.is_dir():
+        raise UserError(f"-o {output}: is a folder. Give a file.")
+    if target.is_file() and not force:
+        raise UserError(f"{output}: exists. Give another -o, or --force.")
 
 
 def _analysed(recording: Input, args: argparse.Namespace) -> Flight | None:

@@ -80,11 +80,7 @@ class _Run:
     def __init__(self, args: argparse.Namespace, notifier: "Notifier") -> None:
         from kontronik_can_gw.runtime.snapshot import program_facts
 
-        self._file: Path = args.config
-        self._wait: bool = args.wait
-        self._record: Path | None = args.record
-        self._status_ns = int((args.status or 0) * SECOND)
-        self._notifier = notifier
+        self._args, self._notifier = args, notifier
         self._program = program_facts(args.config)
         self._loop: Loop | None = None
         self._stopping = False
@@ -109,12 +105,12 @@ class _Run:
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.statistics import Statistics, default_file
 
-        loaded = load_all(self._file, _parameter_store)
+        loaded = load_all(self._args.config, _parameter_store)
         if loaded.canopen is not None:
             gc.collect()  # the nodes that were built to be checked leave their memory to those that run
         config = loaded.config
         need_descriptors(2 * len(config.esc))
-        wait = self._wait or config.run.wait_for_devices
+        wait = self._args.wait or config.run.wait_for_devices
         if config.run.realtime_priority is not None:
             try:
                 realtime.begin(config.run.realtime_priority)
@@ -135,7 +131,7 @@ class _Run:
             config.can,
             wait,
             loaded.store,
-            self._status_ns,
+            int((self._args.status or 0) * SECOND),
             notifier=self._notifier,
             statistics=statistics,
             program=self._program,
@@ -153,24 +149,15 @@ class _Run:
 
     def _gateway(self, loaded: Loaded) -> "tuple[Gateway, Recorder | None]":
         """The gateway, and what records it; what only a recorder needs is not loaded without one."""
-        from kontronik_can_gw.gateway import Gateway
-
         config, now = loaded.config, time.monotonic_ns()
         silent = config.dbc.on_loss == "silent"
-        parts = (loaded.escs, loaded.layout, now, silent, loaded.canopen)
-        if self._record is None and config.record.directory is None:
-            return Gateway(*parts), None
-        from kontronik_can_gw.cli.recording import recorder_of, setup_of
-        from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
-        from kontronik_can_gw.runtime.recorder import state_of
+        if self._args.record is not None or config.record.directory is not None:
+            from kontronik_can_gw.cli.recording import recorded
 
-        recorder = recorder_of(config, self._record)
-        gateway = RecordedGateway(recorder.put, *parts)
-        recorder.header = setup_of(loaded).header() | {
-            "created_ns": now,
-            "state": state_of(gateway),
-        }
-        return gateway, recorder
+            return recorded(loaded, self._args.record, now, silent)
+        from kontronik_can_gw.gateway import Gateway
+
+        return Gateway(loaded.escs, loaded.layout, now, silent, loaded.canopen), None
 
 
 def _parameter_store(folder: Path) -> "ParameterStore":
@@ -196,12 +183,8 @@ def _say_parameters(loaded: Loaded) -> None:
         log.error("%s: stored parameters: %s. Running on defaults.", loaded.escs[esc].name, reason)
     if loaded.canopen is None:
         return
+    text = "%s: %s is %s, by what a master stored or the EDS's default"
     for configured, holds in zip(loaded.config.escs, loaded.escs, strict=True):
         for name in ("pole_pairs", "gear", "cell_count", "timeout_ns"):
-            if getattr(configured, name) != getattr(holds, name):
-                log.info(
-                    "%s: %s is %s, by what a master stored or the EDS's default",
-                    holds.name,
-                    name,
-                    getattr(holds, name),
-                )
+            if getattr(configured, name) != (held := getattr(holds, name)):
+                log.info(text, holds.name, name, held)

@@ -5,20 +5,19 @@ import json
 import time
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.text import Text
 
 from kontronik_can_gw.cli.arguments import JSON, number_from, option
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.parse import load
+from kontronik_can_gw.desk.monitor import terminal
+from kontronik_can_gw.desk.monitor.lines import BAD, FAINT, line, wrapped
+from kontronik_can_gw.desk.monitor.status import Seen, look_at, screen
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.printable import printable, printable_json
-
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.text import Text
-
-    from kontronik_can_gw.desk.monitor.status import Seen
 
 PROGRAM = "kontronik-can-gw"
 RUN_FOLDER = Path("/run")
@@ -48,11 +47,6 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    from kontronik_can_gw.desk.monitor import terminal
-    from kontronik_can_gw.desk.monitor.status import screen
-
     config = None if args.config is None else load(args.config)
     given = args.file if config is None else config.statistics_path
     seen = _look(given, config)
@@ -69,27 +63,22 @@ def main(args: argparse.Namespace) -> int:
     if not args.once and terminal.is_screen(console):
         _live(console, given, config, args.interval)
         return 0
-    for line in _joined([screen(each) for each in seen]):
+    for text in _joined([screen(each) for each in seen]):
         if console.is_terminal:
-            console.print(line, soft_wrap=True)
+            console.print(text, soft_wrap=True)
         else:
-            print(line.plain.rstrip())
+            print(text.plain.rstrip())
     return max(each.code for each in seen)
 
 
-def _look(given: Path | None, config: Config | None) -> "list[Seen]":
+def _look(given: Path | None, config: Config | None) -> list[Seen]:
     """The gateway with the given file; else those that run as a service, with this configuration if there is one."""
-    from kontronik_can_gw.desk.monitor.status import look_at
-
     now = time.monotonic_ns()
     if given is not None:
         return [look_at(given, now)]
     plain = RUN_FOLDER / PROGRAM / "status.json"
-    files = [
-        *([plain] if plain.exists() else []),
-        *sorted(RUN_FOLDER.glob(f"{PROGRAM}-*/status.json")),
-    ]
-    seen = [look_at(file, now) for file in files]
+    instances = sorted(RUN_FOLDER.glob(f"{PROGRAM}-*/status.json"))
+    seen = [look_at(file, now) for file in (plain, *instances) if file.exists()]
     if config is None:
         return seen
     wanted = printable(str(Path(config.file).absolute()))
@@ -108,22 +97,16 @@ def _no_file(config: Config | None) -> str:
     )
 
 
-def _joined(parts: "list[list[Text]]") -> "list[Text]":
+def _joined(parts: list[list[Text]]) -> list[Text]:
     """The gateways one after the other."""
-    from kontronik_can_gw.desk.monitor.lines import line
-
     return [each for part in parts for each in ([*part, line()])][:-1]
 
 
-def _live(console: "Console", given: Path | None, config: Config | None, interval: float) -> None:
+def _live(console: Console, given: Path | None, config: Config | None, interval: float) -> None:
     """Refresh the display until a key, SIGINT or SIGTERM."""
-    from kontronik_can_gw.desk.monitor import terminal
-    from kontronik_can_gw.desk.monitor.lines import BAD, FAINT, line, wrapped
-    from kontronik_can_gw.desk.monitor.status import screen
-
     stop = Event()
 
-    def draw(size: tuple[int, int], keys: bool) -> "list[Text]":
+    def draw(size: tuple[int, int], keys: bool) -> list[Text]:
         width, height = size
         seen = _look(given, config)
         share = max(3, (height - 1 - len(seen)) // max(1, len(seen)))

@@ -17,7 +17,7 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
-from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.gateway_status import CanState, GatewayState
 
 Facts = dict[str, Any]
@@ -35,6 +35,10 @@ def by_configuration(folder: Path, text: str) -> Facts:
     found = json.loads(described("-c", configuration(folder, text), "--format", "json"))
     assert isinstance(found, dict)
     return found
+
+
+def holds(found: Facts, **expected: object) -> None:
+    assert {name: found[name] for name in expected} == expected
 
 
 # --- texts
@@ -68,38 +72,39 @@ def test_messages_and_signals_are_those_that_cantools_reads(facts: Facts) -> Non
     assert set(told) == {message.name for message in database.messages}
     for message in database.messages:
         found = told[message.name]
-        assert (found["id"], found["length"], found["comment"]) == (
-            message.frame_id,
-            message.length,
-            message.comment,
-        )
-        assert (found["extended"], found["fd"]) == (message.is_extended_frame, message.is_fd)
-        assert found["cycle_ms"] == (message.cycle_time or 0)
         assert message.dbc is not None
-        assert found["delay_ms"] == message.dbc.attributes["GenMsgDelayTime"].value
+        holds(
+            found,
+            id=message.frame_id,
+            length=message.length,
+            comment=message.comment,
+            extended=message.is_extended_frame,
+            fd=message.is_fd,
+            cycle_ms=message.cycle_time or 0,
+            delay_ms=message.dbc.attributes["GenMsgDelayTime"].value,
+        )
         assert ("cyclic" in found["send_type"]) == ("Cyclic" in str(message.send_type))
-        assert {signal["name"] for signal in found["signals"]} == {
-            signal.name for signal in message.signals
-        }
-        for row in found["signals"]:
-            signal = message.get_signal_by_name(row["name"])
-            assert (row["start_bit"], row["length"], row["byte_order"]) == (
-                *(signal.start, signal.length),
-                signal.byte_order,
-            )
-            assert (row["signed"], row["is_float"], row["unit"]) == (
-                *(signal.is_signed, signal.is_float),
-                signal.unit or "",
-            )
-            assert (row["factor"], row["offset"]) == (signal.scale, signal.offset)
-            assert (row["minimum"], row["maximum"]) == (signal.minimum, signal.maximum)
-            assert row["comment"] == signal.comment
+        signals = {row["name"]: row for row in found["signals"]}
+        assert set(signals) == {signal.name for signal in message.signals}
+        for signal in message.signals:
             choices = {int(number): str(name) for number, name in (signal.choices or {}).items()}
-            assert {value["value"]: value["name"] for value in row["values"]} == choices
             texts = {name: number for number, name in choices.items()}
-            assert (row["not_available"], row["error"]) == (
-                texts.get("NotAvailable"),
-                texts.get("Error"),
+            holds(
+                signals[signal.name],
+                start_bit=signal.start,
+                length=signal.length,
+                byte_order=signal.byte_order,
+                signed=signal.is_signed,
+                is_float=signal.is_float,
+                unit=signal.unit or "",
+                factor=signal.scale,
+                offset=signal.offset,
+                minimum=signal.minimum,
+                maximum=signal.maximum,
+                comment=signal.comment,
+                values=[{"value": number, "name": choices[number]} for number in sorted(choices)],
+                not_available=texts.get("NotAvailable"),
+                error=texts.get("Error"),
             )
 
 
@@ -108,32 +113,34 @@ def test_objects_are_those_that_canopen_reads(facts: Facts) -> None:
     told = {item["index"]: item for item in facts["canopen"]["objects"]}
     assert sorted(told) == sorted(dictionary)
     for index, item in dictionary.items():
-        found = told[index]
+        found, is_alone = told[index], isinstance(item, ODVariable)
         assert found["name"] == item.name
-        variables: dict[int, Any] = (
-            {0: item} if isinstance(item, ODVariable) else dict(item.subindices)
-        )
+        variables: dict[int, Any] = {0: item} if is_alone else dict(item.subindices)
         assert [entry["sub"] for entry in found["entries"]] == sorted(variables)
-        assert (found["kind"] == "VAR") == isinstance(item, ODVariable) or found["kind"] == "DOMAIN"
+        assert (found["kind"] == "VAR") == is_alone or found["kind"] == "DOMAIN"
         for entry in found["entries"]:
             variable = variables[entry["sub"]]
-            assert (entry["name"], entry["access"]) == (variable.name, variable.access_type)
-            assert (entry["readable"], entry["writable"]) == (variable.readable, variable.writable)
-            assert entry["type"] == TYPE_NAMES[variable.data_type]
-            assert entry["mappable"] == variable.pdo_mappable
-            assert (entry["low"], entry["high"]) == (variable.min, variable.max)
-            assert entry["plus_node_id"] == variable.relative
-            assert entry["default"] == variable.default
-            if entry["bits"] is not None:
-                assert entry["bits"] == len(variable)
+            holds(
+                entry,
+                name=variable.name,
+                access=variable.access_type,
+                readable=variable.readable,
+                writable=variable.writable,
+                type=TYPE_NAMES[variable.data_type],
+                mappable=variable.pdo_mappable,
+                low=variable.min,
+                high=variable.max,
+                plus_node_id=variable.relative,
+                default=variable.default,
+            )
+            assert entry["bits"] in (None, len(variable))
 
 
 def test_the_node_has_the_cob_ids_and_pdos_that_canopen_computes(facts: Facts) -> None:
     node = facts["canopen"]["nodes"][0]
-    assert (node["esc"], node["node_id"]) == ("esc1", 1)
-    assert {0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x601, 0x701} <= {
-        cob["id"] for cob in node["cob_ids"]
-    }
+    holds(node, esc="esc1", node_id=1)
+    ids = {cob["id"] for cob in node["cob_ids"]}
+    assert {0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x601, 0x701} <= ids
     dictionary: Any = canopen.import_od(str(EDS), node_id=1)
     tried: dict[int, int] = {n: dictionary[0x1800 + n][1].default for n in range(6)}
     assert {pdo["number"] - 1: pdo["cob_id"] for pdo in node["pdos"]} == {
@@ -141,49 +148,41 @@ def test_the_node_has_the_cob_ids_and_pdos_that_canopen_computes(facts: Facts) -
     }
     for pdo in node["pdos"]:
         parameters, mapping = dictionary[0x17FF + pdo["number"]], dictionary[0x19FF + pdo["number"]]
-        assert pdo["transmission_type"] == parameters[2].default
-        assert (pdo["inhibit_ms"], pdo["event_ms"]) == (
-            parameters[3].default / 10,
-            parameters[5].default,
-        )
+        kind, inhibit, timer = (parameters[sub].default for sub in (2, 3, 5))
+        holds(pdo, transmission_type=kind, inhibit_ms=inhibit / 10, event_ms=timer)
         mapped = [mapping[sub].default for sub in range(1, mapping[0].default + 1)]
-        assert [text.split()[0] for text in pdo["mapped"]] == [
-            f"{m >> 16:04X}h:{m >> 8 & 0xFF:02X}" for m in mapped
-        ]
+        named = [f"{m >> 16:04X}h:{m >> 8 & 0xFF:02X}" for m in mapped]
+        assert [text.split()[0] for text in pdo["mapped"]] == named
 
 
 def test_emergencies_are_those_that_the_eds_enables(facts: Facts) -> None:
     told = facts["canopen"]["emergencies"]
-    of_esc = [e for e in told if e["byte3"] != 0xFF]
+    of_esc = {e["byte3"]: e for e in told if e["byte3"] != 0xFF}
     dictionary: Any = canopen.import_od(str(EDS))
     mask = dictionary[0x2100][6].default
-    assert {e["byte3"] for e in of_esc} == {bit for bit in range(32) if mask >> bit & 1}
-    assert OperatingError.PROGRAMMING_ALLOWED not in {e["byte3"] for e in of_esc}
-    found = {(e["code"], e["byte4"]) for e in told if e["byte3"] == 0xFF}
-    assert found == {
-        *(
-            (error.value[0], None if error is GatewayError.HEARTBEAT_LOST else error.value[1])
-            for error in GatewayError
-        ),
-        (0, 0),
-    }
+    assert set(of_esc) == {bit for bit in range(32) if mask >> bit & 1}
+    assert OperatingError.PROGRAMMING_ALLOWED not in of_esc
+    expected: set[tuple[int, int | None]] = {error.value for error in GatewayError} | {(0, 0)}
+    code, detail = GatewayError.HEARTBEAT_LOST.value
+    expected = expected - {(code, detail)} | {(code, None)}
+    assert {(e["code"], e["byte4"]) for e in told if e["byte3"] == 0xFF} == expected
     assert all(e["meaning"] and e["remedy"].endswith(".") for e in told)
-    assert {e["code"]: e["register"] for e in of_esc}[0x3220] == 0b101
+    assert {e["code"]: e["register"] for e in of_esc.values()}[0x3220] == 0b101
 
 
 def test_each_source_is_reported_with_a_meaning_and_where_it_is_shown(facts: Facts) -> None:
-    known = VALUES
     told = {row["name"]: row for row in facts["sources"]}
-    assert {name for name, row in told.items() if row["bindable"]} == set(known)
+    assert {name for name, row in told.items() if row["bindable"]} == set(VALUES)
     assert all(row["meaning"] for row in told.values())
     shown = {s["source"] for m in facts["dbc"]["messages"] for s in m["signals"] if s["source"]}
     assert {name for name, row in told.items() if row["signals"]} == shown
-    voltage = told["battery_voltage"]
-    assert voltage["signals"] == ["EscSpeed.BatteryVoltage"]
-    assert voltage["objects"] == ["2000h:02", "6079h:00"]
-    assert voltage["available"] == "with fresh live data"
+    holds(
+        told["battery_voltage"],
+        signals=["EscSpeed.BatteryVoltage"],
+        objects=["2000h:02", "6079h:00"],
+        available="with fresh live data",
+    )
     assert told["undervoltage"]["meaning"] == OperatingError.UNDERVOLTAGE.meaning
-    assert known["battery_voltage"].group is Group.LIVE
 
 
 # --- by a configuration
@@ -206,12 +205,8 @@ def test_of_two_escs_each_has_its_signals_and_cob_ids_and_the_objects_are_report
     }
     nodes = two["canopen"]["nodes"]
     assert [(node["esc"], node["node_id"]) for node in nodes] == [("left", 20), ("right", 21)]
-    assert [pdo["cob_id"] for pdo in nodes[1]["pdos"]] == [
-        0x180 + 21,
-        0x280 + 21,
-        0x380 + 21,
-        0x480 + 21,
-    ]
+    ids = [0x180 + 21, 0x280 + 21, 0x380 + 21, 0x480 + 21]
+    assert [pdo["cob_id"] for pdo in nodes[1]["pdos"]] == ids
     assert two["canopen"]["objects"] == facts["canopen"]["objects"]
 
 
