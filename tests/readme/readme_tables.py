@@ -5,43 +5,28 @@ from dataclasses import MISSING, fields
 from fractions import Fraction
 from pathlib import Path
 
-import cantools.database
-
-from kontronik_can_gw.canopen.data_types import ARRAY, RECORD
-from kontronik_can_gw.canopen.eds import Eds, load
-from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
-from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import TABLES as KEYS
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.esc.kontronik.states import OperatingError
-from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.config.nodes import shipped_canopen
+from kontronik_can_gw.desk.describe.facts import describe
+from kontronik_can_gw.desk.describe.parts import Facts
+from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
+from kontronik_can_gw.esc.values import VALUES
 
 PROJECT = Path(__file__).resolve().parents[2]
 PAGES = {
     path: path.read_text(encoding="utf-8")
     for path in [PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md"))]
 }
+_BUS = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+FACTS = describe(_BUS, shipped_canopen([1]), _BUS.escs)
 _FOLDED = {*range(0x1800, 0x1C00), 0x2002}
-_TYPES = {2: "i8", 3: "i16", 4: "i32", 5: "u8", 6: "u16", 7: "u32", 9: "text", 15: "domain"}
-_FOUND_BY_GATEWAY = {
-    GatewayError.TELEMETRY_LOST: "telemetry lost",
-    GatewayError.CRC_RATE: "telemetry degraded: many CRC errors or dropped bytes",
-    GatewayError.PORT_GONE: "serial port gone",
-    GatewayError.OTHER_DEVICE: "another device than `[esc].device` says",
-    GatewayError.RECEIVE_OVERRUN: "received CAN frames were lost",
-    GatewayError.CAN_PASSIVE: "CAN controller error passive",
-    GatewayError.HEARTBEAT_LOST: "a watched heartbeat stayed away; byte 4: the node-ID",
-    GatewayError.BUS_OFF_LEFT: "back from bus-off",
-    GatewayError.ID_COLLISION: "somebody else sends with an id of this node: two nodes with one node-ID?",
-    GatewayError.SYNC_LENGTH: "SYNC of a wrong length",
-    GatewayError.PARAMETER_FILE: "the parameter file could not be read: defaults",
-}
-_WHEN = {
-    Group.LIVE: "with fresh live data",
-    Group.INFO: "with info of the present device",
-    Group.LINK: "always",
-    Group.GATEWAY: "always",
-}
+_TYPES = {"VISIBLE_STRING": "text", "DOMAIN": "domain"}
+
+
+def _table(head: str, *rows: str) -> str:
+    columns = head.count("|") + 1
+    return "\n".join([f"| {head} |", "|" + "---|" * columns, *(f"| {row} |" for row in rows)])
 
 
 def configuration() -> str:
@@ -62,124 +47,97 @@ def configuration() -> str:
 
 
 def messages() -> str:
-    database = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-    assert isinstance(database, cantools.database.Database)
-    lines = []
-    for message in database.messages:
-        attributes = message.dbc.attributes if message.dbc else {}
-        delay = attributes.get("GenMsgDelayTime")
-        timing = re.sub(r"(?<!^)(?=[A-Z])", " ", str(message.send_type)).lower()
-        timing += f", every {message.cycle_time} ms" if message.cycle_time else ""
-        timing += f", at least {delay.value} ms apart" if delay is not None and delay.value else ""
-        flags = [s for s in message.signals if s.length == 1]
-        lines += [f"**{message.name}** {message.frame_id:03X}h: {timing}. {message.comment}", ""]
-        lines += ["| signal | bits | unit | range | meaning |", "|---|---|---|---|---|"]
-        for s in message.signals:
-            if s in flags:
-                continue
-            span = (
-                f"{s.minimum:.10g} … {s.maximum:.10g}"
-                if s.minimum is not None and s.maximum is not None
-                else ""
-            )
-            kind = "i" if s.is_signed else "u"
-            place = f"{s.start}+{s.length} {kind}"
-            step = f" × {s.scale:.10g}" if s.scale != 1 else ""
-            lines.append(f"| {s.name} | {place}{step} | {s.unit or ''} | {span} | {s.comment} |")
+    parts = []
+    for message in FACTS["dbc"]["messages"]:
+        timing = " and ".join(message["send_type"])
+        timing += f", every {message['cycle_ms']} ms" if message["cycle_ms"] else ""
+        timing += f", at least {message['delay_ms']} ms apart" if message["delay_ms"] else ""
+        parts.append(f"**{message['name']}** {message['id']:03X}h: {timing}. {message['comment']}")
+        flags = [s for s in message["signals"] if s["length"] == 1]
+        rows = [_signal(s) for s in message["signals"] if s not in flags]
         if flags:
-            names = ", ".join(f"{s.start} {s.name}" for s in flags)
-            lines.append(
-                f"| flags | {flags[0].start}…{flags[-1].start} | | 0, 1 | bit and name: {names} |"
-            )
-        lines.append("")
-    return "\n".join(lines).rstrip()
+            names = ", ".join(f"{s['start_bit']} {s['name']}" for s in flags)
+            bits = f"{flags[0]['start_bit']}…{flags[-1]['start_bit']}"
+            rows.append(f"flags | {bits} | | 0, 1 | bit and name: {names}")
+        parts.append(_table("signal | bits | unit | range | meaning", *rows))
+    return "\n\n".join(parts)
+
+
+def _signal(signal: Facts) -> str:
+    place = f"{signal['start_bit']}+{signal['length']} {'i' if signal['signed'] else 'u'}"
+    step = f" × {signal['factor']:.10g}" if signal["factor"] != 1 else ""
+    span = f"{signal['minimum']:.10g} … {signal['maximum']:.10g}"
+    return f"{signal['name']} | {place}{step} | {signal['unit']} | {span} | {signal['comment']}"
 
 
 def source_table() -> str:
-    lines = ["| source | unit | available |", "|---|---|---|"]
-    flags: dict[Group, list[str]] = {}
-    for source in VALUES.values():
-        if source.bit is not None:
-            flags.setdefault(source.group, []).append(f"`{source.name}`")
+    rows: list[str] = []
+    flags: dict[str, list[str]] = {}
+    for source in (source for source in FACTS["sources"] if source["bindable"]):
+        name = f"`{source['name']}`"
+        if VALUES[source["name"]].bit is not None:
+            flags.setdefault(source["available"], []).append(name)
             continue
-        when = _WHEN[source.group] + (", if supplied" if source.optional else "")
-        note = "; counter" if source.rolls else "; names" if source.names else ""
-        lines.append(f"| `{source.name}` | {source.unit} | {when}{note} |")
-    for group, names in flags.items():
-        lines.append(f"| {', '.join(names)} | flag | {_WHEN[group]} |")
-    return "\n".join(lines)
+        note = "; counter" if source["counter"] else "; names" if source["values"] else ""
+        rows.append(f"{name} | {source['unit']} | {source['available']}{note}")
+    rows += [f"{', '.join(names)} | flag | {when}" for when, names in flags.items()]
+    return _table("source | unit | available", *rows)
 
 
 def emergencies() -> str:
-    lines = ["| code | byte 3 | meaning |", "|---|---|---|"]
-    for bit in OperatingError:
-        if bit is not OperatingError.PROGRAMMING_ALLOWED:
-            lines.append(
-                f"| {BitCodes(tuple(OperatingError)).code(bit):04X}h | {int(bit)} | {bit.meaning} |"
-            )
-    for error in GatewayError:
-        code, which = error.value
-        lines.append(
-            f"| {code:04X}h | FFh{f', byte 4 = {which}' if which else ''} | {_FOUND_BY_GATEWAY[error]} |"
-        )
-    lines.append("| 0000h | FFh | no error any more |")
-    return "\n".join(lines)
+    rows = []
+    for found in FACTS["canopen"]["emergencies"]:
+        byte4 = f", byte 4 = {found['byte4']}" if found["byte4"] else ""
+        byte3 = "FFh" if found["byte3"] == 0xFF else found["byte3"]
+        rows.append(f"{found['code']:04X}h | {byte3}{byte4} | {found['meaning']}")
+    return _table("code | byte 3 | meaning", *rows)
 
 
 def objects() -> str:
-    eds = load(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
-    live = BINDINGS
-    lines = [
-        "| object | name | type | access | default | limits | PDO |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for entry in eds.entries:
-        index, sub = entry.index, entry.sub
-        several = entry.object_type in (ARRAY, RECORD)
-        if several and sub == 0:
-            name = f"{eds.object_names[index]}{_pdo(eds, index)}"
-            lines.append(f"| **{index:04X}h** | **{name}** | | | | | |")
-        if index in _FOLDED or (several and sub == 0):
-            continue
-        where = f"{index:04X}h:{sub:02X}" if several else f"**{index:04X}h**"
-        name = entry.name if several else f"**{entry.name}**"
-        limits = (
-            ""
-            if entry.low is entry.high is None
-            else f"{_number(entry.low)} … {_number(entry.high)}"
-        )
-        default = (
-            f"$NODEID + {_number(entry.default)}" if entry.relative else _number(entry.default)
-        )
-        if (entry.index, entry.sub) in live:  # a formal 0
-            default = ""
-        mappable = "yes" if entry.mappable else ""
-        lines.append(
-            f"| {where} | {name} | {_TYPES[entry.data_type]} | {entry.access} | {default} | {limits} | {mappable} |"
-        )
-    return "\n".join(lines)
+    rows = []
+    for item in FACTS["canopen"]["objects"]:
+        index, several = item["index"], item["kind"] in ("ARRAY", "RECORD")
+        if several:
+            rows.append(f"**{index:04X}h** | **{item['name']}{_pdo(index)}** | | | | |")
+        for entry in item["entries"]:
+            if index in _FOLDED or (several and entry["sub"] == 0):
+                continue
+            where = f"{index:04X}h:{entry['sub']:02X}" if several else f"**{index:04X}h**"
+            name = entry["name"] if several else f"**{entry['name']}**"
+            default = _number(entry["default"])
+            default = f"$NODEID + {default}" if entry["plus_node_id"] else default
+            low, high = _number(entry["low"]), _number(entry["high"])
+            cells = [where, name, _type(entry["type"]), entry["access"]]
+            cells += ["" if entry["source"] else default, f"{low} … {high}" if low + high else ""]
+            rows.append(" | ".join([*cells, "yes" if entry["mappable"] else ""]))
+    return _table("object | name | type | access | default | limits | PDO", *rows)
 
 
-def _pdo(eds: Eds, index: int) -> str:
+def _type(name: str) -> str:
+    short = name.replace("UNSIGNED", "u").replace("INTEGER", "i")
+    return _TYPES.get(name, short)
+
+
+def _pdo(index: int) -> str:
     """The default of a PDO, shown after the name of its parameters."""
-    entries = {(e.index, e.sub): e for e in eds.entries}
-    value = {at: entry.default for at, entry in entries.items() if isinstance(entry.default, int)}
+    pdos = {pdo["number"]: pdo for pdo in FACTS["canopen"]["nodes"][0]["pdos"]}
+    pdo = pdos.get((index & 0x1FF) + 1)
     if index in range(0x1800, 0x1A00):
-        cob_id, kind, inhibit, timer = (value[index, sub] for sub in (1, 2, 3, 5))
-        if cob_id >> 31:
+        if pdo is None:
             return ": spare"
-        return f": $NODEID + {cob_id & 0x7FF:X}h, type {kind}, inhibit time {inhibit / 10:g} ms, event timer {timer} ms"
+        kind, inhibit, timer = (
+            pdo[name] for name in ("transmission_type", "inhibit_ms", "event_ms")
+        )
+        return f": $NODEID + {pdo['cob_id'] - 1:X}h, type {kind}, inhibit time {inhibit:g} ms, event timer {timer} ms"
     if index in range(0x1A00, 0x1C00):
-        mapped = (value[index, sub] for sub in range(1, value[index, 0] + 1))
-        return ": " + (", ".join(entries[m >> 16, m >> 8 & 0xFF].name for m in mapped) or "nothing")
+        mapped = [] if pdo is None else [name.partition(" ")[2] for name in pdo["mapped"]]
+        return ": " + (", ".join(mapped) or "nothing")
     return ""
 
 
-def _number(value: float | bytes | None) -> str:
+def _number(value: float | str | None) -> str:
     if value is None:
         return ""
-    if isinstance(value, bytes):
-        return value.decode("ascii")
     return f"{value:X}h" if isinstance(value, int) and value > 0xFFFF else str(value)
 
 
