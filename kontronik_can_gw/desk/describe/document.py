@@ -26,18 +26,16 @@ def _lead(facts: Facts) -> Iterator[str]:
     dbc, canopen = facts["dbc"], facts["canopen"]
     yield f"Made by {facts['program']} from the files in use, by: kontronik-can-gw describe."
     yield f"ESCs: {', '.join(facts['escs'])}."
-    yield (
-        f"DBC: {dbc['file']}, messages of {dbc['node']}."
-        if dbc
-        else "DBC: none, dbc.enabled is false."
-    )
-    yield (f"EDS: {canopen['file']}." if canopen else "CANopen: none, canopen.enabled is false.")
+    sent = f"{dbc['file']}, messages of {dbc['node']}" if dbc else "none, dbc.enabled is false"
+    yield f"DBC: {sent}."
+    yield f"EDS: {canopen['file']}." if canopen else "CANopen: none, canopen.enabled is false."
 
 
 def _sections(facts: Facts) -> Iterator[Section]:
     if facts["dbc"]:
         yield from _messages(facts["dbc"], several=len(facts["escs"]) > 1)
-    yield from _states_and_errors(facts)
+    for title, key, text, columns in _REFERENCE:
+        yield Section(title, 2, [text, _table(facts[key], columns)])
     if facts["canopen"]:
         yield from _canopen(facts["canopen"])
     yield Section("Sources", 2, [_SOURCES, _sources(facts["sources"])])
@@ -165,43 +163,35 @@ def _meaning(signal: Facts) -> str:
 # --- errors and states
 
 
-def _states_and_errors(facts: Facts) -> Iterator[Section]:
-    live = "Bits of the error word that the ESC sends with each live frame."
-    test = "Bits that the ESC sends about once a second, in its info frame. All of them mean that the self-test failed."
-    yield Section("Operating errors", 2, [live, _table(facts["operating_errors"], _ERROR)])
-    yield Section("Self-test errors", 2, [test, _table(facts["selftest_errors"], _ERROR)])
-    sheet = "What the ESC is doing. Other numbers have no name; newer firmware may send them."
-    yield Section("Operating states", 2, [sheet, _table(facts["operating_states"], _STATE)])
-    devices: Columns = {
-        "number": "value",
-        "device": _name,
-        "peak current": _peak_current,
-        "does not supply": lambda device: ", ".join(device["not_supplied"]) or "nothing",
-    }
-    yield Section("Devices", 2, [_table(facts["devices"], devices)])
-    line = "The telemetry line between an ESC and the gateway."
-    yield Section("Link states", 2, [line, _table(facts["link_states"], _STATE)])
-    controller = "The gateway's CAN controller."
-    yield Section("CAN states", 2, [controller, _table(facts["can_states"], _STATE)])
-    yield Section("Gateway states", 2, [_table(facts["gateway_states"], _STATE)])
-    where = "Reported as emergencies on CANopen nodes, in the log and by kontronik-can-gw status."
-    faults: Columns = {"fault": _name, "meaning": "meaning", "what to do": "remedy"}
-    found = _table(facts["gateway_faults"], faults)
-    yield Section("Faults that the gateway finds", 2, [where, found])
-
-
-_ERROR: Columns = {
-    "bit": "bit",
-    "name": _name,
-    "class": "severity",
-    "meaning": "meaning",
-    "what to do": "remedy",
-}
-_STATE: Columns = {"number": "value", "state": _name, "meaning": "meaning", "what to do": "remedy"}
-
-
 def _peak_current(device: Facts) -> str:
     return "unknown" if device["peak_current"] is None else f"of the {device['peak_current']}"
+
+
+_ABOUT: Columns = {"meaning": "meaning", "what to do": "remedy"}
+_ERROR: Columns = {"bit": "bit", "name": _name, "class": "severity", **_ABOUT}
+_STATE: Columns = {"number": "value", "state": _name, **_ABOUT}
+_DEVICE: Columns = {
+    "number": "value",
+    "device": _name,
+    "peak current": _peak_current,
+    "does not supply": lambda device: ", ".join(device["not_supplied"]) or "nothing",
+}
+# fmt: off
+_REFERENCE: tuple[tuple[str, str, str, Columns], ...] = (
+    ("Operating errors", "operating_errors", "Bits of the error word that the ESC sends with each live frame.", _ERROR),
+    ("Self-test errors", "selftest_errors",
+     "Bits that the ESC sends about once a second, in its info frame. All of them mean that the self-test failed.", _ERROR),
+    ("Operating states", "operating_states",
+     "What the ESC is doing. Other numbers have no name; newer firmware may send them.", _STATE),
+    ("Devices", "devices", "", _DEVICE),
+    ("Link states", "link_states", "The telemetry line between an ESC and the gateway.", _STATE),
+    ("CAN states", "can_states", "The gateway's CAN controller.", _STATE),
+    ("Gateway states", "gateway_states", "", _STATE),
+    ("Faults that the gateway finds", "gateway_faults",
+     "Reported as emergencies on CANopen nodes, in the log and by kontronik-can-gw status.", {"fault": _name, **_ABOUT}),
+)
+# fmt: on
+"""Title, key of the facts, text, columns."""
 
 
 # --- CANopen
@@ -218,8 +208,7 @@ def _canopen(facts: Facts) -> Iterator[Section]:
         "byte 4": lambda emergency: str(emergency["byte4"] or ""),
         "name": _name,
         "class": "severity",
-        "meaning": "meaning",
-        "what to do": "remedy",
+        **_ABOUT,
     }
     yield Section("Emergencies", 2, [text, _table(facts["emergencies"], columns)])
     writes = "Nothing can be written over the bus: canopen.read_only is true."
@@ -251,12 +240,10 @@ def _node(node: Facts) -> Section:
 def _default(entry: Facts) -> str:
     default = entry["default"]
     if default is None or entry["source"] is not None:  # a live value has no default of its own
-        text = ""
+        default = ""
     elif isinstance(default, int) and default > 0xFFFF:
-        text = f"{default:X}h"
-    else:
-        text = str(default)
-    return f"$NODEID + {text}" if entry["plus_node_id"] else text
+        default = f"{default:X}h"
+    return f"$NODEID + {default}" if entry["plus_node_id"] else str(default)
 
 
 def _limits(entry: Facts) -> str:
@@ -266,9 +253,8 @@ def _limits(entry: Facts) -> str:
 
 
 def _steps(entry: Facts) -> str:
-    if entry["resolution"] in (None, 1):
-        return str(entry["unit"])
-    return f"{_number(entry['resolution'])} {entry['unit']}".strip()
+    step = "" if entry["resolution"] == 1 else _number(entry["resolution"])
+    return f"{step} {entry['unit']}".strip()
 
 
 _ENTRY: Columns = {

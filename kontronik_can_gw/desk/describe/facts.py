@@ -4,7 +4,7 @@ Nothing is defined here: messages and signals are from the DBC in use, objects f
 and the bindings, errors and states from their definitions. Ids, indices and bit numbers are integers; times in ms.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from kontronik_can_gw import __version__
@@ -19,10 +19,10 @@ from kontronik_can_gw.desk.describe.canopen_facts import canopen_facts
 from kontronik_can_gw.desk.describe.line_states import CAN_STATES, GATEWAY_STATES, LINK_STATES, Text
 from kontronik_can_gw.desk.describe.parts import Facts, error, one_line, value_table
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, State
+from kontronik_can_gw.esc.decoder import EscProtocol, State
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import VALUES, Group, Value
+from kontronik_can_gw.esc.values import VALUES, Group
 
 FORMAT = "kontronik-can-gw description"
 VERSION = 1
@@ -32,6 +32,11 @@ _AVAILABLE = {
     Group.INFO: "with info of the present device",
     Group.LINK: "always",
     Group.GATEWAY: "always",
+}
+_STATES: Mapping[str, Mapping[Any, Text]] = {
+    "link_states": LINK_STATES,
+    "can_states": CAN_STATES,
+    "gateway_states": GATEWAY_STATES,
 }
 
 
@@ -51,8 +56,14 @@ def describe(
         "dbc": dbc,
         "canopen": None if canopen is None else canopen_facts(canopen, escs, meanings),
         "sources": _sources(dbc, None if canopen is None else canopen.eds, meanings),
-        "operating_errors": _errors(protocols, "operating_errors"),
-        "selftest_errors": _errors(protocols, "selftest_errors"),
+        **{
+            word: [
+                {"bit": int(bit), **error(bit)}
+                for protocol in protocols
+                for bit in protocol.errors.get(word, ())
+            ]
+            for word in ("operating_errors", "selftest_errors")
+        },
         "operating_states": [
             _state(number, state.text, state)
             for protocol in protocols
@@ -61,9 +72,10 @@ def describe(
         "devices": [
             _device(protocol, number) for protocol in protocols for number in protocol.devices
         ],
-        "link_states": _states(LINK_STATES),
-        "can_states": _states(CAN_STATES),
-        "gateway_states": _states(GATEWAY_STATES),
+        **{
+            key: [_state(state, pascal_case(state.name), text) for state, text in texts.items()]
+            for key, texts in _STATES.items()
+        },
         "gateway_faults": [_fault(fault) for fault in GatewayError],
     }
 
@@ -105,43 +117,25 @@ def _sources(dbc: Facts | None, eds: Eds | None, meanings: Mapping[str, str]) ->
             name = bound.source.name
             objects.setdefault(name, []).append(f"{entry.index:04X}h:{entry.sub:02X}")
             names.setdefault(name, entry.name)
+    shown = [binding.source for binding in BINDINGS.values()]
+    others = {source.name: source for source in shown if source.name not in VALUES}
     return [
         {
             "name": name,
             "unit": source.unit,
             "available": _AVAILABLE[source.group] + (", where supplied" if source.optional else ""),
-            "meaning": meanings.get(name) or names.get(name) or _in_words(name),
+            "meaning": meanings.get(name) or names.get(name, name.replace("_", " ").capitalize()),
             "counter": source.rolls,
             "bindable": name in VALUES,
             "values": value_table({int(value): text for value, text in source.names.items()}),
             "signals": signals.get(name, []),
             "objects": objects.get(name, []),
         }
-        for name, source in _listed()
+        for name, source in {**VALUES, **others}.items()
     ]
 
 
-def _listed() -> Iterator[tuple[str, Value]]:
-    """The sources that a signal can be bound to, and those that only objects show."""
-    yield from VALUES.items()
-    others = {binding.source.name: binding.source for binding in BINDINGS.values()}
-    yield from ((name, source) for name, source in others.items() if name not in VALUES)
-
-
-def _in_words(name: str) -> str:
-    return name.replace("_", " ").capitalize()
-
-
-# --- errors, states, devices
-
-
-def _errors(protocols: Sequence[EscProtocol], word: str) -> list[Facts]:
-    bits: list[ErrorBit] = [bit for each in protocols for bit in each.errors.get(word, ())]
-    return [{"bit": int(bit), **error(bit)} for bit in bits]
-
-
-def _states(texts: Mapping[Any, Text]) -> list[Facts]:
-    return [_state(state, pascal_case(state.name), text) for state, text in texts.items()]
+# --- states, devices, faults
 
 
 def _state(state: int, name: str, text: Text | State) -> Facts:
@@ -150,14 +144,12 @@ def _state(state: int, name: str, text: Text | State) -> Facts:
 
 def _device(protocol: EscProtocol, device: int) -> Facts:
     """A kind of ESC; ``peak_current``: what it is the peak of, None where that is not known."""
-    missing = [
-        field.name for field in protocol.fields if device in field.not_on and not field.is_info
-    ]
+    fields = [field for field in protocol.fields if not field.is_info]
     return {
         "value": device,
         "name": protocol.devices[device],
         "peak_current": protocol.peak_current_of.get(device),
-        "not_supplied": missing,
+        "not_supplied": [field.name for field in fields if device in field.not_on],
     }
 
 
