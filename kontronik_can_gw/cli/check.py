@@ -1,6 +1,7 @@
 """``check``: shows what a configuration means and sends, without opening anything."""
 
 import argparse
+import re
 import struct
 from collections.abc import Sequence
 
@@ -60,23 +61,19 @@ def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
     """Each node's COB-IDs and PDOs in columns."""
     rows: list[tuple[str, ...]] = [("node", "COB-ID", "what", "sent", "objects")]
     for node, esc in zip(nodes.nodes, loaded.escs, strict=True):
-        first = f"{esc.name}: {'waits for LSS' if node.node_id == UNCONFIGURED else node.node_id}"
         if node.node_id == UNCONFIGURED:
-            rows.append((first, "7E5h", "LSS", "", f"serial number {node.identity.identity[3]}"))
+            serial = f"serial number {node.identity.identity[3]}"
+            rows.append((f"{esc.name}: waits for LSS", "7E5h", "LSS", "", serial))
             continue
+        first = f"{esc.name}: {node.node_id}"
+        tpdos = {tpdo.cob_id: tpdo for tpdo in node.tpdos if tpdo.valid}
         for cob_id, what in dict(all_ids(node)).items():
-            tpdo = next((t for t in node.tpdos if t.valid and t.cob_id == cob_id), None)
-            objects = (
-                ""
-                if tpdo is None
-                else ", ".join(entry.variable.entry.name for entry in tpdo.mapped)
-            )
-            what = what.removesuffix(f" of CANopen node {node.node_id}").removesuffix(
-                f" to CANopen node {node.node_id}"
-            )
-            rows.append(
-                (first, f"{cob_id:03X}h", what, "" if tpdo is None else pdo_timing(tpdo), objects)
-            )
+            sent, objects = "", ""
+            if (tpdo := tpdos.get(cob_id)) is not None:
+                sent = pdo_timing(tpdo)
+                objects = ", ".join(entry.variable.entry.name for entry in tpdo.mapped)
+            what = re.sub(rf" (of|to) CANopen node {node.node_id}$", "", what)
+            rows.append((first, f"{cob_id:03X}h", what, sent, objects))
             first = ""
     return columns(rows)
 

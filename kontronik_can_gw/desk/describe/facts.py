@@ -117,8 +117,8 @@ def _sources(dbc: Facts | None, eds: Eds | None, meanings: Mapping[str, str]) ->
             name = bound.source.name
             objects.setdefault(name, []).append(f"{entry.index:04X}h:{entry.sub:02X}")
             names.setdefault(name, entry.name)
-    shown = [binding.source for binding in BINDINGS.values()]
-    others = {source.name: source for source in shown if source.name not in VALUES}
+    sources = [binding.source for binding in BINDINGS.values()]
+    others = {source.name: source for source in sources if source.name not in VALUES}
     return [
         {
             "name": name,
