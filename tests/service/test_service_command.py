@@ -7,47 +7,45 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import Done, run
+from command_line import Done, refused, run
 
-from kontronik_can_gw.cli import service_machine
+from kontronik_can_gw.cli import service, service_machine
 from kontronik_can_gw.cli.service_files import is_ours
 from kontronik_can_gw.errors import UserError
 
 UNITS = "etc/systemd/system"
 CONFIGURATION = "etc/kontronik-can-gw/gateway.toml"
+RULES = "etc/udev/rules.d/70-kontronik-can-gw.rules"
+SYSUSERS = "etc/sysusers.d/kontronik-can-gw.conf"
+UNIT = f"{UNITS}/kontronik-can-gw.service"
+NETWORK = "etc/systemd/network/50-kontronik-can-gw-can0"
 FILES = [
-    CONFIGURATION,
-    "etc/sysusers.d/kontronik-can-gw.conf",
-    "etc/tmpfiles.d/kontronik-can-gw.conf",
-    "etc/systemd/network/50-kontronik-can-gw-can0.link.example",
-    "etc/systemd/network/50-kontronik-can-gw-can0.network.example",
-    f"{UNITS}/kontronik-can-gw.service",
-    f"{UNITS}/kontronik-can-gw@.service",
-    "etc/udev/rules.d/70-kontronik-can-gw.rules",
+    *(CONFIGURATION, SYSUSERS, "etc/tmpfiles.d/kontronik-can-gw.conf", RULES),
+    *(f"{NETWORK}.link.example", f"{NETWORK}.network.example"),
+    *(UNIT, f"{UNITS}/kontronik-can-gw@.service"),
 ]
 EXECUTABLE = "/opt/kontronik-can-gw/bin/kontronik-can-gw"
 
 
-def the_line(done: Done, code: int) -> str:
-    """What is said of a failure, without the program's name."""
-    assert (done.code, done.out, done.err.count("\n")) == (code, "", 1), done
-    return done.err.strip()
+def install(root: Path, *words: object, executable: str = EXECUTABLE) -> Done:
+    return run("service", "install", "--root", root, "--executable", executable, *words)
 
 
-def install(root: Path, *words: object) -> Done:
-    return run("service", "install", "--root", root, "--executable", EXECUTABLE, *words)
+def uninstall(root: Path, *words: object) -> str:
+    done = run("service", "uninstall", "--root", root, *words)
+    assert done.code == 0
+    return done.err
 
 
 def tree(root: Path) -> list[str]:
-    return sorted(
-        str(path.relative_to(root))
-        for path in root.rglob("*")
-        if path.is_symlink() or path.is_file()
-    )
+    """What was added to a root folder."""
+    found = [path for path in root.rglob("*") if path.is_symlink() or path.is_file()]
+    names = {str(path.relative_to(root)) for path in found}
+    return sorted(names - {EXECUTABLE.lstrip("/")})
 
 
-def edit(root: Path, name: str = CONFIGURATION) -> None:
-    (root / name).write_text('[[esc]]\nport = "/dev/esc_left"\n')
+def edit(root: Path, name: str = "gateway") -> None:
+    (root / f"etc/kontronik-can-gw/{name}.toml").write_text('[[esc]]\nport = "/dev/esc_left"\n')
 
 
 def written(program: Path) -> Path:
@@ -64,8 +62,9 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "image"
 
 
-def added(root: Path) -> list[str]:
-    return [name for name in tree(root) if name != EXECUTABLE.lstrip("/")]
+@pytest.fixture
+def wants(root: Path) -> Path:
+    return root / UNITS / "multi-user.target.wants"
 
 
 # --- install and uninstall below a folder
@@ -74,12 +73,9 @@ def added(root: Path) -> list[str]:
 def test_a_staged_install_writes_files_that_all_may_read(root: Path) -> None:
     done = install(root)
     assert done.code == 0
-    assert added(root) == sorted(FILES)
+    assert tree(root) == sorted(FILES)
     assert {(root / name).stat().st_mode & 0o777 for name in FILES} == {0o644}
-    assert (
-        f"ExecStart={EXECUTABLE} run --wait"
-        in (root / UNITS / "kontronik-can-gw.service").read_text()
-    )
+    assert f"ExecStart={EXECUTABLE} run --wait" in (root / UNIT).read_text()
     assert "is the example. Set ports, bit rate and motors first." in done.err
     assert done.err.endswith("kontronik-can-gw.service was not enabled.\n")
 
@@ -87,11 +83,10 @@ def test_a_staged_install_writes_files_that_all_may_read(root: Path) -> None:
 def test_uninstall_removes_what_install_wrote_and_keeps_the_configuration(root: Path) -> None:
     install(root, "--metrics", "--mqtt", "--network", 500_000)
     edit(root)
-    install(root)
-    assert run("service", "uninstall", "--root", root).code == 0
-    assert added(root) == [CONFIGURATION]
-    assert not (root / UNITS / "kontronik-can-gw.service.d").exists()
-    assert "nothing is installed" in run("service", "uninstall", "--root", root).err
+    install(root, "--metrics")
+    uninstall(root)
+    assert tree(root) == [CONFIGURATION]
+    assert "nothing is installed" in uninstall(root)
 
 
 def test_purge_removes_configurations_and_parameters_and_nothing_of_others(root: Path) -> None:
@@ -99,22 +94,28 @@ def test_purge_removes_configurations_and_parameters_and_nothing_of_others(root:
     for name in ("kontronik-can-gw", "kontronik-can-gw-left", "kontronik-can-gwen"):
         (root / "var/lib" / name).mkdir(parents=True)
         (root / "var/lib" / name / "esc1.params").write_text("x")
-    assert run("service", "uninstall", "--root", root, "--purge").code == 0
-    assert added(root) == ["var/lib/kontronik-can-gwen/esc1.params"]
+    uninstall(root, "--purge")
+    assert tree(root) == ["var/lib/kontronik-can-gwen/esc1.params"]
     assert not (root / "var/lib/kontronik-can-gw").exists()
 
 
-def test_an_edited_configuration_is_kept_and_enabled(root: Path) -> None:
+def test_an_edited_configuration_is_kept_and_its_services_are_enabled(
+    root: Path, wants: Path
+) -> None:
     install(root)
     edit(root)
     before = (root / CONFIGURATION).read_text()
-    assert install(root).err.endswith("kontronik-can-gw.service is enabled\n")
-    link = root / UNITS / "multi-user.target.wants/kontronik-can-gw.service"
-    assert str(link.readlink()) == "/etc/systemd/system/kontronik-can-gw.service"
+    done = install(root, "--metrics")
+    assert "kontronik-can-gw.service is enabled\n" in done.err
+    assert "kontronik-can-gw-metrics.service is enabled\n" in done.err
     assert (root / CONFIGURATION).read_text() == before
+    unit = (root / UNITS / "kontronik-can-gw-metrics.service").read_text()
+    assert f"ExecStart={EXECUTABLE} metrics -c /etc/" in unit
+    assert {link.name: str(link.readlink()) for link in wants.iterdir()} == {
+        name: f"/etc/systemd/system/{name}"
+        for name in ("kontronik-can-gw.service", "kontronik-can-gw-metrics.service")
+    }
     assert install(root).code == 0
-    run("service", "uninstall", "--root", root)
-    assert not link.is_symlink()
 
 
 def test_an_install_removes_what_an_earlier_version_left(root: Path) -> None:
@@ -122,9 +123,8 @@ def test_an_install_removes_what_an_earlier_version_left(root: Path) -> None:
     body = "[Service]\nIPAddressAllow=localhost\n"
     checksum = hashlib.sha256(body.encode()).hexdigest()
     head = f'# Written by "kontronik-can-gw service install" 0.5.0, checksum {checksum}.'
-    ours, changed = (
-        root / UNITS / f"kontronik-can-gw{end}.service.d/prometheus.conf" for end in ("", "@")
-    )
+    folders = [root / UNITS / f"kontronik-can-gw{end}.service.d" for end in ("", "@")]
+    ours, changed = (folder / "prometheus.conf" for folder in folders)
     for file, text in ((ours, body), (changed, body + "# by hand\n")):
         file.parent.mkdir(parents=True)
         file.write_text(f"{head}\n{text}")
@@ -133,165 +133,128 @@ def test_an_install_removes_what_an_earlier_version_left(root: Path) -> None:
     assert changed.exists()
 
 
-def test_metrics_are_a_service_of_their_own(root: Path) -> None:
-    install(root, "--metrics")
-    edit(root)
-    assert "kontronik-can-gw-metrics.service is enabled" in install(root, "--metrics").err
-    unit = root / UNITS / "kontronik-can-gw-metrics.service"
-    assert f"ExecStart={EXECUTABLE} metrics -c /etc/" in unit.read_text()
-    link = root / UNITS / "multi-user.target.wants/kontronik-can-gw-metrics.service"
-    assert link.is_symlink()
-    run("service", "uninstall", "--root", root)
-    assert not unit.exists() and not link.is_symlink()
-
-
-def test_an_instance_has_its_own_configuration_and_goes_alone(root: Path) -> None:
+def test_an_instance_has_its_own_configuration_and_goes_alone(root: Path, wants: Path) -> None:
     for name in ("left", "right"):
         install(root, "--instance", name)
-        edit(root, f"etc/kontronik-can-gw/{name}.toml")
+        edit(root, name)
         install(root, "--instance", name)
-    wants = root / UNITS / "multi-user.target.wants"
-    assert sorted(link.name for link in wants.iterdir()) == [
-        "kontronik-can-gw@left.service",
-        "kontronik-can-gw@right.service",
-    ]
-    assert (
-        str((wants / "kontronik-can-gw@left.service").readlink())
-        == f"/{UNITS}/kontronik-can-gw@.service"
-    )
+    template = f"/{UNITS}/kontronik-can-gw@.service"
+    assert {link.name: str(link.readlink()) for link in wants.iterdir()} == {
+        f"kontronik-can-gw@{name}.service": template for name in ("left", "right")
+    }
     assert not (root / CONFIGURATION).exists()
-    run("service", "uninstall", "--root", root, "--instance", "left")
+    uninstall(root, "--instance", "left")
     assert [link.name for link in wants.iterdir()] == ["kontronik-can-gw@right.service"]
-    assert (root / UNITS / "kontronik-can-gw@.service").exists()
-    run("service", "uninstall", "--root", root)
+    assert (root / template.lstrip("/")).exists()
+    uninstall(root)
     assert list(wants.iterdir()) == []
 
 
-def test_a_faulty_configuration_is_reported_and_not_enabled(root: Path) -> None:
+def test_a_faulty_configuration_is_reported_and_not_enabled(root: Path, wants: Path) -> None:
     install(root)
     (root / CONFIGURATION).write_text("[can]\nbitrat = 5\n")
     done = install(root)
     assert done.code == 0
     assert "can.bitrat: unknown key" in done.err
-    assert not (root / UNITS / "multi-user.target.wants").exists()
+    assert not wants.exists()
     assert install(root, "--now").code == 1
 
 
-def test_an_older_file_of_ours_is_replaced(root: Path) -> None:
+def test_an_active_network_file_takes_the_place_of_its_example_and_is_replaced(root: Path) -> None:
+    install(root)
     install(root, "--network", 250_000)
-    network = root / "etc/systemd/network/50-kontronik-can-gw-can0.network"
+    network = root / f"{NETWORK}.network"
     assert "BitRate=250000" in network.read_text()
     assert f"{network}: replaced\n" in install(root, "--network", 500_000).err
     assert "BitRate=500000" in network.read_text()
-    assert not list(network.parent.glob("*.bak"))
+    install(root)
+    assert sorted(network.parent.iterdir()) == [network.with_suffix(".link"), network]
 
 
-def test_what_was_changed_by_hand_and_what_is_not_ours_stays(root: Path) -> None:
-    rules = root / "etc/udev/rules.d/70-kontronik-can-gw.rules"
-    unit = root / UNITS / "kontronik-can-gw.service"
+def test_what_was_changed_by_hand_stays_and_is_put_aside_by_uninstall(root: Path) -> None:
+    rules, unit = root / RULES, root / UNIT
     unit.parent.mkdir(parents=True)
     unit.write_text("[Service]\nExecStart=/bin/true\n")
     install(root)
-    rules.write_text(rules.read_text() + "# mine\n")
+    mine = rules.read_text() + "# mine\n"
+    rules.write_text(mine)
     done = install(root)
     assert done.code == 0
     for path in (rules, unit):
         assert f"{path}: kept, it was changed by hand. Remove it" in done.err
-    assert rules.read_text().endswith("# mine\n")
+    assert rules.read_text() == mine
     assert unit.read_text() == "[Service]\nExecStart=/bin/true\n"
-    rules.unlink()
+    name = rules.name
+    assert f"{name}: was changed by hand, kept as {name}.bak" in uninstall(root)
+    assert rules.with_name(f"{name}.bak").read_text() == mine
+    assert not rules.exists()
     assert f"{rules}: new\n" in install(root).err
     assert is_ours(rules.read_text())
 
 
-def test_an_active_network_file_takes_the_place_of_its_example(root: Path) -> None:
-    install(root)
-    install(root, "--network", 500_000)
-    network = root / "etc/systemd/network"
-    active = ["50-kontronik-can-gw-can0.link", "50-kontronik-can-gw-can0.network"]
-    assert sorted(path.name for path in network.iterdir()) == active
-    install(root)
-    assert sorted(path.name for path in network.iterdir()) == active
-
-
-def test_the_group_of_serial_ports_comes_from_the_root(root: Path) -> None:
+def test_the_group_of_serial_ports_and_a_home_folder_are_those_of_the_machine(root: Path) -> None:
     (root / "etc").mkdir()
     (root / "etc/group").write_text("root:x:0:\nuucp:x:986:\n")
-    install(root)
-    assert "\nSupplementaryGroups=uucp\n" in (root / UNITS / "kontronik-can-gw.service").read_text()
-    assert (
-        "m kontronik-can-gw uucp\n" in (root / "etc/sysusers.d/kontronik-can-gw.conf").read_text()
-    )
-
-
-def test_a_program_in_a_home_folder_is_made_visible(root: Path) -> None:
-    run("service", "install", "--root", root, "--executable", "/home/pi/.venv/bin/kontronik-can-gw")
-    assert "\nProtectHome=read-only\n" in (root / UNITS / "kontronik-can-gw.service").read_text()
-
-
-def test_uninstall_keeps_what_was_changed_by_hand_aside(root: Path) -> None:
-    install(root)
-    rules = root / "etc/udev/rules.d/70-kontronik-can-gw.rules"
-    rules.write_text(
-        rules.read_text() + 'SUBSYSTEM=="tty", ENV{ID_SERIAL_SHORT}=="A1", SYMLINK+="esc_left"\n'
-    )
-    mine = rules.read_text()
-    done = run("service", "uninstall", "--root", root)
-    assert (
-        "70-kontronik-can-gw.rules: was changed by hand, kept as 70-kontronik-can-gw.rules.bak"
-        in done.err
-    )
-    assert rules.with_name("70-kontronik-can-gw.rules.bak").read_text() == mine
-    assert not rules.exists()
+    install(root, executable="/home/pi/.venv/bin/kontronik-can-gw")
+    unit = (root / UNIT).read_text()
+    assert "\nSupplementaryGroups=uucp\n" in unit
+    assert "\nProtectHome=read-only\n" in unit
+    assert "m kontronik-can-gw uucp\n" in (root / SYSUSERS).read_text()
 
 
 def test_a_link_that_leads_out_of_the_root_is_not_followed(root: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (root / "etc").symlink_to(tmp_path / "elsewhere")
-    assert "leads out of" in the_line(install(root), 1)
+    done = install(root)
+    assert (done.code, done.err.count("\n")) == (1, 1)
+    assert "leads out of" in done.err
     assert tree(tmp_path / "elsewhere") == []
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(root: Path) -> None:
     (root / "etc").write_text("a file")
-    assert "cannot be" in the_line(install(root), 1)
-
-
-@pytest.mark.parametrize("option", ["--dry-run", "--print", "--force"])
-def test_a_removed_option_says_what_to_do(root: Path, option: str) -> None:
-    assert f"{option}: was removed. " in the_line(install(root, option), 2)
-    assert added(root) == []
+    done = install(root)
+    assert (done.code, done.err.count("\n")) == (1, 1)
+    assert "cannot be" in done.err
 
 
 # --- wrong uses
 
 
+@pytest.mark.parametrize("kind", ["mqtt", "metrics"])
+def test_a_service_whose_library_is_missing_is_not_installed(
+    root: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service, "own_executable", lambda: EXECUTABLE)
+    monkeypatch.setattr(service, "find_spec", lambda _name: None)
+    said = refused(1, "service", "install", "--root", root, f"--{kind}")
+    assert said.startswith(f"--{kind}: needs ")
+    assert said.endswith(f": pip install 'kontronik-can-gw[{kind}]'")
+    assert tree(root) == []
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "the following arguments are required: ACTION"),
-        (["instal"], "invalid choice: 'instal'"),
-        (["install", "--instance", "../x"], "'../x' is no name: letters, digits, _ . -"),
-        (["install", "--instance", "gateway"], "'gateway' is the plain service's configuration"),
-        (["install", "--network", "fast"], "'fast' is not a bit rate in bit/s"),
-        (["install", "--network", "5000000"], "'5000000' is not a bit rate in bit/s"),
-        (["install", "--channel", "can 0"], "'can 0' is not the name of an interface"),
-        (["status", "-n", "many"], "'many' is not a number of lines"),
-        (["uninstall", "--now"], "unrecognized arguments: --now"),
+        ("install --instance ../x", "'../x' is no name: letters, digits, _ . -"),
+        ("install --instance gateway", "'gateway' is the plain service's configuration"),
+        ("install --network fast", "'fast' is not a bit rate in bit/s"),
+        ("install --network 5000000", "'5000000' is not a bit rate in bit/s"),
+        ("install --channel can+0", "'can+0' is not the name of an interface"),
+        ("status -n many", "'many' is not a number of lines"),
+        ("uninstall --now", "unrecognized arguments: --now"),
     ],
 )
-def test_a_wrong_use_is_reported_in_the_last_line(words: list[str], said: str) -> None:
-    done = run("service", *words)
-    assert (done.code, done.out) == (2, "")
-    assert said in done.err.splitlines()[-1]
+def test_a_wrong_use_is_reported_in_the_last_line(words: str, said: str) -> None:
+    assert said in refused(2, "service", *words.split())
 
 
 @pytest.mark.parametrize(
     "executable", ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExecStartPre=/x"]
 )
 def test_a_program_that_a_unit_cannot_hold_is_refused(root: Path, executable: str) -> None:
-    done = run("service", "install", "--root", root, "--executable", executable)
-    assert (done.code, added(root)) == (2, [])
+    done = install(root, executable=executable)
+    assert (done.code, tree(root)) == (2, [])
     assert "must be an absolute path without spaces" in done.err
 
 
@@ -300,7 +263,7 @@ def test_without_systemd_it_is_refused(
     action: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(service_machine, "_BOOTED", tmp_path / "none")
-    assert "this system does not run systemd." in the_line(run("service", action), 1)
+    assert "this system does not run systemd." in refused(1, "service", action)
 
 
 @pytest.mark.parametrize("action", ["install", "uninstall"])
@@ -309,17 +272,17 @@ def test_without_root_it_is_refused(
 ) -> None:
     monkeypatch.setattr(service_machine, "_BOOTED", tmp_path)
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    said = the_line(run("service", action), 1)
-    assert said.startswith("kontronik-can-gw service: only root may do that: sudo /")
+    said = refused(1, "service", action)
+    assert said.startswith("only root may do that: sudo /")
     assert f" service {action} " in said
 
 
 def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path) -> None:
     program = written(tmp_path / "closed" / "kontronik-can-gw")
     program.parent.chmod(0o700)
-    with pytest.raises(UserError) as refused:
+    with pytest.raises(UserError) as error:
         service_machine.check_executable(str(program), Path("/"))
-    said = str(refused.value)
+    said = str(error.value)
     assert "the service has a /tmp of its own" in said or "is closed to others" in said
 
 
