@@ -17,10 +17,6 @@ LIVE = bytes.fromhex("4B4F444C000000008A0900000000000000000000581FE90300001D2000
 COMMAND = [sys.executable, "-m", "kontronik_can_gw", "decode"]
 
 
-def decode(*words: str, data: bytes = b"") -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run([*COMMAND, *words], input=data, capture_output=True, timeout=60)
-
-
 @pytest.fixture(scope="module")
 def flight() -> bytes:
     return b"".join(sent.wire for sent in SimulatedEsc().frames_until(20 * 10**9))
@@ -36,13 +32,12 @@ def test_a_file_is_decoded_to_json_lines(tmp_path: Path, flight: bytes) -> None:
 
 
 def test_standard_input_gives_the_same_as_a_file(flight: bytes) -> None:
-    result = decode("-", data=flight)
-    assert result.returncode == 0
-    assert result.stdout.decode("ascii") == json_lines(Decoder().feed(flight))
+    done = subprocess.run([*COMMAND, "-"], input=flight, capture_output=True, check=True)
+    assert done.stdout.decode("ascii") == json_lines(Decoder().feed(flight))
 
 
-def test_csv_has_one_header_and_a_row_per_frame(flight: bytes) -> None:
-    lines = decode("-", "--csv", data=flight).stdout.decode("ascii").splitlines()
+def test_csv_has_one_header_and_a_row_per_frame(tmp_path: Path, flight: bytes) -> None:
+    lines = run("decode", written(tmp_path / "flight.bin", flight), "--csv").out.splitlines()
     assert lines[0] == ",".join(COLUMNS)
     assert len(lines) == 2022
     assert {line.count(",") for line in lines} == {len(COLUMNS) - 1}
@@ -66,11 +61,17 @@ def test_a_stream_is_decoded_as_it_comes() -> None:
 
 def test_statistics_are_written_as_json(tmp_path: Path) -> None:
     stats = tmp_path / "stats.json"
-    assert decode("-", "--stats", str(stats), data=b"xx" + LIVE).returncode == 0
-    counters = json.loads(stats.read_text())
-    assert counters["live"] == counters["live_legacy"] == 1
-    assert counters["info"] == counters["crc_errors"] == 0
-    assert (counters["bytes"], counters["dropped_bytes"]) == (40, 2)
+    file = written(tmp_path / "x.bin", b"xx" + LIVE)
+    assert run("decode", file, "--stats", stats).code == 0
+    known = {
+        "live": 1,
+        "live_legacy": 1,
+        "info": 0,
+        "crc_errors": 0,
+        "bytes": 40,
+        "dropped_bytes": 2,
+    }
+    assert json.loads(stats.read_text()).items() >= known.items()
 
 
 def test_an_unreadable_file_gives_one_clear_line_and_exit_code_1(tmp_path: Path) -> None:

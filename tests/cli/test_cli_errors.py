@@ -104,20 +104,12 @@ def test_a_removed_key_is_a_warning_of_every_command_that_reads_the_configuratio
 # --- ports
 
 
-@pytest.mark.parametrize("kind", ["none", "file", "directory", "pipe", "null"])
+@pytest.mark.parametrize("kind", ["directory", "pipe"])
 def test_what_is_no_serial_port_is_reported_with_where_to_look(tmp_path: Path, kind: str) -> None:
-    port = Path("/dev/null") if kind == "null" else tmp_path / "port"
-    if kind == "file":
-        port.write_bytes(b"x")
-    elif kind == "directory":
-        port.mkdir()
-    elif kind == "pipe":
-        os.mkfifo(port)
+    port = tmp_path / "port"
+    port.mkdir() if kind == "directory" else os.mkfifo(port)
     said = refused(1, "run", "-c", configuration(tmp_path, port))
-    assert (
-        f"esc1: {port}: {'no such serial port' if kind == 'none' else 'is not a serial port'}"
-        in said
-    )
+    assert said.startswith(f"esc1: {port}: is not a serial port")
     assert "/dev/serial/by-id" in said
 
 
@@ -132,12 +124,8 @@ def forbidden(path: str, mode: int) -> list[str]:
     os.chown(path, 65534, os.stat(path).st_gid)
     os.chmod(path, mode)
     assert shutil.which("setpriv"), "util-linux is needed"
-    return [
-        "setpriv",
-        "--clear-groups",
-        "--regid=65533",
-        "--bounding-set=-dac_override,-dac_read_search",
-    ]
+    no_override = "--bounding-set=-dac_override,-dac_read_search"
+    return ["setpriv", "--clear-groups", "--regid=65533", no_override]
 
 
 @pytest.mark.parametrize(
@@ -152,12 +140,7 @@ def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
     group = Path(terminal.path).group()
     before = forbidden(terminal.path, mode)
     done = program("run", "-c", configuration(tmp_path, terminal.path), before=before)
-    assert (done.returncode, done.stdout, done.stderr.count("\n"), "Traceback" in done.stderr) == (
-        1,
-        "",
-        1,
-        False,
-    )
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
     assert f"esc1: {terminal.path}: permission denied" in done.stderr
     assert remedy.format(group) in done.stderr
     assert ("usermod" in done.stderr) == (mode == 0o660)
@@ -198,9 +181,29 @@ def test_one_device_by_two_names_is_refused(tmp_path: Path, terminal: PtyEsc) ->
         )
 
 
-def test_only_a_configuration_that_is_not_there_is_answered_with_init(tmp_path: Path) -> None:
-    assert "init" in refused(2, "check", "-c", tmp_path / "none.toml")
+def test_a_folder_is_no_configuration_and_is_not_answered_with_init(tmp_path: Path) -> None:
     assert "init" not in refused(2, "check", "-c", tmp_path)
+
+
+LONG = "x" * 300
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(f"convert a {LONG}.csv", f"convert {LONG} a.csv", f"report a -o {LONG}"),
+        *(f"replay {LONG} --to log", f"monitor {LONG}", f"dbc -o {LONG}", f"check -c {LONG}"),
+        *(f"mqtt {LONG} --broker x", f"service install --root {LONG}", f"decode {LONG}"),
+    ],
+)
+def test_a_name_that_is_too_long_is_one_line(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run(*words.split())
+    assert done.code in (1, 2)
+    assert done.err.count("\n") == 1
+    assert "File name too long" in done.err
 
 
 # --- CAN interface
@@ -225,18 +228,14 @@ def test_init_writes_the_example_once_and_replaces_it_only_when_forced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = run("init")
-    assert (done.code, done.out) == (0, "")
-    assert "kontronik-can-gw check -c gateway.toml" in done.err
+    assert run("init").code == 0
     file = tmp_path / "gateway.toml"
     assert load(file).esc[0].pole_pairs == 7
     file.write_text("mine")
-    said = refused(2, "init")
-    assert "gateway.toml: exists. Give another name, or --force to replace it." in said
+    refused(2, "init")
     assert file.read_text() == "mine"
     assert run("init", "--force").code == 0
-    example = file.read_text()
-    assert run("init", "-").out == example
+    assert run("init", "-").out == file.read_text() != "mine"
     assert os.listdir(tmp_path) == ["gateway.toml"]
 
 

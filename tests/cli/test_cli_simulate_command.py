@@ -1,4 +1,4 @@
-"""``kontronik-can-gw simulate`` as a process: terminals, links, files, signals, one clear line per mistake."""
+"""``simulate``: terminals, links, files, signals; what is transmitted to the ESC."""
 
 import os
 import signal
@@ -6,9 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from command_line import refused
+import pytest
+from command_line import refused, run
 
-from kontronik_can_gw.cli import main
 from kontronik_can_gw.esc.kontronik import (
     Deframer,
     Device,
@@ -23,44 +23,37 @@ from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
 COMMAND = [sys.executable, "-m", "kontronik_can_gw", "simulate"]
 
 
-def frames_of(file: Path) -> list[Frame]:
+def frames_of(data: bytes) -> list[Frame]:
     deframer = Deframer()
-    return deframer.feed(file.read_bytes()) + deframer.flush()
+    return deframer.feed(data) + deframer.flush()
 
 
-def written(tmp_path: Path, *words: str) -> list[Frame]:
-    out = tmp_path / "out.bin"
-    assert main(["simulate", "--out", str(out), *words]) == 0
-    return frames_of(out)
+def written(tmp_path: Path, words: str) -> list[Frame]:
+    assert run("simulate", "--out", tmp_path / "out.bin", *words.split()).code == 0
+    return frames_of((tmp_path / "out.bin").read_bytes())
 
 
-def test_the_bytes_of_a_file_are_those_of_the_simulator(tmp_path: Path) -> None:
-    out = tmp_path / "out.bin"
-    assert main(["simulate", "--seconds", "90", "--seed", "5", "--out", str(out)]) == 0
+def test_the_bytes_of_a_file_and_of_standard_output_are_those_of_the_simulator(
+    tmp_path: Path,
+) -> None:
+    words = ["simulate", "--seconds", "90", "--seed", "5", "--out"]
+    assert run(*words, tmp_path / "out.bin").code == 0
     expected = SimulatedEsc(seed=5).frames_until(90 * 10**9 - 1)
-    assert out.read_bytes() == b"".join(sent.wire for sent in expected)
+    assert (tmp_path / "out.bin").read_bytes() == b"".join(sent.wire for sent in expected)
+    assert run(*words, "-").data == (tmp_path / "out.bin").read_bytes()
 
 
 def test_several_escs_of_mixed_layouts_write_a_file_each(tmp_path: Path) -> None:
-    words = [
-        "--esc",
-        "3",
-        "--layout",
-        "mixed",
-        "--seconds",
-        "2s",
-        "--out",
-        str(tmp_path / "esc{n}.bin"),
-    ]
-    assert main(["simulate", *words]) == 0
-    layouts = [{frame.layout for frame in frames_of(tmp_path / f"esc{n}.bin")} for n in (1, 2, 3)]
+    words = ["--esc", "3", "--layout", "mixed", "--seconds", "2s", "--out"]
+    assert run("simulate", *words, tmp_path / "esc{n}.bin").code == 0
+    files = [tmp_path / f"esc{n}.bin" for n in (1, 2, 3)]
+    layouts = [{frame.layout for frame in frames_of(file.read_bytes())} for file in files]
     assert layouts == [{Layout.V4}, {Layout.LEGACY}, {Layout.V4}]
 
 
 def test_device_variant_firmware_and_cells_are_as_asked(tmp_path: Path) -> None:
-    words = ["--device", "Kontrol_X", "--variant", "7", "--firmware", "3.9", "--cells", "12"]
-    words += ["--seconds", "2", "--rate", "200", "--info-every", "50"]
-    frames = written(tmp_path, *words)
+    words = "--device Kontrol_X --variant 7 --firmware 3.9 --cells 12"
+    frames = written(tmp_path, f"{words} --seconds 2 --rate 200 --info-every 50")
     infos = [frame.data for frame in frames if isinstance(frame.data, InfoData)]
     assert len(infos) == 8
     assert len(frames) == 408
@@ -69,87 +62,60 @@ def test_device_variant_firmware_and_cells_are_as_asked(tmp_path: Path) -> None:
 
 
 def test_error_bits_and_device_swaps_come_when_asked(tmp_path: Path) -> None:
-    words = [
-        "--error",
-        "undervoltage@1s+500ms",
-        "--error",
-        "BEC-overcurrent@2",
-        "--swap-device",
-        "jivepro@3s",
-    ]
-    frames = written(tmp_path, *words, "--swap-device", "uhv:legacy@4.5s", "--seconds", "6")
-    lives = [frame for frame in frames if isinstance(frame.data, LiveData)]
-    words_of_errors = [
-        frame.data.operating_errors for frame in lives if isinstance(frame.data, LiveData)
-    ]
-    assert [word & 1 for word in words_of_errors] == [int(100 <= n < 150) for n in range(600)]
+    words = "--error undervoltage@1s+500ms --error BEC-overcurrent@2 --seconds 6"
+    frames = written(tmp_path, f"--swap-device uhv:legacy@4.5s --swap-device jivepro@3s {words}")
+    lives = [(f.layout, f.data) for f in frames if isinstance(f.data, LiveData)]
+    errors = [data.operating_errors for _, data in lives]
+    assert [word & 1 for word in errors] == [int(100 <= n < 150) for n in range(600)]
     bec = 1 << OperatingError.BEC_OVERCURRENT
-    assert [word & bec for word in words_of_errors] == [bec if n >= 200 else 0 for n in range(600)]
-    assert [frame.layout is Layout.V4 for frame in lives] == [n < 300 for n in range(600)]
+    assert [word & bec for word in errors] == [bec if n >= 200 else 0 for n in range(600)]
+    assert [layout is Layout.V4 for layout, _ in lives] == [n < 300 for n in range(600)]
     devices = [frame.data.device for frame in frames if isinstance(frame.data, InfoData)]
     assert devices == [Device.KOSMIK] * 3 + [Device.JIVEPRO] + [Device.UHV]
 
 
-def test_standard_output_can_be_decoded_at_once() -> None:
-    words = [
-        "--seconds",
-        "3",
-        "--out",
-        "-",
-        "--noise",
-        "2",
-        "--lose-bytes",
-        "0.1%",
-        "--flip-bits",
-        "1e-4",
-        "--dropout",
-        "500ms/2s",
-    ]
-    result = subprocess.run([*COMMAND, *words], capture_output=True, timeout=60)
-    assert result.returncode == 0
-    assert 150 < len(Deframer().feed(result.stdout)) < 253
+def test_what_is_lost_and_disturbed_is_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:
+    words = "--seconds 3 --noise 2 --lose-bytes 0.1% --flip-bits 1e-4 --dropout 500ms/2s"
+    assert 150 < len(written(tmp_path, words)) < 253
 
 
-def test_escs_on_terminals_are_listed_and_send_until_the_signal(tmp_path: Path) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        link = tmp_path / "esc{n}"
-        words = [*COMMAND, "--esc", "2", "--link", str(link), "--layout", "legacy"]
-        with subprocess.Popen(
-            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as process:
-            assert process.stdout
-            assert process.stderr
-            lines = [process.stdout.readline().split() for _ in range(2)]
-            assert [line[0] for line in lines] == ["esc1", "esc2"]
-            for name, path in lines:
-                assert str((tmp_path / name).readlink()) == path
-                fd = os.open(tmp_path / name, os.O_RDONLY | os.O_NOCTTY)
-                deframer = Deframer()
-                frames: list[Frame] = []
-                while len(frames) < 5:
-                    frames += deframer.feed(os.read(fd, 4096))
-                os.close(fd)
-                assert deframer.counters.dropped_bytes == 0
-            process.send_signal(number)
-            assert process.stdout.read() == ""
-            assert "esc1: " in process.stderr.read()
-        assert process.returncode == 0
-        assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_escs_on_terminals_are_listed_and_send_until_the_signal(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    words = [*COMMAND, "--esc", "2", "--link", str(tmp_path / "esc{n}"), "--layout", "legacy"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout
+        assert process.stderr
+        lines = [process.stdout.readline().split() for _ in range(2)]
+        assert [line[0] for line in lines] == ["esc1", "esc2"]
+        for name, path in lines:
+            assert str((tmp_path / name).readlink()) == path
+            fd = os.open(tmp_path / name, os.O_RDONLY | os.O_NOCTTY)
+            deframer = Deframer()
+            frames: list[Frame] = []
+            while len(frames) < 5:
+                frames += deframer.feed(os.read(fd, 4096))
+            os.close(fd)
+            assert deframer.counters.dropped_bytes == 0
+        process.send_signal(number)
+        assert process.stdout.read() == ""
+        assert "esc1: " in process.stderr.read()
+    assert process.returncode == 0
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_gateway_that_transmits_is_reported_loudly() -> None:
-    with subprocess.Popen(
-        COMMAND, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(COMMAND, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout
         assert process.stderr
         path = process.stdout.readline().split()[1]
         fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
         os.write(fd, b"AT")
-        assert (
-            process.stderr.readline()
-            == f"ERROR: esc1 {path}: the gateway transmits to the ESC: 41 54\n"
-        )
+        loud = f"ERROR: esc1 {path}: the gateway transmits to the ESC: 41 54\n"
+        assert process.stderr.readline() == loud
         process.send_signal(signal.SIGTERM)
         assert "2 bytes came from the gateway, beginning with 41 54" in process.stderr.read()
         os.close(fd)

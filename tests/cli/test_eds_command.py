@@ -19,7 +19,6 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 
 EDS = shipped("eds/kontronik_esc.eds")
 Key = tuple[int, int]
-TELEMETRY = BINDINGS
 
 
 def command(*words: object) -> tuple[object, str, str]:
@@ -51,14 +50,11 @@ def values(dictionary: Any) -> dict[Key, int | bytes]:
     """Every ParameterValue, as the canopen library reads it."""
     found: dict[Key, int | bytes] = {}
     for item in dictionary.values():
-        members = (
-            [item] if isinstance(item, canopen.objectdictionary.ODVariable) else list(item.values())
-        )
-        for each in members:
-            if each.value is not None:
-                found[each.index, each.subindex] = (
-                    each.value.encode() if isinstance(each.value, str) else each.value
-                )
+        is_alone = isinstance(item, canopen.objectdictionary.ODVariable)
+        for each in [item] if is_alone else item.values():
+            if (value := each.value) is not None:
+                key = each.index, each.subindex
+                found[key] = value.encode() if isinstance(value, str) else value
     return found
 
 
@@ -68,16 +64,13 @@ def dcf_values(*words: object) -> dict[Key, int | bytes]:
     return values(imported(text))
 
 
-# --- the EDS --------------------------------------------------------------------------------------------------------------
+# --- the EDS
 
 
 def test_without_a_node_id_the_shipped_eds_is_written_byte_for_byte(tmp_path: Path) -> None:
-    assert command("-o", tmp_path / "out.eds") == (
-        0,
-        "",
-        f"kontronik-can-gw: {tmp_path}/out.eds written\n",
-    )
-    assert (tmp_path / "out.eds").read_bytes() == EDS.read_bytes()
+    out = tmp_path / "out.eds"
+    assert command("-o", out) == (0, "", f"kontronik-can-gw: {out} written\n")
+    assert out.read_bytes() == EDS.read_bytes()
     assert os.listdir(tmp_path) == ["out.eds"]
     code, text, said = command()
     assert (code, text.encode(), said) == (0, EDS.read_bytes(), "")
@@ -92,7 +85,7 @@ def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
     assert command("-c", file)[1].encode() == without(mine, range(0x6000, 0x6800))
 
 
-# --- the DCF of the defaults ----------------------------------------------------------------------------------------------
+# --- the DCF of the defaults
 
 
 def test_a_dcf_without_a_configuration_names_no_serial_number_to_look_for() -> None:
@@ -108,7 +101,7 @@ def test_telemetry_states_and_commands_are_not_in_a_dcf() -> None:
     found = dcf_values("--node-id", 1)
     states = (0x1001, 0x1002, 0x1003, 0x1010, 0x1011, 0x1020, 0x1021, 0x2010, 0x2102, 0x603F)
     assert not {index for index, _ in found} & set(states)
-    assert not set(found) & set(TELEMETRY)
+    assert not set(found) & set(BINDINGS)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +124,7 @@ def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
     ]
 
 
-# --- the DCF of a configured node -----------------------------------------------------------------------------------------
+# --- the DCF of a configured node
 
 
 def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_master_stored(
@@ -159,13 +152,9 @@ def test_the_dcf_of_a_configured_node_has_its_settings_identity_and_what_a_maste
     assert [found[0x1018, sub] for sub in (1, 4)] == [0x123, 1001]
     assert [found[0x2100, sub] for sub in range(1, 9)] == [7, 5, 2, 400, 0, 0xFF, 12, 5]
     assert [found[0x2101, sub] for sub in (1, 2, 3, 4)] == [33, 33, 250_000, 250_000]
-    assert (found[0x1017, 0], found[0x1800, 3], found[0x1A00, 0], found[0x1F80, 0]) == (
-        500,
-        1000,
-        1,
-        0,
-    )
-    assert (found[0x1014, 0], found[0x1200, 1], found[0x1803, 1]) == (0xA1, 0x621, 0x400004A1)
+    communication = {(0x1017, 0): 500, (0x1800, 3): 1000, (0x1A00, 0): 1, (0x1F80, 0): 0}
+    communication |= {(0x1014, 0): 0xA1, (0x1200, 1): 0x621, (0x1803, 1): 0x400004A1}
+    assert {key: found[key] for key in communication} == communication
 
     of_left = dcf_values("-c", file, "--node-id", "0x14")
     assert (of_left[0x1018, 4], of_left[0x1017, 0], of_left[0x2100, 1]) == (1000, 1000, 1)
@@ -179,23 +168,12 @@ def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
     found = values(dictionary)
     assert len(found) > 100
     for (index, sub), value in found.items():
-        variable = dictionary.get_variable(index, sub)
         text = value.decode() if isinstance(value, bytes) else value
-        assert variable.encode_raw(text) == node.dictionary.upload(index, sub, 0), (
-            f"{index:04X}h:{sub:02X}"
-        )
+        data = dictionary.get_variable(index, sub).encode_raw(text)
+        assert data == node.dictionary.upload(index, sub, 0), f"{index:04X}h:{sub:02X}"
 
 
-@pytest.mark.parametrize(
-    ("lines", "right", "expected"),
-    [
-        ("enabled = true\nnode_id = 20", "", "There are 20, 21."),
-        ("enabled = true\nnode_id = 20", "node_id = 255", "There is 20."),
-        ("enabled = true\nnode_id = 255", "", "All wait for LSS."),
-    ],
-)
-def test_a_node_id_that_no_node_has_is_refused_with_those_there_are(
-    lines: str, right: str, expected: str, tmp_path: Path
-) -> None:
-    said = refused(2, "eds", "-c", configuration(tmp_path, lines, right=right), "--node-id", 5)
-    assert said == f"--node-id 5: no node of the configuration has it. {expected}"
+def test_a_node_id_that_no_node_has_is_refused_with_the_one_there_is(tmp_path: Path) -> None:
+    file = configuration(tmp_path, "enabled = true\nnode_id = 20", right="node_id = 255")
+    said = refused(2, "eds", "-c", file, "--node-id", 5)
+    assert said == "--node-id 5: no node of the configuration has it. There is 20."
