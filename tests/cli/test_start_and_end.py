@@ -7,6 +7,7 @@ import sys
 import tomllib
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -33,16 +34,8 @@ AS_PROGRAM = "from kontronik_can_gw.__main__ import main; sys.exit(main())"
 
 def run(*command: str, folder: Path) -> "subprocess.CompletedProcess[str]":
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-        cwd=folder,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-    )
+    where: Any = {"cwd": folder, "env": environment, "stdin": subprocess.DEVNULL}
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, **where)
 
 
 @pytest.fixture
@@ -57,11 +50,13 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("module", "words"),
     [
-        ("kontronik_can_gw.cli", ["check", "-c", "gateway.toml"]),
-        ("argparse", ["check", "-c", "gateway.toml"]),
-        ("kontronik_can_gw.cli.check", ["check", "-c", "gateway.toml"]),
-        ("kontronik_can_gw.config.keys", ["check", "-c", "gateway.toml"]),
-        ("cantools.database", ["check", "-c", "gateway.toml"]),
+        *(
+            (module, ["check", "-c", "gateway.toml"])
+            for module in (
+                *("kontronik_can_gw.cli", "argparse", "kontronik_can_gw.cli.check"),
+                *("kontronik_can_gw.config.keys", "cantools.database"),
+            )
+        ),
         ("kontronik_can_gw.canopen.eds", ["eds"]),
         ("kontronik_can_gw.cli.run", ["run", "-c", "gateway.toml"]),
     ],
@@ -76,15 +71,9 @@ def test_ctrl_c_while_modules_are_loaded_ends_it_without_a_word(
 
 def test_who_has_ctrl_c_ignored_is_not_ended_by_it(folder: Path) -> None:
     """As of a shell script's background jobs."""
-    code = INTERRUPTED.format(
-        module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[]
-    )
-    done = run(
-        sys.executable,
-        "-c",
-        "import signal; signal.signal(2, signal.SIG_IGN)\n" + code,
-        folder=folder,
-    )
+    code = "import signal; signal.signal(2, signal.SIG_IGN)\n" + INTERRUPTED
+    code = code.format(module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[])
+    done = run(sys.executable, "-c", code, folder=folder)
     assert (done.returncode, done.stderr) == (0, "")
 
 

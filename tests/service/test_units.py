@@ -22,24 +22,18 @@ MAX_EXPOSED = 2.0
 
 
 def files(root: Path, **more: Any) -> dict[str, PlannedFile]:
-    """All files by their names."""
+    """All files by their names, *.conf by its folder's."""
     usual: dict[str, Any] = {"executable": "/bin/true", "home_visible": False, "group": "dialout"}
-    made = {Path(file.path).name: file for file in planned(Choices(**(usual | more)), root)}
-    return made | {
-        Path(file.path).parent.name: file
-        for file in planned(Choices(**(usual | more)), root)
-        if ".d/" in file.path
-    }
+    made = {Path(file.path): file for file in planned(Choices(**(usual | more)), root)}
+    return {(p.parent if p.suffix == ".conf" else p).name: file for p, file in made.items()}
 
 
 def units(folder: Path, beside: bool = False) -> list[Path]:
     """The gateway's units in a folder, or those of the services beside it; the template as an instance."""
-    choices = Choices("/bin/true", False, "dialout", companions=COMPANIONS if beside else ())
-    for file in planned(choices, folder):
-        if "/system/" in file.path:
-            path = folder / file.path.partition("/system/")[2].replace("@.service", "@left.service")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(file.text)
+    made = files(folder, companions=COMPANIONS if beside else ())
+    for name, file in made.items():
+        if name.endswith(".service"):
+            (folder / name.replace("@", "@left")).write_text(file.text)
     return [folder / name.replace("@", "@left") for name in (BESIDE if beside else NAMES)]
 
 
@@ -56,14 +50,8 @@ def analyze(*words: str) -> "subprocess.CompletedProcess[str]":
     if shutil.which("systemd-analyze") is None:
         pytest.skip(ENABLE)
     environment = os.environ | {"SYSTEMD_COLORS": "0", "LC_ALL": "C.UTF-8"}
-    return subprocess.run(
-        ["systemd-analyze", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-        env=environment,
-    )
+    command = ["systemd-analyze", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
 
 
 # --- by systemd's tools
@@ -202,27 +190,19 @@ RULE = re.compile(
 def test_udev_rules_are_well_formed(tmp_path: Path) -> None:
     """By the grammar of the keys in use, and by udev itself where it can (udevadm verify, systemd 254)."""
     text = files(tmp_path)["70-kontronik-can-gw.rules"].text
-    lines = [
-        line.removeprefix("#") for line in text.splitlines() if re.match("#?[A-Z]+(==|=)", line)
-    ]
+    lines = [line.strip("#") for line in text.splitlines() if re.match("#?[A-Z]+(==|=)", line)]
     assert len(lines) == 6
-    for line in lines:
-        for part in line.split(", "):
-            assert RULE.fullmatch(part), part
-    assert (
-        text.count('GOTO="kontronik_can_gw_end"') == text.count('LABEL="kontronik_can_gw_end"') == 1
-    )
+    assert all(RULE.fullmatch(part) for line in lines for part in line.split(", "))
+    for label in ('GOTO="kontronik_can_gw_end"', 'LABEL="kontronik_can_gw_end"'):
+        assert text.count(label) == 1
     udevadm = shutil.which("udevadm", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/bin")
+    rules = tmp_path / "70-kontronik-can-gw.rules"
+    rules.write_text(text)
     if (
         udevadm
-        and "verify"
-        in subprocess.run([udevadm, "--help"], capture_output=True, text=True, check=False).stdout
+        and "verify" in subprocess.run([udevadm, "-h"], capture_output=True, text=True).stdout
     ):
-        rules = tmp_path / "70-kontronik-can-gw.rules"
-        rules.write_text(text)
-        done = subprocess.run(
-            [udevadm, "verify", str(rules)], capture_output=True, text=True, check=False
-        )
+        done = subprocess.run([udevadm, "verify", str(rules)], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr + done.stdout
 
 
