@@ -5,7 +5,8 @@ import json
 import os
 import stat
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TextIO
 
@@ -38,11 +39,14 @@ def main(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         fd, status = _opened(args.file, name, stack)
         size = status.st_size if stat.S_ISREG(status.st_mode) else None
-        stats = None if args.stats is None else _stats_file(args.stats, status, stack)
+        stats = _stats_file(args.stats, status, stack) if args.stats is not None else None
         decoder = decode.Decoder()
 
         def write(text: str) -> None:
-            _write(text, flush=size is None or not text)
+            with _writing("standard output"):
+                sys.stdout.write(text)
+                if size is None or not text:
+                    sys.stdout.flush()
 
         try:
             with Progress(name, size) as progress:
@@ -53,17 +57,15 @@ def main(args: argparse.Namespace) -> int:
         except BrokenPipeError:
             raise
         except OSError as error:
-            failure = RunError(f"{name}: cannot be read: {_reason(error)}.")
+            failure = RunError(f"{name}: cannot be read: {error.strerror}.")
         except KeyboardInterrupt:
             code = 130
         write("")
         print(decode.summary(decoder.counters), file=sys.stderr)
         if stats is not None:
-            try:
+            with _writing(f"--stats {args.stats}"):
                 stats.write(json.dumps(decoder.counters.as_dict(), indent=2) + "\n")
                 stats.flush()
-            except OSError as error:
-                raise _unwritable(f"--stats {args.stats}", error) from None
         if failure is not None:
             raise failure
     return code
@@ -77,9 +79,9 @@ def _opened(file: str, name: str, stack: ExitStack) -> tuple[int, os.stat_result
             fd = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOCTTY)
             stack.callback(os.close, fd)
         status = os.fstat(fd)
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise RunError(
-            f"{name}: cannot be opened: {_reason(error)}. Give a file of recorded UART bytes."
+            f"{name}: cannot be opened: {error.strerror}. Give a file of recorded UART bytes."
         ) from None
     if stat.S_ISDIR(status.st_mode):
         raise RunError(f"{name}: is a directory. Give a file of recorded UART bytes.")
@@ -88,32 +90,21 @@ def _opened(file: str, name: str, stack: ExitStack) -> tuple[int, os.stat_result
 
 def _stats_file(file: str, source: os.stat_result, stack: ExitStack) -> TextIO:
     """The file for the counters; UserError where it is the input."""
-    try:
+    with _writing(f"--stats {file}"):
         target = Path(file)
-        is_file = stat.S_ISREG(source.st_mode)
-        if is_file and target.exists() and os.path.samestat(target.stat(), source):
+        is_input = target.exists() and os.path.samestat(target.stat(), source)
+        if is_input and stat.S_ISREG(source.st_mode):
             raise UserError(f"--stats {file}: is the input. Give another file.")
         return stack.enter_context(target.open("w", encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise _unwritable(f"--stats {file}", error) from None
 
 
-def _write(text: str, *, flush: bool) -> None:
-    """Write to standard output."""
+@contextmanager
+def _writing(what: str) -> Iterator[None]:
     try:
-        sys.stdout.write(text)
-        if flush:
-            sys.stdout.flush()
+        yield
     except BrokenPipeError:
         raise
     except OSError as error:
-        discard_output()  # what is buffered has nowhere to go
-        raise _unwritable("standard output", error) from None
-
-
-def _unwritable(what: str, error: Exception) -> RunError:
-    return RunError(f"{what}: cannot be written: {_reason(error)}.")
-
-
-def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error)
+        if what == "standard output":
+            discard_output()  # what is buffered has nowhere to go
+        raise RunError(f"{what}: cannot be written: {error.strerror}.") from None

@@ -40,8 +40,6 @@ _STYLES = {
 }
 _INDENT = " " * 11
 _WIDTHS = (40, 100)
-
-
 OPTIONS = (CONFIG, JSON)
 EPILOG = (
     "Changes nothing and sends nothing, neither to the bus nor to an ESC; may be called while the gateway runs. "
@@ -95,7 +93,6 @@ def _load(path: Path, unit: Unit | None) -> tuple[Config | None, Loaded | None, 
 def _configuration(
     system: System, findings: Findings, config: Config, loaded: Loaded | None, unit: Unit | None
 ) -> None:
-
     if loaded is not None:
         _outputs(findings, config, loaded)
         _warnings(findings, config, loaded)
