@@ -49,7 +49,8 @@ def _signal(plan: SignalPlan, signal: Any, escs: Sequence[str]) -> Facts:
     ``minimum`` and ``maximum`` are those of the DBC, else of what can be sent. ``not_available`` and ``error`` are raw values.
     ``role``: source, alive counter, CRC, constant or multiplexer. ``notes``: what of the source's resolution or range is lost.
     """
-    has_codes = plan.role is Role.SOURCE and not _is_flag(plan)
+    plain_bit = plan.length == 1 and not plan.signed and plan.factor == 1 and plan.offset == 0
+    has_codes = plan.role is Role.SOURCE and not (plain_bit and plan.numbers is None)
     low, high = _range(plan)
     choices = {int(value): str(text) for value, text in (signal.choices or {}).items()}
     return {
@@ -74,11 +75,6 @@ def _signal(plan: SignalPlan, signal: Any, escs: Sequence[str]) -> Facts:
         "values": value_table(choices),
         "notes": [f"{note[:1].upper()}{note[1:]}" for note in plan.notes],
     }
-
-
-def _is_flag(plan: SignalPlan) -> bool:
-    is_one_bit = plan.length == 1 and not plan.signed
-    return is_one_bit and plan.numbers is None and plan.factor == 1 and plan.offset == 0
 
 
 def _range(plan: SignalPlan) -> list[float]:

@@ -150,9 +150,8 @@ def _emergencies(eds: Eds, escs: Sequence[EscSettings]) -> Iterator[Facts]:
         codes, named = BitCodes(bits), {int(bit): error(bit) for bit in bits}
         for bit in range(32 if bits else 0):
             if mask >> bit & 1:
-                about = named.get(bit) or _about(
-                    f"bit{bit}", "a bit that has no name yet", "Ask the maker of the ESC."
-                )
+                unnamed = "a bit that has no name yet", "Ask the maker of the ESC."
+                about = named.get(bit) or _about(f"bit{bit}", *unnamed)
                 yield _emergency(codes.code(bit), bit, None, about)
     for fault in GatewayError:
         code, detail = fault.value

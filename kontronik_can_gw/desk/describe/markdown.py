@@ -1,7 +1,7 @@
 """Renders sections as Markdown (CommonMark with GitHub's tables). All texts are escaped."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 
@@ -40,29 +40,18 @@ def markdown(title: str, lead: Sequence[str], sections: Sequence[Section]) -> st
 
 
 def _contents(sections: Sequence[Section]) -> str:
-    titles = [section.title for section in sections]
-    listed = zip(sections, _anchors(titles), strict=True)
-    return "\n".join(f"* [{text(s.title)}](#{anchor})" for s, anchor in listed if s.level == 2)
+    titles = [section.title for section in sections if section.level == 2]
+    return "\n".join(f"* [{text(title)}](#{_anchor(title)})" for title in titles)
 
 
-def _anchors(titles: Sequence[str]) -> Iterator[str]:
-    """The anchors that GitHub makes from headings."""
-    taken: set[str] = set()
-    for title in titles:
-        plain = re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") or "section"
-        anchor, number = plain, 0
-        while anchor in taken:
-            number += 1
-            anchor = f"{plain}-{number}"
-        taken.add(anchor)
-        yield anchor
+def _anchor(title: str) -> str:
+    """The anchor that GitHub makes from a heading."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
 def _table(table: Table) -> str:
-    rows = (table.head, ("---",) * len(table.head))
-    lines = [*(f"| {' | '.join(row)} |" for row in rows)]
-    lines += [f"| {' | '.join(map(cell, row))} |" for row in table.rows]
-    return "\n".join(lines)
+    rows = [table.head, ["---"] * len(table.head), *(map(cell, row) for row in table.rows)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def cell(content: str) -> str:
