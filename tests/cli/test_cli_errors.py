@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import jsonschema
@@ -22,17 +22,6 @@ from kontronik_can_gw.desk.pty import PtyEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 Done = subprocess.CompletedProcess[str]
-
-
-def program(*words: object, before: Sequence[str] = ()) -> Done:
-    command = [*before, *PROGRAM, *map(str, words)]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-        "COLUMNS": "200",
-    }
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=60, check=False, env=environment
-    )
 
 
 def configuration(tmp_path: Path, port: object = "/dev/ttyUSB0", **more: str) -> Path:
@@ -139,7 +128,11 @@ def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
         shutil.chown(terminal.path, group="tty")
     group = Path(terminal.path).group()
     before = forbidden(terminal.path, mode)
-    done = program("run", "-c", configuration(tmp_path, terminal.path), before=before)
+    command = [*before, *PROGRAM, "run", "-c", str(configuration(tmp_path, terminal.path))]
+    path = os.pathsep.join(filter(None, sys.path))
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}
+    )
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
     assert f"esc1: {terminal.path}: permission denied" in done.stderr
     assert remedy.format(group) in done.stderr
@@ -150,22 +143,18 @@ def test_a_second_gateway_on_a_port_gets_the_name_of_the_first(
     tmp_path: Path, terminal: PtyEsc
 ) -> None:
     file = configuration(tmp_path, terminal.path)
-    first = subprocess.Popen([*PROGRAM, "run", "-c", str(file)], stderr=subprocess.PIPE, text=True)
-    try:
-        assert first.stderr is not None
-        while line := first.stderr.readline():
-            if f"{terminal.path} is open" in line:
-                break
-        assert first.poll() is None
-        said = refused(1, "run", "-c", file)
-        assert f"esc1: {terminal.path}: is in use by another program" in said
-        assert f"(pid {first.pid})" in said
-        assert first.poll() is None
-    finally:
-        first.terminate()
+    command = [*PROGRAM, "run", "-c", str(file)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as first:
+        try:
+            assert first.stderr is not None
+            assert any(f"{terminal.path} is open" in line for line in first.stderr)
+            said = refused(1, "run", "-c", file)
+            assert f"esc1: {terminal.path}: is in use by another program" in said
+            assert f"(pid {first.pid})" in said
+            assert first.poll() is None
+        finally:
+            first.terminate()
         assert first.wait(60) == 0
-        if first.stderr is not None:
-            first.stderr.close()
 
 
 def test_one_device_by_two_names_is_refused(tmp_path: Path, terminal: PtyEsc) -> None:
@@ -284,29 +273,23 @@ def test_a_dbc_goes_into_a_pipe_and_through_a_link_without_replacing_them(tmp_pa
 # --- standard output
 
 
-@pytest.mark.parametrize("words", [["schema"], ["init", "-"], ["dbc"]])
-def test_a_full_disk_at_standard_output_is_one_line(words: list[str]) -> None:
-    with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [*PROGRAM, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
-        )
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1, done.stderr
+def shell(command: str) -> Done:
+    command = command.replace("PROGRAM", " ".join(PROGRAM))
+    return subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("words", ["schema", "init -", "dbc"])
+def test_a_full_disk_at_standard_output_is_one_line(words: str) -> None:
+    done = shell(f"PROGRAM {words} >/dev/full")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
     assert "standard output: cannot be written: No space left on device" in done.stderr
 
 
 def test_a_closed_standard_output_is_no_reason_for_a_traceback(tmp_path: Path) -> None:
-    command = f"exec {sys.executable} -m kontronik_can_gw init {tmp_path}/a.toml >&-"
-    done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True, check=False)
-    assert "Traceback" not in done.stderr
-    assert done.returncode == 0
+    done = shell(f"exec PROGRAM init {tmp_path}/a.toml >&-")
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
 
 
 def test_a_reader_that_goes_away_gets_no_message() -> None:
-    done = subprocess.run(
-        ["sh", "-c", f"{sys.executable} -m kontronik_can_gw dbc --esc 8 | head -c 10"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = shell("PROGRAM dbc --esc 8 | head -c 10")
     assert (done.stdout, done.stderr) == ('VERSION ""', "")

@@ -6,6 +6,7 @@ import logging
 import re
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import run
@@ -48,9 +49,6 @@ def test_what_a_terminal_obeys_is_shown_as_a_question_mark() -> None:
     assert printable(EVIL) == SHOWN
     assert printable("Größe 5 µΩ ‰ 温度 €") == "Größe 5 µΩ ‰ 温度 €"
     assert printable("a\tb\n\x1b", keep="\n\t") == "a\tb\n?"
-
-
-def test_json_keeps_what_it_was_and_shows_it_escaped() -> None:
     text = printable_json({EVIL: [EVIL, "µ", "\U000e0001"]}, indent=1)
     assert is_clean(text)
     assert "µ" in text
@@ -87,19 +85,20 @@ def test_findings_of_doctor(is_terminal: bool) -> None:
     assert text.count("fake") == 4
 
 
+def record(name: str, level: int, text: str, *args: str, error: Exception | None = None) -> Any:
+    info = None if error is None else (type(error), error, error.__traceback__)
+    return logging.LogRecord(name, level, "", 0, text, args, info)
+
+
 def test_a_log_line_is_one_line() -> None:
     stream = io.StringIO()
     handler = BackgroundHandler(stream, longest_end_s=60)
     handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
-    handler.emit(logging.LogRecord("x", logging.WARNING, "", 0, "said %s", (EVIL,), None))
+    handler.emit(record("x", logging.WARNING, "said %s", EVIL))
     try:
         raise ValueError(EVIL)
     except ValueError as error:
-        handler.emit(
-            logging.LogRecord(
-                "x", logging.ERROR, "", 0, "b", (), (ValueError, error, error.__traceback__)
-            )
-        )
+        handler.emit(record("x", logging.ERROR, "b", error=error))
     handler.close()
     assert stream.getvalue().startswith(f"WARNING said {SHOWN}\nERROR b\nTraceback")
     assert is_clean(stream.getvalue())
@@ -122,9 +121,8 @@ def test_what_a_library_logs(
 ) -> None:
     main(["schema"])
     capsys.readouterr()
-    record = logging.LogRecord("cantools", logging.WARNING, "", 0, "overwriting %s", (EVIL,), None)
     assert logging.lastResort is not None
-    logging.lastResort.handle(record)
+    logging.lastResort.handle(record("cantools", logging.WARNING, "overwriting %s", EVIL))
     assert capsys.readouterr().err == f"kontronik-can-gw: overwriting {SHOWN}\n"
 
 
