@@ -11,6 +11,7 @@ from kontronik_can_gw.canopen.data_types import KINDS, TYPE_BITS, TYPE_NAMES
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.eds_sections import Problems, read_sections
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import CanopenSetup
@@ -88,15 +89,10 @@ def _entry(entry: Entry, meanings: Mapping[str, str]) -> Facts:
 
 def _comments(eds: Eds) -> list[str]:
     """The lines of [Comments]."""
-    found: dict[int, str] = {}
-    inside = False
-    for line in eds.data.decode("latin-1").splitlines():
-        text = line.strip()
-        if text.startswith("["):
-            inside = text.lower() == "[comments]"
-        elif inside and (match := re.fullmatch(r"line(\d+)\s*=\s*(.*)", text, re.IGNORECASE)):
-            found[int(match[1])] = match[2]
-    return [found[number] for number in sorted(found) if found[number]]
+    found = read_sections(eds.data, Problems(eds.name)).get("comments")
+    keys = {} if found is None else found.values
+    lines = {int(key[4:]): text for key, text in keys.items() if re.fullmatch(r"line\d+", key)}
+    return [lines[number] for number in sorted(lines) if lines[number]]
 
 
 def _named(line: str) -> set[int]:
