@@ -1,7 +1,7 @@
 """``kontronik-can-gw convert``: recordings to tables, CAN logs and plain bytes."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,6 @@ from kontronik_can_gw.desk.recordings.convert import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from kontronik_can_gw.desk.recordings.convert import Conversion
     from kontronik_can_gw.desk.recordings.inputs import Input
     from kontronik_can_gw.desk.recordings.layouts import BusLayout
 
@@ -190,23 +189,24 @@ def _opened(args: argparse.Namespace, source: "Path", layout: "BusLayout | None"
         return open_input(source, layout, rate, progress.reach)
 
 
-def _conversion(args: argparse.Namespace, form: str, recording: "Input") -> "Conversion":
-    """What is to be done. UserError for what the recording has not."""
-    from kontronik_can_gw.desk.recordings.convert import (
-        BytesConversion,
-        LogConversion,
-        TableConversion,
-    )
+def _conversion(
+    args: argparse.Namespace, form: str, recording: "Input"
+) -> "Callable[..., str | None]":
+    """What is to be done with recording, output and progress. UserError for what the recording has not."""
+    from functools import partial
+
+    from kontronik_can_gw.desk.recordings.convert import to_bytes, to_log, to_table
     from kontronik_can_gw.desk.recordings.tables.rows import Choice, fields_of_frames
 
     if form == BYTES:
-        return BytesConversion(_esc(args, recording, needed=True) or 0)
+        return partial(to_bytes, esc=_esc(args, recording, needed=True) or 0)
     if form in LOGS:
-        return LogConversion(LOGS[form], args.start, args.end)
+        return partial(to_log, form=LOGS[form], start_ns=args.start, end_ns=args.end)
     times = {"start_ns": args.start, "end_ns": args.end, "rate": args.rate}
     fields = fields_of_frames(recording) if args.frames else recording.fields
     choice = Choice.of(fields, args.signals, _esc(args, recording), **times)
-    return TableConversion(form, choice, args.frames, args.units_line)
+    more = {"by_frame": args.frames, "units_line": args.units_line}
+    return partial(to_table, form=form, choice=choice, **more)
 
 
 def _format(args: argparse.Namespace) -> str:

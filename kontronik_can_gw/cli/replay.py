@@ -183,12 +183,10 @@ def _log_writer(
     file: "IO[bytes] | Path", kind: str, recording: "Input", start_ns: int, name: str
 ) -> "CanLogWriter":
     from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
-    from kontronik_can_gw.desk.recordings.inputs import CaptureInput
 
     wall_ns = recording.wall_ns(start_ns)
-    channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
     begun_ns = None if wall_ns is None else wall_ns - start_ns
-    return CanLogWriter(file, kind, begun_ns, start_ns, channel, name)
+    return CanLogWriter(file, kind, begun_ns, start_ns, recording.channel, name)
 
 
 def _to_can(args: argparse.Namespace, recording: "Input", pace: "Pace") -> str:

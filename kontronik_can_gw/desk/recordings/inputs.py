@@ -128,8 +128,7 @@ class CanLogInput(Input):
         return fields_of_log(self.reader, self.bus.escs)
 
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        columns = range(len(self.fields)) if chosen is None else chosen
-        yield from samples_of_frames(self.frames(), self.reader, columns)
+        yield from samples_of_frames(self.frames(), self.reader, self._chosen(chosen))
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")
