@@ -6,7 +6,7 @@ Nothing here is taken from the program that is checked, but names of fields and 
 NaN: not available. Texts are their numbers.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import cantools.database
 import numpy as np
 from cantools.database.can import Database
+from esc.sheet import INFO_FIELDS, LIVE_FIELDS, Field
 from hour_recording import CELLS, GEAR, MS, SECOND, START, TIMEOUT_NS, Meant, Recording, Times
 from numpy.typing import NDArray
 
@@ -25,77 +26,36 @@ SAME_ROW_NS = 5 * MS
 INFO_TIMEOUT_NS = 10 * SECOND
 JIVEPRO = 3
 
-# signal: (field of the live frame, steps to one unit)
-LIVE = {
-    "ElectricalSpeed": ("electrical_speed", 1),
-    "BatteryVoltage": ("battery_voltage", 100),
-    "ThrottlePercent": ("throttle", 1),
-    "Timing": ("timing", 1),
-    "BatteryCurrent": ("battery_current", 10),
-    "MotorCurrent": ("motor_current", 10),
-    "PeakCurrent": ("peak_current", 10),
-    "OutputOpeningPercent": ("output_opening", 1),
-    "BecVoltage": ("bec_voltage", 1000),
-    "PwmInput": ("pwm_input", 1),
-    "BecTemperature": ("bec_temperature", 1),
-    "PowerStageTemperature": ("power_stage_temperature", 1),
-    "ConsumedCharge": ("consumed_charge", 1),
-    "OperatingState": ("operating_state", 1),
-    "OperatingStateRaw": ("operating_state", 1),
-}
-INFO = {
-    "CellCount": ("cell_count", 1),
-    "MaxElectricalSpeed": ("max_electrical_speed", 1),
-    "MinBatteryVoltage": ("min_battery_voltage", 100),
-    "MaxBatteryVoltage": ("max_battery_voltage", 100),
-    "MaxBatteryCurrent": ("max_battery_current", 10),
-    "MaxMotorCurrent": ("max_motor_current", 10),
-    "MaxPeakCurrent": ("max_peak_current", 10),
-    "MaxBecCurrent": ("max_bec_current", 1000),
-    "MinBecVoltage": ("min_bec_voltage", 1000),
-    "MaxThrottlePercent": ("max_throttle", 1),
-    "MaxOutputOpeningPercent": ("max_output_opening", 1),
-    "MinPowerStageTemperature": ("min_power_stage_temperature", 1),
-    "MaxPowerStageTemperature": ("max_power_stage_temperature", 1),
-    "MinBecTemperature": ("min_bec_temperature", 1),
-    "MaxBecTemperature": ("max_bec_temperature", 1),
-}
-OPERATING_ERRORS = (
-    *("Undervoltage", "Overvoltage", "OvercurrentIntegralError", "OvercurrentIntegralWarning"),
-    *("PowerStageOvertempWarning", "PowerStageOvertempError", "BecUndervoltage", "BecOvervoltage"),
-    *("BecOvercurrent", "BecOvertemperature", "SwitchedOffByRunningDown", "CapacityLimitReached"),
-    *(
-        "OperatingErrorFound",
-        "OperatingWarningFound",
-        "SelftestError",
-        "EepromError",
-        "WatchdogErrorTripped",
-    ),
-    *(
-        "ProgrammingAllowed",
-        "LimitBatteryVoltageMinimum",
-        "LimitCurrentMaximum",
-        "LimitPowerStageTemperature",
-    ),
-    *("LimitBecTemperature", "LimitBecCurrent", "LimitDischargedCapacity"),
-)
-SELFTEST_ERRORS = (
-    *("TestPhaseLowSide", "TestPhaseHighSide", "TestShortToGround", "TestBackEmfOffset"),
-    *("TestCurrentZeroPoint", "TestUndervoltage", "TestOvervoltage", "TestBecUndervoltage"),
-    *(
-        "TestBecOvervoltage",
-        "TestReversePolarityFuse",
-        "TestOvervoltageFuse",
-        "TestPowerStageOvertemp",
-    ),
-    *(
-        "TestBecOvertemperature",
-        "TestMotorPhaseMissing",
-        "TestEepromEmpty",
-        "TestEepromStickPositions",
-    ),
-    *("TestEepromChecksum", "TestEepromSize", "TestEepromVersion"),
-)
+
+def signals_of(fields: Sequence[Field], *but: str) -> dict[str, tuple[str, int]]:
+    """Of signals that stand in a frame as they are: field, and steps to one unit."""
+    return {
+        "".join(map(str.capitalize, one.name.split("_"))) + "Percent" * (one.unit == "%"): (
+            one.name,
+            one.steps,
+        )
+        for one in fields
+        if one.name not in but
+    }
+
+
+LIVE = signals_of(LIVE_FIELDS, "bec_current", "operating_errors")
+LIVE["OperatingStateRaw"] = LIVE["OperatingState"]
+INFO = signals_of(INFO_FIELDS, "device_and_variant", "firmware_word", "selftest_errors")
+_OPERATING_ERRORS = """
+    Undervoltage Overvoltage OvercurrentIntegralError OvercurrentIntegralWarning PowerStageOvertempWarning
+    PowerStageOvertempError BecUndervoltage BecOvervoltage BecOvercurrent BecOvertemperature SwitchedOffByRunningDown
+    CapacityLimitReached OperatingErrorFound OperatingWarningFound SelftestError EepromError WatchdogErrorTripped ProgrammingAllowed
+    LimitBatteryVoltageMinimum LimitCurrentMaximum LimitPowerStageTemperature LimitBecTemperature LimitBecCurrent
+    LimitDischargedCapacity
+"""
+_SELFTEST_ERRORS = """
+    TestPhaseLowSide TestPhaseHighSide TestShortToGround TestBackEmfOffset TestCurrentZeroPoint TestUndervoltage TestOvervoltage
+    TestBecUndervoltage TestBecOvervoltage TestReversePolarityFuse TestOvervoltageFuse TestPowerStageOvertemp TestBecOvertemperature
+    TestMotorPhaseMissing TestEepromEmpty TestEepromStickPositions TestEepromChecksum TestEepromSize TestEepromVersion
+"""
+OPERATING_ERRORS = tuple(_OPERATING_ERRORS.split())
+SELFTEST_ERRORS = tuple(_SELFTEST_ERRORS.split())
 LENGTHS = {"live": (40, 38), "info": (44, 41)}
 """Bytes of a frame in V4 and legacy layout."""
 ALIVE = "Alive"
