@@ -34,21 +34,22 @@ class TextReader(ABC):
     def __init__(self, file: BinaryIO, damage: Damage) -> None:
         self._file = file
         self._damage = damage
+        self._number = 1
         self.wall_start_ns: int | None = None
         self._read_head([file.readline(LONGEST_LINE) for _ in range(_HEAD_LINES)])
         file.seek(0)
 
     def __iter__(self) -> Iterator[TimedFrame]:
-        number = 1
+        self._number = 1
         while line := self._file.readline(LONGEST_LINE):
             try:
                 item = self._frame(line)
             except (ValueError, LookupError):  # of numbers, texts, kinds, lengths
-                self._damage.line(number)
+                self._damage.line(self._number)
             else:
                 if item is not None:
                     yield item
-            number += line.endswith(b"\n")
+            self._number += line.endswith(b"\n")
 
     @abstractmethod
     def _read_head(self, lines: list[bytes]) -> None:
@@ -114,7 +115,13 @@ class CandumpReader(TextReader):
 
     def _frame(self, line: bytes) -> TimedFrame | None:
         size = None
-        if (match := CANDUMP_LINE.fullmatch(line)) is not None:
+        match = CANDUMP_LINE.fullmatch(line)
+        if match is None and (start := line.rfind(b"(")) > 0:
+            # rubbish in front of a whole line
+            match = CANDUMP_LINE.fullmatch(line, start)
+            if match is not None:
+                self._damage.line(self._number)
+        if match is not None:
             found = match.groupdict()
             fd = found["fd"] is not None
         elif line.strip():
@@ -249,6 +256,7 @@ _TRC_PIECES = {
     "O": rb"(?P<s>\d{1,12})(?:\.(?P<f>\d{1,6}))?",
     "T": rb"(?P<kind>DT|FD|FB|FE|BI)",
     "I": rb"(?P<id>[0-9A-Fa-f]{1,8})",
+    "B": rb"[\x21-\x7e]+",
     "d": rb"(?P<dir>Rx|Tx)",
     "l": rb"(?P<size>\d{1,2})",
     "L": rb"(?P<dlc>\d{1,2})",
@@ -269,13 +277,13 @@ class TrcReader(TextReader):
             if key == ";$FILEVERSION":
                 version = value.strip()
             elif key == ";$COLUMNS":
-                columns = value
+                columns = value.replace(" ", "")
             elif key == ";$STARTTIME":
                 self.wall_start_ns = _trc_start(value)
-        if not columns:
+        if not columns.endswith(",D"):
             newest = "2.1" if version.startswith("2") else "1.0"
             columns = _TRC_COLUMNS.get(version, _TRC_COLUMNS[newest])
-        names = columns.replace(" ", "").removesuffix(",D").split(",")
+        names = columns.removesuffix(",D").split(",")
         pieces = (_TRC_PIECES.get(name, rb"\S+") for name in names)
         data = rb"(?:\s+(?P<data>\S[^\r\n]*))?\s*"
         self._line = re.compile(rb"\s*" + rb"\s+".join(pieces) + data)
