@@ -1,7 +1,7 @@
 """A gateway that is recorded while random things happen to it, without a clock: what it sent, and the entries."""
 
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,15 +24,22 @@ from kontronik_can_gw.transmit_queue import TransmitQueue
 START = 5_000 * SECOND + 123
 
 
-def made(escs: int = 1, canopen: bool = False, **dbc: object) -> tuple[CaptureSetup, Layout]:
-    """A gateway's making, and the layout of what it sends."""
+def esc(number: int) -> dict[str, object]:
+    return {"name": f"e{number}", "pole_pairs": number + 1}
+
+
+def made(
+    escs: int = 1,
+    canopen: bool = False,
+    of_esc: Callable[[int], dict[str, object]] = esc,
+    **dbc: object,
+) -> tuple[CaptureSetup, Layout]:
+    """A gateway's making, and the layout of what it sends. ``of_esc``: the configuration of each ESC but for its port."""
     tables: dict[str, object] = {
         "can": {"interface": "virtual"},
         "dbc": dbc,
         "canopen": {"enabled": canopen, "self_start": True, "store": "/nonexistent/store"},
-        "esc": [
-            {"port": f"/dev/ttyUSB{n}", "name": f"e{n}", "pole_pairs": n + 1} for n in range(escs)
-        ],
+        "esc": [{"port": f"/dev/ttyUSB{n}"} | of_esc(n) for n in range(escs)],
     }
     loaded = assemble(parse(tables, "bench.toml"))
     return setup_of(loaded), loaded.layout

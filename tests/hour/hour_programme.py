@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 if __name__ == "__main__":
-    sys.path[:0] = map(str, Path(__file__).resolve().parents[1:3])
+    tests = Path(__file__).resolve().parents[1]
+    sys.path[:0] = [str(tests.parent), str(tests), str(tests / "capture")]
 
 # A process's peak memory counts that of the process it was started from: so commands are started by a small one.
 _MEASURE = """
