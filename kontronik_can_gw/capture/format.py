@@ -52,7 +52,6 @@ _FRAME = struct.Struct("<IB")
 _FD, _REMOTE = 1, 2
 _COUNTERS = struct.Struct("<8Q")
 _NUMBER = struct.Struct("<Q")
-_CAME = struct.Struct("<Q")
 
 
 class Kind(IntEnum):
@@ -158,7 +157,7 @@ def data_payload(entries: Iterable[tuple[int, int, int, bytes, int, int | None]]
     count = 0
     for time_ns, kind, index, content, flags, came_ns in entries:
         if kind in _WITH_ARRIVAL:
-            content = _CAME.pack(time_ns if came_ns is None else came_ns) + content
+            content = _NUMBER.pack(time_ns if came_ns is None else came_ns) + content
         table += _ENTRY.pack(time_ns, kind, flags, index, len(content))
         if content:
             data.append(content)
@@ -177,9 +176,9 @@ def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
     for time_ns, kind, flags, index, length in _ENTRY.iter_unpack(payload[_COUNT.size : at]):
         data, came_ns = payload[at : at + length], None
         if version > 1 and kind in _WITH_ARRIVAL:
-            if length < _CAME.size:
+            if length < _NUMBER.size:
                 raise ValueError("has an entry without its time of arrival")
-            came_ns, data = _CAME.unpack_from(data)[0], data[_CAME.size :]
+            came_ns, data = _NUMBER.unpack_from(data)[0], data[_NUMBER.size :]
         yield Entry(time_ns, kind, index, data, flags, came_ns)
         at += length
     if at != len(payload):

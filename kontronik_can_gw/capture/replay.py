@@ -4,7 +4,7 @@ The core is that of a live run and gets the recorded times, so frames and times 
 entry is missing. Nothing here waits or sends.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture.format import (
@@ -109,40 +109,13 @@ class Replay:
             gateway.escs[esc].line_errors = read_number(data)
         elif kind == Kind.LOST:
             self.lost += read_number(data)
-        else:
-            self._play_rare(entry)
+        elif kind == Kind.STATE:
+            if self._midway:
+                self._midway = False
+                self._take_up(read_json(data))
+        elif kind != Kind.CLOCK:
+            _RARE[kind](gateway, entry)
         return []
-
-    def _play_rare(self, entry: Entry) -> None:
-        now, kind, esc, data, flags, _ = entry
-        gateway = self.gateway
-        match kind:
-            case Kind.PORT_OPENED:
-                gateway.port(esc, True, now)
-            case Kind.PORT_LOST:
-                gateway.port(esc, False, now)
-            case Kind.CAN_OPENED:
-                gateway.can_opened(now)
-            case Kind.CAN_RETURNED:
-                gateway.can_returned(now)
-            case Kind.HELD_UP:
-                gateway.held_up(now, bool(flags))
-            case Kind.CAN_STATE:
-                gateway.set_can_state(CanState(flags), now)
-            case Kind.OVERRUN:
-                gateway.receive_overrun(now)
-            case Kind.SAVED:
-                gateway.saved(esc, data.decode("utf-8", "replace") if flags else None, now)
-            case Kind.DAMAGED:
-                gateway.parameters_damaged(esc, now)
-            case Kind.STATE:
-                if self._midway:
-                    self._midway = False
-                    self._take_up(read_json(data))
-            case Kind.CLOCK:
-                pass
-            case _:
-                raise ValueError(f"unknown kind {kind}")
 
     def _start(self, now: int, can_open: bool) -> None:
         self._started = True
@@ -170,6 +143,22 @@ class Replay:
             self.gateway.status.started_ns = state["started_ns"]
         if "can_state" in state:
             self.gateway.status.can_state = CanState(state["can_state"])
+
+
+_RARE: dict[int, Callable[[Gateway, Entry], object]] = {
+    Kind.PORT_OPENED: lambda gateway, e: gateway.port(e.esc, True, e.time_ns),
+    Kind.PORT_LOST: lambda gateway, e: gateway.port(e.esc, False, e.time_ns),
+    Kind.CAN_OPENED: lambda gateway, e: gateway.can_opened(e.time_ns),
+    Kind.CAN_RETURNED: lambda gateway, e: gateway.can_returned(e.time_ns),
+    Kind.HELD_UP: lambda gateway, e: gateway.held_up(e.time_ns, bool(e.flags)),
+    Kind.CAN_STATE: lambda gateway, e: gateway.set_can_state(CanState(e.flags), e.time_ns),
+    Kind.OVERRUN: lambda gateway, e: gateway.receive_overrun(e.time_ns),
+    Kind.SAVED: lambda gateway, e: gateway.saved(
+        e.esc, e.data.decode("utf-8", "replace") if e.flags else None, e.time_ns
+    ),
+    Kind.DAMAGED: lambda gateway, e: gateway.parameters_damaged(e.esc, e.time_ns),
+}
+"""Calls of the gateway that are made now and then; an unknown kind raises KeyError."""
 
 
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:

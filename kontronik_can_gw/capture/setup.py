@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     from kontronik_can_gw.canopen.nodes import CanopenSetup
 
 Header = Mapping[str, Any]
+_UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, UserError)
+"""What a header raises that holds anything."""
+_LATEST = 1 << 62
+_KINDS = {"program": dict, "devices": list, "escs": list, "ports": list, "state": dict}
 
 
 @dataclass(frozen=True)
@@ -56,16 +60,11 @@ class CaptureSetup:
 
     def header(self) -> dict[str, Any]:
         """The header's JSON content."""
-        dbc: dict[str, Any] | None = None
+        dbc = None
         if self.dbc is not None:
             name, data = self.dbc
-            dbc = {
-                "file": name,
-                "text": data.decode("latin-1"),
-                "fd": self.fd,
-                "silent_on_loss": self.silent_on_loss,
-            }
-            dbc |= asdict(self.dbc_settings)
+            own = {"fd": self.fd, "silent_on_loss": self.silent_on_loss}
+            dbc = {"file": name, "text": data.decode("latin-1")} | own | asdict(self.dbc_settings)
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -94,14 +93,7 @@ class CaptureSetup:
         try:
             _check(header)
             return cls._of(header)
-        except (
-            LookupError,
-            TypeError,
-            AttributeError,
-            ValueError,
-            ArithmeticError,
-            UserError,
-        ) as error:
+        except _UNUSABLE as error:
             raise ValueError(f"the header cannot be used: {error}") from None
 
     @classmethod
@@ -206,9 +198,6 @@ def _text(value: Any, longest: int) -> str:
     return value
 
 
-_LATEST = 1 << 62
-
-
 def _check(header: Header) -> None:
     """Check the parts that readers use unchanged. ValueError for what a recorder never writes."""
     for name in ("monotonic_ns", "wall_ns", "created_ns"):
@@ -217,13 +206,7 @@ def _check(header: Header) -> None:
     for name in ("run", "file"):
         _text(header.get(name, ""), 4096)
     _number(header.get("part", 0), 0, 1 << 32)
-    for name, kind in (
-        ("program", dict),
-        ("devices", list),
-        ("escs", list),
-        ("ports", list),
-        ("state", dict),
-    ):
+    for name, kind in _KINDS.items():
         if not isinstance(header.get(name, kind()), kind):
             raise ValueError(f"{name} is not as a recorder writes it")
     if not 1 <= len(header["escs"]) <= 1000 or not isinstance(header["configuration"], str):

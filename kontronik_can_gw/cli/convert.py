@@ -5,9 +5,10 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from decimal import Decimal, InvalidOperation
+from functools import partial
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
@@ -22,12 +23,11 @@ from kontronik_can_gw.desk.recordings.convert import (
     STREAMS,
     SUFFIXES,
     TABLES,
-    BytesConversion,
-    Conversion,
-    LogConversion,
     Output,
-    TableConversion,
     reason,
+    to_bytes,
+    to_log,
+    to_table,
 )
 from kontronik_can_gw.desk.recordings.inputs import LIVE_RATE, CanLogInput, Input, open_input
 from kontronik_can_gw.desk.recordings.spool import is_stream
@@ -199,16 +199,17 @@ def _opened(args: argparse.Namespace) -> Input:
         return open_input(source, layout, rate, progress.reach)
 
 
-def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Conversion:
-    """What is to be done. UserError for what the recording has not."""
+def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
+    """What is to be done with recording, output and progress. UserError for what the recording has not."""
     if form == BYTES:
-        return BytesConversion(_esc(args, recording, needed=True) or 0)
+        return partial(to_bytes, esc=_esc(args, recording, needed=True) or 0)
     if form in LOGS:
-        return LogConversion(LOGS[form], args.start, args.end)
+        return partial(to_log, form=LOGS[form], start_ns=args.start, end_ns=args.end)
     times = {"start_ns": args.start, "end_ns": args.end, "rate": args.rate}
     fields = fields_of_frames(recording) if args.frames else recording.fields
     choice = Choice.of(fields, args.signals, _esc(args, recording), **times)
-    return TableConversion(form, choice, args.frames, args.units_line)
+    more = {"by_frame": args.frames, "units_line": args.units_line}
+    return partial(to_table, form=form, choice=choice, **more)
 
 
 def _format(args: argparse.Namespace) -> str:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from kontronik_can_gw.cli.common import say
-from kontronik_can_gw.desk.recordings.part_file import PartFile
+from kontronik_can_gw.desk.recordings.convert import Output
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.printable import printable
 
@@ -25,13 +25,11 @@ def write_output(where: str, text: str, encoding: str = "utf-8") -> None:
 
 
 def _write_file(path: Path, data: bytes) -> None:
-    part = PartFile(path)
     try:
-        try:
-            with part.path.open("wb") as file:
-                file.write(data)
-            part.finish()
-        finally:
-            part.discard()
+        with Output(path, what="-o") as out:
+            file = out.open()
+            assert not isinstance(file, Path)
+            file.write(data)
+            out.is_whole = True
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror}. Give another -o.") from None

@@ -11,15 +11,10 @@ import argparse
 import json
 import re
 import time
+from functools import partial
 from pathlib import Path
 
-from kontronik_can_gw.desk.recordings.convert import (
-    TABLES,
-    Conversion,
-    LogConversion,
-    Output,
-    TableConversion,
-)
+from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
 from kontronik_can_gw.desk.recordings.inputs import DumpInput
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.desk.recordings.tables.rows import Choice
@@ -47,13 +42,13 @@ def main() -> None:
         pyarrow.array([0])  # imports pandas where it is installed
     layout = None if args.dbc is None else layout_of_dbc(args.dbc)
     with DumpInput(args.source, layout) as recording:
-        conversion: Conversion = LogConversion(args.form)
+        convert = partial(to_log, form=args.form)
         if args.form in TABLES:
             names = LiveData._fields if args.live else ()
-            conversion = TableConversion(args.form, Choice.of(recording.fields, names))
+            convert = partial(to_table, form=args.form, choice=Choice.of(recording.fields, names))
         cpu, wall = time.process_time(), time.perf_counter()
         with Output(args.target, args.form) as out:
-            told = conversion(recording, out, lambda position: None)
+            told = convert(recording, out, lambda position: None)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     print(json.dumps({"cpu_s": cpu, "wall_s": wall, "peak_mb": peak_mb(), "told": told}))
 

@@ -1,10 +1,12 @@
 """A gateway that is recorded while random things happen to it, without a clock: what it sent, and the entries."""
 
 import random
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from kontronik_can_gw.canopen.nodes import CanopenSetup
-from kontronik_can_gw.capture.format import Entry
+from kontronik_can_gw.capture.format import Entry, block, data_payload, json_payload
 from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.cli.recording import setup_of
@@ -22,15 +24,22 @@ from kontronik_can_gw.transmit_queue import TransmitQueue
 START = 5_000 * SECOND + 123
 
 
-def made(escs: int = 1, canopen: bool = False, **dbc: object) -> tuple[CaptureSetup, Layout]:
-    """A gateway's making, and the layout of what it sends."""
+def esc(number: int) -> dict[str, object]:
+    return {"name": f"e{number}", "pole_pairs": number + 1}
+
+
+def made(
+    escs: int = 1,
+    canopen: bool = False,
+    of_esc: Callable[[int], dict[str, object]] = esc,
+    **dbc: object,
+) -> tuple[CaptureSetup, Layout]:
+    """A gateway's making, and the layout of what it sends. ``of_esc``: the configuration of each ESC but for its port."""
     tables: dict[str, object] = {
         "can": {"interface": "virtual"},
         "dbc": dbc,
         "canopen": {"enabled": canopen, "self_start": True, "store": "/nonexistent/store"},
-        "esc": [
-            {"port": f"/dev/ttyUSB{n}", "name": f"e{n}", "pole_pairs": n + 1} for n in range(escs)
-        ],
+        "esc": [{"port": f"/dev/ttyUSB{n}"} | of_esc(n) for n in range(escs)],
     }
     loaded = assemble(parse(tables, "bench.toml"))
     return setup_of(loaded), loaded.layout
@@ -148,3 +157,25 @@ class Bench:
             )
             gateway.status.received_frames += 1
             gateway.receive_frame(CanFrame(can_id & 0x7FF, data), now, now - rng.randrange(50 * MS))
+
+
+def capture_file(
+    setup: CaptureSetup, entries: Sequence[Entry], devices: Sequence[str] = (), **more: object
+) -> bytes:
+    """A capture as the recorder writes it. ``devices``: what is learnt of the ESCs at its end; ``more``: of its header."""
+    header = setup.header() | {"run": "r", "part": 0, "created_ns": START, "monotonic_ns": START}
+    blocks = [(b"H", json_payload(header | {"wall_ns": 1_700_000_000 * SECOND} | more))]
+    for at in range(0, len(entries), 300):
+        blocks.append((b"D", data_payload(entries[at : at + 300])))
+    if devices:
+        known = {"variant": 200, "firmware": "1.2", "layout": "V4"}
+        learnt = [known | {"device": name} for name in devices]
+        blocks.append((b"I", json_payload({"devices": learnt})))
+    blocks.append((b"E", b""))
+    return b"".join(block(kind, number, data) for number, (kind, data) in enumerate(blocks))
+
+
+def capture(path: Path, setup: CaptureSetup, entries: Sequence[Entry], **more: object) -> Path:
+    """A ``capture_file`` at ``path``."""
+    path.write_bytes(capture_file(setup, entries, **more))  # type: ignore[arg-type]
+    return path

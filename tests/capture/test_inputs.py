@@ -1,20 +1,15 @@
 """Recordings of every kind as rows and frames: rows are what the bus said, times are those of the wire, nothing old is ever shown."""
 
-import math
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cantools.database
 import pytest
-from capture_bench import START, Bench, made
+from capture_bench import START, Bench, capture, made
+from simulated_bus import write_log
 
-from kontronik_can_gw.capture.format import Entry, block, data_payload, json_payload
-from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.decode import Decoder
 from kontronik_can_gw.desk.recordings.inputs import (
     CanLogInput,
     CaptureInput,
@@ -27,29 +22,6 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import MS, SECOND
-from kontronik_can_gw.signals.unpacker import SignalReader
-
-_LOADED = cantools.database.load_file(shipped("dbc/kontronik_esc.dbc"))
-assert isinstance(_LOADED, cantools.database.can.Database)
-SHIPPED: cantools.database.can.Database = _LOADED
-
-
-def capture(path: Path, setup: CaptureSetup, entries: Sequence[Entry], **more: object) -> Path:
-    """A capture file as the recorder writes it."""
-    header = setup.header() | {
-        "run": "r",
-        "part": 0,
-        "created_ns": START,
-        "monotonic_ns": START,
-        "wall_ns": 1_700_000_000 * SECOND,
-    }
-    data = block(b"H", 0, json_payload(header | more))
-    number = 1
-    for at in range(0, len(entries), 300):
-        data += block(b"D", number, data_payload(entries[at : at + 300]))
-        number += 1
-    path.write_bytes(data + block(b"E", number, b""))
-    return path
 
 
 def plain_run(
@@ -138,36 +110,17 @@ def test_the_bytes_of_an_esc_come_out_as_they_went_in(tmp_path: Path) -> None:
         assert data == b"".join(e.data for e in bench.entries if e.kind == 1 and e.esc == index)
         dump = tmp_path / f"{index}.bin"
         dump.write_bytes(data)
-        decoder = Decoder()
-        lives = [r for r in decoder.feed(data) + decoder.flush() if r["kind"] == "live"]
         with open_input(dump) as plain:
             assert isinstance(plain, DumpInput)
             assert plain.times_assumed
-            at = columns(plain)
-            rows = [row for row in plain.samples() if row.values[at["battery_voltage"]] is not None]
-            assert [r.values[at["electrical_speed"]] for r in rows] == [
-                r["electrical_speed"] for r in lives
-            ]
-            assert [r.time_ns for r in rows] == [n * 10 * MS for n in range(len(lives))]
             assert b"".join(plain.esc_bytes(0)) == data
-            if decoder.counters.dropped_bytes:
-                assert (
-                    f"{decoder.counters.dropped_bytes} bytes belong to no frame" in plain.damage[0]
-                )
-            assert len(list(plain.frames())) > len(lives)
 
 
 def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> None:
     bench, _ = plain_run(6)
     stop, resume = START + 2 * SECOND, START + 5 * SECOND
-    log = tmp_path / "a.log"
-    log.write_text(
-        "".join(
-            f"({(f.time_ns - START) / SECOND + 1_700_000_000:.6f}) can0 {f.frame.can_id:03X}#{f.frame.data.hex().upper()}\n"
-            for f in bench.sent
-            if not stop < f.time_ns < resume
-        )
-    )
+    sent = [(f.time_ns - START, f.frame) for f in bench.sent if not stop < f.time_ns < resume]
+    log = write_log(tmp_path / "a.log", sent, start_s=1_700_000_000)
     with open_input(log) as found:
         assert isinstance(found, CanLogInput)
         at = columns(found)
@@ -183,40 +136,6 @@ def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> N
             "the loss has a row of its own"
         )
         assert found.wall_ns(rows[0].time_ns) == pytest.approx(1_700_000_000 * SECOND, abs=2 * MS)
-
-
-def test_every_value_of_the_shipped_dbc_reads_as_cantools_reads_it() -> None:
-    import random
-
-    bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-    reader = SignalReader(bus.layout)
-    rng = random.Random(3)
-    for plan in bus.layout.messages:
-        message = SHIPPED.get_message_by_name(plan.name)
-        for _ in range(300):
-            data = (
-                rng.randbytes(8)
-                if rng.random() < 0.7
-                else bytes(rng.choice([0, 255, 254, 128, 129]) for _ in range(8))
-            )
-            wanted = message.decode_simple(data)
-            for first, values in reader.read(plan.can_id, data) or ():
-                for offset, value in enumerate(values):
-                    column = reader.columns[first + offset]
-                    other = wanted[column.name]
-                    if isinstance(value, (int, float)):
-                        assert isinstance(other, (int, float))
-                        assert math.isclose(value, other, rel_tol=1e-12), column.name
-                        assert column.digits is not None
-                        assert round(value, column.digits) == value
-                    elif value is None:
-                        assert (
-                            str(other) in ("NotAvailable", "Error")
-                            or column.texts
-                            or column.is_flag
-                        ), column.name
-                    else:
-                        assert value == str(other)
 
 
 def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Self
 
 import pytest
 
@@ -17,22 +18,8 @@ from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
-
-
-def until(condition: Callable[[], bool], what: str, seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, what
-        time.sleep(0.01)
-
-
-ENOUGH = 12_000
-"""Bytes of a capture with its header, which stands there twice, and some data."""
-
-
-def size_of(folder: Path, pattern: str = "*") -> int:
-    """What has been written so far; 0 where there is no folder yet."""
-    return sum(path.stat().st_size for path in folder.glob(pattern))
+ENOUGH = 36_000
+"""Bytes of a capture with some seconds of telemetry."""
 
 
 @contextmanager
@@ -40,10 +27,8 @@ def telemetry(*options: EscOptions) -> Iterator[list[str]]:
     """ESCs on pseudo terminals; their paths."""
     terminals = [pty.PtyEsc() for _ in options]
     stopped = threading.Event()
-    escs = [
-        (SimulatedEsc(o, seed=n), t)
-        for n, (o, t) in enumerate(zip(options, terminals, strict=True))
-    ]
+    simulated = [SimulatedEsc(one, seed=number) for number, one in enumerate(options)]
+    escs = list(zip(simulated, terminals, strict=True))
     thread = threading.Thread(target=lambda: pty.run(escs, stop=stopped.is_set), daemon=True)
     thread.start()
     try:
@@ -62,58 +47,58 @@ class Run:
 
     def __init__(self, config: Path, *words: object) -> None:
         self._log = config.with_suffix(".err")
+        command = [*PROGRAM, "run", "-c", str(config), *map(str, words)]
         with self._log.open("w") as file:
-            self.process = subprocess.Popen(
-                [*PROGRAM, "run", "-c", str(config), *map(str, words)], stderr=file
-            )
+            self.process = subprocess.Popen(command, stderr=file)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
 
     @property
     def log(self) -> str:
         return self._log.read_text()
 
-    def wait_for(self, text: str) -> None:
-        until(
-            lambda: text in self.log or self.process.poll() is not None, f"{text!r} in:\n{self.log}"
-        )
-        assert text in self.log
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + 120
+        while not condition():
+            assert self.process.poll() is None, self.log
+            assert time.monotonic() < end, self.log
+            time.sleep(0.01)
 
-    def end(self, number: int = signal.SIGTERM) -> int:
-        self.process.send_signal(number)
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
         return self.process.wait(120)
 
 
-@pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., Run]]:
-    runs: list[Run] = []
-
-    def begin(config: Path, *words: object) -> Run:
-        runs.append(Run(config, *words))
-        return runs[-1]
-
-    yield begin
-    for run in runs:
-        if run.process.poll() is None:
-            run.process.kill()
-            run.process.wait()
-
-
-def configuration(ports: list[str], record: str = "", more: str = "") -> str:
-    text = f'[can]\ninterface = "virtual"\nchannel = "r{os.getpid()}"\n[record]\n{record}\n{more}\n'
-    return text + "".join(f'[[esc]]\nport = "{port}"\npole_pairs = 7\n' for port in ports)
+def configuration(path: Path, ports: list[str], more: str = "") -> Path:
+    text = f'[can]\ninterface = "virtual"\nchannel = "r{os.getpid()}"\n{more}\n'
+    path.write_text(text + "".join(f'[[esc]]\nport = "{one}"\npole_pairs = 7\n' for one in ports))
+    return path
 
 
 def test_a_run_is_recorded_whole_and_converts_to_the_log_that_a_replay_gives(
-    start: Callable[..., Run], tmp_path: Path
+    tmp_path: Path,
 ) -> None:
-    config = tmp_path / "gw.toml"
+    """By a configuration of 0.5.0, which asks for a CAN log beside the capture: that is not written any more."""
     noisy = EscOptions(faults=Faults(noise=0.5, lost_bytes=0.002))
-    canopen = f'[canopen]\nenabled = true\nself_start = true\nstore = "{tmp_path}/store"\n'
+    more = f'[canopen]\nenabled = true\nself_start = true\nstore = "{tmp_path}/store"\n'
+    more += '[record]\ncan_log = "blf"\n'
+    folder = tmp_path / "captures"
     with telemetry(noisy, EscOptions()) as ports:
-        config.write_text(configuration(ports, "", canopen))
-        run = start(config, "--record", tmp_path / "captures")
-        run.wait_for("esc2: telemetry ok")
-        until(lambda: size_of(tmp_path / "captures") > 3 * ENOUGH, "some seconds of telemetry")
-        assert run.end() == 0
+        config = configuration(tmp_path / "gw.toml", ports, more)
+        with Run(config, "--record", folder) as run:
+            run.wait_for(lambda: "esc2: telemetry ok" in run.log)
+            run.wait_for(lambda: sum(p.stat().st_size for p in folder.iterdir()) > ENOUGH)
+            assert run.end() == 0
+    removed = (
+        f"warning: {config}: record.can_log: was removed and is ignored. `kontronik-can-gw convert"
+    )
+    assert removed in run.log
+    assert {path.suffix for path in folder.iterdir()} == {".kcap"}
     again, converted = tmp_path / "again.log", tmp_path / "converted.log"
     for words in (
         ["replay", "captures", "--to", "log", "-o", again],
@@ -122,45 +107,26 @@ def test_a_run_is_recorded_whole_and_converts_to_the_log_that_a_replay_gives(
         subprocess.run([*PROGRAM, *map(str, words)], check=True, cwd=tmp_path)
     assert again.read_bytes() == converted.read_bytes()
     assert len(again.read_text().splitlines()) > 300
-    with open_input(tmp_path / "captures") as found:
+    with open_input(folder) as found:
         list(found.frames())
         assert found.damage == []
         assert "KOSMIK 120, firmware 4.17, V4 layout" in found.provenance["esc1"]
 
 
-def test_a_can_log_is_not_written_any_more_and_the_gateway_runs(
-    start: Callable[..., Run], tmp_path: Path
-) -> None:
-    """By a configuration of 0.5.0."""
-    config = tmp_path / "gw.toml"
-    with telemetry(EscOptions()) as ports:
-        config.write_text(configuration(ports, 'directory = "captures"\ncan_log = "blf"'))
-        run = start(config)
-        run.wait_for("esc1: telemetry ok")
-        assert run.end() == 0
-    assert (
-        f"warning: {config}: record.can_log: was removed and is ignored. `kontronik-can-gw convert"
-        in run.log
-    )
-    assert [path.suffix for path in (tmp_path / "captures").iterdir()] == [".kcap"]
-
-
 @pytest.mark.parametrize("wait", [False, True])
-def test_a_folder_that_cannot_be_made(
-    wait: bool, start: Callable[..., Run], tmp_path: Path
-) -> None:
+def test_a_folder_that_cannot_be_made(wait: bool, tmp_path: Path) -> None:
     """An error at once for a person, no obstacle for a service."""
-    config = tmp_path / "gw.toml"
     (tmp_path / "file").write_text("")
     with telemetry(EscOptions()) as ports:
-        config.write_text(configuration(ports))
-        words = ["--wait"] if wait else []
-        run = start(config, "--record", tmp_path / "file" / "captures", *words)
-        if not wait:
-            assert run.process.wait(120) == 1
-            assert run.log.count("\n") == 1
-            assert "Give another folder (record.directory, --record)" in run.log
-            return
-        run.wait_for("esc1: telemetry ok")
-        run.wait_for("cannot be written: Not a directory. Trying again.")
-        assert run.end() == 0
+        config = configuration(tmp_path / "gw.toml", ports)
+        words = ["--record", tmp_path / "file" / "captures", *(["--wait"] if wait else [])]
+        with Run(config, *words) as run:
+            if not wait:
+                assert run.process.wait(120) == 1
+                assert run.log.count("\n") == 1
+                assert "Give another folder (record.directory, --record)" in run.log
+                return
+            run.wait_for(lambda: "esc1: telemetry ok" in run.log)
+            refused = "cannot be written: Not a directory. Trying again."
+            run.wait_for(lambda: refused in run.log)
+            assert run.end() == 0

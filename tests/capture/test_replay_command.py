@@ -8,9 +8,9 @@ from pathlib import Path
 
 import can
 import pytest
-from capture_bench import START, Bench, made
+from capture_bench import START, Bench, capture, made
 from command_line import refused, run, written
-from test_inputs import capture, plain_run
+from test_inputs import plain_run
 
 from kontronik_can_gw.desk.recordings.pacing import Pace
 from kontronik_can_gw.esc.telemetry import MS, SECOND

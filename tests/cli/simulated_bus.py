@@ -3,9 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from capture_bench import START, Bench
-
-from kontronik_can_gw.capture.format import block, data_payload, json_payload
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -100,19 +97,3 @@ class Clock:
     def sleep(self, seconds: float) -> None:
         assert seconds > 0, "a busy loop"
         self.now += seconds
-
-
-def capture_file(
-    bench: Bench, wall_ns: int = 1_700_000_000 * SECOND_NS, devices: Sequence[str] = ()
-) -> bytes:
-    """What was recorded, as the file of a capture. ``devices``: what is learnt of the ESCs at its end."""
-    times = {"created_ns": START, "monotonic_ns": START, "wall_ns": wall_ns}
-    parts = [block(b"H", 0, json_payload(bench.setup.header() | {"run": "r", "part": 0} | times))]
-    for number, at in enumerate(range(0, len(bench.entries), 300)):
-        parts.append(block(b"D", number + 1, data_payload(bench.entries[at : at + 300])))
-    if devices:
-        learnt = [
-            {"device": name, "variant": 200, "firmware": "1.2", "layout": "V4"} for name in devices
-        ]
-        parts.append(block(b"I", len(parts), json_payload({"devices": learnt})))
-    return b"".join([*parts, block(b"E", len(parts), b"")])

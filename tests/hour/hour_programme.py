@@ -22,20 +22,18 @@ from pathlib import Path
 from typing import Any
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+    tests = Path(__file__).resolve().parents[1]
+    sys.path[:0] = [str(tests.parent), str(tests), str(tests / "capture")]
 
 # A process's peak memory counts that of the process it was started from: so commands are started by a small one.
-_RUNNER = """
+_MEASURE = """
 import json, os, subprocess, sys, time
-for line in sys.stdin:
-    command, out, err = json.loads(line)
-    with open(out, "wb") as output, open(err, "wb") as errors:
-        begun = time.monotonic()
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
-        _, status, used = os.wait4(child.pid, 0)
-        child.returncode = os.waitstatus_to_exitcode(status)
-    took = time.monotonic() - begun
-    print(json.dumps([child.returncode, took, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024]), flush=True)
+begun = time.monotonic()
+child = subprocess.Popen(sys.argv[2:], stdin=subprocess.DEVNULL, stdout=open(sys.argv[1], "wb"))
+_, status, used = os.wait4(child.pid, 0)
+child.returncode = os.waitstatus_to_exitcode(status)
+took = time.monotonic() - begun
+print(json.dumps([child.returncode, took, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024]))
 """
 
 
@@ -62,50 +60,28 @@ class Step:
     arguments: list[str]
     output: Path
     read_by: str
-    check: Callable[[], Any]
+    check: partial[Any]
     to_output: bool = False
     """What it prints is the result."""
 
 
-class Runner:
-    """Runs commands one behind the other, beside this process."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _RUNNER],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    def submit(self, arguments: list[str], output: Path) -> None:
-        """Run ``kontronik-can-gw`` with these arguments when the ones before are done."""
-        assert self._process.stdin is not None
-        command = [sys.executable, "-m", "kontronik_can_gw", *arguments]
-        self._process.stdin.write(
-            json.dumps([command, str(output), str(self._folder / "errors.txt")]) + "\n"
-        )
-        self._process.stdin.flush()
-
-    def result(self) -> tuple[float, float, float]:
-        """Wall seconds, CPU seconds, peak memory in MB of the next command. RuntimeError where it failed."""
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise RuntimeError("the runner has ended")
-        code, seconds, cpu, peak = json.loads(line)
-        if code:
-            raise RuntimeError(
-                f"exit code {code}: {(self._folder / 'errors.txt').read_text().strip()}"
-            )
-        return seconds, cpu, peak
-
-    def close(self) -> None:
-        """End it."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(60)
+def measured(arguments: list[str], output: Path) -> tuple[float, float, float]:
+    """Wall seconds, CPU seconds and peak memory in MB of a command, whose output goes to a file. RuntimeError where it failed."""
+    command = [
+        sys.executable,
+        "-c",
+        _MEASURE,
+        str(output),
+        sys.executable,
+        "-m",
+        "kontronik_can_gw",
+    ]
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=True)
+    code, *found = json.loads(done.stdout)
+    if code:
+        raise RuntimeError(f"exit code {code}: {done.stderr.strip()}")
+    seconds, cpu, peak = found
+    return seconds, cpu, peak
 
 
 def steps_of(folder: Path, truth: Any) -> list[Step]:
@@ -116,133 +92,85 @@ def steps_of(folder: Path, truth: Any) -> list[Step]:
     one_esc = len(truth.escs) == 1
     decoded = check.Decoded(truth)
     frames: dict[str, check.Frames] = {}
+    by_can = "python-can, cantools"
     steps: list[Step] = []
 
     def step(
-        name: str, words: list[str], output: str, read_by: str, compare: Callable[[Path], Any]
+        name: str,
+        words: list[str],
+        output: str,
+        read_by: str,
+        compare: Callable[..., Any],
+        *of: Any,
     ) -> None:
         """A command whose words have OUT for the file that it makes; one without it prints what is to be there."""
         path = folder / output
         arguments = [str(path) if word == "OUT" else word for word in words]
-        steps.append(
-            Step(
-                name, arguments, path, read_by, partial(compare, path), to_output="OUT" not in words
-            )
-        )
+        check_it = partial(compare, *of, path)
+        steps.append(Step(name, arguments, path, read_by, check_it, "OUT" not in words))
 
     def compare_log(path: Path) -> Any:
-        verdict, frames[path.suffix] = check.check_log(path, truth, decoded)
+        verdict, found = check.check_log(path, truth, decoded)
+        frames.setdefault(path.suffix, found)
         return verdict
 
     def compare_table_of_log(form: str, path: Path) -> Any:
         return check.check_table_of_log(path, truth, frames[f".{form}"], decoded)
 
+    convert = ["convert", capture, "OUT"]
     for form, library in check.TABLES.items():
-        step(
-            f"convert to {form}",
-            ["convert", capture, "OUT"],
-            f"hour.{form}",
-            library,
-            partial(check.check_table, truth),
-        )
-    library = "python-can, cantools"
+        step(f"convert to {form}", convert, f"hour.{form}", library, check.check_table, truth)
     for form in check.LOGS:
-        step(
-            f"convert to {form}", ["convert", capture, "OUT"], f"hour.{form}", library, compare_log
-        )
+        step(f"convert to {form}", convert, f"hour.{form}", by_can, compare_log)
     for form in check.LOGS if one_esc else ():
         words = ["convert", str(folder / f"hour.{form}"), "OUT"]
-        compare = partial(compare_table_of_log, form)
-        step(
-            f"convert {form} to csv", words, f"of_{form}.csv", f"pandas against {library}", compare
-        )
-    step(
-        "replay to log",
-        ["replay", capture, "--to", "log", "-o", "OUT"],
-        "replayed.log",
-        library,
-        compare_log,
-    )
+        compare = f"pandas against {by_can}", compare_table_of_log, form
+        step(f"convert {form} to csv", words, f"of_{form}.csv", *compare)
+    words = ["replay", capture, "--to", "log", "-o", "OUT"]
+    step("replay to log", words, "replayed.log", by_can, compare_log)
     for index in range(len(truth.escs)):
         name = f"esc{index + 1}"
-        more = [] if one_esc else ["--esc", name]
-        compare = partial(check.check_bytes, truth, index)
-        step("convert to bin", ["convert", capture, "OUT", *more], f"{name}.bin", "numpy", compare)
+        words = convert if one_esc else [*convert, "--esc", name]
+        step("convert to bin", words, f"{name}.bin", "numpy", check.check_bytes, truth, index)
         words = ["decode", str(folder / f"{name}.bin")]
-        step(
-            "decode the bin",
-            words,
-            f"{name}.decoded.jsonl",
-            "json",
-            partial(check.check_decoded, truth, index),
-        )
-    step(
-        "report",
-        ["report", capture, "-o", "OUT"],
-        "hour.html",
-        "its text",
-        partial(check.check_report, truth),
-    )
-    compare = partial(check.check_last, truth, decoded)
-    step(
-        "monitor --once",
-        ["monitor", capture, "--once"],
-        "last.json",
-        "json against cantools",
-        compare,
-    )
+        compare_decoded = check.check_decoded, truth, index
+        step("decode the bin", words, f"{name}.decoded.jsonl", "json", *compare_decoded)
+    words = ["report", capture, "-o", "OUT"]
+    step("report", words, "hour.html", "its text", check.check_report, truth)
+    words = ["monitor", capture, "--once"]
+    of_last = "json against cantools", check.check_last, truth, decoded
+    step("monitor --once", words, "last.json", *of_last)
     return steps
 
 
 def run(steps: list[Step], folder: Path, say: Callable[[str], None] = print) -> list[Result]:
-    """Run all commands in their order, and compare each result while the next one runs."""
-    runner = Runner(folder)
+    """Run all commands in their order, and compare each result."""
     results = []
-    try:
-        for step in steps:
-            runner.submit(step.arguments, step.output if step.to_output else folder / "output.txt")
-        for step in steps:
-            result = Result(step.name, read_by=step.read_by)
-            result.seconds, result.cpu_seconds, result.peak_mb = runner.result()
-            result.size_mb = step.output.stat().st_size / 1e6
-            verdict = step.check()
-            result.rows, result.values = verdict.rows, verdict.values
-            result.differences = verdict.differences + (not verdict.values)
-            say(f"{step.name}: {result.values} values compared, {result.differences} differ")
-            for line in verdict.problems:
-                say(f"    {line}")
-            results.append(result)
-    finally:
-        runner.close()
+    for step in steps:
+        result = Result(step.name, read_by=step.read_by)
+        output = step.output if step.to_output else folder / "output.txt"
+        result.seconds, result.cpu_seconds, result.peak_mb = measured(step.arguments, output)
+        result.size_mb = step.output.stat().st_size / 1e6
+        verdict = step.check()
+        result.rows, result.values = verdict.rows, verdict.values
+        result.differences = verdict.differences + (not verdict.values)
+        say(f"{step.name}: {result.values} values compared, {result.differences} differ")
+        for line in verdict.problems:
+            say(f"    {line}")
+        results.append(result)
     return results
 
 
 def table(results: list[Result]) -> str:
     """The results as a Markdown table."""
-    heads = (
-        "",
-        "seconds",
-        "CPU s",
-        "rows/CPU s",
-        "peak MB",
-        "size MB",
-        "values compared",
-        "read back by",
-    )
-    lines = ["| " + " | ".join(heads) + " |", "|---" + "|---:" * 6 + "|---|"]
+    heads = ("seconds", "CPU s", "rows/CPU s", "peak MB", "size MB", "values compared")
+    lines = [f"| | {' | '.join(heads)} | read back by |", "|---" + "|---:" * 6 + "|---|"]
     for one in results:
         rate = f"{one.rows / one.cpu_seconds:,.0f}".replace(",", " ") if one.rows > 10 else ""
-        values = f"{one.values:,}".replace(",", " ") + (
-            f" ({one.differences} differ)" if one.differences else ""
-        )
-        cells = [
-            one.name,
-            f"{one.seconds:.1f}",
-            f"{one.cpu_seconds:.1f}",
-            rate,
-            f"{one.peak_mb:.0f}",
-        ]
-        lines.append("| " + " | ".join([*cells, f"{one.size_mb:.1f}", values, one.read_by]) + " |")
+        differ = f" ({one.differences} differ)" if one.differences else ""
+        values = f"{one.values:,}".replace(",", " ") + differ
+        numbers = f"{one.seconds:.1f} | {one.cpu_seconds:.1f} | {rate} | {one.peak_mb:.0f}"
+        lines.append(f"| {one.name} | {numbers} | {one.size_mb:.1f} | {values} | {one.read_by} |")
     return "\n".join(lines)
 
 

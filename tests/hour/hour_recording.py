@@ -10,10 +10,12 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
+from itertools import zip_longest
 from pathlib import Path
 from typing import IO
 
 import numpy as np
+from capture_bench import made
 from numpy.typing import NDArray
 
 from kontronik_can_gw.capture.format import (
@@ -26,9 +28,6 @@ from kontronik_can_gw.capture.format import (
 )
 from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.capture.setup import CaptureSetup
-from kontronik_can_gw.cli.recording import setup_of
-from kontronik_can_gw.config.assemble import assemble
-from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.esc.kontronik import Device
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import (
@@ -43,7 +42,6 @@ from kontronik_can_gw.esc.kontronik.simulator import Sent as Wired
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.recorded_gateway import RecordedGateway
-from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.transmit_queue import TransmitQueue
 
 MS = 1_000_000
@@ -149,26 +147,13 @@ def options_of(index: int, seconds: float) -> EscOptions:
     )
 
 
-def made(escs: int) -> tuple[CaptureSetup, Layout]:
-    """The gateway's making, and the layout of what it sends."""
-    loaded = assemble(
-        parse(
-            {
-                "can": {"interface": "virtual"},
-                "esc": [
-                    {
-                        "port": f"/dev/ttyUSB{n}",
-                        "name": f"esc{n + 1}",
-                        "pole_pairs": 5 + 2 * n,
-                        "gear": "17/2",
-                    }
-                    for n in range(escs)
-                ],
-            },
-            "hour.toml",
-        )
-    )
-    return setup_of(loaded), loaded.layout
+def esc(number: int) -> dict[str, object]:
+    """The configuration of an ESC."""
+    return {"name": f"esc{number + 1}", "pole_pairs": pole_pairs(number), "gear": str(GEAR)}
+
+
+def pole_pairs(number: int) -> int:
+    return 5 + 2 * number
 
 
 class _Writer:
@@ -217,7 +202,7 @@ class _Read:
 
 def record(path: Path, seconds: float, escs: int = 1, seed: int = 1) -> Recording:
     """Make a capture of so many seconds at ``path``."""
-    setup, layout = made(escs)
+    setup, layout = made(escs, of_esc=esc)
     length = int(seconds * SECOND)
     end = START + length
     states = [
@@ -228,7 +213,7 @@ def record(path: Path, seconds: float, escs: int = 1, seed: int = 1) -> Recordin
     recording = Recording(
         path,
         setup,
-        [Meant(pole_pairs=5 + 2 * n) for n in range(escs)],
+        [Meant(pole_pairs=pole_pairs(n)) for n in range(escs)],
         Sent(),
         end,
         START + length // 2 + 1,
@@ -293,39 +278,25 @@ def _reads(recording: Recording, seconds: float, rng: random.Random) -> Iterator
     plans = [options_of(index, seconds) for index in range(len(recording.escs))]
     starts = [START + 5 * MS + index * 1_700_000 for index in range(len(plans))]
     simulated = [
-        SimulatedEsc(plans[index], seed=index + 1, start_ns=starts[index])
-        for index in range(len(plans))
+        SimulatedEsc(plan, seed=index + 1, start_ns=starts[index])
+        for index, plan in enumerate(plans)
     ]
     held: list[_Read] = []
     end = START + int(seconds * SECOND)
-    slice_end = START
-    while slice_end < end:
-        slice_end = min(slice_end + SECOND, end)
+    for slice_end in [*range(START + SECOND, end, SECOND), end]:
         found = held
-        held = []
         for index, esc in enumerate(simulated):
             meant = recording.escs[index]
             unread = b""
             frames = [one for one in esc.frames_until(slice_end) if _arrives(one, meant, end)]
-            for place, one in enumerate(frames):
+            for one, behind in zip_longest(frames, frames[1:]):
                 last = one.time_ns + len(one.wire) * BYTE_NS
                 live = isinstance(one.data, LiveData)
-                (meant.live_ns if live else meant.info_ns).append(last)
-                (meant.lives if live else meant.infos).extend(one.data)
-                if live:
-                    swaps = [
-                        swap
-                        for swap in plans[index].faults.swaps
-                        if one.time_ns - starts[index] >= swap.time_ns
-                    ]
-                    meant.devices.append(int(swaps[-1].device if swaps else plans[index].device))
-                    meant.legacy.append(len(one.wire) == 38)
-                meant.wire += one.wire
-                behind = frames[place + 1 : place + 2]
-                if live and behind and behind[0].time_ns == last and rng.random() < 0.5:
+                _note(one, meant, plans[index], starts[index])
+                if live and behind and behind.time_ns == last and rng.random() < 0.5:
                     unread = one.wire
                     # it stands in front
-                    meant.read_ns.append(last + len(behind[0].wire) * BYTE_NS - 1)
+                    meant.read_ns.append(last + len(behind.wire) * BYTE_NS - 1)
                     continue
                 if live:
                     meant.read_ns.append(last)
@@ -340,6 +311,21 @@ def _reads(recording: Recording, seconds: float, rng: random.Random) -> Iterator
         held = [read for read in found if read.time_ns > slice_end]
         yield from (read for read in found if read.time_ns <= slice_end)
     yield from sorted(held)
+
+
+def _note(one: Wired, meant: Meant, plan: EscOptions, start_ns: int) -> None:
+    """Keep what a frame means."""
+    last = one.time_ns + len(one.wire) * BYTE_NS
+    meant.wire += one.wire
+    if not isinstance(one.data, LiveData):
+        meant.info_ns.append(last)
+        meant.infos.extend(one.data)
+        return
+    meant.live_ns.append(last)
+    meant.lives.extend(one.data)
+    swaps = [swap for swap in plan.faults.swaps if one.time_ns - start_ns >= swap.time_ns]
+    meant.devices.append(int(swaps[-1].device if swaps else plan.device))
+    meant.legacy.append(len(one.wire) == 38)
 
 
 def _arrives(one: Wired, meant: Meant, end: int) -> bool:

@@ -6,7 +6,7 @@ Nothing here is taken from the program that is checked, but names of fields and 
 NaN: not available. Texts are their numbers.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import cantools.database
 import numpy as np
 from cantools.database.can import Database
+from esc.sheet import INFO_FIELDS, LIVE_FIELDS, Field
 from hour_recording import CELLS, GEAR, MS, SECOND, START, TIMEOUT_NS, Meant, Recording, Times
 from numpy.typing import NDArray
 
@@ -25,77 +26,36 @@ SAME_ROW_NS = 5 * MS
 INFO_TIMEOUT_NS = 10 * SECOND
 JIVEPRO = 3
 
-# signal: (field of the live frame, steps to one unit)
-LIVE = {
-    "ElectricalSpeed": ("electrical_speed", 1),
-    "BatteryVoltage": ("battery_voltage", 100),
-    "ThrottlePercent": ("throttle", 1),
-    "Timing": ("timing", 1),
-    "BatteryCurrent": ("battery_current", 10),
-    "MotorCurrent": ("motor_current", 10),
-    "PeakCurrent": ("peak_current", 10),
-    "OutputOpeningPercent": ("output_opening", 1),
-    "BecVoltage": ("bec_voltage", 1000),
-    "PwmInput": ("pwm_input", 1),
-    "BecTemperature": ("bec_temperature", 1),
-    "PowerStageTemperature": ("power_stage_temperature", 1),
-    "ConsumedCharge": ("consumed_charge", 1),
-    "OperatingState": ("operating_state", 1),
-    "OperatingStateRaw": ("operating_state", 1),
-}
-INFO = {
-    "CellCount": ("cell_count", 1),
-    "MaxElectricalSpeed": ("max_electrical_speed", 1),
-    "MinBatteryVoltage": ("min_battery_voltage", 100),
-    "MaxBatteryVoltage": ("max_battery_voltage", 100),
-    "MaxBatteryCurrent": ("max_battery_current", 10),
-    "MaxMotorCurrent": ("max_motor_current", 10),
-    "MaxPeakCurrent": ("max_peak_current", 10),
-    "MaxBecCurrent": ("max_bec_current", 1000),
-    "MinBecVoltage": ("min_bec_voltage", 1000),
-    "MaxThrottlePercent": ("max_throttle", 1),
-    "MaxOutputOpeningPercent": ("max_output_opening", 1),
-    "MinPowerStageTemperature": ("min_power_stage_temperature", 1),
-    "MaxPowerStageTemperature": ("max_power_stage_temperature", 1),
-    "MinBecTemperature": ("min_bec_temperature", 1),
-    "MaxBecTemperature": ("max_bec_temperature", 1),
-}
-OPERATING_ERRORS = (
-    *("Undervoltage", "Overvoltage", "OvercurrentIntegralError", "OvercurrentIntegralWarning"),
-    *("PowerStageOvertempWarning", "PowerStageOvertempError", "BecUndervoltage", "BecOvervoltage"),
-    *("BecOvercurrent", "BecOvertemperature", "SwitchedOffByRunningDown", "CapacityLimitReached"),
-    *(
-        "OperatingErrorFound",
-        "OperatingWarningFound",
-        "SelftestError",
-        "EepromError",
-        "WatchdogErrorTripped",
-    ),
-    *(
-        "ProgrammingAllowed",
-        "LimitBatteryVoltageMinimum",
-        "LimitCurrentMaximum",
-        "LimitPowerStageTemperature",
-    ),
-    *("LimitBecTemperature", "LimitBecCurrent", "LimitDischargedCapacity"),
-)
-SELFTEST_ERRORS = (
-    *("TestPhaseLowSide", "TestPhaseHighSide", "TestShortToGround", "TestBackEmfOffset"),
-    *("TestCurrentZeroPoint", "TestUndervoltage", "TestOvervoltage", "TestBecUndervoltage"),
-    *(
-        "TestBecOvervoltage",
-        "TestReversePolarityFuse",
-        "TestOvervoltageFuse",
-        "TestPowerStageOvertemp",
-    ),
-    *(
-        "TestBecOvertemperature",
-        "TestMotorPhaseMissing",
-        "TestEepromEmpty",
-        "TestEepromStickPositions",
-    ),
-    *("TestEepromChecksum", "TestEepromSize", "TestEepromVersion"),
-)
+
+def signals_of(fields: Sequence[Field], *but: str) -> dict[str, tuple[str, int]]:
+    """Of signals that stand in a frame as they are: field, and steps to one unit."""
+    return {
+        "".join(map(str.capitalize, one.name.split("_"))) + "Percent" * (one.unit == "%"): (
+            one.name,
+            one.steps,
+        )
+        for one in fields
+        if one.name not in but
+    }
+
+
+LIVE = signals_of(LIVE_FIELDS, "bec_current", "operating_errors")
+LIVE["OperatingStateRaw"] = LIVE["OperatingState"]
+INFO = signals_of(INFO_FIELDS, "device_and_variant", "firmware_word", "selftest_errors")
+_OPERATING_ERRORS = """
+    Undervoltage Overvoltage OvercurrentIntegralError OvercurrentIntegralWarning PowerStageOvertempWarning
+    PowerStageOvertempError BecUndervoltage BecOvervoltage BecOvercurrent BecOvertemperature SwitchedOffByRunningDown
+    CapacityLimitReached OperatingErrorFound OperatingWarningFound SelftestError EepromError WatchdogErrorTripped ProgrammingAllowed
+    LimitBatteryVoltageMinimum LimitCurrentMaximum LimitPowerStageTemperature LimitBecTemperature LimitBecCurrent
+    LimitDischargedCapacity
+"""
+_SELFTEST_ERRORS = """
+    TestPhaseLowSide TestPhaseHighSide TestShortToGround TestBackEmfOffset TestCurrentZeroPoint TestUndervoltage TestOvervoltage
+    TestBecUndervoltage TestBecOvervoltage TestReversePolarityFuse TestOvervoltageFuse TestPowerStageOvertemp TestBecOvertemperature
+    TestMotorPhaseMissing TestEepromEmpty TestEepromStickPositions TestEepromChecksum TestEepromSize TestEepromVersion
+"""
+OPERATING_ERRORS = tuple(_OPERATING_ERRORS.split())
+SELFTEST_ERRORS = tuple(_SELFTEST_ERRORS.split())
 LENGTHS = {"live": (40, 38), "info": (44, 41)}
 """Bytes of a frame in V4 and legacy layout."""
 ALIVE = "Alive"
@@ -232,10 +192,12 @@ class EscTruth:
         self._rate_at = _Steps(events + ended)
         self._rate_behind = _Steps(events + [(at + 1, rate) for at, rate in ended])
 
-    def signals(self, times: Times, told_ns: Times | None = None) -> dict[str, Expected]:
+    def signals(
+        self, times: Times, told_ns: Times | None = None, aged_ns: Times | None = None
+    ) -> dict[str, Expected]:
         """Each signal of the ESC at these times, as the gateway can know it.
 
-        ``told_ns``: of rows: when age and rate of the data were last told, which are not new in every row.
+        ``told_ns``, ``aged_ns``: of rows: when the rate, or the age, of the data was last told, which are not new in every row.
         """
         newest = np.searchsorted(self.read_ns, times, "right") - 1
         at = np.maximum(newest, 0)
@@ -268,6 +230,8 @@ class EscTruth:
             live("BatteryPower", power / 1000)
             live("OperatingErrors", errors)
         self._infos(times, fresh, at, found, told_ns is not None)
+        aged = times if aged_ns is None else aged_ns
+        found["DataAge"] = _one(np.where(newest >= 0, (aged - self.live_ns[at]) // MS, np.nan))
         self._link(times, told, told_ns is not None, newest, at, found)
         return found
 
@@ -326,8 +290,6 @@ class EscTruth:
         found["Losses"] = _one(np.searchsorted(self.timed_out_ns, times, "right"))
         found["Layout"] = _one(np.where(newest >= 0, 1 + self.legacy[at], 0))
         found["LinkState"] = _one(self.links[np.searchsorted(self.link_ns, times, "right") - 1])
-        age = (told - self.live_ns[at]) // MS
-        found["DataAge"] = _one(np.where(newest >= 0, age, np.nan))
         # what a frame tells at the very time at which a second ends may be either; in rows a second ends behind the live frame
         behind, now = self._rate_behind(told), self._rate_at(told)
         if rows or np.any(np.isnan(behind) != np.isnan(now)):
@@ -339,7 +301,9 @@ class EscTruth:
 
     def _counted(self, times: Times, newest: Any, at: Any, found: dict[str, Expected]) -> None:
         """What only rows hold: counters, and how long the motor has turned."""
-        infos = np.searchsorted(self.info_ns, times, "right")
+        infos = np.searchsorted(
+            self.info_ns, times + 1, "right"
+        )  # read with a live frame: counted with it
         found["LiveFrames"] = _one(newest + 1)
         found["InfoFrames"] = _one(infos)
         found["SuspectFrames"] = _one(np.zeros(len(times)))
@@ -410,6 +374,7 @@ class Truth:
         rows: list[int] = []
         until: list[int] = []
         told: list[list[tuple[int, int]]] = [[] for _ in self.escs]
+        by_any: list[tuple[int, int]] = []
         seen: set[int] | None = None
         for read, esc_index, info, at in sorted(events):
             if seen is not None and (
@@ -424,10 +389,12 @@ class Truth:
                 until[-1] = read
                 if not info:
                     seen.add(esc_index)
-            told[esc_index].append((read, at if seen is None else max(at, rows[-1])))
+            by_any.append((read, at if seen is None else max(at, rows[-1])))
+            told[esc_index].append(by_any[-1])
         self.row_ns = np.array(rows, dtype=np.int64)
         self._until_ns = np.array(until, dtype=np.int64)
         """When the last of a row was read."""
+        self._by_any = np.array(by_any, dtype=np.int64)
         self._told = [np.array(one, dtype=np.int64) for one in told]
         """Of each ESC when something was read, and what time it was given."""
 
@@ -435,9 +402,14 @@ class Truth:
         """The table: values by name, a row at each of ``row_ns``."""
         until = self._until_ns
         found: dict[str, Expected] = {}
+
+        def last(told: Times) -> Times:
+            """When something was last told; ages are told anew with what any ESC says."""
+            found: Times = told[np.maximum(np.searchsorted(told[:, 0], until, "right") - 1, 0), 1]
+            return found
+
         for prefix, esc, told in zip(self.prefixes, self.escs, self._told, strict=True):
-            at = told[np.maximum(np.searchsorted(told[:, 0], until, "right") - 1, 0), 1]
-            for name, expected in esc.signals(until, at).items():
+            for name, expected in esc.signals(until, last(told), last(self._by_any)).items():
                 for end in (expected.low, expected.high):
                     end[until < told[0, 0]] = np.nan  # nothing was ever heard of it
                 found[prefix + name] = expected

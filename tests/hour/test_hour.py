@@ -1,15 +1,15 @@
 """A minute of the hour: every format by every command reads back as what was meant; and a mutilated file is found out."""
 
 import json
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import hour_check
 import numpy as np
 import pytest
-from hour_check import Decoded, Verdict, check_log, check_table, check_table_of_log
+from hour_check import Verdict
 from hour_programme import Step, run, steps_of, table
 from hour_recording import record
 from hour_truth import Truth
@@ -30,14 +30,14 @@ class Minute:
         self.folder = folder
         self.truth = Truth(record(folder / "hour.kcap", 60))
         self.told: list[str] = []
-        self.results = {
-            one.name: one for one in run(steps_of(folder, self.truth), folder, self.told.append)
-        }
-        self.decoded = Decoded(self.truth)
+        self.steps = steps_of(folder, self.truth)
+        self.results = {one.name: one for one in run(self.steps, folder, self.told.append)}
 
-    def log_of(self, path: Path) -> Verdict:
-        """Compare a log."""
-        return check_log(path, self.truth, self.decoded)[0]
+    def check(self, file: str, path: Path) -> Verdict:
+        """Compare another file as the one of this name was."""
+        [step] = (one for one in self.steps if one.output.name == file)
+        verdict: Verdict = step.check.func(*step.check.args[:-1], path)
+        return verdict
 
 
 @pytest.fixture(scope="module")
@@ -83,23 +83,8 @@ def test_nothing_is_left_out(minute: Minute) -> None:
 
 # --- the comparison finds what is wrong
 
-
-def _changed_value(lines: list[str]) -> None:
-    at = lines[0].split(",").index("battery_voltage [V]")
-    row = next(n for n, line in enumerate(lines) if n >= 3000 and line.split(",")[at])
-    _edit(lines, row, "battery_voltage [V]", lambda text: f"{float(text) + 0.01:.2f}")
-
-
-def _old_value_in_a_gap(lines: list[str]) -> None:
-    at = lines[0].split(",").index("battery_voltage [V]")
-    gap = next(n for n, line in enumerate(lines) if not line.split(",")[at])
-    _edit(lines, gap, "battery_voltage [V]", lambda _: lines[gap - 1].split(",")[at])
-
-
-def _bec_current_of_a_jivepro(lines: list[str]) -> None:
-    at = lines[0].split(",").index("device")
-    row = next(n for n, line in enumerate(lines) if line.split(",")[at] == "JIVEPro")
-    _edit(lines, row, "bec_current [A]", lambda _: "0.0")
+Fault = Callable[[list[str]], object]
+"""Changes the lines of a file."""
 
 
 def _edit(lines: list[str], row: int, head: str, change: Callable[[str], str]) -> None:
@@ -108,103 +93,124 @@ def _edit(lines: list[str], row: int, head: str, change: Callable[[str], str]) -
     lines[row] = ",".join(cells)
 
 
+def _row(lines: list[str], head: str, wanted: Callable[[str], bool], since: int = 1) -> int:
+    """The first row whose cell is as wanted."""
+    at = lines[0].split(",").index(head)
+    return next(n for n in range(since, len(lines)) if wanted(lines[n].split(",")[at]))
+
+
+VOLTAGE = "battery_voltage [V]"
+
+
+def _changed_value(lines: list[str]) -> None:
+    row = _row(lines, VOLTAGE, bool, 3000)
+    _edit(lines, row, VOLTAGE, lambda text: f"{float(text) + 0.01:.2f}")
+
+
+def _old_value_in_a_gap(lines: list[str]) -> None:
+    gap = _row(lines, VOLTAGE, lambda text: not text)
+    old = lines[gap - 1].split(",")[lines[0].split(",").index(VOLTAGE)]
+    _edit(lines, gap, VOLTAGE, lambda _: old)
+
+
+def _bec_current_of_a_jivepro(lines: list[str]) -> None:
+    row = _row(lines, "device", "JIVEPro".__eq__)
+    _edit(lines, row, "bec_current [A]", lambda _: "0.0")
+
+
 def _without_last_column(lines: list[str]) -> None:
     lines[:] = [line.rpartition(",")[0] for line in lines]
 
 
-TABLE_FAULTS: dict[str, Callable[[list[str]], object]] = {
-    "value": _changed_value,
-    "value in a gap": _old_value_in_a_gap,
-    "row": lambda lines: lines.pop(3000),
-    "time": lambda lines: _edit(
-        lines, 3000, "Time [s]", lambda text: f"{float(text) + 0.000005:.6f}"
+def _later(text: str) -> str:
+    return f"{float(text) + 0.000005:.6f}"
+
+
+def _add(key: str, row: int = 2000) -> Fault:
+    """One more in a line of JSON."""
+
+    def add(lines: list[str]) -> None:
+        record = json.loads(lines[row])
+        record[key] = (record[key] or 0) + 1
+        lines[row] = json.dumps(record)
+
+    return add
+
+
+def _in_log(change: Callable[[str], str]) -> Fault:
+    return lambda lines: lines.__setitem__(9000, change(lines[9000]))
+
+
+FAULTS: dict[tuple[str, str], Fault] = {
+    ("hour.csv", "value"): _changed_value,
+    ("hour.csv", "value in a gap"): _old_value_in_a_gap,
+    ("hour.csv", "row"): lambda lines: lines.pop(3000),
+    ("hour.csv", "time"): lambda lines: _edit(lines, 3000, "Time [s]", _later),
+    ("hour.csv", "clock"): lambda lines: _edit(
+        lines, 3000, "Utc", lambda _: lines[2000].split(",")[1]
     ),
-    "clock": lambda lines: _edit(lines, 3000, "Utc", lambda _: lines[2000].split(",")[1]),
-    "text": lambda lines: _edit(lines, 3000, "operating_state", lambda _: "StandBy"),
-    "value of a JIVEPro": _bec_current_of_a_jivepro,
-    "column": _without_last_column,
+    ("hour.csv", "text"): lambda lines: _edit(lines, 3000, "operating_state", lambda _: "StandBy"),
+    ("hour.csv", "value of a JIVEPro"): _bec_current_of_a_jivepro,
+    ("hour.csv", "column"): _without_last_column,
+    ("hour.csv", "unit"): lambda lines: lines.__setitem__(0, lines[0].replace("[V]", "[mV]", 1)),
+    ("hour.jsonl", "value"): _add("pwm_input"),
+    ("of_log.csv", "value"): _changed_value,
+    ("of_log.csv", "value in a gap"): _old_value_in_a_gap,
+    ("of_log.csv", "row"): lambda lines: lines.pop(3000),
+    ("of_log.csv", "time"): lambda lines: _edit(lines, 3000, "Time [s]", _later),
+    ("hour.log", "byte"): _in_log(lambda line: re.sub("#(....).", r"#\g<1>5", line)),
+    ("hour.log", "id"): _in_log(lambda line: line.replace(" can0 6", " can0 5")),
+    ("hour.log", "time"): _in_log(lambda line: f"({_later(line[1:18])}{line[18:]}"),
+    ("hour.log", "missing frame"): lambda lines: lines.pop(9000),
+    ("hour.log", "doubled frame"): lambda lines: lines.insert(9000, lines[9000]),
+    ("hour.log", "order"): lambda lines: lines.insert(9000, lines.pop(9001)),
+    ("esc1.decoded.jsonl", "last"): lambda lines: lines.pop(),
+    ("esc1.decoded.jsonl", "value"): _add("throttle"),
+    ("esc1.decoded.jsonl", "word"): _add("operating_errors"),
+    ("esc1.decoded.jsonl", "signed value"): _add("battery_current"),
 }
 
 
-def _mutilated(path: Path, fault: Callable[[list[str]], object], folder: Path) -> Path:
-    lines = path.read_text().splitlines()
-    fault(lines)
-    bad = folder / f"bad{path.suffix}"
+@pytest.mark.parametrize(("file", "fault"), FAULTS)
+def test_a_mutilated_file_is_found_out(
+    file: str, fault: str, minute: Minute, tmp_path: Path
+) -> None:
+    lines = (minute.folder / file).read_text().splitlines()
+    before = list(lines)
+    FAULTS[file, fault](lines)
+    assert lines != before
+    bad = tmp_path / f"bad{Path(file).suffix}"
     bad.write_text("\n".join(lines) + "\n")
-    return bad
-
-
-@pytest.mark.parametrize("fault", TABLE_FAULTS)
-def test_a_mutilated_table_is_found_out(fault: str, minute: Minute, tmp_path: Path) -> None:
-    verdict = check_table(
-        minute.truth, _mutilated(minute.folder / "hour.csv", TABLE_FAULTS[fault], tmp_path)
-    )
+    if fault == "unit":
+        with pytest.raises(AssertionError, match="the unit of battery_voltage"):
+            minute.check(file, bad)
+        return
+    verdict = minute.check(file, bad)
     assert not verdict.ok
-    assert verdict.differences >= 1
     assert verdict.problems
 
 
-def test_a_wrong_unit_is_found_out(minute: Minute, tmp_path: Path) -> None:
-    path = tmp_path / "bad.csv"
-    path.write_text(
-        (minute.folder / "hour.csv")
-        .read_text()
-        .replace("battery_voltage [V]", "battery_voltage [mV]", 1)
-    )
-    with pytest.raises(AssertionError, match="the unit of battery_voltage"):
-        check_table(minute.truth, path)
-
-
-def test_a_mutilated_file_of_each_other_format_is_found_out(minute: Minute, tmp_path: Path) -> None:
+def test_a_mutilated_file_of_libraries_and_of_bytes_is_found_out(
+    minute: Minute, tmp_path: Path
+) -> None:
     from asammdf import MDF
     from pyarrow import compute, parquet  # type: ignore[import-untyped]
 
-    _mutilated(minute.folder / "hour.jsonl", lambda lines: _add(lines, 3000, "pwm_input"), tmp_path)
     found = parquet.read_table(minute.folder / "hour.parquet")
     place = found.schema.names.index("motor_current [A]")
     other = compute.add(found.column(place), 0.1)
-    parquet.write_table(
-        found.set_column(place, found.schema.field(place), other), tmp_path / "bad.parquet"
-    )
+    changed = found.set_column(place, found.schema.field(place), other)
+    parquet.write_table(changed, tmp_path / "hour.parquet")
     with MDF(minute.folder / "hour.mf4") as mdf:
-        mdf.cut(start=10, stop=50).save(tmp_path / "bad.mf4")
-    for name in ("bad.jsonl", "bad.parquet", "bad.mf4"):
-        assert not check_table(minute.truth, tmp_path / name).ok, name
-
-
-def _add(lines: list[str], row: int, key: str) -> None:
-    """One more in a line of JSON."""
-    record = json.loads(lines[row])
-    record[key] = (record[key] or 0) + 1
-    lines[row] = json.dumps(record)
-
-
-def _flip(line: str) -> str:
-    at = line.index("#") + 4
-    return line[:at] + ("0" if line[at] != "0" else "1") + line[at + 1 :]
-
-
-def _later(line: str) -> str:
-    seconds, _, rest = line[1:].partition(")")
-    whole, _, fraction = seconds.partition(".")
-    return f"({whole}.{(int(fraction) + 3) % 1_000_000:06d}){rest}"
-
-
-LOG_FAULTS: dict[str, Callable[[list[str]], Any]] = {
-    "changed byte": lambda lines: lines.__setitem__(9000, _flip(lines[9000])),
-    "missing frame": lambda lines: lines.pop(9000),
-    "doubled frame": lambda lines: lines.insert(9000, lines[9000]),
-    "shifted time": lambda lines: lines.__setitem__(9000, _later(lines[9000])),
-    "another id": lambda lines: lines.__setitem__(9000, lines[9000].replace(" can0 6", " can0 5")),
-    "two frames change places": lambda lines: lines.__setitem__(
-        slice(9000, 9002), [lines[9001], lines[9000]]
-    ),
-}
-
-
-@pytest.mark.parametrize("fault", LOG_FAULTS)
-def test_a_mutilated_log_is_found_out(fault: str, minute: Minute, tmp_path: Path) -> None:
-    assert not minute.log_of(_mutilated(minute.folder / "hour.log", LOG_FAULTS[fault], tmp_path)).ok
+        mdf.cut(start=10, stop=50).save(tmp_path / "hour.mf4")
+    data = bytearray((minute.folder / "esc1.bin").read_bytes())
+    data[5000] ^= 1
+    (tmp_path / "esc1.bin").write_bytes(data)
+    last = json.loads((minute.folder / "last.json").read_text())
+    last["escs"][0]["values"]["battery_voltage"] += 0.01
+    (tmp_path / "last.json").write_text(json.dumps(last))
+    for path in tmp_path.iterdir():
+        assert not minute.check(path.name, path).ok, path.name
 
 
 @pytest.mark.parametrize(
@@ -219,54 +225,27 @@ def test_a_value_that_no_esc_meant_is_found_out(
     index = [place for place, one in enumerate(sent.ids) if one == can_id][200]
     before = sent.data[index]
     old, new = (bits.to_bytes(8, "little").hex().upper() for bits in (before, before ^ 1 << bit))
-
-    def wrong(lines: list[str]) -> None:
-        assert f"#{old}" in lines[index]
-        lines[index] = lines[index].replace(old, new)
-
-    path = _mutilated(minute.folder / "hour.log", wrong, tmp_path)
+    lines = (minute.folder / "hour.log").read_text().splitlines()
+    assert f"#{old}" in lines[index]
+    lines[index] = lines[index].replace(old, new)
+    (tmp_path / "bad.log").write_text("\n".join(lines) + "\n")
     sent.data[index] = before ^ 1 << bit
     try:
-        verdict = minute.log_of(path)
+        verdict = minute.check("hour.log", tmp_path / "bad.log")
     finally:
         sent.data[index] = before
     assert verdict.differences == 1
     assert verdict.problems[0].startswith(f"{name}: 1 values differ")
 
 
-def test_a_mutilated_table_of_a_log_is_found_out(minute: Minute, tmp_path: Path) -> None:
-    _, frames = check_log(minute.folder / "hour.log", minute.truth, minute.decoded)
-    for name, fault in list(TABLE_FAULTS.items())[:4]:
-        path = _mutilated(minute.folder / "of_log.csv", fault, tmp_path)
-        assert not check_table_of_log(path, minute.truth, frames, minute.decoded).ok, name
-
-
-def test_mutilated_bytes_and_records_are_found_out(minute: Minute, tmp_path: Path) -> None:
-    data = bytearray((minute.folder / "esc1.bin").read_bytes())
-    data[5000] ^= 1
-    (tmp_path / "bad.bin").write_bytes(data)
-    assert not hour_check.check_bytes(minute.truth, 0, tmp_path / "bad.bin").ok
-    faults: list[Callable[[list[str]], object]] = [lambda lines: lines.pop()]
-    faults += [
-        partial(_add, row=2000, key=key)
-        for key in ("throttle", "operating_errors", "battery_current")
-    ]
-    for fault in faults:
-        path = _mutilated(minute.folder / "esc1.decoded.jsonl", fault, tmp_path)
-        assert not hour_check.check_decoded(minute.truth, 0, path).ok, fault
-    last = json.loads((minute.folder / "last.json").read_text())
-    last["escs"][0]["values"]["battery_voltage"] += 0.01
-    (tmp_path / "last.json").write_text(json.dumps(last))
-    assert not hour_check.check_last(minute.truth, minute.decoded, tmp_path / "last.json").ok
-
-
 def test_a_file_without_values_is_no_success(tmp_path: Path) -> None:
-    step = Step("nothing", ["schema"], tmp_path / "nothing", "", Verdict, to_output=True)
+    step = Step("nothing", ["schema"], tmp_path / "nothing", "", partial(Verdict), to_output=True)
     [result] = run([step], tmp_path, lambda _: None)
     assert result.differences == 1
 
 
 def test_a_command_that_fails_ends_the_programme(tmp_path: Path) -> None:
     arguments = ["convert", str(tmp_path / "none.kcap"), str(tmp_path / "a.csv")]
+    step = Step("bad", arguments, tmp_path / "a.csv", "", partial(Verdict))
     with pytest.raises(RuntimeError, match=r"exit code 1: .*none\.kcap"):
-        run([Step("bad", arguments, tmp_path / "a.csv", "", Verdict)], tmp_path, lambda _: None)
+        run([step], tmp_path, lambda _: None)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from capture_bench import Bench, made
+from capture_bench import Bench, capture_file, made
 from command_line import Done, run, written
-from simulated_bus import Clock, capture_file, flight, layout_of, write_log
+from simulated_bus import Clock, flight, layout_of, write_log
 
 from kontronik_can_gw.cli import monitor
 from kontronik_can_gw.config.keys import shipped
@@ -93,7 +93,7 @@ def test_once_of_a_log_shows_what_holds_at_its_end(log: Path) -> None:
 
 def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) -> None:
     bench = Bench(*made(2)).live(3, 8, wild=False)
-    file = written(tmp_path / "x.kcap", capture_file(bench))
+    file = written(tmp_path / "x.kcap", capture_file(bench.setup, bench.entries))
     found = document(run("monitor", file, "--once"))
     assert [esc["name"] for esc in found["escs"]] == ["e0", "e1"]
     assert found["time"].startswith("2023-11-14T")

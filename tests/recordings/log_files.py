@@ -56,9 +56,9 @@ def write_log(
         writer.close()
 
 
-def read_log(path: Path, channel: str | None = None) -> tuple[list[Item], list[str]]:
+def read_log(path: Path) -> tuple[list[Item], list[str]]:
     """By our reader: frames with Unix times (if the log has them), and the damage."""
-    with CanLog(path, channel) as log:
+    with CanLog(path) as log:
         items = [
             ((log.wall_start_ns or 0) + time_ns, frame, received)
             for time_ns, frame, received in log.frames()

@@ -6,8 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import cantools.database
-from capture_bench import Bench, made
-from simulated_bus import capture_file
+from capture_bench import Bench, capture_file, made
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
@@ -28,7 +27,8 @@ def capture_bytes(
     escs: int = 2, seed: int = 3, seconds: float = 6, devices: Sequence[str] = ()
 ) -> bytes:
     """A capture file in which everything happens. ``devices``: what is learnt of the ESCs at its end."""
-    return capture_file(Bench(*made(escs)).live(seed, seconds), WALL_NS, devices)
+    bench = Bench(*made(escs)).live(seed, seconds)
+    return capture_file(bench.setup, bench.entries, devices, wall_ns=WALL_NS)
 
 
 @cache

@@ -17,7 +17,8 @@ from log_files import (
     write_log,
 )
 
-from kontronik_can_gw.desk.recordings.can_logs import CanLog, CanLogWriter, log_format
+from kontronik_can_gw.desk.recordings.can_logs import CanLog, CanLogWriter
+from kontronik_can_gw.desk.recordings.can_logs.log import log_format
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 
@@ -106,8 +107,6 @@ def test_a_candump_log_of_other_tools_is_read(tmp_path: Path) -> None:
     with CanLog(path) as log:
         found = list(log.frames())
         assert log.damage == []
-        assert log.foreign == {"remote frames": 1, "error frames": 1}
-        assert log.channels == {"can0": 3, "can1": 1, "vcan0": 1}
     at = 1_700_000_000_000_000_000
     assert found == [
         (at + 1000, CanFrame(0x681, b"\x00\x11"), False),
@@ -116,7 +115,6 @@ def test_a_candump_log_of_other_tools_is_read(tmp_path: Path) -> None:
         (at + 6000, CanFrame(0x123, bytes.fromhex("1122334455667788")), False),
         (at + 7000, CanFrame(0x7FF, b"\xaa"), True),
     ]
-    assert [frame.can_id for _, frame, _ in read_log(path, "can1")[0]] == [0x123]
 
 
 def test_what_candump_shows_on_the_screen_is_read(tmp_path: Path) -> None:
@@ -132,9 +130,8 @@ def test_what_candump_shows_on_the_screen_is_read(tmp_path: Path) -> None:
     )
     with CanLog(path) as log:
         found = list(log.frames())
-        assert log.wall
+        assert log.wall_start_ns == 0
         assert log.damage == ["1 damaged line: 7"]
-        assert log.foreign == {"remote frames": 1, "error frames": 1}
     at = 1_700_000_000_000_000_000
     assert found == [
         (at + 1000, CanFrame(0x681, bytes.fromhex("0011223344556677")), False),
@@ -163,8 +160,6 @@ def test_asc_with_decimal_base_and_relative_times_is_read(tmp_path: Path) -> Non
     with CanLog(path) as log:
         found = list(log.frames())
         assert log.damage == []
-        assert log.foreign == {"error frames": 1, "remote frames": 1}
-        assert log.channels == {"1": 1, "2": 1}
         assert log.wall_start_ns is not None
         assert log.wall_start_ns % 1_000_000_000 == 250_000_000
     assert found == [

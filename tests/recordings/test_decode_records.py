@@ -1,8 +1,9 @@
-"""Records from bytes: exact values, in wire order, alike however the stream is cut."""
+"""Records from bytes: exact values, in wire order. (However a stream is cut: tests/esc.)"""
 
 import json
 
-from hypothesis import given, settings
+from esc.sheet import RECORDED_INFO, RECORDED_LIVE
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kontronik_can_gw.desk.recordings.decode import (
@@ -14,22 +15,8 @@ from kontronik_can_gw.desk.recordings.decode import (
 from kontronik_can_gw.esc.kontronik import Device, InfoData, Layout, LiveData, encode, rows
 from kontronik_can_gw.esc.kontronik.fields import device_and_variant
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc, Swap
 
-S = 1_000_000_000
-
-# Recorded from a JIVE PRO 120, firmware 1.14, idle.
-LIVE = bytes.fromhex(
-    "4B4F444C 00000000 8A09 0000 0000 0000 0000 0000 581F E903 00 00 1D 20 00000200 0C 00 39234C14".replace(
-        " ", ""
-    )
-)
-INFO = bytes.fromhex(
-    "4B4F4449 780C 0E01 00000000 06 00000000 6E09 0000 0000 0000 0000 0000 DF15 00 00 1B 1E 1C 21 904AE8A9".replace(
-        " ", ""
-    )
-)
-
+LIVE, INFO = RECORDED_LIVE, RECORDED_INFO
 LIVE_JSON = (
     '{"kind": "live", "layout": "legacy", "offset": 0, "electrical_speed": 0, "battery_voltage": 24.42, '
     '"battery_current": 0.0, "motor_current": 0.0, "peak_current": 0.0, "consumed_charge": 0, "bec_current": 0.0, '
@@ -51,16 +38,6 @@ INFO_JSON = (
 def decode(data: bytes) -> list[Record]:
     decoder = Decoder()
     return decoder.feed(data) + decoder.flush()
-
-
-def spoiled_stream() -> bytes:
-    """Both layouts, rubbish, a device swap."""
-    faults = Faults(
-        noise=2, lost_bytes=0.002, flipped_bits=0.0002, swaps=(Swap(12 * S, Device.JIVEPRO),)
-    )
-    return b"".join(
-        sent.wire for sent in SimulatedEsc(EscOptions(faults=faults)).frames_until(25 * S)
-    )
 
 
 def test_the_recorded_frames_give_exactly_this_json() -> None:
@@ -90,15 +67,3 @@ def test_printed_floats_read_back_to_the_exact_step(raw: int, signed: int) -> No
     for name in ("battery_voltage", "battery_current", "bec_voltage"):
         assert rows(LiveData)[name].raw(record[name]) == getattr(data, name)
         assert len(repr(record[name]).partition(".")[2]) <= 3
-
-
-@given(st.lists(st.integers(1, 400), min_size=1, max_size=30))
-@settings(max_examples=20, deadline=None)
-def test_the_records_do_not_depend_on_how_the_stream_is_cut(sizes: list[int]) -> None:
-    stream = spoiled_stream()[:20_000]
-    decoder, records, at, turn = Decoder(), [], 0, 0
-    while at < len(stream):
-        size = sizes[turn % len(sizes)]
-        records += decoder.feed(stream[at : at + size])
-        at, turn = at + size, turn + 1
-    assert records + decoder.flush() == decode(stream)

@@ -42,6 +42,12 @@ Cells = list[dict[str, Any]]
 """Of each row the values by signal name, None where not available; Time in seconds, Utc as text to the microsecond."""
 
 
+def utc_text(wall_ns: int) -> str:
+    """Cut at the microsecond."""
+    moment = datetime.fromtimestamp(wall_ns // 10**9, UTC)
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{wall_ns % 10**9 // 1000:06d}Z"
+
+
 def _unit(header: str) -> str:
     return header.partition(" [")[0]
 
@@ -116,8 +122,7 @@ def expected_of(recording: Input) -> Cells:
         cells: dict[str, Any] = {"Time": (time_ns - origin) / 1e9}
         wall_ns = recording.wall_ns(time_ns)
         if wall_ns is not None:
-            moment = datetime.fromtimestamp(wall_ns // 10**9, UTC)
-            cells["Utc"] = f"{moment:%Y-%m-%dT%H:%M:%S}.{wall_ns % 10**9 // 1000:06d}Z"
+            cells["Utc"] = utc_text(wall_ns)
         rows.append(cells | dict(zip(names, values, strict=True)))
     return rows
 
@@ -147,15 +152,10 @@ def test_every_format_reads_back_equal(tmp_path: Path, recording: Path, form: st
     assert len(found) == len(expected) > 100
     for one, other in zip(found, expected, strict=True):
         if form == "mf4" and "Utc" in one:  # a float of seconds behind the start
-            one["Utc"] = (
-                other["Utc"]
-                if abs(pd.Timestamp(one["Utc"]) - pd.Timestamp(other["Utc"])) < _US
-                else "?"
-            )
+            apart = abs(pd.Timestamp(one["Utc"]) - pd.Timestamp(other["Utc"]))
+            assert apart < pd.Timedelta(microseconds=2)
+            one["Utc"] = other["Utc"]
         assert one == other
-
-
-_US = pd.Timedelta(microseconds=2)
 
 
 _BESIDE_FLAGS = {
@@ -196,6 +196,12 @@ def decoded(lines: list[tuple[int, int, bytes]]) -> Cells:
     return rows
 
 
+def equal(found: Any, expected: Any) -> bool:
+    return bool(
+        found == (pytest.approx(expected, abs=1e-9) if isinstance(expected, float) else expected)
+    )
+
+
 @pytest.mark.parametrize("form", ["csv", "jsonl", "parquet"])
 def test_rows_of_frames_are_what_cantools_reads(tmp_path: Path, form: str) -> None:
     lines = candump_lines(1000, seed=4)
@@ -210,54 +216,29 @@ def test_rows_of_frames_are_what_cantools_reads(tmp_path: Path, form: str) -> No
     for one, other in zip(found, expected, strict=True):
         of_message = {name for name in other if name in fields}
         for name in ("Time", "Id", "Message", *of_message):
-            assert one[name] == (
-                pytest.approx(other[name], abs=1e-9)
-                if isinstance(other[name], float)
-                else other[name]
-            )
-        others = {
-            name: value for name, value in one.items() if name in fields and name not in of_message
-        }
+            assert equal(one[name], other[name]), name
+        others = {name: one[name] for name in one.keys() & fields.keys() - of_message}
         assert not others if form == "jsonl" else set(others.values()) <= {None}
 
 
 def test_mf4_of_frames_has_a_group_for_each_message(tmp_path: Path) -> None:
     lines = candump_lines(1000, seed=5)
-    source = write_candump(tmp_path / "bus.log", lines)
     out = tmp_path / "out.mf4"
-    assert convert(source, out, "--frames") == 0
-    mdf = asammdf.MDF(out)
-    groups: list[Any] = list(mdf.groups)
-    assert [group.channel_group.acq_name for group in groups] == [
-        m.name for m in _messages_with_signals(mdf)
-    ]
-    for message in _messages_with_signals(mdf):
-        rows = [row for row in decoded(lines) if row["Message"] == message.name]
-        for signal in message.signals:
-            if signal.name not in mdf:
-                continue
-            found = mdf.get(signal.name)
-            assert found.timestamps.tolist() == pytest.approx(
-                [row["Time"] for row in rows], abs=1e-9
-            )
-            assert found.unit == (signal.unit or "")
-            texts = [
-                v.decode() if isinstance(v, bytes) else None if math.isnan(v) else v
-                for v in found.samples
-            ]
-            assert [None if text == "NotAvailable" else text for text in texts] == [
-                pytest.approx(row[signal.name])
-                if isinstance(row[signal.name], float)
-                else row[signal.name]
-                for row in rows
-            ]
-    mdf.close()
-
-
-def _messages_with_signals(mdf: Any) -> list[Any]:
-    return [
-        m for m in shipped_database().messages if any(signal.name in mdf for signal in m.signals)
-    ]
+    assert convert(write_candump(tmp_path / "bus.log", lines), out, "--frames") == 0
+    with asammdf.MDF(out) as mdf:
+        messages = [m for m in shipped_database().messages if any(s.name in mdf for s in m.signals)]
+        groups: list[Any] = list(mdf.groups)
+        assert [group.channel_group.acq_name for group in groups] == [m.name for m in messages]
+        for message in messages:
+            rows = [row for row in decoded(lines) if row["Message"] == message.name]
+            for signal in (one for one in message.signals if one.name in mdf):
+                found = mdf.get(signal.name)
+                assert found.unit == (signal.unit or "")
+                assert all(map(equal, found.timestamps.tolist(), [row["Time"] for row in rows]))
+                for sample, row in zip(found.samples, rows, strict=True):
+                    value = sample.decode() if isinstance(sample, bytes) else float(sample)
+                    missing = value == "NotAvailable" or value != value
+                    assert equal(None if missing else value, row[signal.name])
 
 
 def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
@@ -385,24 +366,17 @@ def test_any_values_read_back_equal(
     rows.sort(key=lambda row: row[0])
     path = tmp_path / f"any.{form}"
     table = Table(FIELDS, has_utc, widths=(2, 2))
-    with open_table(
-        path if form in ("parquet", "mf4") else (file := path.open("wb")), form, table
-    ) as writer:
-        for row in rows:
-            writer.write(Row(row[0], row[1], (row[2][:2], row[2][2:])))
-    if form not in ("parquet", "mf4"):
-        file.close()
+    with path.open("wb") as file:
+        by_path = form in ("parquet", "mf4")
+        with open_table(path if by_path else file, form, table) as writer:
+            for time_ns, wall_ns, values in rows:
+                writer.write(Row(time_ns, wall_ns, (values[:2], values[2:])))
     found = READ[form](path, {field.name: field for field in FIELDS})
     assert len(found) == len(rows)
     for cells, (time_ns, wall_ns, values) in zip(found, rows, strict=True):
         assert round(cells["Time"] * 1e9) == time_ns
         if has_utc and form != "mf4":
-            text = (
-                ""
-                if wall_ns is None
-                else f"{datetime.fromtimestamp(wall_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%S}"
-            )
-            assert cells["Utc"] == (f"{text}.{wall_ns % 10**9 // 1000:06d}Z" if text else None)
+            assert cells["Utc"] == (None if wall_ns is None else utc_text(wall_ns))
         assert tuple(cells[field.name] for field in FIELDS) == values
 
 

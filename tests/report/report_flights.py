@@ -2,21 +2,19 @@
 
 import base64
 import gzip
-import heapq
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from simulated_bus import layout_of
+from simulated_bus import flight, layout_of
 
-from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.samples import fields_of_log
+from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
 from kontronik_can_gw.desk.report.analysis import Analysis
 from kontronik_can_gw.desk.report.flight import Flight
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions
 from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.gateway import Gateway
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 
 Row = tuple[int, list[Value]]
@@ -28,36 +26,12 @@ def shipped_bus(*names: str) -> BusLayout:
 
 
 def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()) -> Iterator[Row]:
-    """Simulated ESCs through the real gateway and the DBC: a row at each frame of theirs."""
-    start_ns = 5 * SECOND
-    gateway = Gateway(bus.escs, bus.layout, start_ns)
-    gateway.start(start_ns)
-    view = View(SignalReader(bus.layout))
-    escs = [
-        SimulatedEsc(
-            options[i] if i < len(options) else EscOptions(),
-            seed=7 + i,
-            start_ns=start_ns + i * 1_234_567,
-        )
-        for i in range(len(bus.escs))
-    ]
-    due = [(esc.next_ns, index) for index, esc in enumerate(escs)]
-    heapq.heapify(due)
-    end_ns = start_ns + round(seconds * SECOND)
-    while due[0][0] < end_ns:
-        now, index = due[0]
-        while (deadline := gateway.next_deadline()) is not None and deadline < now:
-            gateway.advance(deadline)
-            for frame in gateway.take_frames(deadline):
-                view.take(frame.key, frame.data, deadline)
-        for sent in escs[index].frames_until(now):
-            gateway.receive_bytes(index, sent.wire, now, now)
-        gateway.advance(now)
-        for frame in gateway.take_frames(now):
-            view.take(frame.key, frame.data, now)
-        view.expire(now)
-        yield now, list(view.values)
-        heapq.heapreplace(due, (escs[index].next_ns, index))
+    """Simulated ESCs through the real gateway, the bus and the DBC."""
+    given = [*options, *[EscOptions()] * len(bus.escs)][: len(bus.escs)]
+    reader = SignalReader(bus.layout)
+    frames = (TimedFrame(5 * SECOND + now, frame) for now, frame in flight(bus, seconds, given))
+    for sample in samples_of_frames(frames, reader, range(len(reader.columns))):
+        yield sample.time_ns, list(sample.values)
 
 
 def analysis_of(

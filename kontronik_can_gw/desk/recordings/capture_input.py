@@ -21,6 +21,7 @@ from kontronik_can_gw.capture.format import (
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.recordings.columns import sections
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
 from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
@@ -31,6 +32,7 @@ from kontronik_can_gw.signals.plan import Layout
 _LOOK_FOR_HEADER = 1 << 25
 _MAX_DAMAGE = 50
 _LATEST_NS = 1 << 62
+_NO_MESSAGES = Layout("", "", ())
 
 
 class CaptureInput(Input):
@@ -39,10 +41,10 @@ class CaptureInput(Input):
     def __init__(self, paths: Sequence[Path], layout: BusLayout | None = None) -> None:
         self._paths = list(paths)
         self._headerless: list[str] = []
-        self.damage = []
         self.position = 0
         self._file: IO[bytes] | None = None
         self.header = self._first_header()
+        first = self._paths[0]
         try:
             size = sum(path.stat().st_size for path in self._paths)
         except OSError as error:
@@ -50,17 +52,14 @@ class CaptureInput(Input):
         try:
             self.setup = CaptureSetup.of(self.header)
             found = self.setup.database()
-            self.setup.gateway(Layout("", "", ()) if found is None else found[1], 0)
-        except UserError as error:
-            raise UserError(
-                *(f"{self._paths[0]}: {problem[:400]}" for problem in error.problems)
-            ) from None
+            self.setup.gateway(_NO_MESSAGES if found is None else found[1], 0)
         except Exception as error:  # a header may hold anything
-            raise UserError(f"{self._paths[0]}: {str(error)[:400]}") from None
-        name = str(self._paths[0])
+            problems = error.problems if isinstance(error, UserError) else [str(error)]
+            raise UserError(*(f"{first}: {problem[:400]}" for problem in problems)) from None
+        name = str(first)
         if len(self._paths) > 1:
-            name = f"{self._paths[0].parent}/{self._paths[0].stem.rpartition('-')[0]}"
-        self.sent_layout = Layout("", "", ()) if found is None else found[1]
+            name = f"{first.parent}/{first.stem.rpartition('-')[0]}"
+        self.sent_layout = _NO_MESSAGES if found is None else found[1]
         """Of the frames; that of the rows, ``bus``, may be another one."""
         if layout is not None:
             layout = shown_by(layout, self.setup.escs)
@@ -69,7 +68,6 @@ class CaptureInput(Input):
         else:
             layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"), self.setup.escs)
         super().__init__(name, layout, size)
-        self.last_path = self._paths[-1]
         self._offsets: list[tuple[int, int]] = []
         self._devices: list[Any] = list(self.header.get("devices") or [])
         self._describe()
@@ -87,17 +85,16 @@ class CaptureInput(Input):
             replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
             for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
         ]
-        sections, makers = self._sections(chosen), []
+        columns = sections(self.fields, self._chosen(chosen), self.bus.escs)
+        makers: list[RowMaker] = []
 
         def make(*of_gateway: Any) -> RowMaker:
-            makers.append(RowMaker(sections, *of_gateway))
+            makers.append(RowMaker(columns, *of_gateway))
             return makers[0]
 
         # without messages; nodes are there, because they may change pole pairs and gear
         gateway = Gateway(
-            *(escs, Layout("", "", ()), self._created_ns),
-            canopen=self.setup.canopen,
-            further=(make,),
+            *(escs, _NO_MESSAGES, self._created_ns), canopen=self.setup.canopen, further=(make,)
         )
         replay = Replay(gateway, self.header.get("state"))
         for entry in self.entries():
@@ -112,18 +109,13 @@ class CaptureInput(Input):
                 yield entry.data
 
     def wall_ns(self, time_ns: int) -> int | None:
-        offset = next(
-            (offset for since, offset in reversed(self._offsets) if since <= time_ns), None
-        )
-        if offset is None:
-            offset = int(self.header.get("wall_ns") or 0) - int(
-                self.header.get("monotonic_ns") or 0
-            )
-        return time_ns + offset
+        header = self.header
+        begun = int(header.get("wall_ns") or 0) - int(header.get("monotonic_ns") or 0)
+        offsets = (offset for since, offset in reversed(self._offsets) if since <= time_ns)
+        return time_ns + next(offsets, begun)
 
     @property
     def channel(self) -> str:
-        """The CAN channel that was sent on."""
         try:
             channel = str(tomllib.loads(self.setup.configuration)["can"]["channel"])
         except (ValueError, LookupError, TypeError, RecursionError):
@@ -138,17 +130,14 @@ class CaptureInput(Input):
         last, impossible = 0, 0
         for number, path in enumerate(self._paths):
             for entry in self._entries_of(path, number):
-                if entry.time_ns > _LATEST_NS or (
-                    entry.kind == Kind.CLOCK and len(entry.data) != 8
-                ):
+                time_ns, is_clock = entry.time_ns, entry.kind == Kind.CLOCK
+                if time_ns > _LATEST_NS or (is_clock and len(entry.data) != 8):
                     impossible += 1
                     continue
-                if entry.kind == Kind.CLOCK:
+                if is_clock:
                     # it stands after what was written by the clock before
-                    self._offsets.append(
-                        (entry.time_ns + 1, read_number(entry.data) - entry.time_ns)
-                    )
-                if entry.time_ns < last:
+                    self._offsets.append((time_ns + 1, read_number(entry.data) - time_ns))
+                if time_ns < last:
                     entry = entry._replace(time_ns=last)
                 last = entry.time_ns
                 yield entry
@@ -166,6 +155,7 @@ class CaptureInput(Input):
         return int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
 
     def _first_header(self) -> Mapping[str, Any]:
+        """The header of the first part that has one; those before it are left out."""
         while True:
             path = self._paths[0]
             for found in self._blocks(path):
@@ -195,14 +185,18 @@ class CaptureInput(Input):
 
     def _entries_of(self, path: Path, part: int) -> Iterator[Entry]:
         expected, ended = 0, False
+
+        def damaged(text: str) -> None:
+            if len(self.damage) <= _MAX_DAMAGE:
+                is_last = len(self.damage) == _MAX_DAMAGE
+                self.damage.append("and more of that kind" if is_last else f"{path.name}: {text}")
+
         for found in self._blocks(path):
             if isinstance(found, Damage):
-                self._add_damage(f"{path.name}: {found.length} bytes at {found.offset} are damaged")
+                damaged(f"{found.length} bytes at {found.offset} are damaged")
                 continue
-            if found.number > expected:
-                self._add_damage(
-                    f"{path.name}: {found.number - expected} blocks in front of byte {found.offset} are missing"
-                )
+            if missing := max(0, found.number - expected):
+                damaged(f"{missing} blocks in front of byte {found.offset} are missing")
             expected, ended = found.number + 1, found.kind == b"E"
             try:
                 if found.kind == b"D":
@@ -213,17 +207,9 @@ class CaptureInput(Input):
                 elif found.kind == b"H":
                     self._check_part(read_json(found.payload), path, part)
             except ValueError as error:
-                self._add_damage(f"{path.name}: the block at {found.offset} {error}")
+                damaged(f"the block at {found.offset} {error}")
         if not ended:
-            self._add_damage(
-                f"{path.name}: was not closed: up to the last second before its end may be missing"
-            )
-
-    def _add_damage(self, text: str) -> None:
-        if len(self.damage) < _MAX_DAMAGE:
-            self.damage.append(text)
-        elif len(self.damage) == _MAX_DAMAGE:
-            self.damage.append("and more of that kind")
+            damaged("was not closed: up to the last second before its end may be missing")
 
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
         if header.get("run") != self.header.get("run"):
@@ -231,13 +217,8 @@ class CaptureInput(Input):
                 f"{path}: is of another run than {self._paths[0]}. Convert each run by itself."
             )
         now, wall = header.get("monotonic_ns"), header.get("wall_ns")
-        if (
-            isinstance(now, int)
-            and isinstance(wall, int)
-            and 0 <= now <= _LATEST_NS
-            and 0 <= wall <= _LATEST_NS
-        ):
-            self._offsets.append((now, wall - now))
+        if all(isinstance(at, int) and 0 <= at <= _LATEST_NS for at in (now, wall)):
+            self._offsets.append((int(now or 0), int(wall or 0) - int(now or 0)))
         missing = int(header.get("part", part)) - int(self.header.get("part", 0)) - part
         if missing > 0:
             self.damage.append(
@@ -253,18 +234,19 @@ class CaptureInput(Input):
             self.damage.append(f"{replay.rejected} entries make no sense to this version")
 
     def _describe(self) -> None:
-        header, words = self.header, self.provenance
-        program = header.get("program", {})
-        words["program"] = (
-            f"kontronik-can-gw {program.get('version', '?')}, Python {program.get('python', '?')}"
-        )
-        words["machine"] = str(program.get("machine", ""))
-        words["run"] = f"{header.get('run', '')}, part {int(header.get('part', 0)) + 1}"
-        words["configuration"] = self.setup.file
-        words["DBC"] = self.setup.dbc[0] if self.setup.dbc else ""
-        for index, (esc, port) in enumerate(zip(self.setup.escs, self.setup.ports, strict=False)):
+        """Say in ``provenance`` what is known by now."""
+        header, setup, program = self.header, self.setup, self.header.get("program", {})
+        version, python = program.get("version", "?"), program.get("python", "?")
+        self.provenance |= {
+            "program": f"kontronik-can-gw {version}, Python {python}",
+            "machine": str(program.get("machine", "")),
+            "run": f"{header.get('run', '')}, part {int(header.get('part', 0)) + 1}",
+            "configuration": setup.file,
+            "DBC": setup.dbc[0] if setup.dbc else "",
+        }
+        for index, (esc, port) in enumerate(zip(setup.escs, setup.ports, strict=False)):
             device = self._devices[index] if index < len(self._devices) else None
             known = "device not known"
             if isinstance(device, dict):
                 known = f"{device.get('device')} {device.get('variant')}, firmware {device.get('firmware')}, {device.get('layout')} layout"
-            words[esc.name] = f"{known}, at {port}"
+            self.provenance[esc.name] = f"{known}, at {port}"

@@ -5,7 +5,7 @@ their word, the others one by one. A value that is not fresh is None.
 """
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from itertools import groupby
 from operator import attrgetter, getitem, itemgetter
 from typing import Any, NamedTuple
@@ -19,45 +19,44 @@ from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.signals.unpacker import Value
 
 Values = tuple[Value, ...]
+Read = Callable[[Any, int], Values]
+"""Gives the values of neighbouring columns; is given an EscTelemetry, or the GatewayStatus, and the time."""
 LEFT_OUT = frozenset({"sent_frames"})
 """Only the frames themselves show it: they are not made for a table."""
 _MAX_KNOWN = 1 << 13
-_ORDER = {Group.LIVE: 0, Group.LINK: 1, Group.INFO: 2, Group.GATEWAY: 3}
-
-
-def _listed(values: Mapping[str, EscValue], of_gateway: bool) -> list[EscValue]:
-    chosen = (
-        value
-        for value in values.values()
-        if value.name not in LEFT_OUT
-        and value.supplied
-        and (value.group is Group.GATEWAY) is of_gateway
-    )
-    return sorted(chosen, key=lambda value: _ORDER[value.group])
+_ORDER = (Group.LIVE, Group.LINK, Group.INFO, Group.GATEWAY)
 
 
 def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
     """A field for each value, of all ESCs and then of the gateway; with several ESCs named ``esc1.battery_voltage``."""
     found = []
-    for index, esc in enumerate(escs):
-        prefix = f"{esc.name}." if len(escs) > 1 else ""
-        found += [_field(value, prefix, index) for value in _listed(values_of_esc(esc), False)]
-    return found + [_field(value, "", None) for value in _listed(VALUES, True)]
+    for index, esc in [*enumerate(escs), (None, None)]:
+        prefix = f"{esc.name}." if esc is not None and len(escs) > 1 else ""
+        every = (VALUES if esc is None else values_of_esc(esc)).values()
+        for group in _ORDER:
+            found += [
+                _field(value, prefix, index)
+                for value in every
+                if value.group is group
+                and (group is Group.GATEWAY) is (esc is None)
+                and value.supplied
+                and value.name not in LEFT_OUT
+            ]
+    return found
 
 
 def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
     texts = tuple(sorted(value.names.items()))
     high = math.inf if value.high is None else value.high / value.per_unit
     name = prefix + value.name
-    return Field(name, value.unit, _kind(value), "", texts, value.name, esc, high=high)
-
-
-def _kind(value: EscValue) -> Kind:
+    kind = Kind.FLOAT
     if value.names:
-        return Kind.TEXT
-    if value.bit is not None:
-        return Kind.FLAG
-    return Kind.WHOLE if value.per_unit == 1 and value.divisor is Divisor.ONE else Kind.FLOAT
+        kind = Kind.TEXT
+    elif value.bit is not None:
+        kind = Kind.FLAG
+    elif value.per_unit == 1 and value.divisor is Divisor.ONE:
+        kind = Kind.WHOLE
+    return Field(name, value.unit, kind, "", texts, value.name, esc, high=high)
 
 
 # --- reading
@@ -67,9 +66,7 @@ def _word(value: EscValue) -> int | None:
     """Where in its frame's fields a value or flag stands as it is; None for one that is derived."""
     if value.not_on or value.divisor is not Divisor.ONE or value.read is not None:
         return None
-    if value.kind is How.WIRE or value.bit is not None:
-        return value.words[0]
-    return None
+    return value.words[0] if value.kind is How.WIRE or value.bit is not None else None
 
 
 class Known(dict[Any, Any]):
@@ -94,21 +91,17 @@ def _scaling(value: EscValue) -> Callable[[Any], Value]:
 
 
 class Section(NamedTuple):
-    """Neighbouring columns that are read together.
-
-    ``group``: what they change with; ``esc``: whose they are, None for the gateway. ``read`` is given an EscTelemetry, or
-    the GatewayStatus, and the time.
-    """
+    """Neighbouring columns that are read together. ``group``: what they change with; ``esc``: whose they are, None for the gateway."""
 
     group: Group
     esc: int | None
     nothing: Values
-    read: Callable[[Any, int], Values]
+    read: Read
     ages: bool = False
     """It changes with time alone."""
 
 
-def _words(values: Sequence[EscValue], attribute: str) -> Callable[[Any, int], Values]:
+def _words(values: Sequence[EscValue], attribute: str) -> Read:
     """What gives values that stand in a frame's fields as they are."""
     words = [_word(value) for value in values]
     take = itemgetter(*words, words[0])  # one more: of a single word it would be no tuple
@@ -123,10 +116,9 @@ def _words(values: Sequence[EscValue], attribute: str) -> Callable[[Any, int], V
     return read
 
 
-def _flags(values: Sequence[EscValue], attribute: str) -> Callable[[Any, int], Values]:
+def _flags(values: Sequence[EscValue], attribute: str) -> Read:
     """What gives the bits of one word of a frame."""
-    word = _word(values[0])
-    assert word is not None
+    word = values[0].words[0]
     bits = [value.bit or 0 for value in values]
     known = Known(lambda found: tuple([found >> bit & 1 for bit in bits]))
     nothing: Values = (None,) * len(values)
@@ -139,7 +131,7 @@ def _flags(values: Sequence[EscValue], attribute: str) -> Callable[[Any, int], V
     return read
 
 
-def _derived(listed: Sequence[EscValue]) -> Callable[[Any, int], Values]:
+def _derived(listed: Sequence[EscValue]) -> Read:
     """What gives values of an ESC that are computed, by its pole pairs and gear as they are then."""
     gateway = GatewayStatus()
 
@@ -156,7 +148,7 @@ def _derived(listed: Sequence[EscValue]) -> Callable[[Any, int], Values]:
     return read
 
 
-def _of_gateway(values: Sequence[EscValue]) -> Callable[[Any, int], Values]:
+def _of_gateway(values: Sequence[EscValue]) -> Read:
     readers: list[tuple[Any, Callable[[Any], Value]]] = [
         (value.read, _scaling(value)) for value in values
     ]
@@ -189,8 +181,7 @@ def sections(
         elif _word(value) is None:
             read = _derived(values)
         else:
-            make = _words if value.bit is None else _flags
-            read = make(values, value.group.value)
+            read = (_words if value.bit is None else _flags)(values, value.group.value)
         ages = value.kind is How.AGE
         found.append(Section(value.group, esc, (None,) * len(values), read, ages))
     return found

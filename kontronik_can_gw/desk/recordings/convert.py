@@ -1,7 +1,6 @@
 """A recording to a table, a log of CAN frames or plain bytes: the work of ``convert``, without its messages.
 
-A conversion is called with the recording, the output and what to call with the bytes read so far. It returns what it wrote, in
-words; None where the recording has nothing of it, and then nothing was written.
+Each conversion returns what it wrote, in words; None where the recording has nothing of it, and then nothing was written.
 """
 
 import gc
@@ -9,12 +8,11 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Protocol, Self
+from typing import IO, TYPE_CHECKING, Self
 
-from kontronik_can_gw.desk.recordings.part_file import PartFile
+from kontronik_can_gw.errors import RunError
 
 if TYPE_CHECKING:
     from kontronik_can_gw.desk.recordings.inputs import Input
@@ -48,152 +46,155 @@ _CLOCK_SET_NS = 1_000_000_000
 
 
 class Output:
-    """Where the data goes: a file that takes its name when all is well and ``is_whole`` was set, or standard output (``target`` None)."""
+    """Where the data goes: a file that takes its name when all is well and ``is_whole`` was set, or standard output (``target`` None).
 
-    def __init__(self, target: Path | None, form: str) -> None:
+    Until then it is written beside, as ``NAME.part``. What is no plain file (a pipe, /dev/stdout) is written to as it stands. ``what``: how
+    a person gives it.
+    """
+
+    def __init__(self, target: Path | None, form: str = "", what: str = "file") -> None:
         self.is_whole = False
         self.name = "" if target is None else target.name
-        self._part = None if target is None else PartFile(target)
+        self._target = target
+        self._part: Path | None = None
+        if target is not None and (not target.exists() or target.is_file()):
+            self._part = target.resolve().with_name(f"{target.name}.part")
+        self._what = what
         self._by_path = form in _BY_PATH
+        self._file: IO[bytes] | None = None
 
     def open(self) -> "IO[bytes] | Path":
         """What to write to: open for bytes, or a path. RunError where it cannot be opened."""
-        if self._part is None:
+        if self._target is None:
             return sys.stdout.buffer
-        file = self._part.open()
+        path = self._part or self._target
+        try:
+            self._file = path.open("wb")
+        except OSError as error:
+            raise RunError(
+                f"{self._target}: cannot be written: {error.strerror}. Give another {self._what}."
+            ) from None
         if not self._by_path:
-            return file
-        file.close()  # it can be written: a library would report it otherwise, or make folders
-        return self._part.path
+            return self._file
+        self._file.close()  # it can be written: a library would report it otherwise, or make folders
+        return path
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        if self._part is None:
-            if kind is None:
-                sys.stdout.flush()
-        elif kind is None and self.is_whole:
-            self._part.finish()
-        else:
-            self._part.discard()
+        if kind is None and self._target is None:
+            sys.stdout.flush()
+        if self._file is not None:
+            # what is buffered of a file that is not kept may find no room
+            with suppress(*([] if kind is None and self.is_whole else [OSError])):
+                self._file.close()
+        if self._part is None or self._target is None:
+            return
+        if kind is not None or not self.is_whole:
+            self._part.unlink(missing_ok=True)
+            return
+        with self._part.open("rb") as file:
+            os.fsync(file.fileno())
+        self._part.replace(self._target.resolve())
 
 
-class Conversion(Protocol):
-    """One kind of conversion."""
-
-    def __call__(
-        self, recording: "Input", out: Output, reached: Callable[[int], None]
-    ) -> str | None: ...
+Reached = Callable[[int], None]
+"""Is called with the bytes read so far."""
 
 
-@dataclass(frozen=True)
-class TableConversion:
+def to_table(
+    recording: "Input",
+    out: Output,
+    reached: Reached,
+    form: str,
+    choice: "Choice",
+    by_frame: bool = False,
+    units_line: bool = False,
+) -> str | None:
     """To a table."""
+    from kontronik_can_gw.desk.recordings.tables.rows import rows_of
+    from kontronik_can_gw.desk.recordings.tables.writers import open_table
 
-    form: str
-    choice: "Choice"
-    by_frame: bool = False
-    units_line: bool = False
-
-    def __call__(
-        self, recording: "Input", out: Output, reached: Callable[[int], None]
-    ) -> str | None:
-        from kontronik_can_gw.desk.recordings.tables.rows import Rows
-        from kontronik_can_gw.desk.recordings.tables.writers import open_table
-
-        rows = Rows(recording, self.choice, self.by_frame)
-        table = rows.table
-        if table is None:
-            return None
-        count, last_ns = 0, 0
-        with open_table(out.open(), self.form, table, self.units_line) as writer, _settled():
-            write = writer.write
-            for row in rows:
-                write(row)
-                count += 1
-                last_ns = row.time_ns
-                if not count % _TURN:
-                    reached(recording.position)
-            reached(recording.position)
-        out.is_whole = True
-        columns = _many(len(self.choice.columns), "signal" if self.by_frame else "value")
-        return f"{_many(count, 'row')} of {columns}, up to {last_ns / 1e9:.3f} s"
+    table, rows = rows_of(recording, choice, by_frame)
+    if table is None:
+        return None
+    count, last_ns = 0, 0
+    with open_table(out.open(), form, table, units_line) as writer, _settled():
+        write = writer.write
+        for row in rows:
+            write(row)
+            count += 1
+            last_ns = row.time_ns
+            if not count % _TURN:
+                reached(recording.position)
+        reached(recording.position)
+    out.is_whole = True
+    columns = _many(len(choice.columns), "signal" if by_frame else "value")
+    return f"{_many(count, 'row')} of {columns}, up to {last_ns / 1e9:.3f} s"
 
 
-@dataclass(frozen=True)
-class LogConversion:
+def to_log(
+    recording: "Input",
+    out: Output,
+    reached: Reached,
+    form: str,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> str | None:
     """To a log of CAN frames (a format of can_logs), from ``start_ns`` to ``end_ns`` after the recording's first frame."""
+    from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
+    from kontronik_can_gw.desk.recordings.tables.rows import cut, first_of
 
-    format: str
-    start_ns: int | None = None
-    end_ns: int | None = None
-
-    def __call__(
-        self, recording: "Input", out: Output, reached: Callable[[int], None]
-    ) -> str | None:
-        from kontronik_can_gw.desk.recordings.can_logs import CanLogWriter
-        from kontronik_can_gw.desk.recordings.inputs import CaptureInput
-        from kontronik_can_gw.desk.recordings.tables.rows import cut, first_of
-
-        first, frames = first_of(recording.frames())
-        if first is None:
-            return None
-        origin_ns = first.time_ns
-        wall_ns = recording.wall_ns(origin_ns)
-        last, frames = first_of(cut(frames, self.start_ns, self.end_ns, origin_ns))
-        if last is None:
-            return None
-        begins = last.time_ns - origin_ns
-        channel = recording.channel if isinstance(recording, CaptureInput) else "can0"
-        writer = CanLogWriter(
-            out.open(), self.format, wall_ns, begins, channel, out.name, recording.provenance
-        )
-        count = 0
-        try:
-            for last in frames:
-                writer.write(last.time_ns - origin_ns, last.frame, last.received)
-                count += 1
-                if not count % _TURN:
-                    reached(recording.position)
-            reached(recording.position)
-            writer.close()
-        except BaseException:
-            writer.discard()
-            raise
-        out.is_whole = True
-        lasted = last.time_ns - origin_ns
-        summary = f"{_many(count - sum(writer.left_out.values()), 'CAN frame')}, up to {lasted / 1e9:.3f} s"
-        for what, number in writer.left_out.items():
-            summary += f"; {number} {what} left out, which {self.format} does not know"
-        moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - lasted
-        if abs(moved) > _CLOCK_SET_NS:
-            summary += (
-                f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
-            )
-        return summary
+    first, frames = first_of(recording.frames())
+    if first is None:
+        return None
+    origin_ns = first.time_ns
+    wall_ns = recording.wall_ns(origin_ns)
+    last, frames = first_of(cut(frames, start_ns, end_ns, origin_ns))
+    if last is None:
+        return None
+    begins, channel = last.time_ns - origin_ns, recording.channel
+    writer = CanLogWriter(
+        out.open(), form, wall_ns, begins, channel, out.name, recording.provenance
+    )
+    count = 0
+    try:
+        for last in frames:
+            writer.write(last.time_ns - origin_ns, last.frame, last.received)
+            count += 1
+            if not count % _TURN:
+                reached(recording.position)
+        reached(recording.position)
+        writer.close()
+    except BaseException:
+        writer.discard()
+        raise
+    out.is_whole = True
+    lasted = last.time_ns - origin_ns
+    frames_written = _many(count - sum(writer.left_out.values()), "CAN frame")
+    summary = f"{frames_written}, up to {lasted / 1e9:.3f} s"
+    for what, number in writer.left_out.items():
+        summary += f"; {number} {what} left out, which {form} does not know"
+    moved = 0 if wall_ns is None else (recording.wall_ns(last.time_ns) or 0) - wall_ns - lasted
+    if abs(moved) > _CLOCK_SET_NS:
+        summary += f"; the clock was set by {moved / 1e9:+.3f} s in it, the log goes on as it began"
+    return summary
 
 
-@dataclass(frozen=True)
-class BytesConversion:
+def to_bytes(recording: "Input", out: Output, reached: Reached, esc: int) -> str | None:
     """To the plain bytes of one ESC."""
-
-    esc: int
-
-    def __call__(
-        self, recording: "Input", out: Output, reached: Callable[[int], None]
-    ) -> str | None:
-        file = out.open()
-        assert not isinstance(file, Path)
-        count = 0
-        for data in recording.esc_bytes(self.esc):
-            file.write(data)
-            count += len(data)
-            reached(recording.position)
-        if not count:
-            return None
-        out.is_whole = True
-        return f"{_many(count, 'byte')} of {recording.bus.escs[self.esc].name}"
+    file = out.open()
+    assert not isinstance(file, Path)
+    count = 0
+    for data in recording.esc_bytes(esc):
+        file.write(data)
+        count += len(data)
+        reached(recording.position)
+    if not count:
+        return None
+    out.is_whole = True
+    return f"{_many(count, 'byte')} of {recording.bus.escs[esc].name}"
 
 
 @contextmanager

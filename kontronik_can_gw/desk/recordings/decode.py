@@ -76,9 +76,7 @@ COLUMNS = columns_of(PROTOCOLS[0])
 
 
 class Decoder:
-    """One stream. ``feed`` and ``flush`` give the records that became certain."""
-
-    __slots__ = ("_decoder", "_device", "_layout", "_protocol")
+    """One stream. ``feed`` and ``flush`` give the records that became certain. ``counters``: of the whole stream."""
 
     def __init__(self, protocol: EscProtocol = PROTOCOLS[0]) -> None:
         self._protocol = protocol
@@ -88,7 +86,6 @@ class Decoder:
 
     @property
     def counters(self) -> Counters:
-        """Of the whole stream."""
         found: Counters = self._decoder.counters
         return found
 
@@ -114,9 +111,7 @@ class Decoder:
             "offset": reading.offset,
         }
         record |= physical_fields(protocol, form.is_info, data, self._device)
-        if not form.is_info:
-            record["suspect"] = reading.suspect
-        return record
+        return record if form.is_info else record | {"suspect": reading.suspect}
 
 
 def json_lines(records: list[Record]) -> str:
@@ -157,19 +152,21 @@ def decode_stream(
 
     What is pending is flushed also when reading fails (OSError) or is interrupted (KeyboardInterrupt); both are passed on.
     """
+
+    def put(records: list[Record]) -> None:
+        if records:
+            write(lines(records))
+
     try:
         while data := os.read(fd, CHUNK):
-            if records := decoder.feed(data):
-                write(lines(records))
+            put(decoder.feed(data))
             advance(len(data))
     except BrokenPipeError:  # from write: nobody wants the rest
         raise
     except (OSError, KeyboardInterrupt):
-        if records := decoder.flush():
-            write(lines(records))
+        put(decoder.flush())
         raise
-    if records := decoder.flush():
-        write(lines(records))
+    put(decoder.flush())
 
 
 def summary(counters: Counters) -> str:

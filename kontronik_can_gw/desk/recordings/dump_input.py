@@ -10,12 +10,14 @@ from kontronik_can_gw.capture.setup import CaptureSetup
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc.settings import DbcSettings
 from kontronik_can_gw.desk.recordings.can_logs import UART_MAGIC
+from kontronik_can_gw.desk.recordings.columns import sections
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.recording import CHUNK, Input
-from kontronik_can_gw.desk.recordings.samples import FoundTelemetry, Sample, samples_of_bytes
+from kontronik_can_gw.desk.recordings.samples import RowMaker, Sample
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.esc.decoder import Counters, Reading
-from kontronik_can_gw.esc.telemetry import SECOND
+from kontronik_can_gw.esc.decoder import Reading
+from kontronik_can_gw.esc.telemetry import SECOND, EscTelemetry, Event
+from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
 
 LIVE_RATE = 100.0
 """Live frames a second that plain bytes are taken to have come at."""
@@ -24,8 +26,6 @@ MAX_WAITING = 1 << 16
 _LONGEST_FRAME = 64
 _UNDECIDED = len(UART_MAGIC) - 1
 """Bytes at the end of a read that may begin a header."""
-Found = tuple[int, bytes, Reading | None]
-"""Bytes up to the end of a frame, its time, and the frame; without a frame at the time of the one before."""
 
 
 class DumpInput(Input):
@@ -57,24 +57,34 @@ class DumpInput(Input):
         yield from follow_bytes(self.setup.gateway(self.bus.layout, 0), self.chunks())
 
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        esc = FoundTelemetry(self.setup.escs[0], 0)
-        yield from samples_of_bytes(esc, self._found(esc), self._sections(chosen))
+        """A gateway runs from the first frame on; it knows no more than the telemetry."""
+        esc = EscTelemetry(self.setup.escs[0], 0)
+        status = GatewayStatus(GatewayState.RUNNING, esc_count=1)
+        columns = sections(self.fields, self._chosen(chosen), self.bus.escs)
+        maker = RowMaker(columns, [esc], status, 0)
+        due = 0
+        for now, _, reading in self._found(esc):
+            if reading is None:
+                continue
+            while due < now and (due := esc.next_deadline()) < now:
+                maker.on_event(0, esc.advance(due), due)
+            events = esc.accept(reading, now, now)
+            if events & Event.LINK:
+                status.escs_ok = int(esc.up)
+                due = 0
+            maker.on_event(0, events, now)
+            yield from maker.take_rows()
+        yield from maker.finish()
 
     def chunks(self) -> Iterator[tuple[int, bytes]]:
         """The bytes up to each frame's end, at its time: a live frame each period, an info frame half a period after it."""
-        for time_ns, data, _ in self._found(FoundTelemetry(self.setup.escs[0], 0)):
+        for time_ns, data, _ in self._found(EscTelemetry(self.setup.escs[0], 0)):
             if data:
                 yield time_ns, data
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         if esc:
             raise UserError(f"{self.name}: holds the bytes of one ESC")
-        yield from self._read()
-
-    def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
-        return None
-
-    def _read(self) -> Iterator[bytes]:
         self.position = 0
         try:
             with self._path.open("rb") as file:
@@ -84,13 +94,20 @@ class DumpInput(Input):
         except OSError as error:
             raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
 
-    def _found(self, esc: FoundTelemetry) -> Iterator[Found]:
-        """The frames that ``esc`` finds. It is given the bytes up to the next header with each, so that its counters are of that time."""
+    def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
+        return None
+
+    def _found(self, esc: EscTelemetry) -> Iterator[tuple[int, bytes, Reading | None]]:
+        """Bytes up to the end of a frame, its time, and the frame; without a frame at the time of the one before.
+
+        The decoder of ``esc`` finds them. It is given the bytes up to the next header with each, so that its counters are of that time.
+        """
         self.damage = []
+        decoder = esc.decoder
         waiting, at, now, lives = bytearray(), 0, 0, 0
         for piece in chain(self._pieces(), (b"",)):
             waiting += piece
-            for frame in esc.find(piece):
+            for frame in decoder.feed(piece) if piece else decoder.flush():
                 if not frame.form.is_info:
                     now = lives * self._period_ns
                     lives += 1
@@ -107,12 +124,18 @@ class DumpInput(Input):
                 del waiting[:gone]
                 at += gone
         yield now, bytes(waiting), None
-        self._count(esc.counters)
+        counters = decoder.counters
+        if counters.dropped_bytes:
+            self.damage.append(
+                f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
+            )
+        if not counters.live:
+            self.damage.append(counters.diagnosis() or "no live frame")
 
     def _pieces(self) -> Iterator[bytes]:
         """The bytes of the file, each header at the beginning of a piece."""
         rest = b""
-        for data in self._read():
+        for data in self.esc_bytes(0):
             first, *others = (rest + data).split(UART_MAGIC)
             pieces = [first, *(UART_MAGIC + other for other in others)]
             rest = pieces[-1][-_UNDECIDED:]
@@ -120,11 +143,3 @@ class DumpInput(Input):
             yield from filter(None, pieces)
         if rest:
             yield rest
-
-    def _count(self, counters: Counters) -> None:
-        if counters.dropped_bytes:
-            self.damage.append(
-                f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
-            )
-        if not counters.live:
-            self.damage.append(counters.diagnosis() or "no live frame")

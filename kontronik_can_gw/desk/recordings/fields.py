@@ -56,10 +56,9 @@ def field_of_signal(column: Column) -> Field:
         kind = Kind.TEXT
     elif column.is_flag:
         kind = Kind.FLAG
-    name, unit, message = column.name, column.unit, column.message
     return Field(
-        *(name, unit, kind, message, column.texts, column.source, column.esc),
-        signal=name,
+        *(column.name, column.unit, kind, column.message, column.texts, column.source, column.esc),
+        signal=column.name,
         high=column.high,
     )
 
@@ -71,14 +70,13 @@ def distinct(fields: Sequence[Field]) -> list[Field]:
     """
     counts = Counter(one.name for one in fields)
     within = Counter((one.message, one.name) for one in fields)
-    return [
-        replace(one, name=f"{one.message}.{one.signal or one.name}")
-        if within[one.message, one.name] > 1
-        else replace(one, name=f"{one.message}.{one.name}")
-        if counts[one.name] > 1 or one.name in _OWN
-        else one
-        for one in fields
-    ]
+
+    def name_of(one: Field) -> str:
+        if within[one.message, one.name] > 1:
+            return f"{one.message}.{one.signal or one.name}"
+        return f"{one.message}.{one.name}" if counts[one.name] > 1 or one.name in _OWN else one.name
+
+    return [replace(one, name=name_of(one)) for one in fields]
 
 
 def frame_fields(names: Collection[tuple[str, str]]) -> tuple[Field, Field]:
@@ -90,8 +88,8 @@ def frame_fields(names: Collection[tuple[str, str]]) -> tuple[Field, Field]:
 
 def column_of(fields: Sequence[Field], source: str, esc: int | None) -> int | None:
     """Index of the first field with a value of values.py; None where there is none."""
-    found = (i for i, one in enumerate(fields) if one.source == source and one.esc == esc)
-    return next(found, None)
+    places = (i for i, one in enumerate(fields) if (one.source, one.esc) == (source, esc))
+    return next(places, None)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ A capture (.kcap) goes through the gateway's core with the recorded clock. Plain
 come at a fixed rate. CAN logs are frames already. ``open_input`` finds out what a file is by its content.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -11,13 +12,8 @@ from pathlib import Path
 from kontronik_can_gw.capture.format import MAGIC, SUFFIX
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.recordings.can_logs import (
-    NAMES,
-    SUFFIXES,
-    UART_MAGIC,
-    CanLog,
-    log_format,
-)
+from kontronik_can_gw.desk.recordings.can_logs import NAMES, SUFFIXES, UART_MAGIC, CanLog
+from kontronik_can_gw.desk.recordings.can_logs.log import log_format
 from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
 from kontronik_can_gw.desk.recordings.dump_input import LIVE_RATE, DumpInput
 from kontronik_can_gw.desk.recordings.fields import Field
@@ -80,11 +76,8 @@ def _parts(path: Path) -> list[Path] | None:
         if not found:
             raise UserError(f"{path}: has no captures (*{SUFFIX})")
     elif not path.exists():
-        found = (
-            sorted(p for p in path.parent.glob(f"*{SUFFIX}") if p.name.startswith(path.name))
-            if path.name
-            else []
-        )
+        every = path.parent.glob(f"*{SUFFIX}") if path.name else ()
+        found = sorted(part for part in every if part.name.startswith(path.name))
         if not found:
             raise RunError(f"{path}: there is no such file.")
     else:
@@ -112,21 +105,21 @@ class CanLogInput(Input):
         self._log = CanLog(self._path)
         ours = self.reader.keys
         seen: set[int] = set()
-        others: dict[int, int] = {}
+        others: Counter[int] = Counter()
         self.others = 0
         self.notes = []
-        for time_ns, frame, received in self._log.frames():
+        for item in self._log.frames():
             self.position = self._log.position
-            key = frame.key
+            key = item.frame.key
             if key in ours:
                 seen.add(key)
             else:
                 self.others += 1
                 if key in others or len(others) < _MAX_IDS:
-                    others[key] = others.get(key, 0) + 1
-            yield TimedFrame(time_ns, frame, received)
+                    others[key] += 1
+            yield item
         self.position = self.size
-        self.damage = list(self._log.damage)
+        self.damage = self._log.damage
         if note := more_escs(self.bus, seen, others):
             self.notes.append(note)
 
@@ -135,15 +128,12 @@ class CanLogInput(Input):
         return fields_of_log(self.reader, self.bus.escs)
 
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        columns = range(len(self.fields)) if chosen is None else chosen
-        yield from samples_of_frames(self.frames(), self.reader, columns)
+        yield from samples_of_frames(self.frames(), self.reader, self._chosen(chosen))
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")
 
     def wall_ns(self, time_ns: int) -> int | None:
-        if self._log.wall:
-            return time_ns
         start = self._log.wall_start_ns
         return None if start is None else start + time_ns
 

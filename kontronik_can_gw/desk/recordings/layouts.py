@@ -67,26 +67,19 @@ def _made(database: "Database", node: str, file: str, known: Sequence[EscSetting
 
 def esc_names(database: "Database", node: str) -> list[str]:
     """What stands in front of sources' names in the signals of ours, in the order of the messages; empty for a DBC of one ESC."""
-    known = {
-        normalize(name): source
-        for name, source in VALUES.items()
-        if source.group is not Group.GATEWAY
-    }
-    of_gateway = {
-        normalize(name) for name, source in VALUES.items() if source.group is Group.GATEWAY
-    }
+    groups = {normalize(name): value.group for name, value in VALUES.items()}
+    known = [name for name, group in groups.items() if group is not Group.GATEWAY]
     counts: dict[str, int] = {}
     for message in database.messages:
         if node not in message.senders:
             continue
         for signal in message.signals:
             key = normalize(signal.name).removesuffix("percent")
-            if key in known or key in of_gateway:
+            if key in groups:
                 continue
             ending = max((name for name in known if key.endswith(name)), key=len, default="")
-            prefix = signal.name[: len(signal.name.removesuffix("Percent")) - len(ending)].rstrip(
-                "_"
-            )
+            name = signal.name.removesuffix("Percent")
+            prefix = name[: len(name) - len(ending)].rstrip("_")
             if ending and prefix:
                 counts[prefix] = counts.get(prefix, 0) + 1
     return [name for name, count in counts.items() if count > 1]

@@ -13,26 +13,18 @@ class Marker:
     def __init__(self, layout: Layout) -> None:
         self._changes: dict[int, tuple[int, int, int, int | None, int]] = {}
         for plan in layout.messages:
+            crc = next((s.pieces[0].at // 8 for s in plan.signals if s.role is Role.CRC), None)
             for signal in plan.signals:
-                if (
-                    signal.source is None
-                    or signal.source.name != "gateway_state"
-                    or signal.page is not None
-                ):
+                source = None if signal.source is None else signal.source.name
+                if source != "gateway_state" or signal.page is not None:
                     continue
                 raw = int(GatewayState.REPLAY)
                 if signal.numbers is not None:
                     raw = signal.numbers.get(raw, signal.error)
-                crc = next((s.pieces[0].at // 8 for s in plan.signals if s.role is Role.CRC), None)
-                key = plan.can_id | (EXTENDED if plan.extended else 0)
                 mask = place(signal.pieces, (1 << signal.length) - 1)
-                self._changes[key] = (
-                    plan.length,
-                    mask,
-                    place(signal.pieces, raw),
-                    crc,
-                    plan.data_id,
-                )
+                key = plan.can_id | (EXTENDED if plan.extended else 0)
+                bits = place(signal.pieces, raw)
+                self._changes[key] = (plan.length, mask, bits, crc, plan.data_id)
 
     @property
     def can_mark(self) -> bool:

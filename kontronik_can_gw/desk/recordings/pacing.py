@@ -32,10 +32,8 @@ class Pace:
 
     def wait(self, time_ns: int) -> bool:
         """Pause until a recorded time is due; the first call sets what time it is now. False: stopped."""
-        if self.stopped:
-            return False
-        if self.speed is None:
-            return True
+        if self.stopped or self.speed is None:
+            return not self.stopped
         now = self._clock()
         if self._origin is None:
             self._origin = (now, time_ns)

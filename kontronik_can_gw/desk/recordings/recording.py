@@ -3,11 +3,10 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Self
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.columns import Section, fields_of_values, sections
+from kontronik_can_gw.desk.recordings.columns import fields_of_values
 from kontronik_can_gw.desk.recordings.fields import Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.samples import Sample
@@ -23,9 +22,6 @@ class Input(ABC):
     it was read) have a line each and are complete when it was read to the end.
     """
 
-    last_path: Path | None = None
-    """Of captures: the last part."""
-
     def __init__(self, name: str, bus: BusLayout, size: int) -> None:
         self.name = name
         self.bus = bus
@@ -37,6 +33,11 @@ class Input(ABC):
         self.notes: list[str] = []
         self.times_assumed = False
         """True where the recording has no times."""
+
+    @property
+    def channel(self) -> str:
+        """The CAN channel that was sent on, where it is known."""
+        return "can0"
 
     @cached_property
     def reader(self) -> SignalReader:
@@ -73,6 +74,5 @@ class Input(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _sections(self, chosen: Sequence[int] | None) -> list[Section]:
-        found = range(len(self.fields)) if chosen is None else chosen
-        return sections(self.fields, found, self.bus.escs)
+    def _chosen(self, chosen: Sequence[int] | None) -> Sequence[int]:
+        return range(len(self.fields)) if chosen is None else chosen

@@ -12,16 +12,16 @@ from typing import NamedTuple
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.recordings.columns import Section, Values
+from kontronik_can_gw.desk.recordings.columns import Read, Section, Values
 from kontronik_can_gw.desk.recordings.fields import Field, Kind, distinct, field_of_signal
-from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.telemetry import MS, EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
-from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
+from kontronik_can_gw.gateway_status import GatewayStatus
 from kontronik_can_gw.output import Output
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import Column, Part, SignalReader, Value
 
+Pick = Callable[[Sequence[Value]], Values]
 SAME_ROW_NS = 5 * MS
 GATEWAY_NS = 100 * MS
 """The gateway's own values are read so often."""
@@ -63,21 +63,19 @@ class RowMaker(Output):
         self._last_ns = 0
         self._in_row: set[int] = set()
         self._gateway_ns = now - GATEWAY_NS
-        listed = [(s.esc, s.group, index, s.read) for index, s in enumerate(sections)]
-        self._by_esc = [
-            [(index, read) for of, _, index, read in listed if of == esc]
-            for esc in range(len(escs))
+
+        def readers(esc: int | None, *but: Group) -> list[tuple[int, Read]]:
+            every = enumerate(sections)
+            return [(i, s.read) for i, s in every if s.esc == esc and s.group not in but]
+
+        self._by_esc = [readers(esc) for esc in range(len(escs))]
+        self._with_live = [readers(esc, Group.INFO) for esc in range(len(escs))]
+        self._of_gateway = readers(None)
+        self._ages = [
+            (s.esc, index, s.read)
+            for index, s in enumerate(sections)
+            if s.ages and s.esc is not None
         ]
-        self._with_live = [
-            [
-                (index, read)
-                for of, group, index, read in listed
-                if of == esc and group is not Group.INFO
-            ]
-            for esc in range(len(escs))
-        ]
-        self._of_gateway = [(index, read) for of, _, index, read in listed if of is None]
-        self._ages = [(s.esc, index, s.read) for index, s in enumerate(sections) if s.ages]
 
     def take_rows(self) -> Sequence[Sample]:
         """The rows that are complete."""
@@ -98,9 +96,7 @@ class RowMaker(Output):
         state, when, row_ns = self._escs[esc], now, self._row_ns
         if events & Event.LIVE and state.live is not None and state.live_ns is not None:
             when = min(now, state.live_ns)  # of its last byte on the wire
-        begun = self._last_ns if row_ns is None else row_ns
-        if when < begun:  # rows do not go back
-            when = begun
+        when = max(when, self._last_ns if row_ns is None else row_ns)  # rows do not go back
         if row_ns is not None:
             again = events & Event.LIVE and esc in self._in_row
             if again or when - row_ns > SAME_ROW_NS:
@@ -110,7 +106,7 @@ class RowMaker(Output):
         for index, read in changed[esc]:
             parts[index] = read(state, when)
         for of, index, read in self._ages:
-            if of is not None and of != esc:
+            if of != esc:
                 parts[index] = read(self._escs[of], when)
         if when - self._gateway_ns >= GATEWAY_NS or events & Event.LINK:
             self._gateway_ns = when
@@ -129,42 +125,6 @@ class RowMaker(Output):
             self._in_row.clear()
 
 
-class FoundTelemetry(EscTelemetry):
-    """Telemetry of bytes whose times are only known when their frames are found."""
-
-    def find(self, data: bytes) -> Sequence[Reading]:
-        """The readings of the next bytes; of none, what is left."""
-        return self.decoder.feed(data) if data else self.decoder.flush()
-
-    def take(self, reading: Reading, now: int) -> int:
-        """A reading that came at a time; its events."""
-        return self.accept(reading, now, now)
-
-
-def samples_of_bytes(
-    esc: FoundTelemetry,
-    found: Iterable[tuple[int, bytes, Reading | None]],
-    sections: Sequence[Section],
-) -> Iterator[Sample]:
-    """The rows of one ESC's frames (time, bytes, frame); a gateway runs from the first one on."""
-    status = GatewayStatus(GatewayState.RUNNING, esc_count=1)
-    maker = RowMaker(sections, [esc], status, 0)
-    due = 0
-    for now, _, frame in found:
-        if frame is None:
-            continue
-        while due < now and (due := esc.next_deadline()) < now:
-            maker.on_event(0, esc.advance(due), due)
-        events = esc.take(frame, now)
-        if events & Event.LINK:
-            status.escs_ok = int(esc.up)
-            due = 0
-        maker.on_event(0, events, now)
-        if maker.rows:
-            yield from maker.take_rows()
-    yield from maker.finish()
-
-
 # --- from CAN frames
 
 
@@ -174,11 +134,10 @@ def fields_of_log(reader: SignalReader, escs: Sequence[EscSettings]) -> list[Fie
     for column in reader.columns:
         field = field_of_signal(column)
         prefix = "" if column.esc is None or len(escs) == 1 else f"{escs[column.esc].name}."
-        field = replace(field, name=prefix + column.source)
         unit, slope, shift = _to_value(column)
         if (slope, shift) != (1, 0):
             field = replace(field, kind=Kind.FLOAT, high=(field.high - shift) / slope)
-        found.append(replace(field, unit=unit))
+        found.append(replace(field, name=prefix + column.source, unit=unit))
     return distinct(found)
 
 
@@ -189,32 +148,23 @@ def _to_value(column: Column) -> tuple[str, float, float]:
     return (column.unit, 1, 0) if factors is None else (unit, float(factors[0]), float(factors[1]))
 
 
-def _brought(column: Column) -> Callable[[Value], Value] | None:
-    """From the signal to the value; None where both are the same."""
-    _, slope, shift = _to_value(column)
-    if (slope, shift) == (1, 0):
-        return None
-    return lambda value: (
-        round((value - shift) / slope, _DIGITS) if isinstance(value, (int, float)) else value
-    )
+def _picker(columns: Sequence[Column], first: int, chosen: Sequence[int]) -> Pick:
+    """What takes the chosen columns out of the values of their part of a message, which begins with the column ``first``."""
+    places = []
+    for index in chosen:
+        _, slope, shift = _to_value(columns[index])
+        places.append((index - first, slope, shift, (slope, shift) == (1, 0)))
 
+    def pick(values: Sequence[Value]) -> Values:
+        found = []
+        for place, slope, shift, is_same in places:
+            value = values[place]
+            if not is_same and isinstance(value, (int, float)):
+                value = round((value - shift) / slope, _DIGITS)
+            found.append(value)
+        return tuple(found)
 
-class _Run:
-    """Neighbouring columns of a table that come in one part of a message."""
-
-    def __init__(self, reader: SignalReader, columns: Sequence[int], part: Part) -> None:
-        self.nothing: Values = (None,) * len(columns)
-        self._places = [column - part.first for column in columns]
-        self._changes = [_brought(reader.columns[column]) for column in columns]
-        self._plain = not any(self._changes)
-
-    def of(self, values: Sequence[Value]) -> Values:
-        """The values of the columns out of those of the part."""
-        picked = [values[place] for place in self._places]
-        if not self._plain:
-            both = zip(picked, self._changes, strict=True)
-            picked = [value if change is None else change(value) for value, change in both]
-        return tuple(picked)
+    return pick
 
 
 def samples_of_frames(
@@ -222,14 +172,17 @@ def samples_of_frames(
 ) -> Iterator[Sample]:
     """Rows of CAN frames, as a listener has them: values hold while they are fresh."""
     view = View(reader)
-    part_of = [index for index, part in enumerate(reader.parts) for _ in range(part.count)]
-    runs: list[tuple[Part, _Run]] = []
-    for index, columns in groupby(chosen, lambda column: part_of[column]):
-        runs.append((reader.parts[index], _Run(reader, list(columns), reader.parts[index])))
+    part_of = [part for part in reader.parts for _ in range(part.count)]
+    runs: list[tuple[Part, Pick]] = []
     by_first: dict[int, list[int]] = {}
-    for at, (part, _) in enumerate(runs):
-        by_first.setdefault(part.first, []).append(at)
-    parts = [run.nothing for _, run in runs]
+    for part, neighbours in groupby(chosen, lambda column: part_of[column]):
+        by_first.setdefault(part.first, []).append(len(runs))
+        runs.append((part, _picker(reader.columns, part.first, list(neighbours))))
+
+    def parts_now() -> list[Values]:
+        return [pick(view.values[part.first : part.first + part.count]) for part, pick in runs]
+
+    parts = parts_now()
     row_ns: int | None = None
     in_row: set[int] = set()
     last = 0
@@ -246,14 +199,14 @@ def samples_of_frames(
             if view.expire(due + 1):
                 row_ns = None
                 in_row.clear()
-                parts = [run.of(view.values[p.first : p.first + p.count]) for p, run in runs]
+                parts = parts_now()
                 yield Sample(due + 1, tuple(parts))
         chunks = view.take(key, frame.data, time_ns)
         if chunks is None:
             continue
         for first, new in chunks:
             for at in by_first.get(first, ()):
-                parts[at] = runs[at][1].of(new)
+                parts[at] = runs[at][1](new)
         in_row.add(key)
         if row_ns is None:
             row_ns = time_ns

@@ -57,11 +57,8 @@ def spooled(path: Path, reached: Callable[[int], None] | None = None) -> Path:
                 count += len(data)
                 if reached is not None:
                     reached(count)
-    except BaseException as error:
-        file.close()
-        if isinstance(error, OSError):
-            raise RunError(f"{shown}: cannot be read: {error.strerror}.") from None
-        raise
+    except OSError as error:
+        raise RunError(f"{shown}: cannot be read: {error.strerror}.") from None
     made = SpooledPath(f"/proc/self/fd/{file.fileno()}")
     made.shown, made.kept = shown, file
     return made
@@ -69,15 +66,15 @@ def spooled(path: Path, reached: Callable[[int], None] | None = None) -> Path:
 
 def _opened(path: Path, shown: str) -> int:
     """A file descriptor. A device is not opened: it might be the port of an ESC."""
-    about = os.fstat(0) if str(path) == STREAM else path.stat()
-    is_pipe = (
-        stat.S_ISFIFO(about.st_mode) or stat.S_ISREG(about.st_mode) or stat.S_ISSOCK(about.st_mode)
-    )
+    is_input = str(path) == STREAM
+    about = os.fstat(0) if is_input else path.stat()
+    kinds = (stat.S_ISFIFO, stat.S_ISREG, stat.S_ISSOCK)
+    is_pipe = any(is_kind(about.st_mode) for is_kind in kinds)
     if not is_pipe and about.st_rdev != Path(os.devnull).stat().st_rdev:
         raise UserError(
             f"{shown}: is a terminal or another device. Give a file, or a pipe that brings a recording."
         )
-    return 0 if str(path) == STREAM else os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    return 0 if is_input else os.open(path, os.O_RDONLY | os.O_CLOEXEC)
 
 
 def _write(file: IO[bytes], data: bytes) -> None:

@@ -1,13 +1,6 @@
 """Logs of CAN frames as the tools of this field write and read them: candump, Vector ASC and BLF, PEAK TRC, MF4 bus logging."""
 
-from kontronik_can_gw.desk.recordings.can_logs.log import (
-    FORMATS,
-    NAMES,
-    SUFFIXES,
-    UART_MAGIC,
-    CanLog,
-    log_format,
-)
+from kontronik_can_gw.desk.recordings.can_logs.log import NAMES, SUFFIXES, UART_MAGIC, CanLog
 from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
 
-__all__ = ["FORMATS", "NAMES", "SUFFIXES", "UART_MAGIC", "CanLog", "CanLogWriter", "log_format"]
+__all__ = ["NAMES", "SUFFIXES", "UART_MAGIC", "CanLog", "CanLogWriter"]

@@ -11,11 +11,11 @@ import zlib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, BinaryIO
 
+from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs.record import (
     OLDEST_WALL_S,
     SECOND_NS,
     Damage,
-    LogFrame,
     is_possible,
 )
 from kontronik_can_gw.frames import CanFrame
@@ -31,7 +31,6 @@ _CONTAINER = struct.Struct("<H6xL4x")
 """Compression (0 none, 2 zlib), size uncompressed."""
 _NOT_COMPRESSED, _ZLIB = 0, 2
 _LOG_CONTAINER = 10
-_ERROR_FRAMES = (2, 73)
 _MIN_SIZES = {1: 16, 86: 16, 100: 84, 101: 40}
 """Bytes after the headers that python-can reads of CAN_MESSAGE, CAN_MESSAGE2, CAN_FD_MESSAGE and CAN_FD_MESSAGE_64."""
 _CLASSIC = (1, 86)
@@ -68,7 +67,7 @@ class BlfReader:
         self._end = file.seek(0, io.SEEK_END)
         file.seek(0)
 
-    def __iter__(self) -> Iterator[LogFrame]:
+    def __iter__(self) -> Iterator[TimedFrame]:
         tail = b""
         follows = self._first
         for offset, end, content in self._containers():
@@ -106,33 +105,35 @@ class BlfReader:
     def _container(self, position: int) -> tuple[bytes, int] | None:
         """The content of the container at ``position``, and where it ends; None where it cannot be read."""
         self._file.seek(position)
-        head = self._file.read(_BASE.size)
-        if len(head) < _BASE.size:
+        head = self._file.read(_BASE.size + _CONTAINER.size)
+        if len(head) < _BASE.size + _CONTAINER.size:
             return None
-        signature, _, _, size, kind = _BASE.unpack(head)
+        signature, _, _, size, kind = _BASE.unpack_from(head)
+        method, full = _CONTAINER.unpack_from(head, _BASE.size)
         if signature != _SIGNATURE or not _BASE.size <= size <= _LARGEST_CONTAINER:
             return None
         after = min(position + size, self._end)
-        body = self._file.read(after - position - _BASE.size)
         is_cut = position + size > self._end
         if kind != _LOG_CONTAINER:
-            if is_cut or kind > _LAST_KIND:
+            return None if is_cut or kind > _LAST_KIND else (b"", after)
+        content = self._file.read(max(0, after - position - len(head)))
+        if method == _ZLIB:
+            unpacker = zlib.decompressobj()
+            try:
+                content = unpacker.decompress(content, _LARGEST_CONTAINER)
+            except zlib.error:
                 return None
-            # an object that is in no container is read as one that is
-            return (head + body if kind in _MIN_SIZES else b""), after
-        if len(body) < _CONTAINER.size:
+            # where its length is wrong, what follows is not lost
+            after -= len(unpacker.unused_data)
+            is_cut = is_cut and not unpacker.eof
+            if not unpacker.eof and not is_cut:
+                return None
+        elif method != _NOT_COMPRESSED or (is_cut and _SIGNATURE not in content):
             return None
-        method, full = _CONTAINER.unpack_from(body)
-        content, unused = _unpacked(method, body[_CONTAINER.size :], is_cut)
-        if content is None:
-            return None
-        if unused is None:
+        if is_cut:
             self._damage.notes.append(
                 f"the last container, at offset {position}, is cut off: {len(content)} of its {full} bytes are there"
             )
-        elif unused >= _PADDING:
-            after -= unused  # its length is wrong, what follows is not lost
-            self._damage.notes.append(f"the length of the container at offset {position} is wrong")
         return content, after
 
     def _next_signature(self, start: int) -> int:
@@ -153,15 +154,13 @@ class BlfReader:
         objects: list[bytes] = []
         position, end = 0, len(data)
         while True:
-            found = data.find(_SIGNATURE, position, position + _PADDING)
-            if found < 0:
-                if from_start and position + _PADDING > end:
+            found = data.find(_SIGNATURE, position)
+            if from_start and not 0 <= found - position < _PADDING:
+                if position + _PADDING > end:
                     return objects, min(position, end)
-                if from_start:
-                    self._damaged(offset)
-                found = data.find(_SIGNATURE, position)
-                if found < 0:
-                    return objects, end
+                self._damaged(offset)
+            if found < 0:
+                return objects, end
             from_start = True
             if found + _BASE.size > end:
                 return objects, found
@@ -169,24 +168,27 @@ class BlfReader:
             after = found + size
             following = data.find(_SIGNATURE, found + len(_SIGNATURE))
             if following < 0:
+                if after > end and size <= _LARGEST_OBJECT:
+                    return objects, found  # it goes on in the next container
                 following = end
-            if after > end and following == end and size <= _LARGEST_OBJECT:
-                return objects, found  # it goes on in the next container
             least = _HEADER_SIZES.get(version, size + 1) + _MIN_SIZES.get(kind, 0)
-            if size < least or kind > _LAST_KIND or not _fits(data, after, following):
+            # "LOBJ" may stand in an object's data: then the length decides
+            is_followed = after <= following < after + _PADDING or following == end
+            if (
+                size < least
+                or kind > _LAST_KIND
+                or not (is_followed or data.startswith(_SIGNATURE, after))
+            ):
                 self._damaged(offset)
-                position = following
-                continue
-            if kind in _MIN_SIZES:
+                after = following
+            elif kind in _MIN_SIZES:
                 if _has_impossible_bits(data, found + _HEADER_SIZES[version], kind):
                     self._damaged(offset)
                 else:
                     objects.append(data[found:after])
-            elif kind in _ERROR_FRAMES:
-                self._damage.skip("error frames")
             position = after
 
-    def _frames(self, objects: list[bytes], offset: int) -> Iterator[LogFrame]:
+    def _frames(self, objects: list[bytes], offset: int) -> Iterator[TimedFrame]:
         """The frames of objects of the container at ``offset``, by python-can."""
         content = b"".join(objects)
         size = _BASE.size + _CONTAINER.size + len(content)
@@ -194,19 +196,13 @@ class BlfReader:
         container = head + _CONTAINER.pack(_NOT_COMPRESSED, len(content)) + content
         for message in _library_reader(_EMPTY_FILE + container):
             can_id, extended, fd = message.arbitration_id, message.is_extended_id, message.is_fd
-            channel = message.channel
-            assert isinstance(channel, int)
             if message.is_remote_frame:
-                self._damage.skip("remote frames")
-            elif not is_possible(can_id, extended, len(message.data), fd):
+                continue
+            if not is_possible(can_id, extended, len(message.data), fd):
                 self._damaged(offset)
-            else:
-                yield LogFrame(
-                    round(message.timestamp * SECOND_NS),
-                    CanFrame(can_id, bytes(message.data), extended, fd),
-                    message.is_rx,
-                    str(channel + 1),
-                )
+                continue
+            frame = CanFrame(can_id, bytes(message.data), extended, fd)
+            yield TimedFrame(round(message.timestamp * SECOND_NS), frame, message.is_rx)
 
     def _damaged(self, offset: int) -> None:
         note = f"frames are damaged in the container at offset {offset}"
@@ -220,35 +216,7 @@ def _library_reader(content: bytes) -> "BLFReader":
     return BLFReader(io.BytesIO(content))
 
 
-def _unpacked(method: int, packed: bytes, is_cut: bool) -> tuple[bytes | None, int | None]:
-    """A container's content, None where it cannot be read, and how many bytes after it are not its own, None where it is cut off."""
-    if method == _NOT_COMPRESSED:
-        if is_cut:
-            return (packed if _SIGNATURE in packed else None), None
-        return packed, 0
-    if method != _ZLIB:
-        return None, 0
-    unpacker = zlib.decompressobj()
-    try:
-        content = unpacker.decompress(packed, _LARGEST_CONTAINER)
-    except zlib.error:
-        return None, 0
-    if unpacker.eof:
-        return content, len(unpacker.unused_data)
-    return (content if is_cut else None), None
-
-
 def _has_impossible_bits(data: bytes, at: int, kind: int) -> bool:
     """True where a frame's id or DLC has bits that none has, which python-can leaves out."""
     can_id = int.from_bytes(data[at + 4 : at + 8], "little")
     return bool(can_id & _NO_ID) or (kind in _CLASSIC and data[at + 3] > _MAX_DLC)
-
-
-def _fits(data: bytes, after: int, following: int) -> bool:
-    """True where an object that ends at ``after`` is followed by the next one, or by the end."""
-    # "LOBJ" may stand in an object's data: then the length decides
-    return (
-        after <= following < after + _PADDING
-        or data.startswith(_SIGNATURE, after)
-        or following == len(data)
-    )

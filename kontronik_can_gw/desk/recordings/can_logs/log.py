@@ -4,25 +4,26 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Self
 
+from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs.blf import BlfReader
-from kontronik_can_gw.desk.recordings.can_logs.record import SECOND_NS, Damage, LogFrame, Reader
+from kontronik_can_gw.desk.recordings.can_logs.record import SECOND_NS, Damage, Reader
 from kontronik_can_gw.desk.recordings.can_logs.text import (
     ASC_HEAD,
-    ASC_LINE,
+    ASC_LINES,
     CANDUMP_LINE,
     CANDUMP_SCREEN_LINE,
     LONGEST_LINE,
+    TRC_HEAD,
+    TRC_LINE,
     AscReader,
     CandumpReader,
+    TrcReader,
 )
-from kontronik_can_gw.desk.recordings.can_logs.trc import TRC_HEAD, TRC_LINE, TrcReader
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.frames import CanFrame
 
 if TYPE_CHECKING:
     from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Reader
 
-FORMATS = ("candump", "asc", "blf", "trc", "mf4")
 SUFFIXES = {
     ".log": "candump",
     ".candump": "candump",
@@ -47,7 +48,7 @@ UART_MAGIC = b"KOD"
 """What a telemetry frame begins with."""
 _LOOKS = {
     "candump": (CANDUMP_LINE.fullmatch, CANDUMP_SCREEN_LINE.fullmatch),
-    "asc": (ASC_HEAD.match, ASC_LINE.match),
+    "asc": (ASC_HEAD.match, *(pattern.match for pattern in ASC_LINES)),
     "trc": (TRC_HEAD.match,),
 }
 """What finds a line of each text format; one of TRC alone could be another's."""
@@ -111,19 +112,16 @@ def _has_any(format_: str, content: bytes) -> bool:
 
 
 class CanLog:
-    """An open log. ``channel``: only frames of this interface (candump: ``can0``, else the number in the log, from 1); None: all.
+    """An open log.
 
     UserError where it is no log that is known, or a table; RunError where it cannot be opened, or is MF4 and asammdf is missing.
     """
 
     _mf4: "Mf4Reader | None" = None
 
-    def __init__(self, path: Path, channel: str | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self._channel = channel
         self._damage = Damage()
-        self.channels: dict[str, int] = {}
-        """Frames of each interface so far, those that ``channel`` leaves out too."""
         self.format = log_format(path) or ""
         if not self.format:
             raise UserError(f"{path}: is no CAN log that is known (candump, ASC, BLF, TRC, MF4).")
@@ -147,11 +145,6 @@ class CanLog:
         return self._reader.wall_start_ns
 
     @property
-    def wall(self) -> bool:
-        """True where the frames' times are Unix times."""
-        return self._reader.wall_start_ns == 0
-
-    @property
     def position(self) -> int:
         """Bytes read so far."""
         if self._mf4 is not None:
@@ -163,54 +156,34 @@ class CanLog:
         """One line for each kind of damage; complete after the frames."""
         return self._damage.texts()
 
-    @property
-    def foreign(self) -> dict[str, int]:
-        """Frames that are whole but no data frames: error frames, remote frames, other events of TRC."""
-        return self._damage.foreign
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames in the order of the log. RunError where the file cannot be read.
 
-    def frames(self) -> Iterator[tuple[int, CanFrame, bool]]:
-        """Time in ns, frame, whether it is marked as received; in the order of the log. RunError where the file cannot be read."""
-        channels, only = self.channels, self._channel
-        try:
-            for time_ns, frame, received, channel in self._plausible(iter(self._reader)):
-                channels[channel] = channels.get(channel, 0) + 1
-                if only is None or channel == only:
-                    yield time_ns, frame, received
-        except OSError as error:
-            raise RunError(f"{self.path}: cannot be read: {_reason(error)}.") from None
-
-    def _plausible(self, items: Iterator[LogFrame]) -> Iterator[LogFrame]:
-        """Without those whose time leads far away and back: a digit or a bit of it is damaged."""
-        last: int | None = None
-        doubtful: LogFrame | None = None
+        Left out is what has a time that leads far away and back: a digit or a bit of it is damaged.
+        """
+        last: TimedFrame | None = None
+        doubtful: TimedFrame | None = None
         wrong = 0
-        for item in items:
-            time_ns = item.time_ns
-            if last is not None and not -_BACK_NS <= time_ns - last <= _AHEAD_NS:
-                if (
-                    doubtful is not None
-                    and not -_BACK_NS <= time_ns - doubtful.time_ns <= _AHEAD_NS
-                ):
-                    wrong += 1
-                elif doubtful is not None:
+        try:
+            for item in self._reader:
+                if last is None or _follows(item, last):
+                    wrong += doubtful is not None
+                elif doubtful is not None and _follows(item, doubtful):
                     # two agree: the clock was set, or the first frame was the damaged one
                     yield doubtful
-                    yield item
-                    doubtful, last = None, time_ns
+                else:
+                    wrong += doubtful is not None
+                    doubtful = item
                     continue
-                doubtful = item
-                continue
-            if doubtful is not None:
-                wrong += 1
-                doubtful = None
-            last = time_ns
-            yield item
+                doubtful, last = None, item
+                yield item
+        except OSError as error:
+            raise RunError(f"{self.path}: cannot be read: {_reason(error)}.") from None
         if doubtful is not None:
             yield doubtful
         if wrong:
-            self._damage.notes.append(
-                f"{wrong} frame{'s' if wrong > 1 else ''} with an impossible time left out"
-            )
+            plural = "s" if wrong > 1 else ""
+            self._damage.notes.append(f"{wrong} frame{plural} with an impossible time left out")
 
     def close(self) -> None:
         """Close the file."""
@@ -223,6 +196,10 @@ class CanLog:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _follows(item: TimedFrame, last: TimedFrame) -> bool:
+    return -_BACK_NS <= item.time_ns - last.time_ns <= _AHEAD_NS
 
 
 def _reason(error: Exception) -> str:

@@ -10,12 +10,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs.record import (
     FD_LENGTHS,
     OLDEST_WALL_S,
     SECOND_NS,
     Damage,
-    LogFrame,
     is_possible,
 )
 from kontronik_can_gw.errors import RunError, UserError
@@ -26,7 +26,19 @@ if TYPE_CHECKING:
 
 _CHUNK = 8192
 _GROUP = "CAN_DataFrame"
-_ERRORS, _REMOTES = "CAN_ErrorFrame", "CAN_RemoteFrame"
+_BUS = {_GROUP, f"{_GROUP}.ID", "CAN_ErrorFrame", "CAN_RemoteFrame"}
+_COLUMNS = {
+    "BusChannel": "<u1",
+    "ID": "<u4",
+    "IDE": "<u1",
+    "DLC": "<u1",
+    "DataLength": "<u1",
+    "DataBytes": "(64,)u1",
+    "Dir": "<u1",
+    "EDL": "<u1",
+    "BRS": "<u1",
+    "ESI": "<u1",
+}
 
 
 def asammdf_module() -> "ModuleType":
@@ -53,47 +65,35 @@ class Mf4Reader:
         self.position = 0
         self.wall_start_ns: int | None = None
         self._mdf = _opened(module, path)
-        if not self._is_bus_log():
+        self._groups = [
+            (index, int(group.channel_group.cycles_nr), {one.name for one in group.channels})
+            for index, group in enumerate(self._mdf.groups)
+        ]
+        filled = [names for _, cycles, names in self._groups if cycles]
+        if filled and not any(_BUS & names for names in filled):
             self.close()
             raise UserError(
                 f"{path}: is a table of values (an MF4 measurement), no log of a CAN bus. Give the recording it was made of."
             )
-        start: datetime = self._mdf.header.start_time
-        stored = int(self._mdf.header.abs_time)
-        if start.timestamp() >= OLDEST_WALL_S:
+        start = self._mdf.header.start_time.timestamp()
+        if start >= OLDEST_WALL_S:
             # a file may say local time, which asammdf works out; the exact fraction of a second is in the number
-            self.wall_start_ns = _seconds(start, stored) * SECOND_NS + stored % SECOND_NS
+            fraction = int(self._mdf.header.abs_time) % SECOND_NS
+            self.wall_start_ns = round(start - fraction / SECOND_NS) * SECOND_NS + fraction
 
-    def _is_bus_log(self) -> bool:
-        """False where it holds values, but nothing of a bus."""
-        bus = (_GROUP, f"{_GROUP}.ID", _ERRORS, _REMOTES)
-        groups = [group for group in self._mdf.groups if int(group.channel_group.cycles_nr)]
-        return not groups or any(
-            channel.name in bus for group in groups for channel in group.channels
-        )
-
-    def __iter__(self) -> Iterator[LogFrame]:
-        groups = []
-        total = 0
-        for index, group in enumerate(self._mdf.groups):
-            names = {channel.name for channel in group.channels}
-            cycles = int(group.channel_group.cycles_nr)
-            if _GROUP in names or f"{_GROUP}.ID" in names:
-                groups.append(self._frames(index, cycles, names))
-                total += cycles
-            elif cycles and _ERRORS in names:
-                self._damage.skip("error frames", cycles)
-            elif cycles and _REMOTES in names:
-                self._damage.skip("remote frames", cycles)
+    def __iter__(self) -> Iterator[TimedFrame]:
+        groups = [group for group in self._groups if {_GROUP, f"{_GROUP}.ID"} & group[2]]
+        total = max(1, sum(cycles for _, cycles, _ in groups))
         if not groups:
             self._damage.notes.append("no CAN frames are logged in it (no group CAN_DataFrame)")
-        for done, item in enumerate(heapq.merge(*groups, key=lambda item: item.time_ns)):
+        merged = heapq.merge(*(self._frames(*one) for one in groups), key=lambda one: one.time_ns)
+        for done, item in enumerate(merged):
             if not done % 256:
-                self.position = self._size * done // max(total, 1)
+                self.position = self._size * done // total
             yield item
         self.position = self._size
 
-    def _frames(self, index: int, cycles: int, names: set[str]) -> Iterator[LogFrame]:
+    def _frames(self, index: int, cycles: int, names: set[str]) -> Iterator[TimedFrame]:
         notes = self._damage.notes
         for start in range(0, cycles, _CHUNK):
             count = min(_CHUNK, cycles - start)
@@ -105,24 +105,23 @@ class Mf4Reader:
                 notes.append(f"frames {which} are damaged: {_short(error)}")
                 continue
             bad = 0
-            for stamp, can_id, data, length, extended, fd, received, channel in rows:
+            for stamp, can_id, data, length, extended, fd, received in rows:
                 pure = can_id & 0x1FFFFFFF
                 if length > len(data) or not is_possible(pure, bool(extended), length, bool(fd)):
                     bad += 1
                     continue
                 frame = CanFrame(pure, data[:length], bool(extended), bool(fd))
-                yield LogFrame(stamp, frame, received, str(channel))
+                yield TimedFrame(stamp, frame, received)
             if bad:
                 notes.append(f"{bad} frames of {which} are damaged")
 
     def _rows(self, index: int, start: int, count: int, names: set[str]) -> Iterator[Any]:
-        """Time in ns, id, data, length, extended, FD, received and channel of some frames of a group; any error."""
+        """Time in ns, id, data, length, extended, FD and received of some frames of a group; any error."""
         import numpy as np
 
         columns: dict[str, Any] = {}
-        for part in ("ID", "DataBytes", "DataLength", "IDE", "Dir", "EDL", "BusChannel"):
-            name = f"{_GROUP}.{part}"
-            if name in names:
+        for part in ("ID", "DataBytes", "DataLength", "IDE", "Dir", "EDL"):
+            if (name := f"{_GROUP}.{part}") in names:
                 signal = self._mdf.get(name, group=index, record_offset=start, record_count=count)
                 columns[part] = signal.samples
                 times = signal.timestamps
@@ -147,7 +146,6 @@ class Mf4Reader:
             column("IDE", [can_id > 0x7FF for can_id in ids]),
             column("EDL", [length > 8 for length in lengths]),
             [value in (0, b"Rx", "Rx") for value in column("Dir", [None] * count)],
-            column("BusChannel", [1] * count),
             strict=False,
         )
 
@@ -157,46 +155,72 @@ class Mf4Reader:
             self._mdf.close()
 
 
-class Mf4Writer:
-    """Writes CAN frames as python-can's MF4Writer does, in chunks. ``start_ns``: Unix time of time 0; None: 1970."""
+class Mf4File:
+    """An MF4 file that is being written, by way of asammdf's temporary file in the target's folder.
 
-    def __init__(
-        self, path: Path, start_ns: int | None, provenance: Mapping[str, str] | None = None
-    ) -> None:
-        module = asammdf_module()
+    ``start_ns``: Unix time of time 0. ``provenance``: for the header, as it is known at the end. The file says nothing of the time of its
+    writing, so that it is the same each time.
+    """
+
+    def __init__(self, path: Path, start_ns: int, provenance: Mapping[str, str]) -> None:
+        self.module = asammdf_module()
+        self._path = path
+        self._start_ns = start_ns
+        self._provenance = provenance
+        with quiet():
+            self.mdf: Any = self.module.MDF(version="4.10", temporary_folder=str(path.parent))
+            moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=start_ns // 1000)
+            self.mdf.header.start_time = moment
+            self.mdf.header.abs_time = start_ns  # asammdf itself goes through a float
+
+    def extend(self, group: int, times_ns: list[int], columns: list[Any]) -> None:
+        """Add rows to a channel group: their times, which must not fall, and an array for each channel."""
         import numpy as np
 
-        self._path = path
-        self._provenance = provenance or {}
-        self._np = np
-        kinds = {
-            "BusChannel": "<u1",
-            "ID": "<u4",
-            "IDE": "<u1",
-            "DLC": "<u1",
-            "DataLength": "<u1",
-            "DataBytes": "(64,)u1",
-            "Dir": "<u1",
-            "EDL": "<u1",
-            "BRS": "<u1",
-            "ESI": "<u1",
-        }
-        self._dtype = np.dtype([(f"{_GROUP}.{name}", kind) for name, kind in kinds.items()])
-        self._rows: list[tuple[Any, ...]] = []
-        self._times: list[float] = []
-        self._last = 0
+        times = np.array(times_ns, dtype=np.int64) / SECOND_NS
         with quiet():
-            self._mdf: Any = module.MDF(version="4.10", temporary_folder=str(path.parent))
-            set_start(self._mdf, start_ns or 0)
+            self.mdf.extend(group, [(column, None) for column in (times, *columns)])
+
+    def save(self) -> None:
+        """Write the file and close it."""
+        beside = self._path.with_name(f"{self._path.name}.mf4")  # asammdf insists on its suffix
+        with quiet():
+            try:
+                if self._provenance:
+                    lines = (f"{key}: {value}" for key, value in self._provenance.items())
+                    self.mdf.header.comment = "\n".join(lines)
+                Path(self.mdf.save(beside, overwrite=True, compression=2)).replace(self._path)
+            finally:
+                self.mdf.close()
+                beside.unlink(missing_ok=True)
+        with self._path.open("r+b") as file:
+            _set_history_time(file, self._start_ns)
+
+    def discard(self) -> None:
+        """Close asammdf's temporary file."""
+        with quiet():
+            self.mdf.close()
+
+
+class Mf4Writer:
+    """Writes CAN frames as python-can's MF4Writer does, in chunks."""
+
+    def __init__(self, path: Path, start_ns: int, provenance: Mapping[str, str]) -> None:
+        import numpy as np
+
+        self._file = file = Mf4File(path, start_ns, provenance)
+        self._np = np
+        self._dtype = np.dtype([(f"{_GROUP}.{name}", kind) for name, kind in _COLUMNS.items()])
+        self._rows: list[tuple[Any, ...]] = []
+        self._times: list[int] = []
+        self._last = 0
+        self.discard = file.discard
+        with quiet():
             # a bus, CAN
-            source = module.blocks.v4_blocks.SourceInformation(source_type=2, bus_type=2)
-            self._mdf.append(
-                module.Signal(
-                    name=_GROUP,
-                    samples=np.array([], dtype=self._dtype),
-                    timestamps=np.array([], dtype="<f8"),
-                    source=source,
-                )
+            source = file.module.blocks.v4_blocks.SourceInformation(source_type=2, bus_type=2)
+            samples, times = np.array([], dtype=self._dtype), np.array([], dtype="<f8")
+            file.mdf.append(
+                file.module.Signal(name=_GROUP, samples=samples, timestamps=times, source=source)
             )
 
     def write(self, time_ns: int, frame: CanFrame, received: bool) -> None:
@@ -206,7 +230,7 @@ class Mf4Writer:
         dlc, data = FD_LENGTHS.index(size), frame.data.ljust(64, b"\0")
         extended, sent, fd = int(frame.extended), int(not received), int(frame.fd)
         self._rows.append((1, frame.can_id, extended, dlc, size, data, sent, fd, fd, 0))
-        self._times.append(self._last / SECOND_NS)
+        self._times.append(self._last)
         if len(self._rows) >= _CHUNK:
             self._flush()
 
@@ -215,27 +239,18 @@ class Mf4Writer:
         if not self._rows:
             return
         table = np.zeros(len(self._rows), dtype=self._dtype)
-        for name, column in zip(
-            self._dtype.names or (), zip(*self._rows, strict=True), strict=True
-        ):
-            if name.endswith("DataBytes"):
-                table[name] = np.frombuffer(b"".join(column), dtype=np.uint8).reshape(-1, 64)
-            else:
-                table[name] = column
-        with quiet():
-            self._mdf.extend(0, [(np.array(self._times), None), (table, None)])
+        for name, column in zip(_COLUMNS, zip(*self._rows, strict=True), strict=True):
+            if name == "DataBytes":
+                column = np.frombuffer(b"".join(column), dtype=np.uint8).reshape(-1, 64)
+            table[f"{_GROUP}.{name}"] = column
+        self._file.extend(0, self._times, [table])
         self._rows.clear()
         self._times.clear()
 
     def close(self) -> None:
         """Write the file."""
         self._flush()
-        save_mf4(self._mdf, self._path, self._provenance)
-
-    def discard(self) -> None:
-        """Close asammdf's temporary file."""
-        with quiet():
-            self._mdf.close()
+        self._file.save()
 
 
 def _opened(module: "ModuleType", path: Path) -> Any:
@@ -256,34 +271,6 @@ def _opened(module: "ModuleType", path: Path) -> Any:
         sys.unraisablehook = hook
 
 
-def set_start(mdf: Any, start_ns: int) -> None:
-    """Unix time in ns of the recording's start, as UTC. asammdf itself goes through a float, which is not exact."""
-    mdf.header.start_time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(
-        microseconds=start_ns // 1000
-    )
-    mdf.header.abs_time = start_ns
-
-
-def save_mf4(mdf: Any, path: Path, provenance: Mapping[str, str]) -> None:
-    """Save and close. ``provenance``: for the header, as it is known at the end.
-
-    The file says nothing of the time of its writing, so that it is the same each time."""
-    with quiet():
-        try:
-            if provenance:
-                mdf.header.comment = "\n".join(
-                    f"{key}: {value}" for key, value in provenance.items()
-                )
-            start = mdf.header.abs_time
-            beside = path.with_name(f"{path.name}.mf4")  # asammdf insists on its suffix
-            Path(mdf.save(beside, overwrite=True, compression=2)).replace(path)
-        finally:
-            mdf.close()
-            beside.unlink(missing_ok=True)
-    with path.open("r+b") as file:
-        _set_history_time(file, start)
-
-
 def _set_history_time(file: IO[bytes], time_ns: int) -> None:
     """Give the file's history (blocks FH) this time: the header HD at 64 has the link to the first at its second place."""
     file.seek(64 + 24 + 8)
@@ -294,11 +281,6 @@ def _set_history_time(file: IO[bytes], time_ns: int) -> None:
         file.seek(address + 40)
         file.write(time_ns.to_bytes(8, "little"))
         address = following
-
-
-def _seconds(moment: datetime, stored_ns: int) -> int:
-    """Whole seconds of a moment that asammdf may have rounded in its last digits."""
-    return round(moment.timestamp() - stored_ns % SECOND_NS / SECOND_NS)
 
 
 def _short(error: Exception) -> str:

@@ -42,42 +42,30 @@ class CanLogWriter:
         """Frames that the format does not know, by what they are."""
         self.write: Write
         """Add a frame: its time in ns, the frame, whether it was received."""
-        self._close: Callable[[], None] = _nothing
-        self._discard: Callable[[], None] = _nothing
-        if isinstance(file, Path):
-            self._mf4(file, wall_start_ns, first_ns, provenance)
-            return
-        if format_ == "candump":
-            self.write = _candump(file, wall_start_ns or 0, channel)
-            return
-        base_ns, start_ns = 0, None
+        self.close: Callable[[], object] = lambda: None
+        """Write what is held back, and the end. The file stays open."""
+        self.discard: Callable[[], object] = lambda: None
+        """Release what is held, where the log is not to be kept."""
+        base_ns = start_ns = 0
         if wall_start_ns is not None:
-            # Vector's and PEAK's headers count milliseconds
-            start_ns = (wall_start_ns + first_ns) // _MS * _MS
+            # Vector's and PEAK's headers count milliseconds, those of MF4 are read as microseconds
+            unit = 1000 if format_ == "mf4" else _MS
+            start_ns = (wall_start_ns + first_ns) // unit * unit
             base_ns = start_ns - wall_start_ns
-        if format_ == "asc":
-            self._asc(file, base_ns, start_ns)
+        if isinstance(file, Path):
+            from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Writer
+
+            mf4 = Mf4Writer(file, start_ns, provenance or {})
+            self.write = lambda at, frame, received: mf4.write(at - base_ns, frame, received)
+            self.close, self.discard = mf4.close, mf4.discard
+        elif format_ == "candump":
+            self.write = _candump(file, wall_start_ns or 0, channel)
+        elif format_ == "asc":
+            self._asc(file, base_ns, None if wall_start_ns is None else start_ns)
         elif format_ == "blf":
             self._blf(file, base_ns, start_ns)
         else:
             self._trc(file, base_ns, start_ns, name)
-
-    def _mf4(
-        self,
-        path: Path,
-        wall_start_ns: int | None,
-        first_ns: int,
-        provenance: Mapping[str, str] | None,
-    ) -> None:
-        from kontronik_can_gw.desk.recordings.can_logs.mf4 import Mf4Writer
-
-        start_ns, base_ns = None, 0
-        if wall_start_ns is not None:
-            start_ns = (wall_start_ns + first_ns) // 1000 * 1000
-            base_ns = start_ns - wall_start_ns
-        mf4 = Mf4Writer(path, start_ns, provenance)
-        self.write = lambda time_ns, frame, received: mf4.write(time_ns - base_ns, frame, received)
-        self._close, self._discard = mf4.close, mf4.discard
 
     def _asc(self, file: IO[bytes], base_ns: int, start_ns: int | None) -> None:
         with without_asammdf():
@@ -95,14 +83,10 @@ class CanLogWriter:
         head = f"date {stamp}\nbase hex  timestamps absolute\ninternal events logged\nBegin Triggerblock {stamp}\n"
         text.write(head + f"{0.0: 9.6f} Start of measurement\n")
         self.write = _through(writer.on_message_received, base_ns)
+        self.close = lambda: (text.write("End TriggerBlock\n"), text.detach())
+        self.discard = text.detach
 
-        def close() -> None:
-            text.write("End TriggerBlock\n")
-            text.detach()
-
-        self._close, self._discard = close, _detached(text)
-
-    def _blf(self, file: IO[bytes], base_ns: int, start_ns: int | None) -> None:
+    def _blf(self, file: IO[bytes], base_ns: int, start_ns: int) -> None:
         with without_asammdf():
             from can import BLFWriter
         writer = BLFWriter(file)  # type: ignore[arg-type]
@@ -112,15 +96,15 @@ class CanLogWriter:
 
         def close() -> None:
             last = writer.stop_timestamp or 0.0
-            start = 0.0 if start_ns is None else start_ns / SECOND_NS
-            writer.start_timestamp, writer.stop_timestamp = start, start + last
+            writer.start_timestamp = start_ns / SECOND_NS
+            writer.stop_timestamp = writer.start_timestamp + last
             held, writer.file = writer.file, _Unclosed(file)  # type: ignore[assignment]
             writer.stop()
             writer.file = held
 
-        self._close = close
+        self.close = close
 
-    def _trc(self, file: IO[bytes], base_ns: int, start_ns: int | None, name: str) -> None:
+    def _trc(self, file: IO[bytes], base_ns: int, start_ns: int, name: str) -> None:
         with without_asammdf():
             from can import TRCWriter
         text = io.TextIOWrapper(file, encoding="utf-8", newline="\r\n", write_through=True)
@@ -129,7 +113,7 @@ class CanLogWriter:
         writer.first_timestamp = 0.0
         writer.header_written = True
         writer.file = text
-        writer.write_header((start_ns or 0) // _MS / 1000)
+        writer.write_header(start_ns // _MS / 1000)
         plain = _through(writer.on_message_received, base_ns)
 
         def write(time_ns: int, frame: CanFrame, received: bool) -> None:
@@ -139,28 +123,7 @@ class CanLogWriter:
                 plain(time_ns, frame, received)
 
         self.write = write
-        self._close = self._discard = _detached(text)
-
-    def close(self) -> None:
-        """Write what is held back, and the end. The file stays open."""
-        self._close()
-
-    def discard(self) -> None:
-        """Release what is held, where the log is not to be kept."""
-        self._discard()
-
-
-def _nothing() -> None:
-    pass
-
-
-def _detached(text: io.TextIOWrapper) -> Callable[[], None]:
-    """A function that lets go of the file under a text, and leaves it open."""
-
-    def detach() -> None:
-        text.detach()
-
-    return detach
+        self.close = self.discard = text.detach
 
 
 def _through(take: "Callable[[Message], None]", base_ns: int, more_ns: float = 0.0) -> Write:

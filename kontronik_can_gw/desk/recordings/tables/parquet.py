@@ -15,6 +15,8 @@ from kontronik_can_gw.signals.unpacker import Value
 ROWS = 4096
 """Rows that gather as such."""
 _FIRST = 64
+"""Rows that tell whether neighbours are one object."""
+_FAR = 1 << 63
 GROUP = 1 << 16
 """Rows of a row group, whose columns stay in memory until it is full."""
 
@@ -89,8 +91,9 @@ class ParquetTable:
         times, walls, rows = zip(*self._rows, strict=True)
         arrays = [pa.array([time_ns / SECOND_NS for time_ns in times], pa.float64())]
         if self._table.has_utc:
-            in_range = [_in_range(wall_ns) for wall_ns in walls]
-            arrays.append(pa.array(in_range, pa.int64()).cast(pa.timestamp("ns", tz="UTC")))
+            # one out of range comes from a damaged clock
+            known = [wall if wall is not None and -_FAR <= wall < _FAR else None for wall in walls]
+            arrays.append(pa.array(known, pa.int64()).cast(pa.timestamp("ns", tz="UTC")))
         for part, values in zip(self._table.parts(), zip(*rows, strict=True), strict=True):
             arrays += self._columns(part, values)
         self._rows = []
@@ -102,11 +105,13 @@ class ParquetTable:
 
     def _columns(self, part: range, rows: Sequence[Values | None]) -> list[Any]:
         """The columns of one part of all rows. Rows that have one object in common are made once and repeated."""
-        once = rows if _differ(rows) else list({id(values): values for values in rows}.values())
+        first = rows[:_FIRST]
+        few_alike = len({id(values) for values in first}) * 2 > len(first)
+        once = rows if few_alike else list({id(values): values for values in rows}.values())
         nothing = (None,) * len(part)
         columns = zip(*(nothing if values is None else values for values in once), strict=True)
         arrays = [self._array(index, column) for index, column in zip(part, columns, strict=True)]
-        if once is rows:
+        if few_alike:
             return arrays
         places = {id(values): place for place, values in enumerate(once)}
         repeated = self._pa.array([places[id(values)] for values in rows], self._pa.int32())
@@ -131,13 +136,3 @@ class ParquetTable:
         if one.kind is Kind.TEXT:
             return pa.dictionary(pa.int32(), pa.string())
         return {Kind.FLAG: pa.int8(), Kind.WHOLE: pa.int64(), Kind.FLOAT: pa.float64()}[one.kind]
-
-
-def _differ(rows: Sequence[Values | None]) -> bool:
-    """True where few neighbours are one object, by the first rows."""
-    first = rows[:_FIRST]
-    return len({id(values) for values in first}) * 2 > len(first)
-
-
-def _in_range(wall_ns: int | None) -> int | None:
-    return wall_ns if wall_ns is not None and -(1 << 63) <= wall_ns < 1 << 63 else None

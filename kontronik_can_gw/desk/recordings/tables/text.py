@@ -9,7 +9,7 @@ from operator import getitem
 from typing import IO
 
 from kontronik_can_gw.desk.recordings.columns import Known, Values
-from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
+from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Table
 from kontronik_can_gw.desk.recordings.tables.rows import SECOND_NS, Row
 from kontronik_can_gw.signals.unpacker import Value
 
@@ -51,24 +51,19 @@ def csv_text(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text
 
 
-def _csv_cell(field: Field) -> Cell:
-    if field.kind is Kind.WHOLE:
-        return lambda value: "" if value is None else str(value)
+def _csv_cell(_: Field) -> Cell:
     return lambda value: csv_text(value) if isinstance(value, str) else _number(value, "")
 
 
 def _json_cell(field: Field) -> Cell:
     key = f"{json.dumps(field.name)}: "
-    if field.kind is Kind.WHOLE:
-        return lambda value: f"{key}null" if value is None else f"{key}{value}"
-    return lambda value: (
-        key
-        + (
-            json.dumps(value, ensure_ascii=False)
-            if isinstance(value, str)
-            else _number(value, "null")
-        )
-    )
+
+    def cell(value: Value) -> str:
+        if isinstance(value, str):
+            return key + json.dumps(value, ensure_ascii=False)
+        return key + _number(value, "null")
+
+    return cell
 
 
 def _number(value: float | None, nothing: str) -> str:
