@@ -15,7 +15,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable_json
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.desk.monitor.sources import Source
+    from kontronik_can_gw.desk.sources import Source
 
 _ONCE_S = 3.0
 EPILOG = """\
@@ -111,8 +111,8 @@ def _check_usage(args: argparse.Namespace) -> None:
 
 @contextmanager
 def _source_of(args: argparse.Namespace) -> "Iterator[Source]":
-    from kontronik_can_gw.desk.monitor.sources import Bus, Recording, can_config
     from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
+    from kontronik_can_gw.desk.sources import Bus, Recording, can_config
 
     is_given = args.config is not None or args.dbc is not None
     if args.file is None:

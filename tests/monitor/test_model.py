@@ -114,7 +114,7 @@ def test_nothing_old_is_shown_when_frames_stay_away() -> None:
     monitor.advance(7 * SECOND_NS)
     esc = monitor.escs[0]
     assert all(esc.value(source) is None for source in esc.units)
-    assert (esc.state, esc.link, esc.device, esc.active) == (None, None, "", [])
+    assert (esc.state, esc.link, esc.device_text, esc.active) == (None, None, "", [])
     assert (monitor.gateway_state, monitor.can_state) == (None, None)
     assert monitor.silent_ns >= 5 * SECOND_NS
     assert esc.tracks["battery_voltage"].high is not None, "extremes stay"

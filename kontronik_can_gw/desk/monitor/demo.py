@@ -13,8 +13,8 @@ from kontronik_can_gw.canopen import cob_ids, nmt
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk import pty
-from kontronik_can_gw.desk.monitor.sources import Bus, Take
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.sources import Bus, Take
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,

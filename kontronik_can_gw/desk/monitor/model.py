@@ -4,12 +4,12 @@ from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.monitor.esc_monitor import EscMonitor, state_name
+from kontronik_can_gw.desk.member import Member
+from kontronik_can_gw.desk.monitor.esc_monitor import EscMonitor
 from kontronik_can_gw.desk.monitor.quantities import HISTORY_S
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 SILENCE_NS = 5 * SECOND
@@ -22,6 +22,7 @@ class Monitor:
     def __init__(self, bus: BusLayout) -> None:
         self.bus = bus
         self.view = View(SignalReader(bus.layout))
+        self.gateway = Member(self.view, None, None)
         self.escs = tuple(
             EscMonitor(settings, index, self.view) for index, settings in enumerate(bus.escs)
         )
@@ -110,12 +111,12 @@ class Monitor:
     @property
     def gateway_state(self) -> str | None:
         """Name of the gateway's state; None where it is not available."""
-        return state_name(GatewayState, self.view.value("gateway_state"))
+        return self.gateway.text("gateway_state")
 
     @property
     def can_state(self) -> str | None:
         """Name of the state of the gateway's CAN controller; None where it is not available."""
-        return state_name(CanState, self.view.value("can_state"))
+        return self.gateway.text("can_state")
 
     @property
     def is_replay(self) -> bool:
@@ -124,7 +125,7 @@ class Monitor:
 
     def gateway_number(self, source: str) -> float | None:
         """A numeric value of the gateway itself, as ``esc_count``."""
-        value = self.view.value(source)
+        value = self.gateway.value(source)
         return value if isinstance(value, (int, float)) else None
 
     def document(self) -> dict[str, Any]:
