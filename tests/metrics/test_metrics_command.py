@@ -6,9 +6,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from http.client import HTTPConnection, HTTPException
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -64,14 +63,6 @@ def ask(
         connection.close()
 
 
-def is_answered(port: int) -> bool:
-    """False where the server turns the client away."""
-    try:
-        return ask(port)[0] == 200
-    except (OSError, HTTPException):
-        return False
-
-
 def test_metrics_are_fetched_as_prometheus_does(server: MetricsServer) -> None:
     for accept in ("*/*", "application/openmetrics-text;version=1.0.0", "a/b;version=x;;=,"):
         status, kind, text = ask(server.port, Accept=accept)
@@ -87,7 +78,7 @@ def test_what_the_gateway_replaces_is_read_anew(
 ) -> None:
     file.unlink()
     status, _, text = ask(server.port)
-    assert (status, text) == (503, f"{file}: there is no such file: the gateway does not run\n")
+    assert (status, text.startswith(f"{file}: not running: there is no such file.")) == (503, True)
     file.write_text(json.dumps(document | {"version": "9.9.9"}))
     assert 'kontronik_build_info{version="9.9.9"} 1.0' in ask(server.port)[2]
 
@@ -97,7 +88,7 @@ def test_what_the_gateway_replaces_is_read_anew(
     [
         (STALE_NS, ""),
         (STALE_NS + 9 * SECOND, "does not answer since 12 s"),
-        (-STALE_NS - 1, "since 3 s"),
+        (-STALE_NS - 1, "not running"),
     ],
 )
 def test_a_frozen_gateway_and_one_of_before_a_reboot_have_no_values(
@@ -135,7 +126,7 @@ def test_a_damaged_file_is_one_line_and_never_a_traceback(
     assert len(said) >= len(cut) + 2 + len(damaged) - len(unused) - 2
     file.unlink()
     file.mkdir()
-    with pytest.raises(NoMetrics, match="cannot be read: Is a directory"):
+    with pytest.raises(NoMetrics, match="is no plain file"):
         metrics_of(file, now)
 
 
@@ -158,50 +149,21 @@ def test_only_get_of_metrics_is_answered(server: MetricsServer) -> None:
         assert ask(server.port, path, method)[0] == 404
 
 
-def test_clients_that_never_come_to_an_end_delay_no_other(
-    server: MetricsServer, capfd: pytest.CaptureFixture[str]
+def test_clients_that_never_come_to_an_end_delay_no_other_and_are_ended(
+    server: MetricsServer, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with (
-        socket.create_connection(("127.0.0.1", server.port)) as mute,
-        socket.create_connection(("127.0.0.1", server.port)) as rude,
+        socket.create_connection(("127.0.0.1", server.port), PATIENCE) as mute,
+        socket.create_connection(("127.0.0.1", server.port), PATIENCE) as rude,
     ):
         rude.sendall(b"\x16\x03\x01\x02\x00\r\n\r\n")
         assert ask(server.port)[0] == 200
         mute.send(b"GET /metr")
         assert ask(server.port)[0] == 200
+    monkeypatch.setattr(metrics_server._Handler, "timeout", 0.1)
+    with socket.create_connection(("127.0.0.1", server.port), PATIENCE) as mute:
+        assert mute.recv(1) == b""
     assert "Traceback" not in capfd.readouterr().err
-
-
-def test_a_client_that_goes_on_for_ever_is_ended_and_too_many_are_turned_away(
-    server: MetricsServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    idle = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(8)]
-    try:
-        for each in idle:
-            each.settimeout(60)
-            each.send(b"G")
-        one_more = socket.create_connection(("127.0.0.1", server.port))
-        one_more.settimeout(60)
-        assert one_more.recv(1) == b""
-    finally:
-        for each in idle:
-            each.close()
-    monkeypatch.setattr(metrics_server, "REQUEST_S", 0.1)
-    end = time.monotonic() + 60
-    while not is_answered(server.port) and time.monotonic() < end:
-        time.sleep(0.01)  # the eight are noticed one by one
-    with socket.create_connection(("127.0.0.1", server.port)) as dripping:
-        dripping.settimeout(0.01)
-        ended = False
-        while not ended and time.monotonic() < end:
-            try:
-                dripping.send(b"G")
-                ended = dripping.recv(1) == b""
-            except TimeoutError:
-                continue
-            except OSError:
-                ended = True
-        assert ended
 
 
 # --- the command
