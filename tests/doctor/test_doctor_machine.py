@@ -1,5 +1,6 @@
 """What `doctor` says of the machine, the service, and the folders."""
 
+import grp
 import os
 import subprocess
 from pathlib import Path
@@ -16,7 +17,6 @@ from kontronik_can_gw.desk.doctor.system import FileSystem, System
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 STORE = "/var/lib/kontronik-can-gw"
 OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR
-CLOCK_SOURCE = "/sys/devices/system/clocksource/clocksource0/current_clocksource"
 CPU = "/sys/devices/system/cpu/cpu0/cpufreq"
 HWMON = "/sys/class/hwmon"
 
@@ -26,7 +26,6 @@ def tree(tmp_path: Path) -> Tree:
     made = Tree(tmp_path)
     made.file("/proc/meminfo", "MemTotal: 900000 kB\nMemAvailable: 500000 kB\n")
     made.file("/proc/loadavg", "0.10 0.20 0.30 1/100 999\n")
-    made.file(CLOCK_SOURCE, "arch_sys_counter\n")
     return made
 
 
@@ -60,7 +59,6 @@ def test_a_good_machine_has_nothing_but_ok(tree: Tree) -> None:
 @pytest.mark.parametrize(
     ("files", "check", "severity"),
     [
-        ({CLOCK_SOURCE: "acpi_pm"}, "machine.clock_source", NOTE),
         ({"/proc/loadavg": "4000.0 0.20 0.30 1/100 999"}, "machine.load", WARNING),
         (
             {"/proc/meminfo": "MemTotal: 900000 kB\nMemAvailable: 20000 kB"},
@@ -249,4 +247,10 @@ def test_the_real_machine_is_looked_at_without_an_exception() -> None:
     assert system.real("/proc/self/..") == "/proc"
     assert system.text("/proc/none") is None
     assert system.names("/proc/none") == []
+    root = system.user_named("root", ["tty", "no such group"])
+    assert root is not None and (root.uid, root.groups >= {0, grp.getgrnam("tty").gr_gid}) == (
+        0,
+        True,
+    )
+    assert system.user_named("no such user") is None
     assert check_machine(system, None)
