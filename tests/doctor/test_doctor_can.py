@@ -84,40 +84,22 @@ DOWN = {"flags": "0x40040"}
         (info(restart_ms=0), PLAIN, "can.restart", ERROR, "restart-ms 100"),
         (info(restart_ms=5000), PLAIN, "can.restart", WARNING, "restart-ms 100"),
         ({"tx_queue_len": "7"}, PLAIN, "can.queue", WARNING, "txqueuelen 128"),
-        (
-            info(berr_counter={"tx": 128, "rx": 7}),
-            PLAIN,
-            "can.state",
-            OK,
-            "transmit 128, receive 7",
-        ),
+        (info(berr_counter={"tx": 128, "rx": 7}), PLAIN, "can.state", OK, "transmit 128, receive 7"),
         (info(state="ERROR-PASSIVE"), PLAIN, "can.state", WARNING, ""),
         (info(state="ERROR-WARNING"), PLAIN, "can.state", WARNING, "its warning limit"),
         (info(state="SLEEPING"), PLAIN, "can.state", WARNING, UP),
         (info(state="BUS-OFF"), PLAIN, "can.state", ERROR, ""),
-        (
-            info(ctrlmode=["LISTEN-ONLY", "BERR-REPORTING"]),
-            PLAIN,
-            "can.mode",
-            ERROR,
-            "listen-only off",
-        ),
+        (info(ctrlmode=["LISTEN-ONLY", "BERR-REPORTING"]), PLAIN, "can.mode", ERROR, "listen-only off"),
         (info(ctrlmode=["LOOPBACK"]), PLAIN, "can.mode", ERROR, "loopback off"),
         (info(bittiming={"bitrate": 0}), PLAIN, "can.bitrate", ERROR, "no bit rate is set"),
         (info(ctrlmode=["ONE-SHOT"]), PLAIN, "can.mode", WARNING, "one-shot off"),
         ({}, FD, "can.fd", ERROR, "dbitrate 2000000 fd on"),
-        (
-            {"mtu": "72"} | info(data_bittiming={"bitrate": 4000000}),
-            FD,
-            "can.data_bitrate",
-            ERROR,
-            "",
-        ),
+        ({"mtu": "72"} | info(data_bittiming={"bitrate": 4000000}), FD, "can.data_bitrate", ERROR, ""),
         ({"linkinfo": {"info_xstats": {"bus_off": 3}}}, PLAIN, "can.bus_off", WARNING, "3 times"),
         ({"statistics/tx_dropped": "9"}, PLAIN, "can.statistics", NOTE, "9 tx dropped"),
         (info(termination=120), PLAIN, "can.termination", NOTE, "120 ohm"),
     ],
-)
+)  # fmt: skip
 def test_what_is_not_as_it_should_be_is_reported_with_the_command(
     tree: Tree, change: dict[str, Any], can: CanConfig, check: str, severity: Severity, said: str
 ) -> None:
@@ -175,13 +157,8 @@ def test_what_is_no_can_interface_and_no_driver_is_reported(tree: Tree) -> None:
 
 def test_slcan_cannot_restart_and_is_not_asked_to(tree: Tree) -> None:
     """The kernel's slcan driver: fixed rates, no bit timing, no restart."""
-    change = info(
-        bittiming=None,
-        restart_ms=0,
-        bittiming_bitrate=500000,
-        bitrate_const=[250000, 500000],
-        clock=0,
-    )
+    rates = {"bittiming_bitrate": 500000, "bitrate_const": [250000, 500000]}
+    change = info(bittiming=None, restart_ms=0, clock=0, **rates)
     interface(tree, change, hardware=False)
     findings = check_can(tree, PLAIN)
     assert grave(findings) == {"can.restart": NOTE}
@@ -219,15 +196,9 @@ def test_another_gateway_on_this_interface_is_noted(tree: Tree) -> None:
     interface(tree, {})
     tree.file("/proc/self/ns/net", "")
     namespace = tree.path("/proc/self/ns/net").stat().st_ino
-    names = [
-        node_lock("can0", 10),
-        node_lock("can0", 2),
-        messages_lock("can0", 0x680),
-        node_lock("can1", 7),
-    ]
-    files = [file_name(name, namespace) for name in names] + [
-        file_name(node_lock("can0", 3), namespace + 1)
-    ]
+    ours = [node_lock("can0", 10), node_lock("can0", 2), messages_lock("can0", 0x680)]
+    files = [file_name(name, namespace) for name in (*ours, node_lock("can1", 7))]
+    files.append(file_name(node_lock("can0", 3), namespace + 1))
     left = file_name(node_lock("can0", 4), namespace)
     lines = []
     for file in [*files, left]:
@@ -239,7 +210,5 @@ def test_another_gateway_on_this_interface_is_noted(tree: Tree) -> None:
     tree.process(90, "python3", "-m", "kontronik_can_gw", "run")
     found = only(check_can(tree, PLAIN), "can.gateway")
     assert found.severity is NOTE
-    assert (
-        found.text
-        == "kontronik-can-gw (pid 90) already sends CANopen node 2, 10 and the messages from 680h on"
-    )
+    what = "CANopen node 2, 10 and the messages from 680h on"
+    assert found.text == f"kontronik-can-gw (pid 90) already sends {what}"
