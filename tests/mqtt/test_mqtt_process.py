@@ -4,7 +4,7 @@ import json
 import signal
 import socket
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from mqtt_bench import (
     kept,
     wait_for,
 )
+from paho.mqtt import publish
 from simulated_bus import flight, layout_of, write_log
 
 pytestmark = pytest.mark.extended
@@ -46,25 +47,6 @@ def talk(*words: object) -> tuple[object, str]:
     done = run("mqtt", *words)
     assert done.out == ""
     return done.code, done.err
-
-
-def put(port: int, messages: Mapping[str, bytes]) -> None:
-    """Let the broker keep something that is not ours."""
-    for topic, payload in messages.items():
-        command = [
-            "mosquitto_pub",
-            "-h",
-            "127.0.0.1",
-            "-p",
-            str(port),
-            "-r",
-            "-q",
-            "1",
-            "-t",
-            topic,
-            "-s",
-        ]
-        subprocess.run(command, input=payload, check=True)
 
 
 def test_online_is_kept_by_the_broker_and_goes_offline_with_sigterm(
@@ -113,14 +95,14 @@ def test_discovery_is_kept_and_can_be_removed_again(tmp_path: Path, broker: Mosq
     assert esc["components"]["battery_voltage"]["unique_id"] == "kontronik_ha_esc1_battery_voltage"
     # what others have there: a gateway whose name begins alike, and another program
     theirs = {
-        "homeassistant/device/kontronik_ha_2/config": b"",
+        "homeassistant/device/kontronik_ha_2/config": json.dumps(found[min(mine)])
+        .replace("/ha/", "/ha_2/")
+        .encode(),
         "homeassistant/device/x/config": b'{"a": 1}',
+        "kontronik/ha_2/online": b"offline",
     }
-    theirs["homeassistant/device/kontronik_ha_2/config"] = (
-        json.dumps(found[min(mine)]).replace("/ha/", "/ha_2/").encode()
-    )
-    theirs["kontronik/ha_2/online"] = b"offline"
-    put(broker.port, theirs)
+    messages = [{"topic": t, "payload": p, "qos": 1, "retain": True} for t, p in theirs.items()]
+    publish.multiple(messages, "127.0.0.1", broker.port)  # type: ignore[arg-type]
     words = ("--broker", broker.address, "--gateway", "ha", "--remove-discovery")
     code, said = talk(*words)
     assert code == 0
