@@ -11,7 +11,6 @@ import termios
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from kontronik_can_gw.errors import RunError
@@ -23,16 +22,6 @@ class PtyEsc:
 
     An existing symbolic link at ``link`` is replaced, anything else there is a RunError. The link is removed at close.
     """
-
-    __slots__ = (
-        "_link",
-        "_master",
-        "_slave",
-        "dropped_bytes",
-        "first_received",
-        "path",
-        "received",
-    )
 
     def __init__(self, link: str | Path | None = None) -> None:
         self.dropped_bytes = 0
@@ -99,12 +88,7 @@ class PtyEsc:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
