@@ -4,8 +4,8 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from http.client import HTTPConnection
 from pathlib import Path
@@ -13,16 +13,12 @@ from typing import Any
 
 import pytest
 from command_line import refused, written
+from harness import LoggedProcess
 from prometheus_client.parser import text_string_to_metric_families
 from statistics_bench import Bench
 
 from kontronik_can_gw.desk import metrics_server
-from kontronik_can_gw.desk.metrics_server import (
-    CONTENT_TYPE,
-    MetricsServer,
-    NoMetrics,
-    metrics_of,
-)
+from kontronik_can_gw.desk.metrics_server import CONTENT_TYPE, MetricsServer, NoMetrics, metrics_of
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.runtime.snapshot import STALE_NS
@@ -85,11 +81,7 @@ def test_what_the_gateway_replaces_is_read_anew(
 
 @pytest.mark.parametrize(
     ("age_ns", "said"),
-    [
-        (STALE_NS, ""),
-        (STALE_NS + 9 * SECOND, "does not answer since 12 s"),
-        (-STALE_NS - 1, "not running"),
-    ],
+    [(STALE_NS, ""), (STALE_NS + 9 * SECOND, "since 12 s"), (-STALE_NS - 1, "not running")],
 )
 def test_a_frozen_gateway_and_one_of_before_a_reboot_have_no_values(
     file: Path, document: dict[str, Any], age_ns: int, said: str
@@ -205,24 +197,19 @@ def test_it_serves_the_file_of_a_configuration_until_sigterm(
     tmp_path: Path, name: str, own: str, shown: str
 ) -> None:
     config = written(tmp_path / name, f'{own}[[esc]]\nport = "/dev/ttyS0"\npole_pairs = 7\n')
-    words = ["metrics", "-c", str(config), "--listen", "127.0.0.1:0"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "kontronik_can_gw", *words],
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    )
+    command = [sys.executable, "-m", "kontronik_can_gw", "metrics", "-c", str(config)]
+    paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    program = LoggedProcess([*command, "--listen", "127.0.0.1:0"], paths)
     try:
-        assert process.stderr is not None
-        line = process.stderr.readline()
-        assert line.endswith(f"{shown}\n"), line
-        port = int(line.partition("127.0.0.1:")[2].partition("/")[0])
+        end = time.monotonic() + PATIENCE
+        while not program.lines:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        assert program.log.endswith(shown)
+        port = int(program.log.partition("127.0.0.1:")[2].partition("/")[0])
         assert ask(port)[0] == 503
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE) == 0
-        assert process.stderr.read() == ""
+        program.process.send_signal(signal.SIGTERM)
+        assert program.process.wait(PATIENCE) == 0
     finally:
-        process.kill()
-        process.wait()
-        assert process.stderr is not None
-        process.stderr.close()
+        program.kill()
+    assert len(program.lines) == 1
