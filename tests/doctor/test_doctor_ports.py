@@ -17,7 +17,7 @@ from kontronik_can_gw.desk.doctor.service import unit_of
 
 OK, NOTE, WARNING, ERROR = Severity.OK, Severity.NOTE, Severity.WARNING, Severity.ERROR
 BY_ID = "/dev/serial/by-id/usb-FTDI_A1234-port0"
-GOOD = Line(even_parity=True, counts=True)
+GOOD = Line(even_parity=True, errors={"framing": 0})
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 RUN = ("python3", "-m", "kontronik_can_gw", "run")
 USB0, AMA0, S0 = "/dev/ttyUSB0", "/dev/ttyAMA0", "/dev/ttyS0"
@@ -198,7 +198,7 @@ def test_a_port_that_only_the_running_gateway_may_open_is_no_error(tree: Tree) -
         (Line("Device or resource busy", busy=True), "port.parity", NOTE, "for himself"),
         (Line(os.strerror(errno.EIO)), "port.parity", ERROR, "Input/output error"),
         (
-            Line(even_parity=True, errors={"framing": 3, "parity": 12}, counts=True),
+            Line(even_parity=True, errors={"framing": 3, "parity": 12, "break": 0}),
             *("port.line_errors", NOTE, "3 framing, 12 parity"),
         ),
     ],
