@@ -143,6 +143,3 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
         -1e-6 <= when - 100 - (now - first) / SECOND_NS / speed <= 0.11 for when, now in taken
     )
     assert "END OF FILE" in recording.progress
-
-
-# --- mistakes

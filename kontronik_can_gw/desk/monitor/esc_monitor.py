@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Collection
 from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
@@ -16,7 +15,6 @@ from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.unpacker import Value
 
 _WORKING = ("ok", "degraded")
-_BELIEVED = 2
 _SEVERITIES = list(Severity)
 
 
@@ -46,12 +44,6 @@ class EscMonitor(Member):
             if name in self.columns and name not in flags
         }
         """Unit of each source in the DBC, in the order of the sources, except flags and words of flags."""
-        link = self.columns.get("link_state", -1)
-        self._link_part = next(
-            (p.first for p in view.reader.parts if p.first <= link < p.first + p.count), None
-        )
-        self._link_reports = 0
-        """Number of link state messages since the first values after a gap."""
 
     def value(self, source: str) -> Value:
         """The value in the source's unit; None where it is not available."""
@@ -84,21 +76,11 @@ class EscMonitor(Member):
     def link(self) -> str | None:
         """The link state's name; None where it is not available.
 
-        It has its own message, which comes up to a cycle later than the first values after a gap and may have been sent before them:
-        until its second reception the values show that the link is good.
+        It has its own message, which comes up to a cycle later than values after a gap: while there are values the link is good.
         """
         link = self.text("link_state")
-        if link is None or normalize(link) in _WORKING:
-            return link
-        is_believed = self._link_reports >= _BELIEVED or not self.is_fresh
-        return link if is_believed else VALUES["link_state"].names[LinkState.OK]
-
-    def note(self, firsts: Collection[int], was_fresh: bool) -> None:
-        """Take note of a frame with the parts that begin at these columns."""
-        if not was_fresh and self.is_fresh:
-            self._link_reports = 0
-        elif self._link_part is not None and self._link_part in firsts:
-            self._link_reports += 1
+        is_old = link is not None and self.is_fresh and normalize(link) not in _WORKING
+        return VALUES["link_state"].names[LinkState.OK] if is_old else link
 
     @property
     def device_text(self) -> str:

@@ -30,7 +30,7 @@ class Monitor:
         """Frames of the layout in the last second; None during the first one."""
         self._start: int | None = None
         self._now = 0
-        self._second: tuple[int, int] | None = None
+        self._second = (0, 0)
         """Begin of the present second, and the number of frames then."""
         self._tracked = {
             esc.columns[source]: (esc, source, track)
@@ -55,16 +55,9 @@ class Monitor:
         """Take a frame that came at ``now``; frames outside the layout are ignored."""
         if frame.remote:
             return
-        now = self.advance(now)
-        fresh = [esc.is_fresh for esc in self.escs]
-        chunks = self.view.take(frame.key, frame.data, now)
-        if chunks is None:
-            return
-        firsts = [first for first, _ in chunks]
-        self._missing.difference_update(firsts)
-        for esc, was_fresh in zip(self.escs, fresh, strict=True):
-            esc.note(firsts, was_fresh)
+        chunks = self.view.take(frame.key, frame.data, self.advance(now)) or ()
         for first, values in chunks:
+            self._missing.discard(first)
             for column, raw in enumerate(values, first):
                 if column in self._tracked:
                     esc, source, track = self._tracked[column]
@@ -76,10 +69,8 @@ class Monitor:
         """Advance the time: values of missing messages become not available. Return the time, which never goes back."""
         self._now = now = max(now, self._now)
         if self._start is None:
-            self._start = now
+            self._start, self._second = now, (now, self.frames)
         self.view.expire(now)
-        if self._second is None:
-            self._second = (now, self.frames)
         begin, frames = self._second
         seconds = (now - begin) // SECOND
         if seconds:
