@@ -3,6 +3,7 @@
 Values are addressed by the names of values.py, not of signals, so any DBC works. A value that is not available is None, never an old one.
 """
 
+import math
 from typing import NamedTuple
 
 from kontronik_can_gw.dbc.names import normalize
@@ -36,22 +37,28 @@ class Member:
         for at, column in enumerate(view.reader.columns):
             if column.esc == index:
                 self.columns.setdefault(column.source, at)
-        self.numbers = {n: at for n, at in self.columns.items() if n not in self.protocol.bits}
+        self.no_flags = {n: at for n, at in self.columns.items() if n not in self.protocol.bits}
         """The columns of all that is no flag."""
         self.of_group = {
-            group: [at for name, at in self.numbers.items() if VALUES[name].group is group]
+            group: [at for name, at in self.no_flags.items() if VALUES[name].group is group]
             for group in Group
         }
         """Those of each group."""
+        self._flags = {
+            word: {bit: self.columns.get(bit.text) for bit in self.protocol.errors.get(word, ())}
+            for word in _WORDS
+        }
+        """The bits of each error word, and the columns of those that are signals of their own."""
 
     def has(self, *sources: str) -> bool:
         """True where the DBC has a signal for one of the sources."""
         return any(source in self.columns for source in sources)
 
     def value(self, source: str) -> Value:
-        """The value as the DBC has it."""
+        """The value as the DBC has it; infinity, which a float signal can hold, is none."""
         at = self.columns.get(source)
-        return None if at is None else self.view.values[at]
+        value = None if at is None else self.view.values[at]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
 
     def text(self, source: str) -> str | None:
         """The text of a value of an enumeration, of which a signal has the number or the text."""
@@ -97,25 +104,25 @@ class Member:
 
         Flags have no code for "not available": they count while another value of their group is known.
         """
-        bits, group = self.protocol.errors.get(word, ()), _WORDS[word]
-        has_numbers = bool(self.of_group[group])
-        sources = (word, *(bit.text for bit in bits))
-        if (has_numbers and not self.is_known(group)) or all(
-            self.value(s) is None for s in sources
-        ):
+        group, values = _WORDS[word], self.view.values
+        columns = [self.columns.get(word), *self._flags[word].values()]
+        has_others = bool(self.of_group[group])
+        is_valid = self.is_known(group) or not has_others
+        if not is_valid or all(at is None or values[at] is None for at in columns):
             return None
         value = self.value(word)
         number = int(value) if isinstance(value, (int, float)) else 0
+        bits = self._flags[word]
         found = [
             Flag(bit.text, bit.severity, bit.meaning, bit.remedy)
-            for bit in bits
-            if number >> bit & 1 or self.value(bit.text) == 1
+            for bit, at in bits.items()
+            if number >> bit & 1 or (at is not None and values[at] == 1)
         ]
         for bit in range(32):
             if number >> bit & 1 and bit not in bits:
                 meaning = f"bit {bit} of {word}, which has no name"
                 found.append(Flag(f"bit{bit}", Severity.WARNING, meaning))
-        return found if has_numbers else found or None
+        return found if has_others else found or None
 
     def _first(self, *sources: str) -> Value:
         """The first value that is available."""

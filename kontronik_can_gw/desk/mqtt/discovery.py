@@ -68,7 +68,7 @@ def device(topics: Topics, member: Published, columns: Sequence[Column]) -> dict
     identifier = topics.identifier(member.name)
     online = {"topic": topics.online}
     components: dict[str, dict[str, Any]] = {}
-    for source, at in member.numbers.items():
+    for source, at in member.no_flags.items():
         if (component := entity(source, columns[at])) is not None:
             components[source] = component
     if member.index is not None and member.has(*member.protocol.bits, *member.protocol.errors):

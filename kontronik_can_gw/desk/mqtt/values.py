@@ -40,7 +40,7 @@ class Published(Member):
             return last is not None and now - last <= SILENCE_NS
         if self.of_group[Group.LIVE]:
             return self.is_known(Group.LIVE)
-        return any(self.view.values[at] is not None for at in self.numbers.values())
+        return any(self.view.values[at] is not None for at in self.no_flags.values())
 
     def notable(self, now: int) -> tuple[object, ...]:
         """The values whose change is published at once."""
@@ -55,7 +55,7 @@ class Published(Member):
         heard = self.view.last_ns if self.index is None else self.heard_ns
         age = None if heard is None else (now - heard) // MS
         made: dict[str, Any] = {"available": self.is_available(now), "age": age}
-        values = {source: self.view.values[at] for source, at in self.numbers.items()}
+        values = {source: self.value(source) for source in self.no_flags}
         if self.index is None:
             return made | values
         errors, is_error = self.flags("operating_errors"), Severity.ERROR
