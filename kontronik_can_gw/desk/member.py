@@ -24,6 +24,8 @@ class Flag(NamedTuple):
     severity: Severity
     meaning: str
     remedy: str = ""
+    is_summary: bool = False
+    is_normal: bool = False
 
 
 class Member:
@@ -114,7 +116,7 @@ class Member:
         number = int(value) if isinstance(value, (int, float)) else 0
         bits = self._flags[word]
         found = [
-            Flag(bit.text, bit.severity, bit.meaning, bit.remedy)
+            Flag(bit.text, bit.severity, bit.meaning, bit.remedy, bit.is_summary, bit.is_normal)
             for bit, at in bits.items()
             if number >> bit & 1 or (at is not None and values[at] == 1)
         ]

@@ -95,21 +95,14 @@ class EscMonitor(Member):
     def active(self) -> list[Flag]:
         """The bits that are set, errors first."""
         found = [flag for word in self.protocol.errors for flag in self.flags(word) or ()]
-        return sorted(found, key=lambda active: _SEVERITIES.index(active.severity))
+        return sorted(found, key=lambda flag: _SEVERITIES.index(flag.severity))
 
     @property
     def alarms(self) -> list[Flag]:
         """The active bits to show: without those that are no alarm, and without a summary of bits that are shown anyway."""
-        bits = self.protocol.bits.values()
-        normal = {bit.text for bit in bits if bit.is_normal}
-        summaries = {bit.text for bit in bits if bit.is_summary}
-        alarms = [active for active in self.active if active.name not in normal]
-        plain = {active.severity for active in alarms if active.name not in summaries}
-        return [
-            active
-            for active in alarms
-            if active.name not in summaries or active.severity not in plain
-        ]
+        alarms = [flag for flag in self.active if not flag.is_normal]
+        shown = {flag.severity for flag in alarms if not flag.is_summary}
+        return [flag for flag in alarms if not flag.is_summary or flag.severity not in shown]
 
     def document(self) -> dict[str, Any]:
         """Everything as JSON; None for what is not available."""
