@@ -62,6 +62,11 @@ class Member:
         value = None if at is None else self.view.values[at]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
+    def number(self, source: str) -> float | None:
+        """The value of a numeric source."""
+        value = self.value(source)
+        return value if isinstance(value, (int, float)) else None
+
     def text(self, source: str) -> str | None:
         """The text of a value of an enumeration, of which a signal has the number or the text."""
         value = self.value(source)
@@ -96,10 +101,8 @@ class Member:
     @property
     def firmware(self) -> str | None:
         """Main and sub version, as "1.14"."""
-        main, sub = self.value("firmware_main"), self.value("firmware_sub")
-        if isinstance(main, (int, float)) and isinstance(sub, (int, float)):
-            return f"{main:.0f}.{sub:.0f}"
-        return None
+        main, sub = self.number("firmware_main"), self.number("firmware_sub")
+        return None if main is None or sub is None else f"{main:.0f}.{sub:.0f}"
 
     def flags(self, word: str) -> list[Flag] | None:
         """The set bits of an error word; None while it is not available.
@@ -112,8 +115,7 @@ class Member:
         is_valid = self.is_known(group) or not has_others
         if not is_valid or all(at is None or values[at] is None for at in columns):
             return None
-        value = self.value(word)
-        number = int(value) if isinstance(value, (int, float)) else 0
+        number = int(self.number(word) or 0)
         bits = self._flags[word]
         found = [
             Flag(bit.text, bit.severity, bit.meaning, bit.remedy, bit.is_summary, bit.is_normal)

@@ -59,13 +59,13 @@ class EscMonitor(Member):
 
     def number(self, source: str) -> float | None:
         """The value of a numeric source. The cell voltage is computed if the DBC has none and the number of cells is known."""
-        value = self.value(source)
+        value = super().number(source)
         if value is None and source == "mean_cell_voltage":
             cells = self._cells or self.number("cell_count")
-            voltage = self.value("battery_voltage")
-            if cells and isinstance(voltage, (int, float)):
-                value = voltage / cells
-        return value if isinstance(value, (int, float)) else None
+            voltage = self.number("battery_voltage")
+            if cells and voltage is not None:
+                return voltage / cells
+        return value
 
     @property
     def is_fresh(self) -> bool:

@@ -114,11 +114,6 @@ class Monitor:
         """True where the gateway reports that it plays a recording."""
         return normalize(self.gateway_state or "") == "replay"
 
-    def gateway_number(self, source: str) -> float | None:
-        """A numeric value of the gateway itself, as ``esc_count``."""
-        value = self.gateway.value(source)
-        return value if isinstance(value, (int, float)) else None
-
     def document(self) -> dict[str, Any]:
         """Everything as JSON: source names, values and their units; None for what is not available."""
         return {
@@ -126,7 +121,7 @@ class Monitor:
             "gateway": {
                 "state": self.gateway_state,
                 "can_state": self.can_state,
-                "uptime_s": self.gateway_number("uptime"),
+                "uptime_s": self.gateway.number("uptime"),
             },
             "units": {name: unit for esc in self.escs for name, unit in esc.units.items() if unit},
             "escs": [esc.document() for esc in self.escs],

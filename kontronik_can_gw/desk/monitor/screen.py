@@ -120,7 +120,7 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, str]]:
         yield from ((hint, POOR) for hint in source.hints)
     elif not monitor.frames and not source.is_file:
         yield f"waiting for frames on {source.name} ...", FAINT
-    count = monitor.gateway_number("esc_count")
+    count = monitor.gateway.number("esc_count")
     if count is not None and count > len(monitor.escs):
         yield (
             f"the gateway has {count:.0f} ESCs, the DBC in use describes {len(monitor.escs)}: give its configuration (-c) or DBC (--dbc).",
