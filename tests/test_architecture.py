@@ -66,7 +66,7 @@ ONLY_IN = {
     "asammdf": ("desk",),
     "paho": ("desk",),
     "shtab": ("cli",),
-    "canopen": ("canopen/eds_import.py",),
+    "canopen": ("canopen/eds_import.py", "desk/monitor/demo.py"),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -25,9 +25,9 @@ EPILOG = (
 
 def main(args: argparse.Namespace) -> int:
     stop = Event()
-    end = time.monotonic() + args.seconds
     with stopping_on_signals(stop.set), simulated_bus(args.seed, stop) as bus:
         monitor = Monitor(bus.bus)
+        end = time.monotonic() + (args.seconds or math.inf)
         watch(bus, monitor, None, lambda: stop.is_set() or time.monotonic() >= end, say)
     say(f"{monitor.frames} CAN frames decoded, 0 bytes sent to the ESC")
     return 0

@@ -12,9 +12,9 @@ from kontronik_can_gw.cli.bus_layout import bus_layout, given_layout
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.screen import file_of
-from kontronik_can_gw.desk.monitor.sources import Bus, Recording, Source, can_config
 from kontronik_can_gw.desk.monitor.watch import once, watch
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
+from kontronik_can_gw.desk.sources import Bus, Recording, Source, can_config
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable_json
 

@@ -5,10 +5,8 @@ import logging
 import re
 import socket
 import time
-from collections.abc import Generator
 from contextlib import closing
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
@@ -18,19 +16,17 @@ from kontronik_can_gw.cli.bus_layout import bus_layout, given_layout
 from kontronik_can_gw.cli.common import logging_to_stderr, say, stopping_on_signals
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.config.parse import mqtt_with
-from kontronik_can_gw.desk.monitor.sources import can_config
 from kontronik_can_gw.desk.mqtt.broker import Broker, check
 from kontronik_can_gw.desk.mqtt.discovery import is_ours
 from kontronik_can_gw.desk.mqtt.messages import Publisher
-from kontronik_can_gw.desk.mqtt.sources import Turn, from_bus, from_recording
 from kontronik_can_gw.desk.mqtt.topics import OFFLINE, Topics
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.sources import Bus, Recording, Source, can_config
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.esc.telemetry import MS
+from kontronik_can_gw.esc.telemetry import MS, SECOND
 from kontronik_can_gw.runtime.fault_log import FaultLog
 from kontronik_can_gw.runtime.locks import Locks
-from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.runtime.systemd import Notifier
 
 if TYPE_CHECKING:  # it needs paho-mqtt
@@ -41,7 +37,8 @@ log = logging.getLogger("kontronik_can_gw")
 _STOP_S = 0.3
 _LAST_S = 2.0
 """Time at the end of a recording to send pending messages."""
-_TURN_NS = 20 * MS
+_TURN_S = 0.02
+"""Maximum time between two turns: delay of what is due, and of a signal."""
 _STATUS_NS = 500 * MS
 _FILES = ("ca_file", "cert_file", "key_file", "password_file")
 _KEYS = ("broker", "tls", *_FILES, "username", "gateway", "topic", "rate", "retain", "discovery")
@@ -166,58 +163,63 @@ def _publish(
         )
 
     notifier, client = Notifier(), MqttClient(broker, topics.online)
-    if args.file is not None:
-        with open_input(args.file, bus) as recorded:
-            _Run(publisher(recorded.bus), client, notifier).run(from_recording(recorded))
-            for line in recorded.damage:
-                log.warning("%s: %s", recorded.name, line)
+    if args.file is None:
+        assert bus is not None
+        can = can_config(bus, args.interface, args.channel)
+        with Bus(bus, can, notifier.present) as live:
+            _Run(live, publisher(bus), client, notifier).run()
         return
-    assert bus is not None
-    can = can_config(bus, args.interface, args.channel)
-    check_interface(can)
-    made = publisher(bus)
-    _Run(made, client, notifier).run(from_bus(can, made.view.reader.keys, notifier.present))
+    with open_input(args.file, bus) as recorded:
+        recording = Recording(recorded, 1.0)
+        if recording.ended:
+            raise RunError(f"{recorded.name}: has no frames of the gateway")
+        _Run(recording, publisher(recorded.bus), client, notifier).run()
+        for line in recorded.damage:
+            log.warning("%s: %s", recorded.name, line)
 
 
 class _Run:
     """Publishes from the source to the broker, until a signal or the end of the source."""
 
-    def __init__(self, publisher: Publisher, client: "MqttClient", notifier: Notifier) -> None:
-        self._publisher, self._client, self._notifier = publisher, client, notifier
+    def __init__(
+        self, source: Source, publisher: Publisher, client: "MqttClient", notifier: Notifier
+    ) -> None:
+        self._source, self._publisher = source, publisher
+        self._client, self._notifier = client, notifier
         self._conditions = FaultLog()
         self._stopping = Event()
         self._due_ns = self._status_ns = 0
 
-    def run(self, turns: Generator[Turn, None, None]) -> None:
-        with stopping_on_signals(self._stopping.set), closing(turns):
-            first = next(turns)  # it raises where the source cannot be opened
+    def run(self) -> None:
+        with stopping_on_signals(self._stopping.set):
             names = ", ".join(self._publisher.escs) or "no ESC"
             log.info("publishing %s below %s/", names, self._publisher.topics.base)
             self._client.start()
             self._notifier.ready("started")
             try:
-                for turn in chain([first], turns):
+                while not self._source.ended:
                     if self._stopping.is_set():
                         return
-                    self._turn(turn)
+                    self._source.pump(self._publisher.take, time.monotonic() + _TURN_S)
+                    self._turn()
                 self._finish()
             finally:
                 self._notifier.stopping("ending")
                 self._client.stop(_STOP_S)
 
-    def _turn(self, turn: Turn) -> None:
-        """Take frames, publish due messages, report faults, feed the watchdog."""
-        for when, frame in turn.frames:
-            self._publisher.take(frame.key, frame.data, when)
-        now = time.monotonic_ns()
+    def _turn(self) -> None:
+        """Publish due messages, report faults, feed the watchdog."""
+        now, source = time.monotonic_ns(), self._source
         if now < self._due_ns:
             return
-        self._due_ns = now + _TURN_NS
-        for message in self._publisher.messages(turn.now, turn.wall_ns):
+        self._due_ns = now + round(_TURN_S * SECOND)
+        wall = source.wall_ns()
+        messages = self._publisher.messages(source.now(), time.time_ns() if wall is None else wall)
+        for message in messages:
             self._client.offer(message)
         self._client.turn(now)
-        if turn.problem:
-            self._conditions.begin("CAN", turn.problem, now)
+        if source.problem:
+            self._conditions.begin("CAN", source.problem, now)
         else:
             self._conditions.end("CAN", "the CAN interface works", now)
         self._conditions.advance(now)
@@ -225,7 +227,7 @@ class _Run:
         if now - self._status_ns > _STATUS_NS:
             self._status_ns = now
             state = "connected" if self._client.connected else self._client.problem or "connecting"
-            self._notifier.status(f"{state}; CAN: {turn.problem or 'ok'}")
+            self._notifier.status(f"{state}; CAN: {source.problem or 'ok'}")
 
     def _finish(self) -> None:
         """Send what is pending at the end of a recording. RunError if the broker does not take it."""

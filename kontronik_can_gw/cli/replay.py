@@ -15,12 +15,12 @@ from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.progress import Progress
 from kontronik_can_gw.cli.terminals import terminals
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.desk.monitor.sources import can_config
 from kontronik_can_gw.desk.recordings.can_logs import SUFFIXES, CanLogWriter
 from kontronik_can_gw.desk.recordings.convert import Output
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, DumpInput, Input, open_input
 from kontronik_can_gw.desk.recordings.marking import Marker
 from kontronik_can_gw.desk.recordings.pacing import Pace
+from kontronik_can_gw.desk.sources import can_config
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.node_state import UNCONFIGURED

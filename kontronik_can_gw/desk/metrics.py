@@ -3,7 +3,7 @@
 What is not available is left out. A gateway that does not run has no metrics: the answer is 503, so Prometheus's own ``up`` is 0.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from prometheus_client import Metric
@@ -15,8 +15,6 @@ from kontronik_can_gw.node_state import NmtState
 from kontronik_can_gw.runtime.snapshot import name_in_words
 
 Document = Mapping[str, Any]
-Labels = Mapping[str, object]
-Sample = tuple[Labels, float | None]
 Row = tuple[str, str, str]
 
 _BASE_UNITS: Mapping[str, tuple[str, float, float]] = {
@@ -50,11 +48,6 @@ _GATEWAY: tuple[Row, ...] = (
     ("recording_bytes_total", "Bytes of captures written since start.", "recording.bytes"),
     ("recording_lost_total", "Entries that could not be recorded since start.", "recording.lost"),
 )
-_PROCESS = {
-    "resident_memory_bytes": "rss_bytes",
-    "open_fds": "open_fds",
-    "threads": "threads",
-}
 _ESC: tuple[Row, ...] = (
     ("esc_fresh", "1 while the ESC's live values are fresh.", "fresh"),
     ("esc_port_open", "1 while the serial port is open.", "port.open"),
@@ -63,31 +56,51 @@ _ESC: tuple[Row, ...] = (
     ("esc_losses_total", "How often telemetry was lost.", "losses"),
 )
 """Metrics that are a value of the document as it stands: name, help, and the value's place."""
+_PROCESS = {"resident_memory_bytes": "rss_bytes", "open_fds": "open_fds", "threads": "threads"}
+_ABOUT = ("layout", "device", "variant", "firmware")
+_WORDS = {
+    "operating_error": ("errors", "warnings", "statuses"),
+    "selftest_error": ("selftest_errors",),
+}
+"""Error words, and the lists of the document that hold their bits."""
+
+
+class _Metrics:
+    """Metrics by name, in the order in which the first sample of each was added."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, Metric] = {}
+
+    def add(self, name: str, text: str, value: float | None, **labels: object) -> None:
+        """Add a sample, if its value is known. Counters are those whose names end in _total."""
+        if value is None:
+            return
+        full = f"kontronik_{name}"
+        if full not in self.found:
+            kind = "counter" if name.endswith("_total") else "gauge"
+            self.found[full] = Metric(full.removesuffix("_total"), text, kind)
+        plain = {key: _plain(label) for key, label in labels.items()}
+        self.found[full].add_sample(full, plain, float(value))
+
+    def add_states(self, name: str, text: str, kind: type[Any], now: str, **labels: object) -> None:
+        """Add a sample for each state that there is: 1 for the present one."""
+        for state in kind:
+            word = name_in_words(state.name)
+            self.add(name, f"{text}: 1 for the one it is in.", word == now, **labels, state=word)
 
 
 def families(document: Document, age_s: float) -> list[Metric]:
     """All metrics of a document. KeyError, TypeError or ValueError where it is damaged."""
-    return [
-        *_one("build_info", "The version that runs.", [({"version": document["version"]}, 1)]),
-        *_one("snapshot_age_seconds", "Age of these statistics.", [({}, round(age_s, 3))]),
-        *_gateway(document),
-        *_escs(document["escs"]),
-        *_values(document),
-        *_nodes(document["nodes"]),
-    ]
-
-
-def _one(name: str, text: str, samples: Iterable[Sample]) -> Iterator[Metric]:
-    """The metric of a name, if any of its samples is known. Counters are those whose names end in _total."""
-    kind = "counter" if name.endswith("_total") else "gauge"
-    full = f"kontronik_{name}"
-    metric = Metric(full.removesuffix("_total"), text, kind)
-    for labels, value in samples:
-        if value is not None:
-            plain = {key: _plain(label) for key, label in labels.items()}
-            metric.add_sample(full, plain, float(value))
-    if metric.samples:
-        yield metric
+    made = _Metrics()
+    made.add("build_info", "The version that runs.", 1, version=document["version"])
+    made.add("snapshot_age_seconds", "Age of these statistics.", round(age_s, 3))
+    _gateway(made, document)
+    for esc in document["escs"]:
+        _esc(made, esc)
+        _values(made, esc, document["units"])
+    for node in document["nodes"]:
+        _node(made, node)
+    return list(made.found.values())
 
 
 def _plain(label: object) -> str:
@@ -105,112 +118,69 @@ def _at(part: Document, place: str) -> float | None:
     return found  # type: ignore[no-any-return]
 
 
-def _gateway(document: Document) -> Iterator[Metric]:
+def _gateway(made: _Metrics, document: Document) -> None:
     for name, text, place in _GATEWAY:
-        yield from _one(name, text, [({}, _at(document, place))])
+        made.add(name, text, _at(document, place))
     for name, key in _PROCESS.items():
         text = f"The process: {name.replace('_', ' ')}."
-        yield from _one(f"process_{name}", text, [({}, document["process"][key] or None)])
+        made.add(f"process_{name}", text, document["process"][key] or None)
     if (store := document["store"]) is not None:
         failed = store["last_error"] is not None
-        yield from _one(
-            "store_failed", "1 if the last saving of parameters failed.", [({}, failed)]
-        )
+        made.add("store_failed", "1 if the last saving of parameters failed.", failed)
     if (recording := document["recording"]) is not None:
         failed = recording["problem"] != ""
-        yield from _one("recording_failed", "1 while nothing can be recorded.", [({}, failed)])
-    can = document["can"]
-    states = _states({}, GatewayState, document["gateway"]["state"])
-    yield from _one("gateway_state", "State of the gateway: 1 for the one it is in.", states)
+        made.add("recording_failed", "1 while nothing can be recorded.", failed)
+    can, state = document["can"], document["gateway"]["state"]
+    made.add_states("gateway_state", "State of the gateway", GatewayState, state)
     names = {"interface": can["interface"], "channel": can["channel"]}
-    yield from _one("can_info", "The CAN interface.", [(names, 1)])
-    states = _states({}, CanState, can["state"])
-    yield from _one("can_state", "State of the CAN controller: 1 for the one it is in.", states)
+    made.add("can_info", "The CAN interface.", 1, **names)
+    made.add_states("can_state", "State of the CAN controller", CanState, can["state"])
     for way, count in zip(("transmit", "receive"), can["error_counters"] or (), strict=False):
-        text = f"The CAN controller's {way} error counter."
-        yield from _one(f"can_{way}_errors", text, [({}, count)])
+        made.add(f"can_{way}_errors", f"The CAN controller's {way} error counter.", count)
     for key, count in can["counters"].items():
         name = key.removesuffix("_count")
-        text = f"CAN: {name.replace('_', ' ')} since start."
-        yield from _one(f"can_{name}_total", text, [({}, count)])
+        made.add(f"can_{name}_total", f"CAN: {name.replace('_', ' ')} since start.", count)
 
 
-def _escs(escs: list[Document]) -> Iterator[Metric]:
-    """What is known of each ESC's line, whether telemetry arrives or not."""
+def _esc(made: _Metrics, esc: Document) -> None:
+    """What is known of an ESC's line, whether telemetry arrives or not."""
+    of = {"esc": esc["name"]}
     for name, text, place in _ESC:
-        yield from _one(name, text, [(_of(esc), _at(esc, place)) for esc in escs])
-    ages = [(esc, esc["data_age_ms"]) for esc in escs]
+        made.add(name, text, _at(esc, place), **of)
+    age_ms = esc["data_age_ms"]
     text = "Age of the newest live frame when the snapshot was made."
-    seconds = [(_of(esc), None if age is None else age / 1000) for esc, age in ages]
-    yield from _one("esc_data_age_seconds", text, seconds)
-    states = [sample for esc in escs for sample in _states(_of(esc), LinkState, esc["link"])]
-    yield from _one("esc_link_state", "State of the ESC's line: 1 for the one it is in.", states)
-    keys = ("layout", "device", "variant", "firmware")
-    described = [
-        (_of(esc) | {key: esc[key] or "" for key in keys}, 1)
-        for esc in escs
-        if esc["device"] is not None
-    ]
-    yield from _one("esc_info", "What the ESC tells of itself.", described)
-    kinds = [
-        (_of(esc) | {"kind": kind}, count)
-        for esc in escs
-        for kind, count in esc["port"]["line_errors"].items()
-    ]
+    made.add("esc_data_age_seconds", text, None if age_ms is None else age_ms / 1000, **of)
+    made.add_states("esc_link_state", "State of the ESC's line", LinkState, esc["link"], **of)
+    if esc["device"] is not None:
+        about = {key: esc[key] or "" for key in _ABOUT}
+        made.add("esc_info", "What the ESC tells of itself.", 1, **of, **about)
     text = "Line errors that the serial driver counted, by kind."
-    yield from _one("esc_port_line_errors_total", text, kinds)
-    for key in dict.fromkeys(key for esc in escs for key in esc["counters"]):
+    for kind, count in esc["port"]["line_errors"].items():
+        made.add("esc_port_line_errors_total", text, count, **of, kind=kind)
+    for key, count in esc["counters"].items():
         text = f"The ESC's stream: {key.replace('_', ' ')}."
-        counts = [(_of(esc), esc["counters"].get(key)) for esc in escs]
-        yield from _one(f"esc_{_COUNTER_NAMES.get(key, key)}_total", text, counts)
+        made.add(f"esc_{_COUNTER_NAMES.get(key, key)}_total", text, count, **of)
 
 
-def _values(document: Document) -> Iterator[Metric]:
-    """What the ESCs measure, in base units."""
-    escs = document["escs"]
-    for name, unit in document["units"].items():
+def _values(made: _Metrics, esc: Document, units: Mapping[str, str]) -> None:
+    """What an ESC measures, in base units, and its error bits."""
+    of = {"esc": esc["name"]}
+    for name, unit in units.items():
         base, multiplier, divisor = _BASE_UNITS[unit]
         words = (_RENAMED.get(name, name), base, "total" if name in _COUNTED else "")
-        unit_text = f" in {base.replace('_', ' ')}" if base else ""
-        values = [(_of(esc), esc["values"][name]) for esc in escs]
-        scaled = [(of, v if v is None else v * multiplier / divisor) for of, v in values]
-        text = f"The ESC's {name.replace('_', ' ')}{unit_text}."
-        yield from _one("_".join(filter(None, words)), text, scaled)
-    words_of_bits: tuple[tuple[str, tuple[str, ...]], ...] = (
-        ("operating_error", ("errors", "warnings", "statuses")),
-        ("selftest_error", ("selftest_errors",)),
-    )
-    for name, keys in words_of_bits:
+        text = f"The ESC's {name.replace('_', ' ')}"
+        text += f" in {base.replace('_', ' ')}." if base else "."
+        value = esc["values"][name]
+        scaled = None if value is None else value * multiplier / divisor
+        made.add("_".join(filter(None, words)), text, scaled, **of)
+    for name, keys in _WORDS.items():
         text = f"1 while the bit of the ESC's {name.replace('_', ' ')} word is set."
-        yield from _one(
-            name, text, [flag for esc in escs for flag in _flags(esc, keys, f"{name}s")]
-        )
+        for error, severity, is_set in _flags(esc, keys, f"{name}s"):
+            made.add(name, text, is_set, **of, error=error, severity=severity)
 
 
-def _nodes(nodes: Iterable[Document]) -> Iterator[Metric]:
-    known = [
-        ({"esc": node["esc"], "node_id": node["node_id"]}, node)
-        for node in nodes
-        if node["node_id"] is not None
-    ]
-    states = [sample for of, node in known for sample in _states(of, NmtState, node["state"])]
-    text = "NMT state of the CANopen node: 1 for the one it is in."
-    yield from _one("canopen_node_state", text, states)
-    sent = [(of, node["pdos_sent"]) for of, node in known]
-    yield from _one("canopen_pdos_sent_total", "PDOs that the CANopen node sent.", sent)
-
-
-def _of(esc: Document) -> dict[str, object]:
-    return {"esc": esc["name"]}
-
-
-def _states(labels: Labels, states: type[Any], now: str) -> list[Sample]:
-    names = [name_in_words(state.name) for state in states]
-    return [(dict(labels) | {"state": name}, int(name == now)) for name in names]
-
-
-def _flags(esc: Document, keys: Iterable[str], word: str) -> list[Sample]:
-    """Each bit that has a name, and those without one that are set; empty while the word is not available."""
+def _flags(esc: Document, keys: Iterable[str], word: str) -> Sequence[tuple[str, str, bool]]:
+    """Name, severity and state of each bit that has a name, and of those without one that are set; none while the word is unknown."""
     lists = [esc[key] for key in keys]
     if None in lists:
         return []
@@ -218,6 +188,13 @@ def _flags(esc: Document, keys: Iterable[str], word: str) -> list[Sample]:
     protocol = protocol_named(esc.get("protocol"))
     known = {bit.text: bit.severity.value for bit in protocol.errors.get(word, ())}
     known |= dict.fromkeys(sorted(found - set(known)), "error")
-    return [
-        (_of(esc) | {"error": name, "severity": known[name]}, int(name in found)) for name in known
-    ]
+    return [(name, severity, name in found) for name, severity in known.items()]
+
+
+def _node(made: _Metrics, node: Document) -> None:
+    if node["node_id"] is not None:
+        of = {"esc": node["esc"], "node_id": node["node_id"]}
+        text = "NMT state of the CANopen node"
+        made.add_states("canopen_node_state", text, NmtState, node["state"], **of)
+        sent = node["pdos_sent"]
+        made.add("canopen_pdos_sent_total", "PDOs that the CANopen node sent.", sent, **of)

@@ -1,8 +1,6 @@
 """Serves the metrics of one gateway's status file on a loopback address, by prometheus_client and the standard library's WSGI server."""
 
-import contextlib
 import errno
-import json
 import re
 import socket
 import threading
@@ -16,16 +14,10 @@ from prometheus_client import CollectorRegistry, Metric, generate_latest
 from prometheus_client.exposition import ThreadingWSGIServer
 
 from kontronik_can_gw.desk.metrics import families
+from kontronik_can_gw.desk.monitor.status import FOREIGN, MALFORMED, NOT_RUNNING, look_at
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.telemetry import SECOND
-from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-REQUEST_S = 5.0
-"""Maximum time of a connection."""
-MAX_CLIENTS = 8
-"""At a time; others are turned away."""
-_MAX_FILE = 1 << 22
 _LOOPBACK = re.compile(r"(localhost|127(\.[0-9]{1,3}){3}|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 
 
@@ -45,52 +37,20 @@ class Collected:
 
 def metrics_of(file: Path, now: int) -> list[Metric]:
     """The metrics of a status file at ``now`` (monotonic). NoMetrics where it is missing, stale or damaged."""
+    seen = look_at(file, now)
+    if seen.code == NOT_RUNNING or seen.document is None:
+        raise NoMetrics(f"{file}: {seen.sentence.removeprefix(f'{file}: ')}")
     try:
-        with file.open("rb") as opened:
-            document = json.loads(opened.read(_MAX_FILE))
-        if (document["program"], document["format"]) != (PROGRAM, FORMAT):
-            raise NoMetrics(f"{file}: is of another version of {PROGRAM}, or of another program")
-        age = now - document["monotonic_ns"]
-        if not -STALE_NS <= age <= STALE_NS:  # a file of before a reboot is newer than now
-            raise NoMetrics(f"{file}: the gateway does not answer since {abs(age) // SECOND} s")
-        return families(document, max(0, age) / SECOND)
-    except FileNotFoundError:
-        raise NoMetrics(f"{file}: there is no such file: the gateway does not run") from None
-    except OSError as error:
-        raise NoMetrics(f"{file}: cannot be read: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise NoMetrics(f"{file}: is not a whole statistics file of {PROGRAM}") from None
+        return families(seen.document, max(0, seen.age_s or 0))
+    except MALFORMED:
+        raise NoMetrics(f"{file}: {FOREIGN}") from None
 
 
 class _Server(ThreadingWSGIServer):
-    def __init__(self, *arguments: Any, **more: Any) -> None:
-        self._places = threading.BoundedSemaphore(MAX_CLIENTS)
-        super().__init__(*arguments, **more)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if self._places.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Serve a client, for no longer than ``REQUEST_S``."""
-        end = threading.Timer(REQUEST_S, _end, (request,))
-        end.daemon = True
-        end.start()
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            end.cancel()
-            self._places.release()
+    """A thread for each client; the service's TasksMax limits their number."""
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that ends early or never comes to an end is no fault of ours."""
-
-
-def _end(connection: socket.socket) -> None:
-    with contextlib.suppress(OSError):  # it has ended already
-        connection.shutdown(socket.SHUT_RDWR)
 
 
 class _Server6(_Server):
@@ -98,6 +58,9 @@ class _Server6(_Server):
 
 
 class _Handler(WSGIRequestHandler):
+    timeout = 5.0
+    """Seconds without a byte of the client."""
+
     def log_message(self, *_: object) -> None:
         """A log of all requests is of no use."""
 

@@ -4,14 +4,12 @@ A real ESC must never be sent a byte (its line has an ASCII mode in which parame
 echo included, is counted in ``PtyEsc.received``.
 """
 
-import heapq
 import os
 import select
 import termios
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from kontronik_can_gw.errors import RunError
@@ -23,16 +21,6 @@ class PtyEsc:
 
     An existing symbolic link at ``link`` is replaced, anything else there is a RunError. The link is removed at close.
     """
-
-    __slots__ = (
-        "_link",
-        "_master",
-        "_slave",
-        "dropped_bytes",
-        "first_received",
-        "path",
-        "received",
-    )
 
     def __init__(self, link: str | Path | None = None) -> None:
         self.dropped_bytes = 0
@@ -99,12 +87,7 @@ class PtyEsc:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -131,24 +114,20 @@ def run(
     for index, (_, terminal) in enumerate(escs):
         index_of[terminal.fileno()] = index
         poller.register(terminal, select.POLLIN)
-    due = [(esc.next_ns, index) for index, (esc, _) in enumerate(escs)]
-    heapq.heapify(due)
     over = False
     while not over:
         now_ns = time.monotonic_ns() - origin_ns
         if end_ns is not None and now_ns >= end_ns:
             now_ns, over = end_ns - 1, True
         over = over or stop()
-        while due and due[0][0] <= now_ns:
-            index = due[0][1]
-            esc, terminal = escs[index]
-            for sent in esc.frames_until(now_ns):
+        for index, (esc, terminal) in enumerate(escs):
+            for sent in esc.frames_until(now_ns) if esc.next_ns <= now_ns else ():
                 taken = terminal.write(sent.wire)
                 if on_sent is not None:
                     on_sent(index, sent, taken)
-            heapq.heapreplace(due, (esc.next_ns, index))
         # At least 1 ms, so that frames due within it share a round: 64 ESCs cost no more rounds than 10.
-        until_ns = min(due[0][0] if due else now_ns + SECOND_NS, now_ns + SECOND_NS // 10)
+        due_ns = min((esc.next_ns for esc, _ in escs), default=now_ns + SECOND_NS)
+        until_ns = min(due_ns, now_ns + SECOND_NS // 10)
         if end_ns is not None:
             until_ns = min(until_ns, end_ns)
         for fd, _ in poller.poll(0 if over else max((until_ns - now_ns) / 1e6, 1)):
@@ -173,15 +152,8 @@ def _make_link(link: Path, target: str) -> Path:
             raise RunError(
                 f"{link}: exists and is not a symbolic link. Remove it or give another --link."
             )
-        # made under another name and moved, so that the link exists at all times
-        beside = link.with_name(f".{link.name}.{os.getpid()}")
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(target)
-        try:
-            beside.replace(link)
-        except OSError:
-            beside.unlink()
-            raise
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
     except OSError as error:
         raise RunError(
             f"{link}: no link can be made: {error.strerror}. Give another --link."

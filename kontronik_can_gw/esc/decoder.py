@@ -207,6 +207,8 @@ class EscProtocol:
     make: Callable[[], Decoder]
     """A decoder at the start of a stream."""
     fields: tuple[Field, ...]
+    maker: str = "unknown"
+    """Who makes the ESCs, as people write it."""
     baud_rate: int = 115_200
     even_parity: bool = False
     """With 8 data bits and 1 stop bit."""

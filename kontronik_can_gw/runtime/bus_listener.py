@@ -9,7 +9,7 @@ import select
 import time
 
 from kontronik_can_gw.config.keys import CanConfig
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway_status import CanState
 from kontronik_can_gw.runtime.can_port import RECEIVE_LIMIT, CanPort
@@ -28,11 +28,11 @@ _BUS_OFF = (
 class BusListener:
     """An open interface, received from only.
 
-    ``keys``: ids, with EXTENDED for 29 bits. Raises RunError where the interface cannot be opened now, UserError where python-can does
-    not know it; later troubles only show in ``problem``. There is no ``fileno``: the descriptor changes with each opening.
+    ``keys``: ids, with EXTENDED for 29 bits. Raises RunError where the interface cannot be opened now, unless ``patient``, UserError where
+    python-can does not know it; later troubles only show in ``problem``. There is no ``fileno``: the descriptor changes with each opening.
     """
 
-    def __init__(self, config: CanConfig, keys: frozenset[int]) -> None:
+    def __init__(self, config: CanConfig, keys: frozenset[int], patient: bool = False) -> None:
         self.problem = ""
         """One line with the remedy while the interface does not work; empty while it does."""
         self.lost_frames = 0
@@ -43,7 +43,12 @@ class BusListener:
         self._check_at = 0.0
         # what python-can says of an interface that went away is said by ``problem``, with the remedy
         logging.getLogger("can").addHandler(logging.NullHandler())
-        self._open()
+        try:
+            self._open()
+        except RunError as error:
+            if not patient:
+                raise
+            self.problem = error.problems[0]
 
     def receive(self, timeout_s: float) -> list[CanFrame]:
         """The frames that have come, oldest first; waits for the first one, at most ``timeout_s``. Never raises."""

@@ -126,11 +126,7 @@ class SerialPort:
 
     def line_errors(self) -> dict[str, int]:
         """What the driver has counted so far, by kind; empty where it counts nothing (pseudo terminals, some adapters)."""
-        try:
-            counts = _COUNTS.unpack(fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_COUNTS.size)))
-        except OSError:
-            return {}
-        return {kind: counts[place] for kind, place in _LINE_ERRORS.items()}
+        return line_errors(self._fd)
 
     @property
     def waits_to_be_read(self) -> bool:
@@ -154,6 +150,15 @@ class SerialPort:
     def close(self) -> None:
         with contextlib.suppress(OSError, termios.error):
             self._serial.close()
+
+
+def line_errors(fd: int) -> dict[str, int]:
+    """The line errors of an open port since its driver was loaded, by kind; empty where it counts none."""
+    try:
+        counts = _COUNTS.unpack(fcntl.ioctl(fd, _TIOCGICOUNT, bytes(_COUNTS.size)))
+    except OSError:
+        return {}
+    return {kind: counts[place] for kind, place in _LINE_ERRORS.items()}
 
 
 def is_mini_uart(path: str, root: Path = Path("/")) -> bool:

@@ -122,9 +122,6 @@ class Tree(System):
         self.folder("/run/systemd/system")
         # for it cannot be given to the service's user
         self.folder("/run/kontronik-can-gw/lock", 0o777)
-        self.file(
-            "/etc/passwd", "root:x:0:0::/:/bin/sh\nkontronik-can-gw:x:990:990::/:/bin/false\n"
-        )
         usual = {
             "LoadState": "loaded",
             "ActiveState": "active",
@@ -135,7 +132,6 @@ class Tree(System):
             "User": "kontronik-can-gw",
             "SupplementaryGroups": "dialout",
         }
-        self.file("/etc/group", f"root:x:0:\ndialout:x:{DIALOUT}:anna\n")
         text = "".join(f"{name}={value}\n" for name, value in {**usual, **shown}.items())
         self.programs["systemctl", "show"] = text
 
@@ -144,6 +140,16 @@ class Tree(System):
     @property
     def user(self) -> User:
         return self.me
+
+    def user_named(self, name: str, more_groups: Sequence[str] = ()) -> User | None:
+        numbers = {"root": 0, "kontronik-can-gw": 990}
+        if name not in numbers:
+            return None
+        own = {numbers[name]}
+        return User(name, numbers[name], self.group_numbers(more_groups) | own)
+
+    def group_numbers(self, names: Sequence[str]) -> frozenset[int]:
+        return frozenset({DIALOUT} if "dialout" in names else ())
 
     def group_name(self, gid: int) -> str:
         return {0: "root", DIALOUT: "dialout"}.get(gid, str(gid))

@@ -68,14 +68,7 @@ def test_no_module_of_doctor_can_write_to_a_device() -> None:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
         methods = {call.attr for call in calls if isinstance(call, ast.Attribute)}
-        assert not methods & {
-            "write",
-            "writelines",
-            "write_text",
-            "write_bytes",
-            "sendto",
-            "tcsendbreak",
-        }, path.name
+        assert not any(name.startswith(("write", "send", "tcsend")) for name in methods), path.name
         names = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
         assert not names & {"O_RDWR", "O_WRONLY", "O_CREAT"}, path.name
         if "open" in methods or any(

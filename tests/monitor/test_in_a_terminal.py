@@ -10,18 +10,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from command_line import written
 from simulated_bus import flight, layout_of, with_errors, write_log
 
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 
 pytestmark = [
     pytest.mark.extended,
-    pytest.mark.skipif(
-        shutil.which("tmux") is None, reason="tmux is not installed: apt-get install tmux"
-    ),
+    pytest.mark.skipif(shutil.which("tmux") is None, reason="apt-get install tmux"),
 ]
-
-
 SLOWLY = ("--speed", "0.25")
 """The recording must not be over before the last key."""
 
@@ -31,13 +28,8 @@ class Terminal:
 
     def __init__(self, folder: Path) -> None:
         self._socket = str(folder / "tmux")
-        self._environment = {
-            "PATH": os.environ["PATH"],
-            "HOME": str(folder),
-            "LANG": "C.UTF-8",
-            "SHELL": "/bin/sh",
-        }
-        self._environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+        paths = {"PATH": os.environ["PATH"], "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        self._environment = paths | {"HOME": str(folder), "LANG": "C.UTF-8", "SHELL": "/bin/sh"}
         self.tmux("-f", "/dev/null", "new-session", "-d", "-x", "80", "-y", "24", "/bin/sh")
         self.tmux("set", "-g", "status", "off")
 
@@ -52,14 +44,15 @@ class Terminal:
     def lines(self) -> list[str]:
         return [line.rstrip() for line in self.tmux("capture-pane", "-p").split("\n")[:-1]]
 
-    def until(
-        self, wanted: Callable[[list[str]], object], what: str, seconds: float = 60
-    ) -> list[str]:
-        end = time.monotonic() + seconds
+    def until(self, wanted: Callable[[list[str]], object], what: str) -> None:
+        end = time.monotonic() + 60
         while not wanted(lines := self.lines()):
-            assert time.monotonic() < end, f"{what}: not within {seconds} s:\n" + "\n".join(lines)
+            assert time.monotonic() < end, f"{what}: not within a minute:\n" + "\n".join(lines)
             time.sleep(0.05)
-        return lines
+
+    def type(self, key: str, wanted: Callable[[list[str]], object], what: str) -> None:
+        self.tmux("send-keys", key)
+        self.until(wanted, what)
 
 
 @pytest.fixture
@@ -71,33 +64,25 @@ def terminal(tmp_path: Path) -> Iterator[Terminal]:
 
 def test_values_move_and_keys_are_obeyed(terminal: Terminal, tmp_path: Path) -> None:
     names = [f"esc{number}" for number in range(1, 9)]
-    log = write_log(
-        tmp_path / "8.log", flight(layout_of(names), 30, [with_errors(OperatingError.UNDERVOLTAGE)])
-    )
-    escs = "".join(
-        f'[[esc]]\nname = "{name}"\nport = "/dev/ttyX{name}"\npole_pairs = 7\n' for name in names
-    )
-    toml = tmp_path / "8.toml"
-    toml.write_text(f"[can]\nbitrate = 1000000\n{escs}")
-    command = shlex.join(
-        [sys.executable, "-m", "kontronik_can_gw", "monitor", str(log), "-c", str(toml), *SLOWLY]
-    )
+    frames = flight(layout_of(names), 30, [with_errors(OperatingError.UNDERVOLTAGE)])
+    log = write_log(tmp_path / "8.log", frames)
+    escs = [
+        f'[[esc]]\nname = "{name}"\nport = "/dev/tty{name}"\npole_pairs = 7\n' for name in names
+    ]
+    toml = written(tmp_path / "8.toml", "[can]\nbitrate = 1000000\n" + "".join(escs))
+    words = ["monitor", str(log), "-c", str(toml), *SLOWLY]
+    command = shlex.join([sys.executable, "-m", "kontronik_can_gw", *words])
     terminal.tmux("send-keys", "-l", f"{command}; echo code $?\n")
     terminal.until(
         lambda lines: sum(line.startswith("ok 100 Hz") for line in lines) == 8, "a table"
     )
     before = terminal.lines()[3]
     terminal.until(lambda lines: lines[3] != before, "another speed")
-    terminal.tmux("send-keys", "3")
-    terminal.until(lambda lines: "esc3" in lines[1] and "esc4" not in "".join(lines), "one ESC")
-    terminal.tmux("send-keys", "n")
-    terminal.until(lambda lines: "esc4" in lines[1], "the next ESC")
-    terminal.tmux("send-keys", "a")
-    terminal.until(lambda lines: lines[1].startswith("ESC"), "all")
-    terminal.tmux("send-keys", "Space")
-    terminal.until(lambda lines: "PAUSED" in lines[0], "a pause")
-    terminal.tmux("send-keys", "q")
-    terminal.until(lambda lines: "code 0" in lines, "the end")
+    terminal.type("3", lambda lines: "esc3" in lines[1] and "esc4" not in "".join(lines), "one ESC")
+    terminal.type("n", lambda lines: "esc4" in lines[1], "the next ESC")
+    terminal.type("a", lambda lines: lines[1].startswith("ESC"), "all")
+    terminal.type("Space", lambda lines: "PAUSED" in lines[0], "a pause")
+    terminal.type("q", lambda lines: "code 0" in lines, "the end")
     terminal.tmux("send-keys", "-l", "echo still he''re\n")
     terminal.until(
         lambda lines: "still here" in lines and any("echo still" in line for line in lines),

@@ -15,9 +15,10 @@ from simulated_bus import Clock, flight, layout_of, write_log
 
 from kontronik_can_gw.cli import monitor
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.monitor import esc_monitor, model, screen, sources, terminal, watch
-from kontronik_can_gw.desk.monitor.sources import Recording
+from kontronik_can_gw.desk import member, sources
+from kontronik_can_gw.desk.monitor import esc_monitor, model, screen, terminal, watch
 from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.sources import Recording
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions, SimulatedEsc
 from kontronik_can_gw.runtime import bus_listener
 
@@ -55,17 +56,30 @@ def document(done: Done) -> dict[str, Any]:
 def test_nothing_in_the_monitor_can_send() -> None:
     """The way to the bus has no method to send with, and its sources call none."""
     assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
-    for module in (monitor, esc_monitor, model, screen, sources, terminal, watch, bus_listener):
+    for module in (
+        monitor,
+        member,
+        esc_monitor,
+        model,
+        screen,
+        sources,
+        terminal,
+        watch,
+        bus_listener,
+    ):
         for node in ast.walk(ast.parse(inspect.getsource(module))):
             if isinstance(node, ast.Attribute):
                 assert "send" not in node.attr, f"{module.__name__}:{node.lineno}"
 
 
-def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", [["monitor"], ["mqtt", "--broker", "127.0.0.1:1"]])
+def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
+    tmp_path: Path, command: list[str]
+) -> None:
     """Some adapters are written to at opening; to an ESC nothing may be written."""
     port = written(tmp_path / "ttyESC", "")
     toml = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n[[esc]]\nport = "{port}"\n')
-    done = run("monitor", "-c", toml, "--interface", "slcan", "--channel", f"{port}@115200")
+    done = run(*command, "-c", toml, "--interface", "slcan", "--channel", f"{port}@115200")
     assert done.code == 2
     assert "nothing may be sent to an ESC" in done.err
 
@@ -129,6 +143,3 @@ def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float
         -1e-6 <= when - 100 - (now - first) / SECOND_NS / speed <= 0.11 for when, now in taken
     )
     assert "END OF FILE" in recording.progress
-
-
-# --- mistakes

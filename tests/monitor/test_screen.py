@@ -12,8 +12,8 @@ from kontronik_can_gw.desk.monitor.lines import ASCII, UNICODE, Glyphs, number
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.quantities import QUANTITIES
 from kontronik_can_gw.desk.monitor.screen import Choice, screen, sparkline
-from kontronik_can_gw.desk.monitor.sources import Source
 from kontronik_can_gw.desk.monitor.watch import obey
+from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 

@@ -3,7 +3,9 @@
 import contextlib
 import json
 import os
+import pwd
 import random
+import secrets
 import shutil
 import signal
 import socket
@@ -11,12 +13,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import paho.mqtt.client as paho
 import pytest
+from harness import LoggedProcess
 from paho.mqtt.enums import CallbackAPIVersion
 
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/sbin")
@@ -63,7 +66,7 @@ class Mosquitto:
         self.port = port or free_port()
         self._file = folder / f"mosquitto{self.port}.conf"
         self._file.write_text(
-            f"listener {self.port} 127.0.0.1\n{lines}persistence false\nuser {_user()}\n"
+            f"listener {self.port} 127.0.0.1\n{lines}persistence false\nuser {pwd.getpwuid(os.geteuid()).pw_name}\n"
         )
         self._log = folder / f"mosquitto{self.port}.log"
         self._process: subprocess.Popen[bytes] | None = None
@@ -97,12 +100,6 @@ class Mosquitto:
             self._process = None
 
 
-def _user() -> str:
-    import pwd
-
-    return pwd.getpwuid(os.geteuid()).pw_name
-
-
 class Heard(NamedTuple):
     """A message as a subscriber got it."""
 
@@ -123,117 +120,67 @@ class Subscriber:
 
     def __init__(self, port: int, topic: str = "#") -> None:
         self.heard: list[Heard] = []
-        self._client = paho.Client(CallbackAPIVersion.VERSION2)
+        self.mark = f"mark/{secrets.token_hex(8)}"
+        """A topic of its own, to be published."""
+        self.client = paho.Client(CallbackAPIVersion.VERSION2)
         self._subscribed = threading.Event()
-        self._client.on_connect = lambda client, *_: client.subscribe(topic, 1)
-        self._client.on_subscribe = lambda *_: self._subscribed.set()
-        self._client.on_message = self._take
-        self._client.reconnect_delay_set(1, 1)
-        self._client.connect("127.0.0.1", port)
-        self._client.loop_start()
+        self.client.on_connect = lambda client, *_: client.subscribe([(topic, 1), (self.mark, 1)])
+        self.client.on_subscribe = lambda *_: self._subscribed.set()
+        self.client.on_message = self._take
+        self.client.reconnect_delay_set(1, 1)
+        self.client.connect("127.0.0.1", port)
+        self.client.loop_start()
         assert self._subscribed.wait(PATIENCE)
 
     def _take(self, _client: object, _data: object, message: paho.MQTTMessage) -> None:
-        self.heard.append(
-            Heard(time.monotonic(), message.topic, bytes(message.payload), message.retain)
-        )
+        payload = bytes(message.payload)
+        self.heard.append(Heard(time.monotonic(), message.topic, payload, message.retain))
 
     def of(self, topic: str) -> list[Heard]:
         return [heard for heard in list(self.heard) if heard.topic == topic]
 
-    def wait(self, topic: str, payload: bytes | None = None, count: int = 1) -> Heard:
-        """Wait for ``count`` messages of a topic (with this payload)."""
+    def wait(self, topic: str, payload: bytes | None = None) -> Heard:
+        """The first message of a topic (with this payload), as soon as it has come."""
 
         def found() -> list[Heard]:
-            return [
-                heard for heard in self.of(topic) if payload is None or heard.payload == payload
-            ]
+            return [heard for heard in self.of(topic) if payload in (None, heard.payload)]
 
-        wait_for(lambda: len(found()) >= count, lambda: f"{topic} {payload!r} in {self.heard}")
-        return found()[count - 1]
+        wait_for(found, lambda: f"{topic} {payload!r} in {self.heard}")
+        return found()[0]
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._client.disconnect()
-        self._client.loop_stop()
+        self.client.disconnect()
+        self.client.loop_stop()
 
 
 def kept(port: int, topic: str = "#") -> dict[str, bytes]:
-    """What the broker keeps: what comes before a message of our own that is sent once the subscription is acknowledged."""
-    mark = f"mark/{time.monotonic_ns()}"
-    found: dict[str, bytes] = {}
-    done = threading.Event()
-
-    def take(_client: object, _data: object, message: paho.MQTTMessage) -> None:
-        if message.topic == mark:
-            done.set()
-        elif message.retain:
-            found[message.topic] = bytes(message.payload)
-
-    def ask(*_: object) -> None:
-        client.subscribe([(topic, 1), (mark, 1)])
-
-    def end(*_: object) -> None:
-        client.publish(mark, b"x", 1)
-
-    client = paho.Client(CallbackAPIVersion.VERSION2)
-    client.on_connect, client.on_subscribe, client.on_message = ask, end, take
-    client.connect("127.0.0.1", port)
-    client.loop_start()
-    try:
-        assert done.wait(PATIENCE)
-        return found
-    finally:
-        client.disconnect()
-        client.loop_stop()
+    """What the broker keeps: it comes before a message of our own that is sent once the subscription is acknowledged."""
+    with Subscriber(port, topic) as heard:
+        heard.client.publish(heard.mark, b"x", 1)
+        heard.wait(heard.mark)
+    return {found.topic: found.payload for found in heard.heard if found.retained}
 
 
-class Process:
+class Process(LoggedProcess):
     """``kontronik-can-gw mqtt`` as its own process."""
 
-    def __init__(self, *words: object, environment: dict[str, str] | None = None) -> None:
-        command = [*PROGRAM, *map(str, words)]
+    def __init__(self, *words: object, environment: Mapping[str, str] | None = None) -> None:
         paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        self.process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | paths | (environment or {}),
-        )
-        self.lines: list[str] = []
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        super().__init__([*PROGRAM, *map(str, words)], paths | dict(environment or {}))
 
-    def _read(self) -> None:
-        assert self.process.stderr
-        for line in self.process.stderr:
-            self.lines.append(line.rstrip())
-
-    @property
-    def log(self) -> str:
-        return "\n".join(self.lines)
-
-    def wait_for_line(self, text: str, count: int = 1) -> None:
-        wait_for(lambda: self.log.count(text) >= count, lambda: f"{text!r} in:\n{self.log}")
+    def wait_for_line(self, text: str) -> None:
+        wait_for(lambda: text in self.log, lambda: f"{text!r} in:\n{self.log}")
 
     def end(self, number: int = signal.SIGTERM) -> int:
         """Send a signal; the exit code."""
         self.process.send_signal(number)
-        code = self.process.wait(PATIENCE)
-        self._reader.join(PATIENCE)
-        return code
+        return self.process.wait(PATIENCE)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-        self._reader.join(PATIENCE)
-        for stream in (self.process.stdout, self.process.stderr):
-            if stream:
-                stream.close()
+        self.kill()

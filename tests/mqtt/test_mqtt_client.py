@@ -33,6 +33,14 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mosquitto]:
     made.stop()
 
 
+@pytest.fixture
+def own(tmp_path: Path) -> Iterator[Mosquitto]:
+    """A broker that may be frozen."""
+    made = Mosquitto(tmp_path)
+    yield made
+    made.stop()
+
+
 @contextlib.contextmanager
 def connecting(broker: Broker) -> Iterator[MqttClient]:
     client = MqttClient(broker, ONLINE)
@@ -91,58 +99,45 @@ def test_of_each_topic_the_newest_waits_and_the_lasting_goes_first(broker: Mosqu
 
 
 def test_a_broker_that_takes_nothing_makes_nothing_pile_up(
-    tmp_path: Path, said: pytest.LogCaptureFixture
+    own: Mosquitto, said: pytest.LogCaptureFixture
 ) -> None:
     """It stands still for some seconds: that is said, what waits is replaced, what then comes is new, and the end comes in time."""
-    made = Mosquitto(tmp_path)
-    try:
-        with Subscriber(made.port, "k/test/state") as heard, connecting(to(made.port)) as client:
-            turning(lambda: client.connected, client)
-            number = 0
+    with Subscriber(own.port, "k/test/state") as heard, connecting(to(own.port)) as client:
+        turning(lambda: client.connected, client)
+        sent: list[bytes] = []
 
-            def offer() -> None:
-                nonlocal number
-                number += 1
-                payload = b"%06d" % number + b"x" * 100_000
-                client.offer(Message("k/test/state", payload))
+        def said_so(text: str) -> bool:
+            sent.append(b"%06d" % len(sent) + b"x" * 100_000)
+            client.offer(Message("k/test/state", sent[-1]))
+            return text in said.text
 
-            def said_so(text: str) -> bool:
-                offer()
-                return text in said.text
-
-            made.freeze(True)
-            turning(lambda: said_so("takes messages too slowly: only the newest are sent"), client)
-            assert client.waiting <= 3  # "online"; a state is with paho, and the newest waits
-            made.freeze(False)
-            turning(lambda: said_so("takes messages again"), client)
-            turning(lambda: not client.waiting, client)
-            heard.wait("k/test/state", b"%06d" % number + b"x" * 100_000)
-            numbers = [int(message.payload[:6]) for message in heard.heard]
-            assert numbers == sorted(numbers)
-            made.freeze(True)
-            for _ in range(100):
-                offer()
-                client.turn(time.monotonic_ns())
-            client.stop(0.3)  # it returns though nothing is taken
-            made.freeze(False)
-    finally:
-        made.stop()
+        own.freeze(True)
+        turning(lambda: said_so("takes messages too slowly: only the newest are sent"), client)
+        assert client.waiting <= 3  # "online"; a state is with paho, and the newest waits
+        own.freeze(False)
+        turning(lambda: said_so("takes messages again"), client)
+        turning(lambda: not client.waiting, client)
+        heard.wait("k/test/state", sent[-1])
+        numbers = [int(message.payload[:6]) for message in heard.heard]
+        assert numbers == sorted(numbers)
+        own.freeze(True)
+        for _ in range(100):
+            said_so("")
+            client.turn(time.monotonic_ns())
+        client.stop(0.3)  # it returns though nothing is taken
+        own.freeze(False)
 
 
 def test_a_broker_that_stands_still_for_long_is_lost_and_found_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: pytest.LogCaptureFixture
+    own: Mosquitto, monkeypatch: pytest.MonkeyPatch, said: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(mqtt_client, "KEEPALIVE_S", 1)
-    made = Mosquitto(tmp_path)
-    try:
-        with connecting(to(made.port)) as client:
-            turning(lambda: client.connected, client)
-            made.freeze(True)
-            turning(lambda: "the connection was lost: nothing came any more" in said.text, client)
-            made.freeze(False)
-            turning(lambda: "connected, after" in said.text, client)
-    finally:
-        made.stop()
+    with connecting(to(own.port)) as client:
+        turning(lambda: client.connected, client)
+        own.freeze(True)
+        turning(lambda: "the connection was lost: nothing came any more" in said.text, client)
+        own.freeze(False)
+        turning(lambda: "connected, after" in said.text, client)
 
 
 # --- brokers that end connections
@@ -186,13 +181,7 @@ def test_rubbish_instead_of_an_answer_ends_nothing(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(mqtt_client, "_MIN_PAUSE_S", 0.01)
     monkeypatch.setattr(mqtt_client, "_MAX_PAUSE_S", 0.1)
     rng = random.Random(1)
-    rubbish = [
-        b"HTTP/1.1 400 Bad Request\r\n\r\n",
-        b"\x00" * 100,
-        b"\x20\x7f\x00",
-        bytes(range(256)),
-        b"",
-    ]
+    rubbish = [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x00" * 100, b"\x20\x7f\x00", bytes(range(256)), b""]  # fmt: skip
     rubbish += [b"\x20" + rng.randbytes(rng.randrange(1, 60)) for _ in range(6)]
     rubbish += [rng.randbytes(rng.randrange(1, 200)) for _ in range(6)]
     for answer in rubbish:
@@ -256,20 +245,10 @@ def encrypted(
     lines = f"allow_anonymous true\ncafile {authority.certificate}\ncertfile {certificate}\nkeyfile {key}\n"
     made = Mosquitto(folder, lines + "require_certificate true\n")
     shown, shown_key = authority.issue("boat")
-    yield (
-        made,
-        Broker(
-            MqttConfig(
-                broker=f"localhost:{made.port}",
-                tls=True,
-                ca_file=str(authority.certificate),
-                cert_file=str(shown),
-                key_file=str(shown_key),
-            ),
-            "tls",
-        ),
-        stranger,
-    )
+    files = {"ca": authority.certificate, "cert": shown, "key": shown_key}
+    given = {f"{name}_file": str(file) for name, file in files.items()}
+    config = MqttConfig(broker=f"localhost:{made.port}", tls=True, **given)  # type: ignore[arg-type]
+    yield made, Broker(config, "tls"), stranger
     made.stop()
 
 

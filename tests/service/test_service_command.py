@@ -44,8 +44,9 @@ def tree(root: Path) -> list[str]:
     return sorted(names - {EXECUTABLE.lstrip("/")})
 
 
-def edit(root: Path, name: str = "gateway") -> None:
-    (root / f"etc/kontronik-can-gw/{name}.toml").write_text('[[esc]]\nport = "/dev/esc_left"\n')
+def edit(root: Path, name: str = "gateway", before: str = "") -> None:
+    text = f'{before}[[esc]]\nport = "/dev/esc_left"\n'
+    (root / f"etc/kontronik-can-gw/{name}.toml").write_text(text)
 
 
 def written(program: Path) -> Path:
@@ -131,6 +132,28 @@ def test_an_install_removes_what_an_earlier_version_left(root: Path) -> None:
     assert f"{ours}: removed" in install(root).err
     assert not ours.parent.exists()
     assert changed.exists()
+
+
+@pytest.mark.parametrize("kind", ["metrics", "mqtt"])
+def test_what_stands_by_the_gateway_is_a_service_of_its_own(root: Path, kind: str) -> None:
+    install(root, f"--{kind}")
+    edit(root, before='[mqtt]\nbroker = "broker.example"\n')
+    assert f"kontronik-can-gw-{kind}.service is enabled" in install(root, f"--{kind}").err
+    unit = root / UNITS / f"kontronik-can-gw-{kind}.service"
+    assert f"ExecStart={EXECUTABLE} {kind} -c /etc/" in unit.read_text()
+    link = root / UNITS / f"multi-user.target.wants/kontronik-can-gw-{kind}.service"
+    assert str(link.readlink()) == f"/{UNITS}/{unit.name}"
+    uninstall(root)
+    assert not unit.exists() and not link.is_symlink()
+
+
+def test_mqtt_without_a_broker_is_installed_but_not_enabled(root: Path) -> None:
+    install(root)
+    edit(root)
+    said = "gateway.toml: mqtt.broker is not set. kontronik-can-gw-mqtt.service was not enabled."
+    assert said in install(root, "--mqtt").err
+    names = [path.name for path in (root / UNITS / "multi-user.target.wants").iterdir()]
+    assert names == ["kontronik-can-gw.service"]
 
 
 def test_an_instance_has_its_own_configuration_and_goes_alone(root: Path, wants: Path) -> None:

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from kontronik_can_gw.desk.doctor.system import System
-from kontronik_can_gw.runtime.serial_port import MINI_UART
 
 _BUS_DRIVERS = ("port", "ctrl", "usb", "")
 """Drivers of the serial core, which newer kernels insert between tty and UART."""
+_OF_USB = ("product", "serial")
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,6 @@ class Adapter:
     product: str = ""
     serial: str = ""
     vendor_id: str = ""
-    mini_uart: bool = False
 
     def __str__(self) -> str:
         words = [self.product, f"driver {self.driver}" if self.driver else ""]
@@ -32,19 +31,15 @@ class Adapter:
 
 def adapter_of(system: System, tty: str) -> Adapter:
     """The hardware of a tty given by name, as ttyUSB0."""
-    driver, mini_uart = "", False
+    driver = ""
     for folder in _ancestors(system, f"/sys/class/tty/{tty}/device"):
-        if system.exists(f"{folder}/driver"):
+        if not driver and system.exists(f"{folder}/driver"):
             name = system.real(f"{folder}/driver").rpartition("/")[2]
-            driver = driver or (name if name not in _BUS_DRIVERS else "")
-        compatible = system.text(f"{folder}/of_node/compatible") or ""
-        mini_uart = mini_uart or MINI_UART in compatible.split("\0") or driver == "bcm2835-aux-uart"
+            driver = "" if name in _BUS_DRIVERS else name
         if (vendor_id := system.text(f"{folder}/idVendor")) is not None:
-            product = system.text(f"{folder}/product") or ""
-            return Adapter(
-                driver, folder, product, system.text(f"{folder}/serial") or "", vendor_id, mini_uart
-            )
-    return Adapter(driver, mini_uart=mini_uart)
+            product, serial = (system.text(f"{folder}/{name}") or "" for name in _OF_USB)
+            return Adapter(driver, folder, product, serial, vendor_id)
+    return Adapter(driver)
 
 
 def _ancestors(system: System, folder: str) -> Iterator[str]:

@@ -6,16 +6,13 @@ Nothing is written, and the settings of a port that another program may use are 
 
 import contextlib
 import errno
-import fcntl
 import os
-import struct
 import termios
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-_GET_COUNTS, _COUNTS = 0x545D, struct.Struct("=20i")
-_COUNTERS = {6: "framing", 8: "parity", 7: "overrun", 9: "break", 10: "buffer overrun"}
-"""Indices in struct serial_icounter_struct."""
+from kontronik_can_gw.runtime.serial_port import line_errors
+
 _STICKY_PARITY = 0o10000000000
 
 
@@ -30,7 +27,6 @@ class Line:
     even_parity: bool | None = None
     errors: Mapping[str, int] = field(default_factory=dict)
     """Line errors since the driver was loaded, by kind; empty where it does not count."""
-    counts: bool = False
 
 
 def look(path: str, alone: bool) -> Line:
@@ -40,9 +36,7 @@ def look(path: str, alone: bool) -> Line:
     except OSError as error:
         return Line(error.strerror or str(error), busy=error.errno == errno.EBUSY)
     try:
-        parity = _try_even_parity(fd, alone)
-        errors = _line_errors(fd)
-        return Line(even_parity=parity, errors=errors or {}, counts=errors is not None)
+        return Line(even_parity=_try_even_parity(fd, alone), errors=line_errors(fd))
     except termios.error as error:
         return Line(f"is not a working serial port ({error.args[-1]})")
     finally:
@@ -71,11 +65,3 @@ def _is_ours(mode: list[object]) -> bool:
     asked = termios.CS8 | termios.PARENB
     seen = flags & (termios.CSIZE | termios.PARENB | termios.PARODD | termios.CSTOPB)
     return seen == asked and speed == termios.B115200
-
-
-def _line_errors(fd: int) -> dict[str, int] | None:
-    try:
-        counts = _COUNTS.unpack(fcntl.ioctl(fd, _GET_COUNTS, bytes(_COUNTS.size)))
-    except OSError:
-        return None
-    return {name: counts[place] for place, name in _COUNTERS.items() if counts[place]}

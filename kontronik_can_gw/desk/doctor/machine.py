@@ -2,8 +2,9 @@
 
 import os
 import platform
+import re
 import time
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.desk.doctor.findings import Finding, Findings
@@ -13,8 +14,6 @@ from kontronik_can_gw.desk.doctor.system import System
 _PACKAGES = ("python-can", "canopen", "pyserial", "cantools", "rich")
 _FIRST_YEAR = 2024
 _MIN_MEMORY_KB = 64 * 1024
-_SLOW_CLOCKS = ("acpi_pm", "hpet", "jiffies", "pit")
-_CLOCK = "/sys/devices/system/clocksource/clocksource0/current_clocksource"
 _FREQUENCY = "/sys/devices/system/cpu/cpu0/cpufreq"
 
 
@@ -22,7 +21,8 @@ def check_machine(system: System, unit: Unit | None, year: int | None = None) ->
     """All findings about the machine. ``year``: replaces that of the wall clock in tests."""
     findings = Findings("Machine")
     check_service(system, findings, unit)
-    _clock(system, findings, time.gmtime().tm_year if year is None else year)
+    year = time.gmtime().tm_year if year is None else year
+    findings.say("machine.clock", "wrong" if year < _FIRST_YEAR else "ok", year=year)
     _processor(system, findings)
     _memory(system, findings)
     _power(system, findings)
@@ -31,15 +31,6 @@ def check_machine(system: System, unit: Unit | None, year: int | None = None) ->
         findings.say("machine.log", "ok" if is_kept else "lost")
     _versions(findings)
     return findings.found
-
-
-def _clock(system: System, findings: Findings, year: int) -> None:
-    findings.say("machine.clock", "wrong" if year < _FIRST_YEAR else "ok", year=year)
-    source = system.text(_CLOCK)
-    if source:
-        findings.say(
-            "machine.clock_source", "slow" if source in _SLOW_CLOCKS else "ok", source=source
-        )
 
 
 def _processor(system: System, findings: Findings) -> None:
@@ -57,12 +48,11 @@ def _processor(system: System, findings: Findings) -> None:
 
 
 def _memory(system: System, findings: Findings) -> None:
-    for line in (system.text("/proc/meminfo") or "").splitlines():
-        name, *words = line.split()
-        if name == "MemAvailable:" and words and words[0].isdigit():
-            free = int(words[0])
-            case = "low" if free < _MIN_MEMORY_KB else "ok"
-            findings.say("machine.memory", case, megabytes=free // 1024)
+    found = re.search(r"^MemAvailable: *(\d+)", system.text("/proc/meminfo") or "", re.MULTILINE)
+    if found is not None:
+        free = int(found[1])
+        case = "low" if free < _MIN_MEMORY_KB else "ok"
+        findings.say("machine.memory", case, megabytes=free // 1024)
 
 
 def _power(system: System, findings: Findings) -> None:
@@ -75,17 +65,11 @@ def _power(system: System, findings: Findings) -> None:
 
 
 def _versions(findings: Findings) -> None:
-    found = []
-    for name in _PACKAGES:
-        try:
-            found.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
     findings.say(
         "machine.versions",
         "ok",
         version=__version__,
         python=platform.python_version(),
         kernel=platform.release(),
-        packages=", ".join(found),
+        packages=", ".join(f"{name} {version(name)}" for name in _PACKAGES),
     )

@@ -9,6 +9,7 @@ from kontronik_can_gw.desk.doctor.findings import Finding, Findings
 from kontronik_can_gw.desk.doctor.line import Line
 from kontronik_can_gw.desk.doctor.service import Unit
 from kontronik_can_gw.desk.doctor.system import Process, System, User
+from kontronik_can_gw.runtime.serial_port import is_mini_uart
 
 Look = Callable[[str, bool], Line]
 _GRABBED_BY_BRLTTY = ("1a86", "10c4", "0403")
@@ -87,7 +88,7 @@ class _Port:
         self._power()
         if look is None:
             return
-        if self._adapter.mini_uart:
+        if is_mini_uart(f"/dev/{self._tty}", self._system.root):
             self._say("port.parity", "mini_uart")
         elif self._holders or is_console or has_prompt:
             self._say("port.parity", "gateway" if self._has_gateway else "in_use")
@@ -198,11 +199,9 @@ class _Port:
             return
         case = {None: "set_up", True: "ok", False: "none"}[line.even_parity]
         self._say("port.parity", case)
+        seen = [f"{n} {kind.replace('_', ' ')}" for kind, n in line.errors.items() if n]
         if line.errors:
-            counts = ", ".join(f"{number} {name}" for name, number in line.errors.items())
-            self._say("port.line_errors", "some", counts=counts)
-        elif line.counts:
-            self._say("port.line_errors", "ok")
+            self._say("port.line_errors", "some" if seen else "ok", counts=", ".join(seen))
 
 
 def _users(findings: Findings, holders: list[Process], complete: bool) -> None:

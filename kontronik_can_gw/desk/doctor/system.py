@@ -10,6 +10,7 @@ import pwd
 import shutil
 import stat
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -164,29 +165,22 @@ class System:
             name = pwd.getpwuid(uid).pw_name
         return User(name, uid, frozenset((*os.getgroups(), os.getegid())))
 
-    def user_named(self, name: str, more_groups: tuple[str, ...] = ()) -> User | None:
+    def user_named(self, name: str, more_groups: Sequence[str] = ()) -> User | None:
         """A user by name, with the groups from the system and ``more_groups``; None where there is none."""
-        for words in self._colons("/etc/passwd"):
-            if words[0] == name and words[2].isdigit() and words[3].isdigit():
-                groups = self._groups(name, more_groups) | {int(words[3])}
-                return User(name, int(words[2]), groups)
-        return None
+        try:
+            found = pwd.getpwnam(name)
+        except KeyError:
+            return None
+        groups = os.getgrouplist(name, found.pw_gid)
+        return User(name, found.pw_uid, frozenset(groups) | self.group_numbers(more_groups))
 
-    def dynamic_user(self, name: str, groups: tuple[str, ...]) -> User:
+    def dynamic_user(self, name: str, groups: Sequence[str]) -> User:
         """A user that systemd creates when the service starts (DynamicUser)."""
-        return User(name, -1, self._groups(name, groups))
+        return User(name, -1, self.group_numbers(groups))
 
-    def _groups(self, user: str, more: tuple[str, ...]) -> frozenset[int]:
-        return frozenset(
-            int(words[2])
-            for words in self._colons("/etc/group")
-            if words[2].isdigit() and (words[0] in more or user in words[3].split(","))
-        )
-
-    def _colons(self, file: str) -> list[list[str]]:
-        """The lines of a file with four or more columns between colons."""
-        lines = [line.split(":") for line in (self.text(file) or "").splitlines()]
-        return [words for words in lines if len(words) > 3]
+    def group_numbers(self, names: Sequence[str]) -> frozenset[int]:
+        """The numbers of those groups that there are."""
+        return frozenset(group.gr_gid for group in grp.getgrall() if group.gr_name in names)
 
     def group_name(self, gid: int) -> str:
         try:

@@ -9,12 +9,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from kontronik_can_gw.canopen import cob_ids, nmt
+from kontronik_can_gw.canopen import nmt
 from kontronik_can_gw.config.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk import pty
-from kontronik_can_gw.desk.monitor.sources import Bus, Take
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.sources import Bus, Take
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,
@@ -33,7 +33,7 @@ from kontronik_can_gw.node_state import NmtState
 from kontronik_can_gw.runtime.loop import Loop
 
 with without_asammdf():
-    import can
+    import canopen
 
 _NODE_ID = 1
 _TPDOS = (0x180, 0x280, 0x380, 0x480)
@@ -45,36 +45,32 @@ _ERRORS = (
 )
 
 
-class Master(can.Listener):
-    """A minimal CANopen master: starts the node and notes its state, PDOs and emergencies."""
+class Master:
+    """A CANopen master that starts its one node, and notes its state, PDOs and emergencies."""
 
-    def __init__(self, bus: can.BusABC) -> None:
-        self._bus = bus
-        self._state = "no heartbeat yet"
+    def __init__(self, network: canopen.Network) -> None:
+        self._node = network.add_node(_NODE_ID)
+        self._node.nmt.add_heartbeat_callback(self._heard)
         self._pdos = 0
-        self._emergency = "none yet"
+        for cob_id in _TPDOS:
+            network.subscribe(cob_id + _NODE_ID, self._count)
 
-    def on_message_received(self, msg: can.Message) -> None:
-        data, function = bytes(msg.data), msg.arbitration_id - _NODE_ID
-        if function == cob_ids.HEARTBEAT:
-            state = NmtState(data[0])
-            self._state = state.name.replace("_", "-").lower()
-            if state in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL):
-                start = bytes((nmt.Command.START, _NODE_ID))
-                self._bus.send(
-                    can.Message(arbitration_id=cob_ids.NMT, data=start, is_extended_id=False)
-                )
-        elif function == cob_ids.EMERGENCY:
-            code = int.from_bytes(data[:2], "little")
-            bits = PROTOCOLS[0].errors["operating_errors"]
-            text = next((bit.meaning for bit in bits if bit == data[3]), "of the gateway")
-            self._emergency = f"{code:04X}h {text if code else 'no error any more'}"
-        elif function in _TPDOS:
-            self._pdos += 1
+    def _heard(self, state: int) -> None:
+        if state in (NmtState.INITIALISING, NmtState.PRE_OPERATIONAL):
+            self._node.nmt.send_command(nmt.Command.START)
+
+    def _count(self, *_: object) -> None:
+        self._pdos += 1
 
     def line(self) -> str:
         """One line with everything that the master knows."""
-        return f"CANopen: node {_NODE_ID} {self._state}, {self._pdos} PDOs, EMCY {self._emergency}"
+        emergency = "none yet"
+        if log := self._node.emcy.log:
+            bits = PROTOCOLS[0].errors["operating_errors"]
+            text = next((bit.meaning for bit in bits if bit == log[-1].data[0]), "of the gateway")
+            emergency = f"{log[-1].code:04X}h {text if log[-1].code else 'no error any more'}"
+        state = self._node.nmt.state.lower()
+        return f"CANopen: node {_NODE_ID} {state}, {self._pdos} PDOs, EMCY {emergency}"
 
 
 class DemoBus(Bus):
@@ -110,10 +106,10 @@ def simulated_bus(seed: int, stop: threading.Event) -> Iterator[DemoBus]:
         layout, loop = _gateway(esc.path, stack.enter_context(tempfile.TemporaryDirectory()))
         assert layout.config is not None
         channel = layout.config.can.channel
-        can_bus = stack.enter_context(can.Bus(interface="virtual", channel=channel))
-        master = Master(can_bus)
-        notifier = can.Notifier(can_bus, [master], timeout=0.1)
-        bus = stack.enter_context(DemoBus(layout, master))
+        network = stack.enter_context(canopen.Network())
+        network.NOTIFIER_CYCLE = 0.1
+        bus = stack.enter_context(DemoBus(layout, Master(network)))
+        network.connect(interface="virtual", channel=channel)
         loop.open()
         flight = [(_flight(seed), esc)]
         works: tuple[Callable[[], object], ...] = (
@@ -130,7 +126,6 @@ def simulated_bus(seed: int, stop: threading.Event) -> Iterator[DemoBus]:
             loop.stop()
             for thread in threads:
                 thread.join(2)
-            notifier.stop()
         if failures:
             raise RunError(f"the demonstration failed: {failures[0]!r}")
         if esc.received:

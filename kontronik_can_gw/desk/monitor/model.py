@@ -4,12 +4,12 @@ from typing import Any
 
 from kontronik_can_gw.dbc.names import normalize
 from kontronik_can_gw.dbc.view import View
-from kontronik_can_gw.desk.monitor.esc_monitor import EscMonitor, state_name
+from kontronik_can_gw.desk.member import Member
+from kontronik_can_gw.desk.monitor.esc_monitor import EscMonitor
 from kontronik_can_gw.desk.monitor.quantities import HISTORY_S
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway_status import CanState, GatewayState
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 SILENCE_NS = 5 * SECOND
@@ -22,6 +22,7 @@ class Monitor:
     def __init__(self, bus: BusLayout) -> None:
         self.bus = bus
         self.view = View(SignalReader(bus.layout))
+        self.gateway = Member(self.view, None, None)
         self.escs = tuple(
             EscMonitor(settings, index, self.view) for index, settings in enumerate(bus.escs)
         )
@@ -29,7 +30,7 @@ class Monitor:
         """Frames of the layout in the last second; None during the first one."""
         self._start: int | None = None
         self._now = 0
-        self._second: tuple[int, int] | None = None
+        self._second = (0, 0)
         """Begin of the present second, and the number of frames then."""
         self._tracked = {
             esc.columns[source]: (esc, source, track)
@@ -54,16 +55,9 @@ class Monitor:
         """Take a frame that came at ``now``; frames outside the layout are ignored."""
         if frame.remote:
             return
-        now = self.advance(now)
-        fresh = [esc.is_fresh for esc in self.escs]
-        chunks = self.view.take(frame.key, frame.data, now)
-        if chunks is None:
-            return
-        firsts = [first for first, _ in chunks]
-        self._missing.difference_update(firsts)
-        for esc, was_fresh in zip(self.escs, fresh, strict=True):
-            esc.note(firsts, was_fresh)
+        chunks = self.view.take(frame.key, frame.data, self.advance(now)) or ()
         for first, values in chunks:
+            self._missing.discard(first)
             for column, raw in enumerate(values, first):
                 if column in self._tracked:
                     esc, source, track = self._tracked[column]
@@ -75,10 +69,8 @@ class Monitor:
         """Advance the time: values of missing messages become not available. Return the time, which never goes back."""
         self._now = now = max(now, self._now)
         if self._start is None:
-            self._start = now
+            self._start, self._second = now, (now, self.frames)
         self.view.expire(now)
-        if self._second is None:
-            self._second = (now, self.frames)
         begin, frames = self._second
         seconds = (now - begin) // SECOND
         if seconds:
@@ -110,22 +102,17 @@ class Monitor:
     @property
     def gateway_state(self) -> str | None:
         """Name of the gateway's state; None where it is not available."""
-        return state_name(GatewayState, self.view.value("gateway_state"))
+        return self.gateway.text("gateway_state")
 
     @property
     def can_state(self) -> str | None:
         """Name of the state of the gateway's CAN controller; None where it is not available."""
-        return state_name(CanState, self.view.value("can_state"))
+        return self.gateway.text("can_state")
 
     @property
     def is_replay(self) -> bool:
         """True where the gateway reports that it plays a recording."""
         return normalize(self.gateway_state or "") == "replay"
-
-    def gateway_number(self, source: str) -> float | None:
-        """A numeric value of the gateway itself, as ``esc_count``."""
-        value = self.view.value(source)
-        return value if isinstance(value, (int, float)) else None
 
     def document(self) -> dict[str, Any]:
         """Everything as JSON: source names, values and their units; None for what is not available."""
@@ -134,7 +121,7 @@ class Monitor:
             "gateway": {
                 "state": self.gateway_state,
                 "can_state": self.can_state,
-                "uptime_s": self.gateway_number("uptime"),
+                "uptime_s": self.gateway.number("uptime"),
             },
             "units": {name: unit for esc in self.escs for name, unit in esc.units.items() if unit},
             "escs": [esc.document() for esc in self.escs],

@@ -32,7 +32,7 @@ from kontronik_can_gw.desk.monitor.lines import (
 )
 from kontronik_can_gw.desk.monitor.model import SILENCE_NS, Monitor
 from kontronik_can_gw.desk.monitor.quantities import HISTORY_S, QUANTITIES, Quantity
-from kontronik_can_gw.desk.monitor.sources import Source
+from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.printable import printable
@@ -42,7 +42,7 @@ _MARKS = {"": TITLE, "!": "bold yellow", "!!": BAD}
 """Styles of what is marked; the marks are for displays without colour."""
 _TROUBLES = {
     "neverseen": "no telemetry yet: is the ESC powered, its cable plugged in?",
-    "searching": "bytes come but no telemetry: right port? Does the ESC send KONTRONIK telemetry?",
+    "searching": "bytes come but no telemetry: right port? Does the ESC send {protocol} telemetry?",
     "porterror": "the gateway cannot open the port: look at its log, or kontronik-can-gw status",
 }
 _FILLERS = {"from", "for", "target", "during", "operation"}
@@ -120,7 +120,7 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, str]]:
         yield from ((hint, POOR) for hint in source.hints)
     elif not monitor.frames and not source.is_file:
         yield f"waiting for frames on {source.name} ...", FAINT
-    count = monitor.gateway_number("esc_count")
+    count = monitor.gateway.number("esc_count")
     if count is not None and count > len(monitor.escs):
         yield (
             f"the gateway has {count:.0f} ESCs, the DBC in use describes {len(monitor.escs)}: give its configuration (-c) or DBC (--dbc).",
@@ -217,7 +217,8 @@ def _trouble(esc: EscMonitor) -> str:
         return ""
     age = esc.number("data_age")
     since = f" for {duration(age / 1000)}" if age is not None else ""
-    return _TROUBLES.get(link, f"no telemetry{since}: is the ESC powered, its cable plugged in?")
+    trouble = _TROUBLES.get(link, f"no telemetry{since}: is the ESC powered, its cable plugged in?")
+    return trouble.format(protocol=esc.protocol.name.upper())
 
 
 def sparkline(esc: EscMonitor, quantity: Quantity, width: int, glyphs: Glyphs) -> Text:
@@ -268,7 +269,7 @@ def _page(esc: EscMonitor, size: tuple[int, int], glyphs: Glyphs) -> list[Text]:
     head = line(_name_part(esc), "  ", _state_part(esc), "  link ", _link_part(esc))
     if age is not None:
         head.append(f", age {age_text(age)}")
-    device = line((esc.device or "-", FAINT), (f", {cells:.0f} cells" if cells else "", FAINT))
+    device = line((esc.device_text or "-", FAINT), (f", {cells:.0f} cells" if cells else "", FAINT))
     if esc.has("crc_errors", "dropped_bytes"):
         crc, dropped = compact(esc.number("crc_errors")), compact(esc.number("dropped_bytes"))
         text = f"  CRC errors {crc}, dropped bytes {dropped}"

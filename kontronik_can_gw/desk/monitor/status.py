@@ -36,8 +36,8 @@ from kontronik_can_gw.runtime.snapshot import FORMAT, PROGRAM, STALE_NS
 
 HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3
 _LARGEST_FILE = 1 << 22
-_FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
-_MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
+FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
+MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """What a document with values of another type raises."""
 _CAN_STYLES = {"error-active": GOOD, "unknown": "", "error-warning": POOR, "error-passive": POOR}
 _MAX_ALARM_LINES = 6
@@ -91,9 +91,9 @@ def look_at(file: Path, now: int) -> Seen:
     except OSError as error:
         return not_running(f"cannot be read: {error.strerror}. Try it with sudo.")
     except (ValueError, RecursionError):
-        return not_running(_FOREIGN)
+        return not_running(FOREIGN)
     if not isinstance(document, dict) or document.get("program") != PROGRAM:
-        return not_running(_FOREIGN)
+        return not_running(FOREIGN)
     if document.get("format") != FORMAT:
         return not_running(f"is of another version of {PROGRAM} ({document.get('version')}).")
     return judge(file, document, now)
@@ -104,8 +104,8 @@ def judge(file: Path, document: Document, now: int) -> Seen:
     try:
         seen = _judge(file, document, now)
         _lines(seen, document, None)
-    except _MALFORMED:
-        return Seen(file, NOT_RUNNING, f"{file}: {_FOREIGN}")
+    except MALFORMED:
+        return Seen(file, NOT_RUNNING, f"{file}: {FOREIGN}")
     return seen
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any
 
 from rich.console import Console
@@ -11,8 +12,9 @@ from kontronik_can_gw.desk.monitor import terminal
 from kontronik_can_gw.desk.monitor.lines import ASCII, UNICODE
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.screen import Choice, file_of, notices, plain_lines, screen
-from kontronik_can_gw.desk.monitor.sources import Source
+from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.esc.telemetry import SECOND
 
 REFRESH_S = 0.15
 PLAIN_LINE_S = 1.0
@@ -110,9 +112,16 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
             raise RunError(f"{source.name}: holds no frame of {file}. Give its DBC (--dbc).")
         silence = f"no frame of {file} on {source.name} for {timeout:g} s."
         raise RunError(source.problem or " ".join([silence, *source.hints]))
+    wall = source.wall_ns()
     head = {
-        "time": source.wall_time(),
+        "time": None if wall is None else _iso(wall),
         "file" if source.is_file else "interface": source.name,
         "dbc": file,
     }
     return head | monitor.document()
+
+
+def _iso(wall_ns: int) -> str:
+    """Date and time with the offset of this machine's zone."""
+    moment = datetime.fromtimestamp(wall_ns / SECOND, UTC).astimezone()
+    return moment.isoformat(timespec="milliseconds")

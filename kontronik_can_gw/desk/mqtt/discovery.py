@@ -6,12 +6,11 @@ from typing import Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.desk.mqtt.topics import Topics
-from kontronik_can_gw.desk.mqtt.values import Member
+from kontronik_can_gw.desk.mqtt.values import Published
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals.unpacker import Column
 
 PROGRAM = "kontronik-can-gw"
-MAKER = "KONTRONIK"
 _MEASURED: dict[str, tuple[str, str | None]] = {
     "V": ("V", "voltage"),
     "A": ("A", "current"),
@@ -64,24 +63,24 @@ _ERROR_ENTITIES: dict[str, dict[str, Any]] = {
 }
 
 
-def device(topics: Topics, member: Member, columns: Sequence[Column]) -> dict[str, Any]:
+def device(topics: Topics, member: Published, columns: Sequence[Column]) -> dict[str, Any]:
     """The discovery of the gateway or of an ESC: one device with all its entities."""
     identifier = topics.identifier(member.name)
     online = {"topic": topics.online}
     components: dict[str, dict[str, Any]] = {}
-    for source, at in member.columns.items():
+    for source, at in member.no_flags.items():
         if (component := entity(source, columns[at])) is not None:
             components[source] = component
-    if member.index is not None and member.flags:
+    if member.index is not None and member.has(*member.protocol.bits, *member.protocol.errors):
         components |= _ERROR_ENTITIES
-    if member.columns.keys() & {"operating_state", "operating_state_raw"}:
+    if member.has("operating_state", "operating_state_raw"):
         components["motor"] = _MOTOR
     for key, component in components.items():
         components[key] = {**component, "unique_id": f"{identifier}_{key}"}
         if key in VALUES and VALUES[key].group is Group.LINK:
             # values of the link are valid, and most useful, while the ESC sends nothing
             components[key] |= {
-                "availability": [online, {"topic": topics.available(None)}],
+                "availability": [online, {"topic": topics.available()}],
                 "availability_mode": "all",
             }
     return {
@@ -94,12 +93,12 @@ def device(topics: Topics, member: Member, columns: Sequence[Column]) -> dict[st
     }
 
 
-def _about(topics: Topics, member: Member) -> dict[str, Any]:
+def _about(topics: Topics, member: Published) -> dict[str, Any]:
     if member.index is None:
         return {"name": f"KONTRONIK gateway {topics.gateway}", "model": PROGRAM}
     name, (model, firmware) = f"{topics.gateway} {member.name}", member.identity
-    about = {"name": name, "manufacturer": MAKER, "model": model or "ESC"}
-    about["via_device"] = topics.identifier(None)
+    about = {"name": name, "manufacturer": member.protocol.maker, "model": model or "ESC"}
+    about["via_device"] = topics.identifier()
     return about if firmware is None else about | {"sw_version": firmware}
 
 

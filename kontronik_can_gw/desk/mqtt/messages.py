@@ -19,10 +19,11 @@ from typing import Any
 from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.mqtt.discovery import device
 from kontronik_can_gw.desk.mqtt.topics import OFFLINE, ONLINE, Message, Topics
-from kontronik_can_gw.desk.mqtt.values import Member
+from kontronik_can_gw.desk.mqtt.values import Published
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import MS, SECOND
+from kontronik_can_gw.esc.values import Group
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 MIN_PAUSE_NS = 200 * MS
@@ -86,13 +87,10 @@ class Publisher:
         self._retain, self._discovery, self._replay = retain, discovery, replay
         columns = self.view.reader.columns
         indices = sorted({column.esc for column in columns if column.esc is not None})
-        self._members = [Member(self.view, None, None)]
-        self._members += [
-            Member(self.view, index, bus.escs[index].name, protocol_named(bus.escs[index].protocol))
-            for index in indices
-        ]
+        self._members = [Published(self.view, None, None)]
+        self._members += [Published(self.view, bus.escs[index], index) for index in indices]
         self._timings = [_Timing(round(SECOND / rate)) for _ in self._members]
-        self._live = {at: member for member in self._members for at in member.live}
+        self._live = {at: m for m in self._members for at in m.of_group[Group.LIVE]}
         self._published: dict[str, bytes] = {}
         """Lasting messages as published, by topic."""
         self._discovered: dict[str, tuple[str | None, str | None]] = {}
@@ -101,11 +99,11 @@ class Publisher:
     @property
     def escs(self) -> list[str]:
         """Names of the ESCs with values in the layout."""
-        return [member.name for member in self._members if member.name is not None]
+        return [member.name for member in self._members if member.name]
 
-    def take(self, key: int, data: bytes, now: int) -> None:
+    def take(self, frame: CanFrame, now: int) -> None:
         """Take a frame."""
-        for first, values in self.view.take(key, data, now) or ():
+        for first, values in self.view.take(frame.key, frame.data, now) or ():
             for at, value in enumerate(values, first):
                 if value is not None and at in self._live:
                     self._live[at].heard(now)
@@ -121,10 +119,12 @@ class Publisher:
                 if self._replay:
                     state["replay"] = True
                 topic = self.topics.state(member.name)
-                made.append(Message(topic, _json(state | member.state(now)), retain=self._retain))
+                made.append(
+                    Message(topic, _json(state | member.document(now)), retain=self._retain)
+                )
         return made
 
-    def _lasting(self, member: Member, now: int) -> list[Message]:
+    def _lasting(self, member: Published, now: int) -> list[Message]:
         """Availability and discovery, where they are not published as they are now."""
         wanted = self._discovery_of(member, now)
         available = member.is_available(now)
@@ -135,7 +135,7 @@ class Publisher:
             Message(topic, payload, lasting=True, retain=True) for topic, payload in news.items()
         ]
 
-    def _discovery_of(self, member: Member, now: int) -> dict[str, bytes]:
+    def _discovery_of(self, member: Published, now: int) -> dict[str, bytes]:
         """The new discovery of a member: once device and firmware are known, or stay unknown for long.
 
         Not before, since the retained discovery of an earlier run may be more complete.
@@ -161,4 +161,4 @@ def _json(made: dict[str, Any]) -> bytes:
 def iso(wall_ns: int) -> str:
     """ISO 8601 in UTC, with milliseconds."""
     moment = datetime.fromtimestamp(wall_ns // MS / 1000, UTC)
-    return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -17,7 +17,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class Topics:
-    """The topics of one gateway. ``esc`` None: the gateway's own."""
+    """The topics of one gateway. ``esc`` empty: the gateway's own."""
 
     prefix: str
     gateway: str
@@ -30,15 +30,15 @@ class Topics:
     def online(self) -> str:
         return f"{self.base}/online"
 
-    def available(self, esc: str | None) -> str:
-        return f"{self.base}/available" if esc is None else f"{self.base}/{esc}/available"
+    def available(self, esc: str = "") -> str:
+        return f"{self.base}/{esc}/available" if esc else f"{self.base}/available"
 
-    def state(self, esc: str | None) -> str:
-        return f"{self.base}/state" if esc is None else f"{self.base}/{esc}/state"
+    def state(self, esc: str = "") -> str:
+        return f"{self.base}/{esc}/state" if esc else f"{self.base}/state"
 
-    def discovery(self, prefix: str, esc: str | None) -> str:
+    def discovery(self, prefix: str, esc: str = "") -> str:
         return f"{prefix}/device/{self.identifier(esc)}/config"
 
-    def identifier(self, esc: str | None) -> str:
+    def identifier(self, esc: str = "") -> str:
         """Home Assistant's identifier of a device, constant as long as gateway and ESC keep their names."""
-        return f"kontronik_{self.gateway}" if esc is None else f"kontronik_{self.gateway}_{esc}"
+        return f"kontronik_{self.gateway}_{esc}" if esc else f"kontronik_{self.gateway}"

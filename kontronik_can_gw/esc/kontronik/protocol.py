@@ -62,6 +62,7 @@ KONTRONIK = EscProtocol(
         _bits("firmware_main", "firmware_word", 8, 0xFF),
         _bits("firmware_sub", "firmware_word", 0, 0xFF),
     ),
+    maker="KONTRONIK",
     even_parity=True,
     layouts=("V4", "legacy"),
     errors={"operating_errors": tuple(OperatingError), "selftest_errors": tuple(SelfTestError)},

@@ -1,9 +1,8 @@
-"""Where the monitor's frames come from: the CAN bus, to which nothing is sent, or a recording played in real time."""
+"""Where the frames of monitor and MQTT come from: the CAN bus, to which nothing is sent, or a recording played in real time."""
 
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
@@ -14,6 +13,7 @@ from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.telemetry import SECOND
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.runtime.bus_listener import BusListener
+from kontronik_can_gw.runtime.open_can import check_interface
 from kontronik_can_gw.signals.unpacker import SignalReader
 
 _MAX_LAG_S = 0.5
@@ -48,35 +48,34 @@ class Source:
         """The present time on the clock of the frames, in ns."""
         return time.monotonic_ns()
 
-    def wall_time(self) -> str | None:
-        """Date and time of ``now``; None where not known."""
-        return _iso(datetime.now(UTC))
-
-
-def _iso(wall: datetime) -> str:
-    return wall.astimezone().isoformat(timespec="milliseconds")
+    def wall_ns(self) -> int | None:
+        """Unix time of ``now``; None where not known."""
+        return time.time_ns()
 
 
 def can_config(bus: BusLayout, interface: str | None, channel: str | None) -> CanConfig:
-    """The interface to listen on. UserError where it is the port of an ESC, to which nothing may be sent."""
+    """The interface to listen on. UserError for one that python-can does not know, and for an ESC's port, to which nothing may be sent."""
     if bus.config is None:
         is_fd = any(message.fd for message in bus.layout.messages)
-        return CanConfig(interface=interface or "socketcan", channel=channel or "can0", fd=is_fd)
-    can = bus.config.can
-    if interface not in (None, can.interface):
-        # options and channel belong to another kind of interface
-        can = replace(can, interface=interface, options={})
-    can = replace(can, channel=channel or can.channel)
-    check_devices(replace(bus.config, can=can))
+        can = CanConfig(interface=interface or "socketcan", channel=channel or "can0", fd=is_fd)
+    else:
+        can = bus.config.can
+        if interface not in (None, can.interface):
+            # options and channel belong to another kind of interface
+            can = replace(can, interface=interface, options={})
+        can = replace(can, channel=channel or can.channel)
+        check_devices(replace(bus.config, can=can))
+    check_interface(can)
     return can
 
 
 class Bus(Source):
-    """Frames from the CAN bus, as context manager."""
+    """Frames from the CAN bus, as context manager. RunError where it cannot be opened, unless ``patient``: then it is tried again."""
 
-    def __init__(self, bus: BusLayout, config: CanConfig) -> None:
+    def __init__(self, bus: BusLayout, config: CanConfig, patient: bool = False) -> None:
         super().__init__(config.channel, bus)
-        self._listener = BusListener(config, SignalReader(bus.layout).keys)
+        self._listener = BusListener(config, SignalReader(bus.layout).keys, patient)
+        self.problem = self._listener.problem
         rate = f"{config.bitrate // 1000} kbit/s"
         if config.interface == "socketcan":
             rate = f"ip -details link show {config.channel}"
@@ -159,6 +158,5 @@ class Recording(Source):
             parts.append("PAUSED")
         return "  ".join(parts)
 
-    def wall_time(self) -> str | None:
-        wall = self._input.wall_ns(self._clock)
-        return None if wall is None else _iso(datetime.fromtimestamp(wall / SECOND, UTC))
+    def wall_ns(self) -> int | None:
+        return self._input.wall_ns(self._clock)
