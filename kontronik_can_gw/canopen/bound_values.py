@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.data_types import BOOLEAN, FLOATS, SIGNED
-from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable, range_of
+from kontronik_can_gw.canopen.data_types import FLOATS, SIGNED, TYPE_BITS, range_of
+from kontronik_can_gw.canopen.dictionary import Dictionary, Value, Variable
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
 from kontronik_can_gw.esc.decoder import EscProtocol
@@ -58,7 +58,7 @@ class CompiledPdo:
 
 def bits_of(variable: Variable) -> int:
     """Length of a variable in a PDO; 0 where it has no fixed one."""
-    return 1 if variable.entry.data_type == BOOLEAN else 8 * (variable.size or 0)
+    return TYPE_BITS.get(variable.entry.data_type, 0)
 
 
 def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatus) -> None:
@@ -66,7 +66,7 @@ def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatu
     for (index, sub), bound in bindings_of(esc.protocol).items():
         variable = dictionary.get(index, sub)
         if variable is not None:
-            low, high = range_of(variable)
+            low, high = range_of(variable.entry.data_type)
             variable.read = partial(_read, bound, low, high, dictionary, esc, gateway)
 
 

@@ -32,12 +32,7 @@ from kontronik_can_gw.canopen.sdo_block import (
     Pace,
     check_block_size,
 )
-from kontronik_can_gw.canopen.sdo_segments import (
-    Incoming,
-    SegmentedDownload,
-    SegmentedUpload,
-    expected,
-)
+from kontronik_can_gw.canopen.sdo_segments import Incoming, SegmentedDownload, SegmentedUpload
 
 TIMEOUT_NS = 2_000_000_000
 """A transfer ends with 05040000h this long after the last frame of either side."""
@@ -52,14 +47,11 @@ class Objects(Protocol):
     def upload(self, index: int, sub: int, now: int) -> bytes:
         """The whole value, as one snapshot."""
 
-    def check_download(self, index: int, sub: int, size: int | None) -> None:
-        """Existence, access and length, before data moves. ``size`` in bytes; None: not indicated."""
+    def check_download(self, index: int, sub: int, size: int | None) -> int:
+        """Existence, access and length, before data moves. ``size`` in bytes; None: not indicated. Returns the most there can be."""
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
         """Write a value. False: the confirmation comes later through ``SdoServer.confirm``."""
-
-    def max_size(self, index: int, sub: int) -> int | None:
-        """Bytes that a download may have at most; None: no limit of the object's own."""
 
 
 _Transfer = SegmentedDownload | SegmentedUpload | BlockDownload | BlockUpload
@@ -203,7 +195,7 @@ class SdoServer:
         expedited, indicated = command & 2, command & 1
         if expedited:
             size = 4 - (command >> 2 & 3) if indicated else None
-            limit = self._prepare_download(size).limit
+            limit = self._objects.check_download(self._index, self._sub, size)
             # without a size the object's own length counts (e = 1, s = 0: "unspecified number of bytes")
             value = data[4 : 4 + (min(4, limit) if size is None else size)]
             self._store(value, self._initiated(0x60), now)
@@ -214,8 +206,8 @@ class SdoServer:
 
     def _prepare_download(self, size: int | None) -> Incoming:
         """Have everything checked that can be before data moves."""
-        self._objects.check_download(self._index, self._sub, size)
-        return expected(size, self._objects.max_size(self._index, self._sub))
+        limit = self._objects.check_download(self._index, self._sub, size)
+        return Incoming(size, limit if size is None else size)
 
     def _take_segment(self, data: bytes, now: int) -> None:
         download = self._running(SegmentedDownload)

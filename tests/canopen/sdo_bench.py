@@ -16,9 +16,16 @@ class Entry:
     value: bytes = b""
     access: str = "rw"
     size: int | None = None
-    most: int | None = None
+    most: int = 65536
     high: int | None = None
     late: bool = False
+
+    def check_size(self, size: int | None) -> int:
+        """Returns the greatest length."""
+        most = self.most if self.size is None else self.size
+        if size is not None and not (self.size or 0) <= size <= most:
+            raise SdoAbort(Abort.TOO_LONG if size > most else Abort.TOO_SHORT)
+        return most
 
 
 def usual_entries() -> dict[tuple[int, int], Entry]:
@@ -61,27 +68,21 @@ class Dictionary:
             raise SdoAbort(Abort.WRITE_ONLY)
         return entry.value
 
-    def check_download(self, index: int, sub: int, size: int | None) -> None:
+    def check_download(self, index: int, sub: int, size: int | None) -> int:
         self.checks.append((index, sub, size))
         entry = self.entry(index, sub)
         if entry.access == "ro":
             raise SdoAbort(Abort.READ_ONLY)
-        if size is not None and entry.size is not None and size != entry.size:
-            raise SdoAbort(Abort.TOO_LONG if size > entry.size else Abort.TOO_SHORT)
+        return entry.check_size(size)
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
         entry = self.entry(index, sub)
-        if entry.size is not None and len(data) != entry.size:
-            raise SdoAbort(Abort.TYPE)
+        entry.check_size(len(data))
         if entry.high is not None and int.from_bytes(data, "little") > entry.high:
             raise SdoAbort(Abort.TOO_HIGH)
         entry.value = data
         self.written.append((index, sub, data))
         return not entry.late
-
-    def max_size(self, index: int, sub: int) -> int | None:
-        entry = self.entry(index, sub)
-        return entry.most if entry.size is None else entry.size
 
 
 class Bench(Heard):

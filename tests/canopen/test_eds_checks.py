@@ -1,8 +1,6 @@
 """An EDS with a mistake is refused by file, section, key and remedy, all mistakes at once; what CiA 306 allows is taken."""
 
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -302,12 +300,6 @@ def test_a_dcf_is_not_taken_for_an_eds() -> None:
     found = problems(dcf.dcf(eds, 1, 500_000, {(0x1017, 0): 500}, "left", "left.dcf"))
     assert len(found) == 2
     assert "this is a DCF" in found[0]
-
-
-def test_the_canopen_library_is_not_loaded_before_an_eds_is() -> None:
-    code = "import sys, kontronik_can_gw.canopen.eds; print('canopen' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "False"
 
 
 def test_a_text_is_not_mapped() -> None:
