@@ -13,6 +13,8 @@ from kontronik_can_gw.canopen.eds_object import Entry
 Value = int | float | bytes
 Read = Callable[[int], Value]
 """``now`` to value. Raises SdoAbort where there is none."""
+Check = Callable[[int], None]
+"""Raises SdoAbort for a value that is refused."""
 Written = Callable[[int], bool | None]
 """What follows a download, given ``now``. False: its confirmation comes later."""
 
@@ -46,7 +48,7 @@ class Variable:
         self.entry = entry
         self.codec = codec(entry.data_type)
         self.read: Read | None = None
-        self.check: Callable[[int], None] | None = None
+        self.check: Check | None = None
         self.written: Written | None = None
         self.power_on: Value = self.empty if entry.default is None else entry.default
         self.value: Value = self.power_on
@@ -105,6 +107,16 @@ class Variable:
         return self.power_on
 
 
+def signature(word: bytes) -> Check:
+    """A check that refuses all numbers but that of these four letters: 08000020h."""
+
+    def check(value: int) -> None:
+        if value != int.from_bytes(word, "little"):
+            raise SdoAbort(Abort.TRANSFER)
+
+    return check
+
+
 class Dictionary:
     """All variables of one node. What is read or written over the bus goes through ``upload`` and ``download``."""
 
@@ -126,7 +138,7 @@ class Dictionary:
         sub: int = 0,
         *,
         read: Read | None = None,
-        check: Callable[[int], None] | None = None,
+        check: Check | None = None,
         written: Written | None = None,
     ) -> None:
         """Give an object to its service: what it shows, which values it refuses, what follows a download.

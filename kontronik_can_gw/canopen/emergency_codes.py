@@ -115,6 +115,7 @@ class BitCodes:
                 bits &= ~summary
         return bits
 
-    def registered(self, word: int, mask: int) -> int:
-        """The bits that set bits of 1001h: all errors, and the warnings in the mask."""
-        return word & self._error_bits & ~self._summary_bits | self.reported(word, mask)
+    def registered(self, word: int, mask: int) -> set[int]:
+        """The codes that set bits of 1001h: of all errors, and of the warnings in the mask."""
+        bits = word & self._error_bits & ~self._summary_bits | self.reported(word, mask)
+        return {self.code(bit) for bit in range(32) if bits >> bit & 1}

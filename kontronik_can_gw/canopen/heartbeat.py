@@ -13,13 +13,14 @@ _CATCHING_UP_NS = SECOND // 2
 
 
 class Producer:
-    """When the next heartbeat is due. A period of 0 produces none."""
+    """Has heartbeats sent. A period of 0 produces none."""
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: Dictionary, send: Callable[[], None]) -> None:
         self.due = NEVER
         self._dictionary = dictionary
+        self._send = send
         self._period = 0
-        dictionary.bind(0x1017, written=self._written)
+        dictionary.bind(0x1017, written=self.configure)
 
     def configure(self, now: int) -> None:
         """Take over 1017h. A changed period holds from now on: the first heartbeat comes one period later."""
@@ -35,18 +36,14 @@ class Producer:
         if self._period:
             self.due = now
 
-    def ticks(self, now: int) -> bool:
-        """True when one is due. Missed ones are not made up for: one heartbeat says all."""
+    def advance(self, now: int) -> None:
+        """Send one if it is due. Missed ones are not made up for: one heartbeat says all."""
         if now < self.due:
-            return False
+            return
         self.due += self._period
         if self.due <= now:
             self.due = now + self._period
-        return True
-
-    def _written(self, now: int) -> bool:
-        self.configure(now)
-        return True
+        self._send()
 
 
 class _Watched:
@@ -63,15 +60,9 @@ class Consumer:
     ``changed`` is called with a node-ID, whether its heartbeat is lost (or no longer), and the time.
     """
 
-    def __init__(
-        self,
-        dictionary: Dictionary,
-        changed: Callable[[int, bool, int], None],
-        rerouted: Callable[[int], bool],
-    ) -> None:
+    def __init__(self, dictionary: Dictionary, changed: Callable[[int, bool, int], None]) -> None:
         self._dictionary = dictionary
         self._changed = changed
-        self._rerouted = rerouted
         self._watched: dict[int, _Watched] = {}
         self._judged_from = -NEVER
         for variable in dictionary.subs(0x1016):
@@ -133,13 +124,12 @@ class Consumer:
                 kept = old if old is not None and old.timeout == timeout else None
                 self._watched[node_id] = kept or _Watched(node_id, timeout)
 
-    def _written(self, now: int) -> bool:
+    def _written(self, now: int) -> None:
         lost = [watched.node_id for watched in self._watched.values() if watched.lost]
         self._configure()
         for node_id in lost:
             if node_id not in self._watched or not self._watched[node_id].lost:
                 self._changed(node_id, False, now)
-        return self._rerouted(now)
 
     def _check(self, own: Variable, value: int) -> None:
         """A new entry. SdoAbort 06040043h where another entry watches the node already (CiA 301, 7.5.2.19)."""

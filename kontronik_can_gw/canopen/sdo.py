@@ -33,6 +33,7 @@ from kontronik_can_gw.canopen.sdo_block import (
     check_block_size,
 )
 from kontronik_can_gw.canopen.sdo_segments import Incoming, SegmentedDownload, SegmentedUpload
+from kontronik_can_gw.output import NEVER
 
 TIMEOUT_NS = 2_000_000_000
 """A transfer ends with 05040000h this long after the last frame of either side."""
@@ -59,7 +60,7 @@ _T = TypeVar("_T", SegmentedDownload, SegmentedUpload, BlockDownload, BlockUploa
 
 
 class SdoServer:
-    """One SDO server. ``send`` is called with the 8 bytes of each answer, from within any method that takes ``now``.
+    """One SDO server. ``send`` is called with the 8 bytes of each answer.
 
     ``segment_ns``: distance that block upload segments keep on average, in bursts of up to four, driven by ``advance``; 0: a whole
     sub-block at once. No input raises.
@@ -74,7 +75,7 @@ class SdoServer:
         self._transfer: _Transfer | None = None
         self._confirming = False
         """All data is here, the result of the dictionary is pending."""
-        self._deadline: int | None = None
+        self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
         self._index = 0
         self._sub = 0
@@ -96,7 +97,7 @@ class SdoServer:
         """The data of one request frame, of any length."""
         if len(data) != 8:
             return
-        if self._deadline is not None and now >= self._deadline:
+        if now >= self._deadline:
             self._abort(Abort.TIMEOUT)
         try:
             download = self._open_block_download()
@@ -108,15 +109,14 @@ class SdoServer:
                 self._serve(data, now)
         except SdoAbort as abort:
             self._abort(abort.code)
-        self._deadline = None if self._transfer is None else now + TIMEOUT_NS
+        self._deadline = NEVER if self._transfer is None else now + TIMEOUT_NS
 
-    def confirm(self, code: Abort | None, now: int, ticket: int | None = None) -> None:
+    def confirm(self, code: Abort | None, ticket: int | None = None) -> None:
         """The result of a download that returned False: ``code`` is why it failed, None that it is done.
 
         Ignored if the transfer is no longer waiting. A caller that can have several results under way passes the ``ticket`` that
         ``waiting`` gave, so that the result of a dropped transfer does not confirm the one after it.
         """
-        del now  # nothing follows a confirmation; taken for the sake of one form of all inputs
         if not self._confirming or (ticket is not None and ticket != self._ticket):
             return
         if code is not None:
@@ -128,19 +128,20 @@ class SdoServer:
 
     def advance(self, now: int) -> None:
         """Let time pass: the time-out of a transfer, and the paced segments of a block upload."""
+        if now < self.due:
+            return
         transfer = self._transfer
-        if isinstance(transfer, BlockUpload) and transfer.next_burst is not None:
-            if now >= transfer.next_burst:
-                transfer.advance(now)
-                self._deadline = now + TIMEOUT_NS
-        elif self._deadline is not None and now >= self._deadline:
+        if isinstance(transfer, BlockUpload) and transfer.bursts:
+            transfer.advance(now)
+            self._deadline = now + TIMEOUT_NS
+        else:
             self._abort(Abort.TIMEOUT)
 
-    def next_deadline(self) -> int | None:
+    @property
+    def due(self) -> int:
         """When ``advance`` has something to do."""
-        transfer = self._transfer
-        burst = transfer.next_burst if isinstance(transfer, BlockUpload) else None
-        return self._deadline if burst is None else burst
+        bursts = isinstance(self._transfer, BlockUpload) and self._transfer.bursts
+        return self._pace.next_burst if bursts else self._deadline
 
     # ---- requests
 
@@ -225,7 +226,7 @@ class SdoServer:
         self._answer = answer
         ticket = self._ticket
         if self._objects.download(self._index, self._sub, data, now):
-            self.confirm(None, now, ticket)
+            self.confirm(None, ticket)
 
     # ---- upload, expedited and segmented
 
@@ -306,7 +307,7 @@ class SdoServer:
         if (download := self._open_block_download()) is not None:
             self._in_flight.expect(download.next_segment)
         self._transfer, self._confirming = None, False
-        self._deadline = None
+        self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
 
 

@@ -7,6 +7,7 @@ from script import MS, Heard, bytes_of, hexadecimal, ms
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.sdo import SdoServer
+from kontronik_can_gw.output import NEVER
 
 
 @dataclass
@@ -104,13 +105,10 @@ class Bench(Heard):
 
     def pass_time(self, until: int) -> None:
         """Let time pass as the runtime does: from deadline to deadline."""
-        while (deadline := self.server.next_deadline()) is not None and deadline <= until:
-            self.now = max(self.now, deadline)
+        while (due := self.server.due) <= until:
+            self.now = max(self.now, due)
             self.server.advance(self.now)
-            following = self.server.next_deadline()
-            assert following is None or following > self.now, (
-                "a deadline that advance does not settle"
-            )
+            assert self.server.due > self.now, "a deadline that advance does not settle"
         self.now = until
 
     def jump(self, now: int) -> None:
@@ -151,8 +149,8 @@ class Bench(Heard):
             case "server", _:
                 return f"server {'busy' if self.server.busy else 'idle'}"
             case "deadline", _:
-                deadline = self.server.next_deadline()
-                return f"deadline {'none' if deadline is None else ms(deadline)}"
+                due = self.server.due
+                return f"deadline {'none' if due == NEVER else ms(due)}"
             case "value", [place, "=", *data]:
                 self.objects.entries[int(place[:4], 16), int(place[5:], 16)].value = bytes_of(
                     " ".join(data)
@@ -160,12 +158,12 @@ class Bench(Heard):
             case "reset", []:
                 self.server.reset()
             case "confirm", []:
-                self.server.confirm(None, self.now)
+                self.server.confirm(None)
             case "confirm", ["!", code]:
-                self.server.confirm(Abort[code], self.now)
+                self.server.confirm(Abort[code])
             case "confirm", ["the", "first"]:
                 assert len(set(self._tickets)) == len(self._tickets) > 1
-                self.server.confirm(None, self.now, self._tickets[0])
+                self.server.confirm(None, self._tickets[0])
             case _:
                 raise AssertionError(f"what is {what!r}?")
         return what

@@ -19,6 +19,7 @@ from sdo_client import Refused, answer_to, download, upload, uploaded
 from wire import Wire
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
+from kontronik_can_gw.output import NEVER
 
 # ---- a model
 
@@ -301,7 +302,7 @@ def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(
         if how == 15 or (model.phase == "late" and how < 5):
             code = Abort.HARDWARE if raw[0] % 2 else None
             bench.answers = []
-            bench.server.confirm(code, now)
+            bench.server.confirm(code)
             assert [code_of(answer) for answer in bench.answers] == model.confirm(code)
             bench.server.advance(now)
             continue
@@ -320,7 +321,7 @@ def test_random_traffic_gets_the_answers_of_the_model_and_never_an_exception(
         ) + model.hear(data, now)
         bench.server.advance(now)  # after a frame that was none the time-out may still be due
         assert bench.server.busy == (model.phase != "idle")
-        assert (bench.server.next_deadline() is None) == (model.phase in ("idle", "late"))
+        assert (bench.server.due == NEVER) == (model.phase in ("idle", "late"))
         assert bench.objects.written == model.objects.written
 
 
@@ -387,8 +388,7 @@ class Client:
         frames = list(self.bench.request(request.ljust(8, b"\0")))
         self.bursts[self.bench.now] += len(frames)
         while len(frames) < block_size and all(frame[0] < 0x80 for frame in frames):
-            due = self.bench.server.next_deadline()
-            assert due is not None
+            due = self.bench.server.due
             self.bench.answers = []
             self.bench.pass_time(due)
             self.bursts[due] += len(self.bench.answers)
@@ -532,11 +532,9 @@ def master(bench: Bench, lose: Callable[[bytes], bool] = lambda data: False) -> 
             return []
         bench.now += MS
         answers = list(bench.request(data))
-        while (
-            deadline := bench.server.next_deadline()
-        ) is not None and deadline < bench.now + 1000 * MS:
+        while (due := bench.server.due) < bench.now + 1000 * MS:
             bench.answers = []
-            bench.pass_time(deadline)
+            bench.pass_time(due)
             answers += bench.answers
         return [(0x581, answer) for answer in answers]
 
