@@ -9,7 +9,7 @@ from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.node_settings import esc_settings
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event, LinkState
-from kontronik_can_gw.gateway_status import GatewayState, GatewayStatus
+from kontronik_can_gw.gateway_status import GatewayStatus
 
 
 class EscObjects:
@@ -82,17 +82,11 @@ class EscObjects:
 
     # --- objects
 
-    def _status_register(self, _now: int) -> int:
+    def _status_register(self, now: int) -> int:
         """1002h: bits 7..0 link status as 2020h:1, 15..8 CAN state, 16 telemetry fresh, 17 information fresh."""
-        esc = self._esc
-        return (
-            int(esc.link)
-            | (self._gateway.state is GatewayState.REPLAY) << 6
-            | (esc.info is not None) << 7
-            | int(self._gateway.can_state) << 8
-            | (esc.live is not None) << 16
-            | (esc.info is not None) << 17
-        )
+        esc, gateway = self._esc, self._gateway
+        fresh = (esc.live is not None) | (esc.info is not None) << 1
+        return at.link_status(esc, gateway, now) | int(gateway.can_state) << 8 | fresh << 16
 
     def _device_name(self, _now: int) -> bytes:
         protocol, info = self._esc.protocol, self._esc.last_info

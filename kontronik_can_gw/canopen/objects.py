@@ -151,7 +151,7 @@ def _age(name: str, stamp: Callable[[EscTelemetry], int | None]) -> Value:
     return Value(name, "ms", Group.LINK, Kind.AGE, read=read, low=0, high=U16)
 
 
-def _link_status(esc: EscTelemetry, gateway: GatewayStatus, _now: int) -> int:
+def link_status(esc: EscTelemetry, gateway: GatewayStatus, _now: int) -> int:
     return esc.link | (gateway.state is GatewayState.REPLAY) << 6 | (esc.info is not None) << 7
 
 
@@ -168,7 +168,7 @@ def _firmware(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | No
 
 _FIRMWARE = Value("firmware", "", Group.INFO, Kind.BITS, read=_firmware, low=0, high=U16)
 _LINK_VALUES = {
-    1: Value("link_status", "", Group.LINK, Kind.STATE, read=_link_status, low=0, high=U8),
+    1: Value("link_status", "", Group.LINK, Kind.STATE, read=link_status, low=0, high=U8),
     2: _of_link("live_counter", lambda esc: esc.counters.live, Group.LIVE),
     3: _age("data_age", lambda esc: esc.live_ns),
     4: _age("info_age", lambda esc: esc.last_info_ns),
