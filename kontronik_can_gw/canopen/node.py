@@ -11,8 +11,7 @@ from kontronik_can_gw.canopen.abort import Abort
 from kontronik_can_gw.canopen.bound_values import bind_values
 from kontronik_can_gw.canopen.can_faults import CanFaults
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT, LSS_ANSWER, SDO_ANSWER
-from kontronik_can_gw.canopen.dictionary import Dictionary, Variable
-from kontronik_can_gw.canopen.eds import Eds
+from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.emergency import Emergencies
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError
 from kontronik_can_gw.canopen.esc_objects import EscObjects
@@ -20,7 +19,6 @@ from kontronik_can_gw.canopen.heartbeat import Consumer, Producer
 from kontronik_can_gw.canopen.identity import Identity
 from kontronik_can_gw.canopen.lss import LssSlave
 from kontronik_can_gw.canopen.nmt import Nmt
-from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.parameters import Parameters
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import Stored
@@ -33,28 +31,28 @@ from kontronik_can_gw.node_state import UNCONFIGURED, NmtState
 from kontronik_can_gw.output import NEVER
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.canopen.nodes import Nodes
+    from kontronik_can_gw.canopen.nodes import CanopenSetup, Nodes
 
 _WITH_COB_ID = frozenset({0x1005, 0x1014, 0x1016, *range(0x1800, 0x1A00)})
 """Objects whose download may change COB-IDs."""
 
 
 class Node:
-    """One ESC's node. ``set_due`` follows each call of one of its services. ``owner``: all nodes of the bus."""
+    """One ESC's node. ``set_due`` follows each call of one of its services. ``number``: of its ESC in the setup."""
 
     def __init__(
         self,
-        eds: Eds,
-        dictionary: Dictionary,
+        number: int,
+        setup: "CanopenSetup",
         esc: EscTelemetry,
         gateway: GatewayStatus,
-        settings: NodeSettings,
-        stored: Stored,
         owner: "Nodes",
     ) -> None:
         self.esc = esc
-        self.dictionary = dictionary
-        self.settings = settings
+        base = setup.escs[number] if setup.escs else esc.settings
+        self.dictionary = dictionary = setup.dictionary(number, base)
+        self.settings = settings = setup.settings[number]
+        self._number = number
         self.due = NEVER
         self._owner = owner
         taken = owner.cob_id_taken
@@ -65,7 +63,7 @@ class Node:
         self.consumer = Consumer(dictionary, self._watch_changed)
         self.sync = SyncConsumer(dictionary, taken)
         self.sdo = SdoServer(dictionary, self._send_sdo, settings.segment_ns)
-        self.parameters = Parameters(dictionary, stored, self.sdo, partial(owner.save, self))
+        self.parameters = Parameters(dictionary, setup.stored[number], self.sdo, self._save)
         self.identity = Identity(
             dictionary,
             settings,
@@ -82,16 +80,13 @@ class Node:
             gateway,
             self.emergencies,
             settings.device,
-            partial(owner.settings_changed, self),
+            partial(owner.settings_changed, number),
             self.nmt.telemetry_lost,
         )
-        self.can_faults = CanFaults(
-            self.emergencies, self.nmt, self._return_from_outage, self._repeat
-        )
+        self.can_faults = CanFaults(self.emergencies, self.nmt, self._returned, self._repeat)
         self._timers = (self._producer, self.consumer, self.sdo, self.emergencies, self.tpdos)
-        version = settings.version.encode("ascii", "replace")
-        dictionary.bind(0x100A, read=lambda _now: version)
-        dictionary.bind(0x1021, read=lambda _now: eds.data)  # the stored EDS
+        dictionary.bind(0x100A, read=lambda _now: settings.version.encode("ascii", "replace"))
+        dictionary.bind(0x1021, read=lambda _now: setup.eds.data)  # the stored EDS
         dictionary.written = self._on_download
 
     @property
@@ -161,10 +156,10 @@ class Node:
             if self.nmt.starts_itself:
                 self.nmt.enter(NmtState.OPERATIONAL, now)
         if parameters.rejected:
-            self._owner.rejected(self, parameters.rejected)
+            self._owner.rejected_parameters += [(self._number, key) for key in parameters.rejected]
         parameters.verify()
-        self._owner.routes_changed()
-        self._owner.state_changed()
+        self._owner.rerouted = True
+        self._owner.state_changes += 1
         self.set_due()
 
     # --- what happens
@@ -195,10 +190,13 @@ class Node:
             self.sdo.confirm(None if error is None else Abort.HARDWARE, ticket)
         self.set_due()
 
-    # --- frames out
+    # --- what services give out
 
     def _send(self, cob_id: int, data: bytes) -> None:
         self._owner.send(CanFrame(cob_id, data, queued=True))
+
+    def _save(self, stored: Stored) -> None:
+        self._owner.saves.append((self._number, stored))
 
     def _send_sdo(self, data: bytes) -> None:
         self._send(SDO_ANSWER + self.node_id, data)
@@ -211,7 +209,7 @@ class Node:
     def _entered(self, now: int) -> None:
         """The NMT state is another one."""
         self.tpdos.stop()
-        self._owner.state_changed()
+        self._owner.state_changes += 1
         if self.state is NmtState.STOPPED:
             self.emergencies.close()
             self.sdo.reset()
@@ -230,9 +228,9 @@ class Node:
         self.tpdos.on_download(variable, now)
         self.parameters.on_download(variable, changed)
         if variable.entry.index in _WITH_COB_ID:
-            self._owner.routes_changed()
+            self._owner.rerouted = True
 
-    def _return_from_outage(self, now: int) -> None:
+    def _returned(self, now: int) -> None:
         """The controller left bus-off, or the interface is back. With 1029h:1 = 0 the node boots, so that its master sets it up anew.
 
         CiA 301 asks for PRE-OPERATIONAL then; a boot-up besides is what brings a node without a master, self-starting, to work again.

@@ -12,6 +12,7 @@ from kontronik_can_gw.canopen.cob_ids import (
     default_ids,
     uses,
 )
+from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.nmt import is_reset_of_all
@@ -42,10 +43,11 @@ class CanopenSetup:
 
     def esc_settings(self, escs: Sequence[EscSettings]) -> list[EscSettings]:
         """The ESCs' settings with the EDS's defaults and what was stored over the bus worked in."""
-        return [
-            esc_settings(make_dictionary(self.eds, esc, node, stored), esc)
-            for esc, node, stored in zip(escs, self.settings, self.stored, strict=True)
-        ]
+        return [esc_settings(self.dictionary(n, esc), esc) for n, esc in enumerate(escs)]
+
+    def dictionary(self, number: int, esc: EscSettings) -> Dictionary:
+        """The dictionary of a node before its first reset."""
+        return make_dictionary(self.eds, esc, self.settings[number], self.stored[number])
 
     def nodes(
         self, escs: Sequence[EscSettings], foreign_ids: Mapping[int, str] | None = None
@@ -74,20 +76,15 @@ class Nodes(Output):
     ) -> None:
         super().__init__()
         self.due = NEVER
-        self._settings_changed = settings_changed
+        self.settings_changed = settings_changed
         self._foreign_ids = foreign_ids or {}
         self._routes: dict[int, list[tuple[Node, FrameTaker]]] = {}
-        self._rerouted = True
+        self.rerouted = True
+        """A node uses other COB-IDs now."""
         self._watched: frozenset[int] = frozenset()
         self._to_watchers: deque[CanFrame] = deque()
         self._started = False
-        self.nodes: list[Node] = []
-        bases = setup.escs or tuple(esc.settings for esc in escs)
-        for esc, base, settings, stored in zip(
-            escs, bases, setup.settings, setup.stored, strict=True
-        ):
-            dictionary = make_dictionary(setup.eds, base, settings, stored)
-            self.nodes.append(Node(setup.eds, dictionary, esc, gateway, settings, stored, self))
+        self.nodes = [Node(n, setup, esc, gateway, self) for n, esc in enumerate(escs)]
 
     # --- what happens
 
@@ -206,26 +203,6 @@ class Nodes(Output):
         if frame.can_id in self._watched:
             self._to_watchers.append(frame)
 
-    def save(self, node: Node, stored: Stored) -> None:
-        """Begin to store; ``node.saved`` is called with the result."""
-        self.saves.append((self.nodes.index(node), stored))
-
-    def settings_changed(self, node: Node, settings: EscSettings) -> None:
-        """2100h was written or reset."""
-        self._settings_changed(self.nodes.index(node), settings)
-
-    def routes_changed(self) -> None:
-        """A node uses other COB-IDs now."""
-        self._rerouted = True
-
-    def rejected(self, node: Node, keys: list[int]) -> None:
-        """Stored values did not hold at a reset: they do not fit the EDS, or clash."""
-        self.rejected_parameters += [(self.nodes.index(node), key) for key in keys]
-
-    def state_changed(self) -> None:
-        """A node's NMT state or node-ID is another one."""
-        self.state_changes += 1
-
     def cob_id_taken(self, cob_id: int, user: object) -> bool:
         """Whether something else of the gateway uses this id; ``user`` as in ``Use``."""
         used = (use for node in self.nodes for use in uses(node))
@@ -260,8 +237,8 @@ class Nodes(Output):
             # what we send does not come back from the bus: one of our nodes may watch another
             frame = self._to_watchers.popleft()
             self._route(frame, now, now)
-        if self._rerouted:
-            self._rerouted = False
+        if self.rerouted:
+            self.rerouted = False
             self._watched = frozenset(
                 HEARTBEAT + node_id for node in self.nodes for node_id in node.consumer.node_ids
             )
