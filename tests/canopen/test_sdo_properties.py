@@ -117,6 +117,7 @@ class Client:
         """The segments that follow a request, paced or not."""
         self.bench.now += next(self._pauses)
         frames = list(self.bench.request(request.ljust(8, b"\0")))
+        assert frames or self.bench.server.due > self.bench.now, "the first segments come at once"
         self.bursts[self.bench.now] += len(frames)
         while len(frames) < block_size and all(frame[0] < 0x80 for frame in frames):
             due = self.bench.server.due
