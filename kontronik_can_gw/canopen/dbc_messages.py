@@ -10,9 +10,10 @@ from fractions import Fraction
 from typing import Any
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.bound_values import Mapped, message_plan
+from kontronik_can_gw.canopen.bound_values import message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
 from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
+from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.eds_object import Entry
 from kontronik_can_gw.canopen.emergency_codes import Register
 from kontronik_can_gw.canopen.node import Node
@@ -133,26 +134,26 @@ class NodeMessages:
     def _tpdo(self, tpdo: Tpdo) -> Message:
         plan = message_plan("", tpdo.cob_id, tpdo.mapped)
         signals: list[Signal] = []
-        words: list[tuple[Mapped, SignalPlan, Sequence[ErrorBit]]] = []
+        words: list[tuple[Variable, SignalPlan, Sequence[ErrorBit]]] = []
         state_name = ""
-        for entry, place in zip(tpdo.mapped, plan.signals, strict=True):
-            if bits := self._error_bits(entry, place):
-                words.append((entry, place, bits))
+        for variable, place in zip(tpdo.mapped, plan.signals, strict=True):
+            if bits := self._error_bits(variable, place):
+                words.append((variable, place, bits))
                 continue
-            made = self._object(entry, place)
-            if entry.bound is not None and entry.bound.source.name == "operating_state_raw":
+            made = self._object(variable, place)
+            if variable.bound is not None and variable.bound.source.name == "operating_state_raw":
                 state_name = state_name or made[0].name
             signals += made
-        for entry, place, bits in words:
-            signals += self._flags(entry, place, bits, state_name)
+        for variable, place, bits in words:
+            signals += self._flags(variable, place, bits, state_name)
         name = self._message_names.take(self._message_prefix, f"Tpdo{tpdo.number + 1}")
         comment = f"TPDO {tpdo.number + 1} of {self._title}. {_when(tpdo)}"
         schedule = _schedule(tpdo)
         return Message(tpdo.cob_id, name, plan.length, comment, _SENDERS, *schedule, signals)
 
-    def _object(self, entry: Mapped, place: SignalPlan) -> list[Signal]:
+    def _object(self, variable: Variable, place: SignalPlan) -> list[Signal]:
         """The signals of one mapped object that is no error word."""
-        item, bound = entry.variable.entry, entry.bound
+        item, bound = variable.entry, variable.bound
         where = _where(item)
         length, signed, start = place.length, place.signed, place.pieces[0].at
         lowest = -(1 << length - 1) if signed else 0
@@ -199,22 +200,22 @@ class NodeMessages:
         ]
 
     def _flags(
-        self, entry: Mapped, place: SignalPlan, bits: Sequence[ErrorBit], state_name: str
+        self, variable: Variable, place: SignalPlan, bits: Sequence[ErrorBit], state_name: str
     ) -> list[Signal]:
         then = f" and {state_name} is NotAvailable" if state_name else ""
         lost = f"While the word is not available all its bits are set{then}."
-        where, start = _where(entry.variable.entry), place.pieces[0].at
+        where, start = _where(variable.entry), place.pieces[0].at
         return [
             self._signal(name, start + bit, 1, f"{where} Bit {int(bit)}, {bit.meaning}. {lost}")
             for bit, name in ((bit, pascal_case(bit.name)) for bit in bits)
             if bit < place.length
         ]
 
-    def _error_bits(self, entry: Mapped, place: SignalPlan) -> Sequence[ErrorBit]:
+    def _error_bits(self, variable: Variable, place: SignalPlan) -> Sequence[ErrorBit]:
         """The bits of an error word that is shown unsigned; empty for every other object."""
-        if entry.bound is None or place.signed:
+        if variable.bound is None or place.signed:
             return ()
-        return self._protocol.errors.get(entry.bound.source.name, ())
+        return self._protocol.errors.get(variable.bound.source.name, ())
 
     def _table(self, name: str, names: Mapping[int, str]) -> tuple[dict[int, str], str]:
         """Value names and signal name of a source. An enumeration is closed: a number without a name gets one, because tools lose
@@ -269,7 +270,7 @@ def _when(tpdo: Tpdo) -> str:
             text += f", no closer than {number(Fraction(tpdo.inhibit_ns, MS))} ms"
         if tpdo.event_ns:
             text += f", at the latest after {tpdo.event_ns // MS} ms"
-    sources = [entry.bound.source for entry in tpdo.mapped if entry.bound is not None]
+    sources = [variable.bound.source for variable in tpdo.mapped if variable.bound is not None]
     if any(source.group is Group.LIVE for source in sources):
         link = any(source.name == "link_status" for source in sources)
         text += f". {'Goes on' if link else 'Not sent'} while the telemetry is lost"

@@ -9,6 +9,7 @@ from kontronik_can_gw.canopen.abort import Abort, SdoAbort
 from kontronik_can_gw.canopen.data_types import DOMAIN_TYPE, codec
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.eds_object import Entry
+from kontronik_can_gw.canopen.objects import Bound
 
 Value = int | float | bytes
 Read = Callable[[int], Value]
@@ -42,11 +43,13 @@ _IF_ABSENT = {
 class Variable:
     """One entry at work. ``check`` may refuse a new value; ``written`` follows one."""
 
-    __slots__ = ("check", "codec", "entry", "power_on", "read", "value", "written")
+    __slots__ = ("bound", "check", "codec", "entry", "power_on", "read", "value", "written")
 
     def __init__(self, entry: Entry) -> None:
         self.entry = entry
         self.codec = codec(entry.data_type)
+        self.bound: Bound | None = None
+        """The value of ESC or gateway that it shows."""
         self.read: Read | None = None
         self.check: Check | None = None
         self.written: Written | None = None

@@ -32,7 +32,7 @@ class Tpdo(TpdoParameters):
         send: Callable[[CanFrame], None],
         taken: Taken,
     ) -> None:
-        super().__init__(number, dictionary, taken, esc.protocol)
+        super().__init__(number, dictionary, taken)
         self.due = NEVER
         self.sent = 0
         """Frames so far."""
@@ -133,7 +133,7 @@ class Tpdo(TpdoParameters):
 
     def on_download(self, variable: Variable, now: int) -> None:
         """An object was written over the bus."""
-        mapped = any(entry.variable is variable for entry in self.mapped)
+        mapped = any(entry is variable for entry in self.mapped)
         if mapped and self._started and self._running:
             self._news(now)
 

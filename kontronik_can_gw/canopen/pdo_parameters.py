@@ -3,11 +3,9 @@
 from collections.abc import Sequence
 
 from kontronik_can_gw.canopen.abort import Abort, SdoAbort
-from kontronik_can_gw.canopen.bound_values import Mapped, bits_of
+from kontronik_can_gw.canopen.bound_values import bits_of
 from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, Taken, check_free, restricted
-from kontronik_can_gw.canopen.dictionary import Dictionary, Written
-from kontronik_can_gw.canopen.objects import bindings_of
-from kontronik_can_gw.esc.decoder import EscProtocol
+from kontronik_can_gw.canopen.dictionary import Dictionary, Variable, Written
 from kontronik_can_gw.esc.telemetry import MS
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
@@ -21,9 +19,7 @@ _MAX_BITS = 64
 class TpdoParameters:
     """What a master configures of one transmit PDO."""
 
-    def __init__(
-        self, number: int, dictionary: Dictionary, taken: Taken, protocol: EscProtocol
-    ) -> None:
+    def __init__(self, number: int, dictionary: Dictionary, taken: Taken) -> None:
         self.number = number
         self.cob_id = 0
         self.valid = False
@@ -31,11 +27,10 @@ class TpdoParameters:
         """Transmission type."""
         self.inhibit_ns = self.event_ns = 0
         self.sync_start = 0
-        self.mapped: list[Mapped] = []
+        self.mapped: list[Variable] = []
         """What is in the PDO; empty where nothing is."""
         self._dictionary = dictionary
         self._taken = taken
-        self._bindings = bindings_of(protocol)
         self.indices = COMMUNICATION + number, MAPPING + number
 
     def bind(self, written: Written) -> None:
@@ -74,18 +69,18 @@ class TpdoParameters:
         """Whether the COB-ID can be used."""
         return not restricted(self.cob_id) and not self._taken(self.cob_id, self)
 
-    def _resolve_all(self, count: int) -> list[Mapped]:
+    def _resolve_all(self, count: int) -> list[Variable]:
         number, mapping = self._dictionary.number, self.indices[1]
         return [self._resolve(number(mapping, sub)) for sub in range(1, count + 1)]
 
-    def _resolve(self, mapping: int) -> Mapped:
+    def _resolve(self, mapping: int) -> Variable:
         """The object of a mapping entry (index, sub-index, bits). SdoAbort where it cannot be mapped."""
         index, sub, bits = mapping >> 16, mapping >> 8 & 0xFF, mapping & 0xFF
         variable = self._dictionary.find(index, sub)
         mappable = variable.entry.mappable and variable.readable
         if not mappable or not bits_of(variable) or bits_of(variable) != bits:
             raise SdoAbort(Abort.NOT_MAPPABLE)
-        return Mapped(variable, self._bindings.get((index, sub)))
+        return variable
 
     def _check_cob_id(self, value: int) -> None:
         """A new 180xh:1.
@@ -138,6 +133,6 @@ class TpdoParameters:
             self._resolve(mapping)
 
 
-def _check_length(mapped: Sequence[Mapped]) -> None:
-    if sum(bits_of(entry.variable) for entry in mapped) > _MAX_BITS:
+def _check_length(mapped: Sequence[Variable]) -> None:
+    if sum(map(bits_of, mapped)) > _MAX_BITS:
         raise SdoAbort(Abort.PDO_LENGTH)

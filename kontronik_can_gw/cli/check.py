@@ -71,9 +71,7 @@ def node_table(nodes: Nodes, loaded: Loaded) -> list[str]:
         for cob_id, what in dict(all_ids(node)).items():
             tpdo = next((t for t in node.tpdos if t.valid and t.cob_id == cob_id), None)
             objects = (
-                ""
-                if tpdo is None
-                else ", ".join(entry.variable.entry.name for entry in tpdo.mapped)
+                "" if tpdo is None else ", ".join(variable.entry.name for variable in tpdo.mapped)
             )
             what = what.removesuffix(f" of CANopen node {node.node_id}").removesuffix(
                 f" to CANopen node {node.node_id}"
