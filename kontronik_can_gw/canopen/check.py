@@ -141,14 +141,8 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
 
 def without_objects(nodes: Nodes) -> list[str]:
     """A line for each TPDO that is valid by its defaults and maps nothing, of all nodes: none of them is ever sent."""
-    numbers = sorted(
-        {
-            tpdo.number
-            for node in nodes.nodes
-            for tpdo in node.tpdos
-            if tpdo.valid and not tpdo.mapped
-        }
-    )
+    tpdos = (tpdo for node in nodes.nodes for tpdo in node.tpdos)
+    numbers = sorted({tpdo.number for tpdo in tpdos if tpdo.valid and not tpdo.mapped})
     return [
         f"TPDO {number + 1} is never sent: {MAPPING + number:04X}h maps nothing, so {COMMUNICATION + number:04X}h:01 cannot be valid. "
         "Map objects, or set bit 31 of its DefaultValue."

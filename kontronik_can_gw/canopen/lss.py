@@ -69,19 +69,18 @@ SCAN_RESET = 0x80
 
 
 class Host(Protocol):
-    """The node as LSS sees it."""
+    """The node as LSS sees it. Node-IDs: 1..127, or 255: unconfigured."""
 
     @property
     def identity(self) -> tuple[int, int, int, int]:
         """1018h:1..4: vendor-ID, product code, revision number, serial number; 32 bit each."""
 
     @property
-    def active_node_id(self) -> int:
-        """1..127, or 255: unconfigured."""
+    def active_node_id(self) -> int: ...
 
     @property
     def pending_node_id(self) -> int:
-        """1..127 or 255; becomes the active one at reset communication."""
+        """Becomes the active one at reset communication."""
 
     def configure_node_id(self, node_id: int) -> bool:
         """Set the pending node-ID, 1..127 or 255. False: refused (bus writes switched off)."""

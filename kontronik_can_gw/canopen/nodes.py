@@ -90,10 +90,8 @@ class Nodes(Output):
 
     def start(self, now: int, can_open: bool) -> None:
         """Power on; without a bus that can hear it the nodes boot when there is one."""
-        if can_open:
-            self._power_on(now)
-
-    def _power_on(self, now: int) -> None:
+        if not can_open:
+            return
         self._started = True
         for node in self.nodes:
             node.power_on(now)
@@ -117,7 +115,6 @@ class Nodes(Output):
         return self.due
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        """Something of an ESC changed."""
         self.nodes[esc].on_event(events, now)
         self._after(now)
 
@@ -132,14 +129,13 @@ class Nodes(Output):
     def can_returned(self, now: int) -> None:
         """Frames can be sent again after some were lost, or for the first time."""
         if not self._started:
-            self._power_on(now)
+            self.start(now, can_open=True)
             return
         for node in self.nodes:
             node.can_faults.frames_pass(now)
         self._after_all(now)
 
     def held_up(self, now: int) -> None:
-        """The process was held up until ``now``."""
         for node in self.nodes:
             node.tpdos.held_up(now)
             node.consumer.held_up(now)
@@ -171,7 +167,6 @@ class Nodes(Output):
         }
 
     def overrun(self, now: int) -> None:
-        """The CAN controller lost received frames."""
         for node in self.nodes:
             node.can_faults.overrun(now)
         self._after_all(now)
@@ -187,7 +182,6 @@ class Nodes(Output):
         self._after(now)
 
     def advance(self, now: int) -> None:
-        """Let time pass."""
         if now < self.due:
             return
         for node in self.nodes:
