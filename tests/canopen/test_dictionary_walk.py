@@ -170,6 +170,7 @@ def fed(behaviour: int = 0) -> Bench:
     """A node whose ESC has just sent both frames. ``behaviour``: 2100h:5."""
     bench = Bench(changes=QUIET)
     assert bench.write(0x2100, 5, behaviour, size=1) is None
+    bench.wait(10)
     bench.uart(uart(INFO, Layout.V4))
     bench.uart(uart(LIVE, Layout.V4))
     bench.take()
